@@ -1,0 +1,1 @@
+"""Recordings in; tables, pictures and calibrations out; the `finforce` command."""

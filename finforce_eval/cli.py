@@ -1,0 +1,125 @@
+"""The `finforce` command: options in, one call out; heavy imports wait until a subcommand runs."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import NoReturn
+
+SOLVERS = ("default", "solid", "frame", "paper")
+MESHES = ("default", "coarse", "fine")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+CONTACT_HELP = (
+    "contact: fixed:Z_MM, the height of first touch above the clamped base; fixed:case takes it from the "
+    "case.json beside each recording (the default); NAME=Z_MM gives it for one recording and may be repeated"
+)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit with 2."""
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def build_parser() -> Parser:
+    """Return the parser with every subcommand."""
+    parser = Parser(prog="finforce", description="Grasp force from the key points of fin-ray jaws.")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
+    _add_evaluate(commands)
+    _add_calibrate(commands)
+    replay = "play a recording through the real nodes in real time and score it"
+    commands.add_parser("replay", help=replay, add_help=False)
+    _add_demo(commands)
+    _add_bench(commands)
+    _add_steel(commands)
+    version = commands.add_parser("version", help="print the version")
+    version.set_defaults(run="finforce_eval.commands:run_version")
+    return parser
+
+
+def add_jaw_options(parser: argparse.ArgumentParser) -> None:
+    """Add what names the jaw, the solver and the contact."""
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
+    parser.add_argument("--solver", default="default", choices=SOLVERS, help="model and objective")
+    parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
+    parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
+
+
+def _add_evaluate(commands: argparse._SubParsersAction) -> None:
+    text = "run the estimator over recordings offline and score it against the measured force"
+    parser = commands.add_parser("evaluate", help=text, description=text)
+    parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
+    add_jaw_options(parser)
+    parser.add_argument("--object", metavar="MESH", help="object mesh; used by contact estimators only")
+    calibration = "calibration file, or a shipped name; without it the jaw file's own material"
+    parser.add_argument("--calibration", metavar="FILE", help=calibration)
+    parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
+    parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
+    parser.set_defaults(run="finforce_eval.commands:run_evaluate")
+
+
+def _add_calibrate(commands: argparse._SubParsersAction) -> None:
+    text = "identify the material from recordings with ground truth"
+    parser = commands.add_parser("calibrate", help=text, description=text)
+    parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
+    add_jaw_options(parser)
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration to be written")
+    parser.set_defaults(run="finforce_eval.commands:run_calibrate")
+
+
+def _add_demo(commands: argparse._SubParsersAction) -> None:
+    text = "replay the shipped recording through the real nodes and write a report"
+    parser = commands.add_parser("demo", help=text, description=text)
+    parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")
+    parser.set_defaults(run="finforce_eval.demo:run_demo")
+
+
+def _add_bench(commands: argparse._SubParsersAction) -> None:
+    text = "measure the time of a solver step and the memory of a solver, single-threaded"
+    parser = commands.add_parser("bench", help=text, description=text)
+    parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
+    parser.add_argument("--frames", type=int, default=600, metavar="N", help="frames per solver (600)")
+    parser.set_defaults(run="finforce_eval.bench:run_bench")
+
+
+def _add_steel(commands: argparse._SubParsersAction) -> None:
+    text = "convert the pictures of the measured steel finger into a recording"
+    parser = commands.add_parser("convert-steel", help=text, description=text)
+    parser.add_argument("output", metavar="FOLDER", help="recording to be written")
+    parser.add_argument("--source", metavar="FILE", help="measurement; without it the shipped one")
+    parser.add_argument("--storage", default="mcap", choices=("mcap", "sqlite3"), help="its format")
+    parser.set_defaults(run="finforce_eval.steel:run_convert")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the `finforce` command.
+
+    Returns:
+        0; 2 after one line on stderr when the input cannot be used; 130 after Ctrl-C.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    # one thread: the times are of one thread, and sums come in the same order on every machine
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
+    from finforce_ifea.errors import FinforceError
+
+    try:
+        if arguments[:1] == ["replay"]:
+            return import_module("finforce_eval.replay").main(arguments[1:]) or 0
+        options = build_parser().parse_args(arguments)
+        module, function = options.run.split(":")
+        return getattr(import_module(module), function)(options) or 0
+    except (FinforceError, OSError) as error:
+        print(f"finforce: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

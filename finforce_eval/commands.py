@@ -1,0 +1,192 @@
+"""The subcommands `evaluate`, `calibrate` and `version`: options to records, calls, and print."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from finforce_eval.contacts import ContactChoice, parse_contacts
+from finforce_eval.errors import OptionError
+from finforce_eval.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
+from finforce_eval.recording import read_recording
+from finforce_eval.results import CaseResult
+from finforce_eval.tables import evaluation_json, format_table
+from finforce_eval.tracks import Recording
+from finforce_ifea.calibration import Calibration, load_calibration, save_calibration
+from finforce_ifea.estimator import Contact, JawEstimator
+from finforce_ifea.jaw import Jaw, load_jaw
+from finforce_ifea.settings import EstimatorSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setup:
+    """What an offline run needs beside the recordings."""
+
+    jaw: Jaw
+    settings: EstimatorSettings
+    calibration: Calibration | None
+    contacts: ContactChoice
+    about: Mapping[str, str]
+
+    def side(self, side: str) -> Setup:
+        """Return the setup of the left or the right jaw; a jaw file describes the left one."""
+        return self if side == self.jaw.side else replace(self, jaw=self.jaw.mirrored())
+
+    def estimator(self) -> JawEstimator:
+        """Return a fresh estimator that has nothing left to compile."""
+        estimator = JawEstimator(self.jaw, settings=self.settings, calibration=self.calibration)
+        estimator.warm_up()
+        return estimator
+
+    def contact(self, recording: Recording) -> Contact:
+        """Return the contact of a recording."""
+        return Contact.fixed(self.jaw, self.contacts.height(recording))
+
+
+def run_version(options: argparse.Namespace) -> None:
+    """Print the version."""
+    print(f"finforce {version()}")
+
+
+def version() -> str:
+    """Return the version of the installed package, or what the sources say."""
+    from importlib.metadata import PackageNotFoundError
+    from importlib.metadata import version as installed
+
+    try:
+        return installed("finforce")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def read_recordings(paths: Sequence[str]) -> list[Recording]:
+    """Read recordings and give each a name of its own.
+
+    Raises:
+        RecordingError: one of them cannot be read.
+        OptionError: one was given twice.
+    """
+    if len({Path(path).resolve() for path in paths}) < len(paths):
+        raise OptionError("a recording was given twice")
+    recordings = [read_recording(path) for path in paths]
+    names = [recording.name for recording in recordings]
+    for recording in recordings:
+        for note in recording.notes:
+            print(f"note: {recording.name}: {note}", file=sys.stderr)
+    return [
+        recording if names.count(recording.name) == 1 else replace(recording, name=_long_name(recording))
+        for recording in recordings
+    ]
+
+
+def _long_name(recording: Recording) -> str:
+    """Return the name with the folders above it."""
+    return "/".join(recording.path.resolve().with_suffix("").parts[-3:])
+
+
+def make_setup(options: argparse.Namespace) -> Setup:
+    """Load what the options name.
+
+    Raises:
+        FinforceError: the contact, the jaw or the calibration cannot be used.
+    """
+    contacts = parse_contacts(options.contact)
+    jaw = load_jaw(options.jaw)
+    settings = EstimatorSettings(solver=options.solver, mesh=options.mesh)
+    calibration = load_calibration(options.calibration) if options.calibration else None
+    about = {
+        "jaw": jaw.name,
+        "solver": options.solver,
+        "mesh": options.mesh,
+        "contact": ", ".join(options.contact) or "fixed:case",
+        "calibration": options.calibration or "none",
+        "version": version(),
+    }
+    return Setup(jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about)
+
+
+def run_evaluate(options: argparse.Namespace) -> None:
+    """Evaluate recordings: print the table, write JSON and report."""
+    setup = make_setup(options)
+    recordings = read_recordings(options.bags)
+    evaluation = evaluate_all(recordings, setup)
+    print(format_table(evaluation))
+    if options.json:
+        write_json(options.json, evaluation_json(evaluation, **setup.about))
+    if options.report:
+        from finforce_eval.report import write_report
+
+        names = setup.jaw.keypoint_names
+        page = write_report(evaluation, options.report, keypoint_names=names, about=setup.about)
+        print(f"Report: {page}")
+
+
+def write_json(path: str, content: Mapping[str, Any]) -> None:
+    """Write one JSON object."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def evaluate_all(recordings: Sequence[Recording], setup: Setup) -> Evaluation:
+    """Evaluate every jaw with ground truth of every recording, under one progress bar.
+
+    Raises:
+        FinforceError: one of them cannot be evaluated.
+    """
+    from tqdm import tqdm
+
+    for recording in recordings:
+        for side in truth_sides(recording):
+            check_keypoint_count(recording, side, setup.jaw)
+        setup.contact(recording)
+    cases = [(recording, side) for recording in recordings for side in truth_sides(recording)]
+    frames = sum(len(recording.jaw(side).keypoints.stamps) for recording, side in cases)
+    results = []
+    with tqdm(total=frames, unit="frame", disable=None, leave=False) as bar:
+        for recording, side in cases:
+            bar.set_description(recording.name)
+            results.append(_evaluate_case(recording, side, setup.side(side), bar.update))
+    return score_results(results, recordings)
+
+
+def truth_sides(recording: Recording) -> list[str]:
+    """Return the jaws of a recording that have ground truth.
+
+    Raises:
+        RecordingError: there is none.
+    """
+    sides = [side for side, track in recording.jaws.items() if track.truth is not None]
+    if not sides:
+        recording.truth(next(iter(recording.jaws)))
+    return sides
+
+
+def _evaluate_case(recording: Recording, side: str, setup: Setup, progress: Any) -> CaseResult:
+    """Evaluate one jaw of one recording."""
+    result = evaluate_recording(
+        recording,
+        setup.jaw,
+        setup.contact(recording),
+        side=side,
+        factory=setup.estimator,
+        progress=progress,
+    )
+    return result if len(truth_sides(recording)) == 1 else replace(result, name=f"{recording.name}/{side}")
+
+
+def run_calibrate(options: argparse.Namespace) -> None:
+    """Identify the material and write the calibration."""
+    from finforce_eval.calibrate import calibrate, format_fit
+
+    options.calibration = None
+    setup = make_setup(options)
+    fit = calibrate(read_recordings(options.bags), setup.jaw, setup.contacts, setup.settings)
+    print(format_fit(fit))
+    Path(options.output).parent.mkdir(parents=True, exist_ok=True)
+    save_calibration(fit.calibration, Path(options.output))
+    print(f"Calibration: {options.output}")

@@ -1,0 +1,11 @@
+"""Errors of recordings and commands; every one is reported as one line and exit status 2."""
+
+from finforce_ifea.errors import FinforceError
+
+
+class RecordingError(FinforceError, ValueError):
+    """A recording cannot be read, or lacks what the command needs."""
+
+
+class OptionError(FinforceError, ValueError):
+    """A command-line option has a value that means nothing here."""

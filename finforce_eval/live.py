@@ -1,0 +1,194 @@
+"""What the nodes answered during a replay, as the time series of an offline run; starts nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.results import CaseResult, Snapshot
+from finforce_eval.scoring import match_truth
+from finforce_eval.tracks import NANOSECONDS, Recording
+from finforce_ifea.pointcloud import decode_keypoints
+
+
+@dataclass(kw_only=True)
+class JawLog:
+    """The answers of one solver, by recorded stamp [ns].
+
+    Attributes:
+        sent: when the key points left [s, monotonic].
+        latency: from then to the arrival of the wrench [s].
+        force: (3,) [N], jaw frame.
+        torque: (3,) [N m], about the origin of the jaw frame.
+        stddev: (3,) [N].
+        surface: (n, 3) [m] at `surface_stamp`, the image with the largest force.
+        surface_stamp: see there; -1 before the first.
+    """
+
+    sent: dict[int, float] = field(default_factory=dict)
+    latency: dict[int, float] = field(default_factory=dict)
+    force: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    torque: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    stddev: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    surface: NDArray[np.float64] | None = None
+    surface_stamp: int = -1
+
+    def is_largest(self, stamp: int) -> bool:
+        """Say whether the force at a stamp exceeds that of the surface kept so far by two per cent."""
+        kept = self.force.get(self.surface_stamp)
+        largest = 0.0 if kept is None else float(np.linalg.norm(kept))
+        return stamp in self.force and float(np.linalg.norm(self.force[stamp])) > 1.02 * largest
+
+
+class ReplayLog:
+    """Takes messages, brings their stamps back to the recording's and keeps what they say.
+
+    Args:
+        sides: the jaws that are played.
+    """
+
+    def __init__(self, sides: tuple[str, ...]) -> None:
+        self.jaws = {side: JawLog() for side in sides}
+        self.grasp: dict[int, float] = {}
+        self.health: dict[str, Mapping[str, str]] = {}
+        self.offset = 0
+
+    def _stamp(self, message: Any) -> int:
+        """Return a stamp as it was recorded [ns]."""
+        stamp = message.header.stamp
+        return stamp.sec * NANOSECONDS + stamp.nanosec - self.offset
+
+    def take_sent(self, topic: str, stamp: int, time: float) -> None:
+        """Note when a message left; only those of key points count."""
+        side = topic.removeprefix("/").removesuffix("/keypoints")
+        if side in self.jaws:
+            self.jaws[side].sent[stamp] = time
+
+    def take_wrench(self, side: str, message: Any, time: float) -> None:
+        """Keep a wrench that arrived at `time` [s, monotonic]."""
+        stamp, log = self._stamp(message), self.jaws[side]
+        log.force[stamp] = _vector(message.wrench.force)
+        log.torque[stamp] = _vector(message.wrench.torque)
+        if stamp in log.sent:
+            log.latency[stamp] = time - log.sent[stamp]
+
+    def take_stddev(self, side: str, message: Any) -> None:
+        """Keep the standard deviation of a force."""
+        self.jaws[side].stddev[self._stamp(message)] = _vector(message.wrench.force)
+
+    def take_surface(self, side: str, message: Any) -> None:
+        """Keep the surface under the largest force."""
+        stamp, log = self._stamp(message), self.jaws[side]
+        if log.is_largest(stamp):
+            log.surface, log.surface_stamp = decode_keypoints(message).points, stamp
+
+    def take_grasp(self, message: Any) -> None:
+        """Keep a grasp force."""
+        self.grasp[self._stamp(message)] = message.wrench.force.x
+
+    def take_diagnostics(self, message: Any) -> None:
+        """Keep the last state of every node."""
+        for status in message.status:
+            values = {entry.key: entry.value for entry in status.values}
+            self.health[status.name] = {"message": status.message, **values}
+
+
+def live_result(
+    recording: Recording, side: str, log: JawLog, *, likelihood_threshold: float, estimator: Any
+) -> CaseResult:
+    """Return the answers of one solver as the time series of an offline run.
+
+    The contact place, the residual and the key points used do not travel; the place and the residual stay
+    open, and the key points that passed the threshold stand for those used.
+
+    Args:
+        recording: that was played.
+        side: "left" or "right".
+        log: the answers.
+        likelihood_threshold: of the solver.
+        estimator: a fresh one of the same jaw, for the undeformed surface and its triangles.
+    """
+    track = recording.jaw(side).keypoints
+    stamps, frames = track.stamps, len(track.stamps)
+    force = _rows(log.force, stamps)
+    norm = np.linalg.norm(force, axis=1, keepdims=True)
+    along = np.divide(force, norm, out=np.zeros_like(force), where=norm > 0.0)
+    phases = recording.phases_at(stamps)
+    seen = np.isfinite(track.points).all(axis=2) & (track.likelihood >= likelihood_threshold)
+    return CaseResult(
+        name=recording.name,
+        side=side,
+        stamps=stamps,
+        truth=match_truth(recording.truth(side), stamps),
+        force=force,
+        place=np.full((frames, 3), np.nan),
+        stddev=np.linalg.norm(along * _rows(log.stddev, stamps), axis=1),
+        residual=np.full(frames, np.nan),
+        used=seen,
+        status=np.where(np.isfinite(force).all(axis=1), "ok", "no wrench"),
+        step_ms=1e3 * np.array([log.latency.get(int(stamp), np.nan) for stamp in stamps]),
+        cycle=phases.cycle,
+        direction=phases.direction,
+        scored=phases.scored,
+        snapshot=_snapshot(recording, side, log, seen, estimator),
+    )
+
+
+def _snapshot(
+    recording: Recording, side: str, log: JawLog, seen: NDArray[np.bool_], estimator: Any
+) -> Snapshot | None:
+    """Return the jaw under the largest force, None if no surface came."""
+    if log.surface is None:
+        return None
+    track = recording.jaw(side).keypoints
+    row = int(np.searchsorted(track.stamps, log.surface_stamp))
+    force = log.force[log.surface_stamp]
+    return Snapshot(
+        stamp=log.surface_stamp,
+        surface0=np.array(estimator.surface()),
+        surface=log.surface,
+        triangles=np.asarray(estimator.surface_triangles),
+        keypoints0=np.asarray(estimator.jaw.keypoints),
+        keypoints=track.points[row],
+        used=seen[row],
+        contact_point=point_of_application(force, log.torque[log.surface_stamp], log.surface),
+        force=force,
+    )
+
+
+def point_of_application(
+    force: NDArray[np.float64], torque: NDArray[np.float64], surface: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the point of a surface through which a force acts, (3,) [m].
+
+    The line of action is x(s) = F x T / |F|^2 + s F; of the vertices the one counts that lies nearest to it,
+    and among equals the one that the force meets first.
+
+    Args:
+        force: F (3,) [N].
+        torque: T (3,) [N m] about the origin.
+        surface: (n, 3) [m].
+    """
+    square = float(force @ force)
+    if square == 0.0:
+        return np.full(3, np.nan)
+    foot = np.cross(force, torque) / square
+    along = (surface - foot) @ force / square
+    distance = np.linalg.norm(surface - foot - along[:, None] * force, axis=1)
+    near = np.flatnonzero(distance < distance.min() + 1e-3)
+    first = near[np.argmin(along[near])]
+    return foot + along[first] * force
+
+
+def _rows(values: Mapping[int, NDArray[np.float64]], stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return one row per stamp, NaN where there is none."""
+    missing = np.full(3, np.nan)
+    return np.array([values.get(int(stamp), missing) for stamp in stamps]).reshape(-1, 3)
+
+
+def _vector(xyz: Any) -> NDArray[np.float64]:
+    return np.array([xyz.x, xyz.y, xyz.z])

@@ -1,0 +1,157 @@
+"""The player of recordings: messages out at the pace of their receipt, results in; it scores nothing."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from time import monotonic
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import WrenchStamped
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+
+import finforce_ros as ros
+from finforce_eval.live import ReplayLog
+from finforce_eval.parameters import PlayerParameters
+from finforce_eval.playback import RawMessage, read_playback
+
+
+class PlayerNode(Node):
+    """Publishes recorded messages, each when its time has come, and spins in between."""
+
+    def __init__(self, name: str = "recording_player", **options: Any) -> None:
+        super().__init__(name, **options)
+        self._spinner = SingleThreadedExecutor(context=self.context)
+        self._spinner.add_node(self)
+        self._outputs: dict[str, Any] = {}
+        self._clock_out: Any = None
+
+    def offer(self, messages: Iterable[RawMessage]) -> None:
+        """Create a publisher for every topic; a type that is not installed is named and left out."""
+        for topic, msgtype in {message.topic: message.msgtype for message in messages}.items():
+            package, _, name = msgtype.split("/")
+            try:
+                kind = getattr(import_module(f"{package}.msg"), name)
+            except ImportError:
+                self.get_logger().warning(f"{topic} is not played: {msgtype} is not installed")
+                continue
+            self._outputs[topic] = self.create_publisher(kind, topic, ros.RESULT)
+
+    def has_listeners(self, topics: Iterable[str]) -> bool:
+        """Say whether somebody listens to each of the topics."""
+        return all(self._outputs[topic].get_subscription_count() for topic in topics)
+
+    def wait_for(self, condition: Callable[[], bool], patience: float) -> bool:
+        """Spin until a condition holds, for at most `patience` [s]; return whether it does."""
+        deadline = monotonic() + patience
+        while not condition():
+            if monotonic() > deadline:
+                return False
+            self.spin_until(min(deadline, monotonic() + 0.05))
+        return True
+
+    def spin_until(self, due: float) -> None:
+        """Answer callbacks until a time of the monotonic clock.
+
+        Raises:
+            KeyboardInterrupt: the process was told to end.
+        """
+        try:
+            while (left := due - monotonic()) > 0.0:
+                self._spinner.spin_once(timeout_sec=left)
+        except ExternalShutdownException:
+            raise KeyboardInterrupt from None
+
+    def play(
+        self,
+        messages: Sequence[RawMessage],
+        *,
+        rate: float = 1.0,
+        offset: int | None = None,
+        sent: Callable[[RawMessage], Any] = lambda message: None,
+    ) -> None:
+        """Publish the messages at their pace.
+
+        Args:
+            messages: in the order of their receipt.
+            rate: speed; 1 as recorded.
+            offset: added to every stamp [ns]; None keeps the stamps and publishes them on /clock.
+            sent: called just before each message leaves.
+        """
+        first = messages[0].time
+        if offset is None:
+            self._start_clock(first)
+        began = monotonic()
+        for message in messages:
+            self.spin_until(began + (message.time - first) / (rate * ros.NANOSECONDS))
+            if offset is None:
+                self._clock_out.publish(Clock(clock=ros.stamp_message(message.time)))
+            if message.topic in self._outputs:
+                sent(message)
+                data = message.data if offset is None else message.restamped(message.stamp + offset)
+                self._outputs[message.topic].publish(data)
+
+    def _start_clock(self, time: int) -> None:
+        """Give the time [ns] to whoever waits for /clock, before the first message needs it."""
+        self._clock_out = self._clock_out or self.create_publisher(Clock, "/clock", ros.RESULT)
+        self.wait_for(lambda: self._clock_out.get_subscription_count() > 0, 2.0)
+        self._clock_out.publish(Clock(clock=ros.stamp_message(time)))
+        self.spin_until(monotonic() + 0.2)
+
+    def listen(self, sides: Iterable[str], log: ReplayLog) -> None:
+        """Hand results to a log, with the time of their arrival."""
+
+        def subscribe(kind: type, topic: str, take: Callable[[Any], Any]) -> None:
+            self.create_subscription(kind, topic, take, ros.RESULT)
+
+        for side in sides:
+            subscribe(WrenchStamped, f"{side}/wrench", lambda m, s=side: log.take_wrench(s, m, monotonic()))
+            subscribe(WrenchStamped, f"{side}/wrench_stddev", lambda m, s=side: log.take_stddev(s, m))
+            subscribe(PointCloud2, f"{side}/surface", lambda m, s=side: log.take_surface(s, m))
+        subscribe(WrenchStamped, "grasp_wrench", log.take_grasp)
+        subscribe(DiagnosticArray, "/diagnostics", log.take_diagnostics)
+
+
+@contextmanager
+def open_player(domain: int) -> Iterator[PlayerNode]:
+    """Give a player on a DDS domain of its own; Ctrl-C and SIGTERM end the block.
+
+    Args:
+        domain: ROS_DOMAIN_ID.
+    """
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain, signal_handler_options=rclpy.SignalHandlerOptions.ALL)
+    node = PlayerNode("finforce_replay", context=context)
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+def play_recording(node: PlayerNode) -> None:
+    """Play the recording that the parameters name, once."""
+    parameters = ros.declare_record(node, PlayerParameters)
+    messages = read_playback(parameters.bag)
+    node.offer(messages)
+    keypoints = {message.topic for message in messages if message.topic.endswith("/keypoints")}
+    if not node.wait_for(lambda: node.has_listeners(keypoints), parameters.patience):
+        node.get_logger().warning("nobody listens to the key points; they are played all the same")
+    node.play(messages, rate=parameters.rate)
+    node.spin_until(monotonic() + 0.5)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Play a recording with its own stamps and /clock."""
+    return ros.run_node("recording_player", PlayerNode, args, play_recording)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""A folder of pictures with a Markdown page that shows them; draws nothing itself."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from finforce_eval.evaluate import Evaluation
+from finforce_eval.results import CaseResult
+from finforce_eval.tables import markdown_table, summary_lines
+
+
+def write_report(
+    evaluation: Evaluation,
+    folder: str | Path,
+    *,
+    keypoint_names: Sequence[str],
+    about: Mapping[str, str],
+    title: str = "Force from key points",
+) -> Path:
+    """Write pictures and README.md of an evaluation.
+
+    Args:
+        evaluation: scores and time series.
+        folder: where to; made when missing, files of the same name are replaced.
+        keypoint_names: K names of the key points of the jaw.
+        about: what was run: solver, jaw, contact, ...
+        title: heading of the page.
+
+    Returns:
+        The page.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    from finforce_eval.figures import draw_unity, draw_violins
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    results = list(evaluation.results.values())
+    draw_unity(results).savefig(folder / "unity.png")
+    draw_violins(results).savefig(folder / "violins.png")
+    sections = [_write_case(result, folder, keypoint_names) for result in results]
+    lines = [
+        f"# {title}",
+        "",
+        *(f"- {key}: {value}" for key, value in about.items()),
+        "",
+        markdown_table(evaluation),
+        "",
+        *summary_lines(evaluation),
+        "",
+        "Errors are norm of the estimate minus norm of the measured force, over the record phases.",
+        "",
+        "![Estimated against measured force](unity.png)",
+        "![Distribution of the error per case](violins.png)",
+        *(line for section in sections for line in section),
+    ]
+    page = folder / "README.md"
+    page.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return page
+
+
+def _write_case(result: CaseResult, folder: Path, keypoint_names: Sequence[str]) -> list[str]:
+    """Write the pictures of one case and return its section of the page."""
+    from finforce_eval.figures import draw_force, draw_keypoints
+    from finforce_eval.jaw_figure import draw_jaw
+
+    stem = re.sub(r"[^\w.-]+", "_", result.name)
+    draw_force(result).savefig(folder / f"{stem}_force.png")
+    draw_keypoints(result, keypoint_names).savefig(folder / f"{stem}_keypoints.png")
+    lines = ["", f"## {result.name}", "", f"![Force over time]({stem}_force.png)"]
+    if result.snapshot is not None:
+        seconds = (result.snapshot.stamp - int(result.stamps[0])) * 1e-9
+        title = f"{result.name}, largest force, t = {seconds:.1f} s"
+        draw_jaw(result.snapshot, title).savefig(folder / f"{stem}_jaw.png")
+        lines.append(f"![The jaw at the largest force]({stem}_jaw.png)")
+    return [*lines, f"![Key points used]({stem}_keypoints.png)"]

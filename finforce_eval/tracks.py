@@ -1,0 +1,249 @@
+"""Recordings as frozen records of NumPy arrays; knows nothing of bag files, jaw models or scores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.errors import RecordingError
+
+JAWS = ("left", "right")
+DIRECTIONS = ("load", "unload")
+STAGES = ("ramp", "settle", "record")
+NANOSECONDS = 1_000_000_000
+
+TrackT = TypeVar("TrackT", "KeypointTrack", "WrenchTrack", "PoseTrack", "PhaseTrack")
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeypointTrack:
+    """Key points of one jaw over time.
+
+    Attributes:
+        stamps: (n,) image time [ns], strictly increasing.
+        points: (n, K, 3) [m], jaw frame; NaN = none.
+        likelihood: (n, K) in [0, 1].
+    """
+
+    stamps: NDArray[np.int64]
+    points: NDArray[np.float64]
+    likelihood: NDArray[np.float64]
+
+    @property
+    def count(self) -> int:
+        """Key points per image, K."""
+        return self.points.shape[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrenchTrack:
+    """Wrenches that an object applies to a jaw over time.
+
+    Attributes:
+        stamps: (n,) [ns].
+        force: (n, 3) [N], jaw frame.
+        torque: (n, 3) [N m], about the origin of the jaw frame.
+    """
+
+    stamps: NDArray[np.int64]
+    force: NDArray[np.float64]
+    torque: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseTrack:
+    """Poses over time.
+
+    Attributes:
+        stamps: (n,) [ns].
+        position: (n, 3) [m], in `frame_id`.
+        quaternion: (n, 4), x y z w.
+        frame_id: the frame in which the pose is given.
+    """
+
+    stamps: NDArray[np.int64]
+    position: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+    frame_id: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhaseTrack:
+    """What the bench was doing, published on change.
+
+    Attributes:
+        stamps: (m,) [ns], begin of each phase.
+        cycle: (m,) number of the loading cycle.
+        direction: (m,) "load" or "unload".
+        displacement_mm: (m,) commanded displacement [mm].
+        stage: (m,) "ramp", "settle" or "record".
+    """
+
+    stamps: NDArray[np.int64]
+    cycle: NDArray[np.int64]
+    direction: NDArray[np.str_]
+    displacement_mm: NDArray[np.float64]
+    stage: NDArray[np.str_]
+
+    def index_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return for each stamp [ns] the row of its phase, -1 before the first."""
+        return np.searchsorted(self.stamps, stamps, side="right") - 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramePhases:
+    """The phases of the bench image by image.
+
+    Attributes:
+        cycle: (n,) loading cycle, 0 without phases.
+        direction: (n,) "load", "unload", or "" without phases.
+        scored: (n,) in a `record` phase; every frame without phases.
+    """
+
+    cycle: NDArray[np.int64]
+    direction: NDArray[np.str_]
+    scored: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JawTrack:
+    """What a recording holds of one jaw."""
+
+    keypoints: KeypointTrack
+    truth: WrenchTrack | None = None
+    pose: PoseTrack | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """One recording.
+
+    Attributes:
+        name: its name, from the folder or the file.
+        path: where it was read from.
+        jaws: "left" and/or "right" -> what was recorded of that jaw.
+        object_pose: T_camera_object over time.
+        phases: phases of the bench, None outside the bench.
+        case: content of `case.json`, empty without it.
+        notes: what was left aside on reading, one sentence each.
+    """
+
+    name: str
+    path: Path
+    jaws: Mapping[str, JawTrack]
+    object_pose: PoseTrack | None = None
+    phases: PhaseTrack | None = None
+    case: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def jaw(self, side: str) -> JawTrack:
+        """Return what was recorded of the jaw `side`.
+
+        Raises:
+            RecordingError: the recording has no key points of that jaw.
+        """
+        if side not in self.jaws:
+            have = ", ".join(self.jaws)
+            raise RecordingError(f"{self.name}: no key points of the {side} jaw; the recording has {have}")
+        return self.jaws[side]
+
+    def truth(self, side: str) -> WrenchTrack:
+        """Return the measured wrenches of the jaw `side`.
+
+        Raises:
+            RecordingError: there are none.
+        """
+        truth = self.jaw(side).truth
+        if truth is None:
+            topic = f"/{side}/ground_truth_wrench"
+            raise RecordingError(f"{self.name}: no ground truth: {topic} is absent or has no messages")
+        return truth
+
+    def phases_at(self, stamps: NDArray[np.int64]) -> FramePhases:
+        """Return the phase of each stamp [ns]."""
+        frames, phases = len(stamps), self.phases
+        if phases is None:
+            nothing = np.full(frames, "", dtype="U6")
+            return FramePhases(
+                cycle=np.zeros(frames, dtype=np.int64), direction=nothing, scored=np.ones(frames, dtype=bool)
+            )
+        row = phases.index_at(stamps)
+        return FramePhases(
+            cycle=np.where(row >= 0, phases.cycle[row], 0),
+            direction=np.where(row >= 0, phases.direction[row], ""),
+            scored=(row >= 0) & (phases.stage[row] == "record"),
+        )
+
+    def between(self, start: int, stop: int) -> Recording:
+        """Return the part with start <= stamp < stop [ns]; a phase under way at start begins there."""
+        jaws = {
+            side: JawTrack(
+                keypoints=_cut(track.keypoints, start, stop),
+                truth=track.truth and _cut(track.truth, start, stop),
+                pose=track.pose and _cut(track.pose, start, stop),
+            )
+            for side, track in self.jaws.items()
+        }
+        phases = self.phases
+        if phases is not None:
+            phases = _cut(replace(phases, stamps=_clip_running(phases.stamps, start)), start, stop)
+        pose = self.object_pose and _cut(self.object_pose, start, stop)
+        return replace(self, jaws=jaws, object_pose=pose, phases=phases)
+
+
+def _clip_running(stamps: NDArray[np.int64], start: int) -> NDArray[np.int64]:
+    """Move the last stamp before start to start."""
+    moved = stamps.copy()
+    running = np.searchsorted(stamps, start, side="right") - 1
+    if running >= 0:
+        moved[running] = start
+    return moved
+
+
+def _cut(track: TrackT, start: int, stop: int) -> TrackT:
+    """Return the rows of a track with start <= stamp < stop."""
+    rows = slice(*np.searchsorted(track.stamps, [start, stop], side="left"))
+    arrays = {name: value[rows] for name, value in vars(track).items() if isinstance(value, np.ndarray)}
+    return replace(track, **arrays)
+
+
+def parse_phases(stamps: Sequence[int], texts: Sequence[str], name: str) -> PhaseTrack:
+    """Read phases written `cycle:load|unload:displacement_mm:ramp|settle|record`.
+
+    Args:
+        stamps: begin of each phase [ns].
+        texts: the messages.
+        name: recording name, for the message of an error.
+
+    Raises:
+        RecordingError: a text reads otherwise, or the stamps go back.
+    """
+    rows = [_parse_phase(text, name) for text in texts]
+    cycle, direction, displacement, stage = zip(*rows, strict=True)
+    order = np.asarray(stamps, dtype=np.int64)
+    if (np.diff(order) < 0).any():
+        raise RecordingError(f"{name}: the stamps of /bench/phase go back")
+    return PhaseTrack(
+        stamps=order,
+        cycle=np.asarray(cycle, dtype=np.int64),
+        direction=np.asarray(direction),
+        displacement_mm=np.asarray(displacement, dtype=np.float64),
+        stage=np.asarray(stage),
+    )
+
+
+def _parse_phase(text: str, name: str) -> tuple[int, str, float, str]:
+    """Split one phase."""
+    try:
+        cycle, direction, displacement, stage = text.split(":")
+        if direction in DIRECTIONS and stage in STAGES and np.isfinite(float(displacement)):
+            return int(cycle), direction, float(displacement), stage
+    except ValueError:
+        pass
+    expected = "cycle:load|unload:displacement_mm:ramp|settle|record"
+    raise RecordingError(f"{name}: /bench/phase says '{text}'; expected {expected}")

@@ -1,0 +1,226 @@
+"""The processes of a system, their parameters and remappings, described once; starts nothing itself."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+OptionsT = TypeVar("OptionsT")
+
+# small matrices: more threads per process cost time and make it vary
+SINGLE_THREAD = {
+    name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Process:
+    """One ROS process.
+
+    Attributes:
+        package: that holds the executable.
+        executable: as `ros2 run` finds it.
+        module: as `python -m` finds it; empty for a program that is not ours.
+        name: of the node.
+        parameters: ROS parameters that differ from the node's defaults.
+        parameter_file: YAML file with more of them, overruled by `parameters`; empty for none.
+        remappings: topic names as the node knows them -> as they are here.
+        arguments: of the program, before those of ROS.
+        ends_all: the whole system ends with this process.
+    """
+
+    package: str = "finforce"
+    executable: str
+    module: str = ""
+    name: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameter_file: str = ""
+    remappings: Mapping[str, str] = field(default_factory=dict)
+    arguments: tuple[str, ...] = ()
+    ends_all: bool = False
+
+    def command(self) -> list[str]:
+        """Return the command line that runs the process with this Python, without `ros2`."""
+        words = [sys.executable, "-m", self.module, *self.arguments]
+        words += ["--ros-args", "-r", f"__node:={self.name}"]
+        if self.parameter_file:
+            words += ["--params-file", self.parameter_file]
+        for name, value in self.parameters.items():
+            words += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, with the type beyond doubt
+        for name, other in self.remappings.items():
+            words += ["-r", f"{name}:={other}"]
+        return words
+
+
+def _option(default: Any, description: str, **metadata: Any) -> Any:
+    """Return a dataclass field that becomes a launch argument."""
+    return field(default=default, metadata={"description": description, **metadata})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverOptions:
+    """What every graph with solvers is asked for; NaN and empty texts leave the node's own default."""
+
+    jaw_file: str = _option("", "jaw file, or the name of a shipped jaw")
+    calibration_file: str = _option("", "calibration file, or a shipped name")
+    contact_height: float = _option(
+        math.nan, "height of first touch above the clamped base [m]; nan: contacts come by topic"
+    )
+    solver: str = _option("", "model and objective: default, solid, frame or paper")
+    mesh: str = _option("", "mesh density: default, coarse or fine")
+    parameter_file: str = _option("", "YAML file with ROS parameters of the nodes")
+    use_sim_time: bool = _option(False, "take the time from /clock")
+    rviz: bool = _option(False, "show the markers in RViz")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions(SolverOptions):
+    """One jaw, live."""
+
+    jaw: str = _option("left", "the jaw that is on the bench: left or right")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions(SolverOptions):
+    """The jaws of a recording."""
+
+    jaws: str = _option("left", "the jaws of the recording: left, right or both")
+    bag: str = _option("", "recording to be played; empty: somebody else plays it, with /clock")
+    rate: float = _option(1.0, "speed of playing")
+    use_sim_time: bool = _option(True, "take the time from /clock")
+
+
+def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Process:
+    """Return the solver of one jaw; `parameters` are added to those that the options name."""
+    asked = {
+        "jaw_file": options.jaw_file,
+        "calibration_file": options.calibration_file,
+        "contact_height": None if math.isnan(options.contact_height) else options.contact_height,
+        "estimator.solver": options.solver,
+        "estimator.mesh": options.mesh,
+    }
+    given = {name: value for name, value in asked.items() if value not in ("", None)}
+    return Process(
+        executable="ifea_solver",
+        module="finforce_ifea.node",
+        name=f"{side}_ifea_solver",
+        parameters={"jaw_name": side, **given, **parameters, "use_sim_time": options.use_sim_time},
+        parameter_file=options.parameter_file,
+    )
+
+
+def bench_processes(options: BenchOptions, share: Path) -> list[Process]:
+    """Return the processes of one jaw on a bench; its force is the grasp force."""
+    return [solver_process(options.jaw, options, completes_grasp=True), *_viewer(options, share)]
+
+
+def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
+    """Return the solvers of the jaws in a recording, and the player where a recording is named.
+
+    With two jaws the left one completes the forces on the gripper, with one jaw that one.
+    """
+    if options.jaws == "both":
+        solvers = [solver_process("left", options, peer="right"), solver_process("right", options)]
+    else:
+        solvers = [solver_process(options.jaws, options, completes_grasp=True)]
+    player = Process(
+        executable="recording_player",
+        module="finforce_eval.node",
+        name="recording_player",
+        parameters={"bag": options.bag, "rate": options.rate},
+        ends_all=True,
+    )
+    return [*solvers, *([player] if options.bag else []), *_viewer(options, share)]
+
+
+def _viewer(options: SolverOptions, share: Path) -> list[Process]:
+    """Return RViz with the shipped configuration, if it was asked for."""
+    if not options.rviz:
+        return []
+    config = str(share / "rviz" / "finforce.rviz")
+    return [
+        Process(
+            package="rviz2",
+            executable="rviz2",
+            name="rviz",
+            parameters={"use_sim_time": options.use_sim_time},
+            arguments=("-d", config),
+        )
+    ]
+
+
+def options_from_texts(record: type[OptionsT], texts: Mapping[str, str]) -> OptionsT:
+    """Return an options record from launch arguments, each turned into the type of its default.
+
+    Raises:
+        ValueError: a text is no such value.
+    """
+    values = {entry.name: _value(entry.name, texts[entry.name], entry.default) for entry in fields(record)}
+    return record(**values)
+
+
+def _value(name: str, text: str, default: Any) -> Any:
+    """Turn one text into the type of a default."""
+    if isinstance(default, bool):
+        if text.lower() not in ("true", "false"):
+            raise ValueError(f"{name}:={text}: expected true or false")
+        return text.lower() == "true"
+    try:
+        return type(default)(text)
+    except ValueError:
+        raise ValueError(f"{name}:={text}: expected a {type(default).__name__}") from None
+
+
+def describe_launch(
+    record: type[OptionsT], build: Callable[[OptionsT, Path], Sequence[Process]], share: Path, **defaults: str
+) -> Any:
+    """Return a launch description: one argument per field of the record, one action per process.
+
+    Args:
+        record: the options dataclass.
+        build: options and share folder to processes.
+        share: folder that holds `config` and `rviz`.
+        defaults: of arguments, in place of the record's.
+    """
+    from launch import LaunchDescription
+    from launch.actions import DeclareLaunchArgument, OpaqueFunction
+
+    arguments = [
+        DeclareLaunchArgument(
+            entry.name,
+            default_value=defaults.get(entry.name, str(entry.default)),
+            description=entry.metadata["description"],
+        )
+        for entry in fields(record)
+        if entry.default is not MISSING
+    ]
+
+    def start(context: Any) -> list[Any]:
+        options = options_from_texts(record, context.launch_configurations)
+        return [_launch_action(process) for process in build(options, share)]
+
+    return LaunchDescription([*arguments, OpaqueFunction(function=start)])
+
+
+def _launch_action(process: Process) -> Any:
+    """Return the launch_ros action of a process."""
+    from launch.actions import Shutdown
+    from launch_ros.actions import Node
+
+    files = [process.parameter_file] if process.parameter_file else []
+    return Node(
+        package=process.package,
+        executable=process.executable,
+        name=process.name,
+        output="screen",
+        parameters=[*files, dict(process.parameters)],
+        remappings=list(process.remappings.items()),
+        arguments=list(process.arguments),
+        additional_env=SINGLE_THREAD,
+        on_exit=Shutdown(reason=f"{process.name} has ended") if process.ends_all else None,
+    )

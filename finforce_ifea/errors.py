@@ -1,0 +1,37 @@
+"""The errors that finforce raises on purpose; what is not listed here is a defect."""
+
+
+class FinforceError(Exception):
+    """The base of every error that finforce raises on purpose."""
+
+
+class JawFileError(FinforceError, ValueError):
+    """A jaw file says something that cannot be a jaw."""
+
+
+class MeshError(FinforceError, ValueError):
+    """A volume mesh cannot be computed with, or a point does not lie on it."""
+
+
+class ObservationError(FinforceError, ValueError):
+    """Key points came in the wrong shape, frame or number."""
+
+
+class ContactError(FinforceError, ValueError):
+    """A contact does not lie on the jaw, or its weights are no weights."""
+
+
+class UnderLoadError(FinforceError, RuntimeError):
+    """A tare was asked for while something presses on the jaw."""
+
+
+class CalibrationError(FinforceError, ValueError):
+    """A calibration file or a calibration run makes no sense."""
+
+
+class NotEnoughDataError(FinforceError, RuntimeError):
+    """Too few observations have arrived for what was asked."""
+
+
+class MissingDependencyError(FinforceError, ImportError):
+    """An optional library is needed and not installed."""

@@ -1,0 +1,294 @@
+"""Key points and a contact in, force out, one image after the other: the entry for nodes and for evaluation."""
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.calibration import Calibration
+from finforce_ifea.errors import NotEnoughDataError, UnderLoadError
+from finforce_ifea.gate import KeypointGate
+from finforce_ifea.jaw import Jaw
+from finforce_ifea.mechanics import Mechanics, build_mechanics
+from finforce_ifea.observation import (
+    Contact,
+    Observation,
+    Solution,
+    blank_solution,
+    check_contact,
+    check_observation,
+)
+from finforce_ifea.relaxation import Relaxation
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tare import Tare, blank_tare, compute_tare
+from finforce_ifea.rolling import DEPTH
+from finforce_ifea.tracking import PlaceTracker, Track
+
+__all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
+
+# A tare looks loaded when the force that explains the offsets exceeds this many standard deviations.
+_LOADED_SIGMA = 3.5
+_DELAY_FRAMES = 15
+_LONGEST_GAP = 1.0
+_UNLOADED_FORCE = 0.02
+_QUIET_DEPTH, _LOADED_DEPTH = 0.15e-3, 0.5e-3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TareReport:
+    """What a tare found.
+
+    Attributes:
+        frames: averaged.
+        keypoints: that have an offset now.
+        largest_offset: [m].
+        noise: standard deviation of one key point along one axis [m].
+    """
+
+    frames: int
+    keypoints: int
+    largest_offset: float
+    noise: float
+
+    def __str__(self) -> str:
+        """Returns the report as one sentence."""
+        return (
+            f"tared {self.keypoints} key points over {self.frames} frames: largest offset "
+            f"{1e3 * self.largest_offset:.2f} mm, noise {1e3 * self.noise:.2f} mm"
+        )
+
+
+class JawEstimator:
+    """Estimates the force on one jaw; deterministic, one thread."""
+
+    def __init__(
+        self, jaw: Jaw, *, settings: EstimatorSettings | None = None, calibration: Calibration | None = None
+    ) -> None:
+        """Builds the mechanics of the jaw as the calibration describes it.
+
+        Raises:
+            FinforceError: Jaw, settings and calibration do not fit each other.
+        """
+        self.settings = settings or EstimatorSettings()
+        self.calibration = calibration
+        self.jaw = calibration.apply(jaw) if calibration else jaw
+        self.mechanics: Mechanics = build_mechanics(self.jaw, self.settings)
+        self._tracker = PlaceTracker(self.mechanics.contact, self.jaw.keypoints, self.settings)
+        self._gate = KeypointGate(self.jaw, self.settings)
+        self._relaxation = Relaxation(calibration.relaxation if calibration else ())
+        self._force_error = calibration.force_error if calibration else 0.1
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets everything but the jaw: offsets, place, relaxation, stamps."""
+        self._tare = blank_tare(len(self.jaw.keypoints), self.settings.noise)
+        self._recent: deque[NDArray] = deque(maxlen=self.settings.tare_memory + _DELAY_FRAMES)
+        self._tare_open = self.settings.automatic_tare
+        self._stamp: float | None = None
+        self._track: Track | None = None
+        self._quiet = 0
+        self._height: float | None = None
+        self._gate.reset()
+        self._relaxation.reset()
+        self._tracker.reset(float(np.median(self.jaw.candidates[:, 2])))
+
+    def warm_up(self) -> None:
+        """Compiles what is compiled on first use, and leaves no trace."""
+        z = float(np.median(self.jaw.candidates[:, 2]))
+        for frame in range(2):
+            observation = Observation(
+                stamp=float(frame), points=self.jaw.keypoints, likelihood=np.ones(len(self.jaw.keypoints))
+            )
+            self._tracker.reset(z)
+            self._tracker.update(observation.points, self._tare, 0.03)
+        self.reset()
+
+    @property
+    def tared(self) -> bool:
+        """Whether the key points' offsets are known."""
+        return bool(self._tare.counts.any())
+
+    @property
+    def surface_triangles(self) -> NDArray:
+        """Triangles of the surface (t, 3), indices into `surface()`."""
+        return self.mechanics.mesh.surface
+
+    def surface(self) -> NDArray:
+        """Returns the deformed mesh vertices (n, 3) [m], in mesh order."""
+        return self.mechanics.model.vertices(self._tracker.q)
+
+    def keypoints_model(self) -> NDArray:
+        """Returns the key points (K, 3) [m] of the deformed model."""
+        return self.mechanics.model.positions(self._tracker.probe, self._tracker.q)
+
+    def update(self, observation: Observation, contact: Contact | None) -> Solution:
+        """Takes one image's key points and returns what they say.
+
+        Args:
+            observation: stamp [s], points (K, 3) [m] in the jaw frame, likelihood (K,).
+            contact: where the object touches; None or no rows when there is no object.
+
+        Raises:
+            ObservationError: Key points of wrong shape, infinite, or stamps that do not rise.
+            ContactError: The contact is not on the jaw.
+        """
+        check_observation(observation, len(self.jaw.keypoints), self._stamp)
+        dt = 0.0 if self._stamp is None else observation.stamp - self._stamp
+        if contact is not None:
+            check_contact(contact, self.jaw)
+            self._follow(contact)
+        self._stamp = observation.stamp
+        points = self._gate.accept(observation)
+        self._recent.append(points)
+        used = np.isfinite(points[:, 0])
+        if used.sum() < self.settings.minimum_keypoints:
+            return self._fail("not_enough_points", f"{int(used.sum())} of {len(used)} key points can be used", used, dt)
+        if self._tare_open and not self.tared:
+            waiting = self._begin(used, dt)
+            if waiting is not None:
+                return waiting
+        if contact is None or not len(contact.points):
+            return self._without_contact(points, used, dt)
+        track = self._tracker.update(points, self._tare, min(dt, _LONGEST_GAP))
+        return self._conclude(track, points, used, dt)
+
+    def _follow(self, contact: Contact) -> None:
+        """Takes the height of a contact over into the tracker."""
+        if not len(contact.points):
+            return
+        height = float(np.average(contact.points[:, 2], weights=contact.weights))
+        if self._height is None or abs(height - self._height) > 1e-6:
+            if self._height is None:
+                self._tracker.reset(height)
+            else:
+                self._tracker.move_height(height)
+            self._height = height
+
+    def _begin(self, used: NDArray, dt: float) -> Solution | None:
+        """Collects unloaded frames, then tares, unless the jaw looks loaded; returns None once that is decided."""
+        if len(self._recent) < self.settings.tare_frames:
+            self._relaxation.update(np.zeros(3), dt)
+            missing = self.settings.tare_frames - len(self._recent)
+            return blank_solution(self._stamp, "waiting", f"{missing} more unloaded frames for the tare", used)
+        try:
+            self.tare()
+        except UnderLoadError:
+            self._tare_open = False
+        except NotEnoughDataError as error:
+            return blank_solution(self._stamp, "waiting", str(error), used)
+        return None
+
+    def tare(self) -> TareReport:
+        """Takes the last frames as unloaded and learns each key point's offset.
+
+        Raises:
+            NotEnoughDataError: Too few frames or visible key points.
+            UnderLoadError: The jaw is, or looks, loaded.
+        """
+        force = 0.0 if self._track is None else float(np.linalg.norm(self._track.force))
+        if self.tared and force > _UNLOADED_FORCE:
+            raise UnderLoadError(f"cannot tare: {force:.2f} N press on the jaw")
+        frames = list(self._recent)[-self.settings.tare_memory :]
+        if len(frames) < min(5, self.settings.tare_frames):
+            raise NotEnoughDataError(f"cannot tare: {len(frames)} frames, expected {self.settings.tare_frames}")
+        tare = compute_tare(frames, self.jaw.keypoints)
+        if tare is None:
+            raise self._explain_no_tare(frames)
+        if not self.tared:
+            self._check_unloaded(tare)
+        self._set_tare(tare)
+        seen = tare.counts > 0
+        return TareReport(
+            frames=len(frames),
+            keypoints=int(seen.sum()),
+            largest_offset=float(np.linalg.norm(tare.offsets, axis=1).max()),
+            noise=float(np.sqrt(np.trace(tare.noise) / 3.0)),
+        )
+
+    def _explain_no_tare(self, frames: list[NDArray]) -> NotEnoughDataError | UnderLoadError:
+        seen = np.isfinite(np.stack(frames)[..., 0]).mean(0) >= 0.5
+        if seen.sum() < 3:
+            return NotEnoughDataError("cannot tare: fewer than three key points are seen in half of the frames")
+        return UnderLoadError("cannot tare: the key points lie millimetres from where the unloaded jaw has them")
+
+    def _set_tare(self, tare: Tare) -> None:
+        self._tare = tare
+        self._track = None
+        if self._height is not None:
+            self._tracker.reset(self._height)
+
+    def _check_unloaded(self, tare: Tare) -> None:
+        """Refuses offsets that a force explains far better than chance."""
+        sigma = self._tracker.significance(tare)
+        if sigma > _LOADED_SIGMA:
+            raise UnderLoadError(f"cannot tare: the key points look loaded ({sigma:.1f} standard deviations)")
+
+    def _refine_tare(self, depth: float) -> None:
+        """Averages more frames until the first load; what is newer than half a second is left out."""
+        self._quiet = self._quiet + 1 if depth < _QUIET_DEPTH else 0
+        if depth > _LOADED_DEPTH or len(self._recent) > self.settings.tare_memory:
+            self._tare_open = False
+        elif self._quiet >= 2 * _DELAY_FRAMES and self._quiet % _DELAY_FRAMES == 0:
+            tare = compute_tare(list(self._recent)[:-_DELAY_FRAMES], self.jaw.keypoints)
+            self._tare = tare or self._tare
+
+    def _without_contact(self, points: NDArray, used: NDArray, dt: float) -> Solution:
+        """Says what can be said without an object: nothing presses, or it cannot be known where."""
+        tare = compute_tare([points, points], self.jaw.keypoints + self._tare.offsets)
+        quiet = self.tared and tare is not None and self._tracker.significance(tare) < _LOADED_SIGMA
+        if quiet:
+            self._relaxation.update(np.zeros(3), dt)
+            return replace(blank_solution(self._stamp, "unloaded", "no object, the jaw is at rest", used), converged=True)
+        return self._fail("no_contact", "the jaw is bent but no contact is known", used, dt)
+
+    def _fail(self, status: str, message: str, used: NDArray, dt: float, iterations: int = 0) -> Solution:
+        """Returns a solution without force."""
+        return blank_solution(self._stamp, status, message, used, iterations)
+
+    def _conclude(self, track: Track | None, points: NDArray, used: NDArray, dt: float) -> Solution:
+        """Turns a track into a solution."""
+        if track is None:
+            return self._fail("not_enough_points", "too few key points agree with the jaw's shape", used, dt)
+        used = track.weights > 0
+        if not track.sound:
+            self._tracker.reset(self._height)
+            return self._fail("diverged", "the shape cannot be reached by the jaw", used, dt, track.iterations)
+        self._track = track
+        if self._tare_open and self.tared:
+            self._refine_tare(track.place[DEPTH])
+        force = self._relaxation.update(track.force, dt)
+        return self._solution(track, force, used)
+
+    def _stddev(self, track: Track, magnitude: float) -> float:
+        direction = track.force / magnitude if magnitude > 0 else np.array([-1.0, 0.0, 0.0])
+        mode = direction @ track.force_modes
+        return float(np.sqrt(mode @ track.covariance @ mode))
+
+    def _solution(self, track: Track, force: NDArray, used: NDArray) -> Solution:
+        magnitude = float(np.linalg.norm(force))
+        loaded = magnitude > 0.0
+        covariance = track.force_modes @ track.covariance @ track.force_modes.T + np.outer(force, force) * self._force_error**2
+        stddev = np.sqrt(np.diag(covariance))
+        arm = track.pressure_point * [1.0, 0.0, 1.0]
+        elastic = float(np.linalg.norm(track.force))
+        total = np.hypot(self._stddev(track, elastic), self._force_error * magnitude)
+        unknown = np.full(3, np.nan)
+        return Solution(
+            stamp=self._stamp,
+            status="ok" if loaded else "unloaded",
+            message="" if self.tared else "no tare: the jaw was loaded from the start; key point offsets are unknown",
+            force=force,
+            torque=np.cross(arm, force),
+            force_stddev=stddev,
+            torque_stddev=np.array([0.0, np.hypot(arm[0] * stddev[2], arm[2] * stddev[0]), 0.0]),
+            magnitude_stddev=float(total),
+            contact_point=arm if loaded else unknown,
+            contact_place=track.pressure_place * [1.0, 0.0, 1.0] if loaded else unknown,
+            normal=force / magnitude if loaded else unknown,
+            residual=track.residual,
+            kkt=track.kkt,
+            keypoints_used=used,
+            iterations=track.iterations,
+            converged=track.converged,
+        )

@@ -1,0 +1,46 @@
+"""The mechanics of a jaw by name: mesh, model and contact surface; knows no key point."""
+
+from dataclasses import dataclass
+
+from finforce_ifea.errors import JawFileError
+from finforce_ifea.jaw import Jaw
+from finforce_ifea.mesh import VolumeMesh
+from finforce_ifea.model import JawModel
+from finforce_ifea.rolling import RollingContact
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.solid import SolidModel
+from finforce_ifea.surface import build_contact_surface
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mechanics:
+    """A jaw's mesh, its model, and the model with its contact surface."""
+
+    mesh: VolumeMesh
+    model: JawModel
+    contact: RollingContact
+
+
+def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
+    """Builds the mechanics that the settings name.
+
+    Raises:
+        JawFileError: The jaw cannot be described by that model.
+        MeshError: The mesh cannot be built.
+    """
+    mesh = jaw.build_mesh(settings.mesh if jaw.drawing is not None else None)
+    name = jaw.model if settings.solver == "default" else settings.solver
+    if name == "frame":
+        if jaw.drawing is None:
+            raise JawFileError(f"the jaw {jaw.name!r} is a volume mesh; a frame needs a drawing")
+        from finforce_ifea.frame import FrameModel
+
+        model: JawModel = FrameModel(jaw.drawing, jaw.material, mesh=mesh)
+        symmetric = True
+    else:
+        if jaw.drawing is not None and not jaw.drawing.is_solid:
+            raise JawFileError(f"the jaw {jaw.name!r} has hinges or rigid bars; only the frame describes it")
+        model = SolidModel(mesh, jaw.material)
+        symmetric = model.symmetric
+    surface = build_contact_surface(jaw, mesh, model, symmetric=symmetric)
+    return Mechanics(mesh=mesh, model=model, contact=RollingContact(model, surface, jaw.inner_face_x))

@@ -1,0 +1,165 @@
+"""What goes into an estimator and what comes out; knows no mechanics."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.errors import ContactError, ObservationError
+from finforce_ifea.jaw import Jaw
+
+TRUSTED = ("ok", "unloaded")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observation:
+    """The key points of one image.
+
+    Attributes:
+        stamp: image capture time [s].
+        points: (K, 3) [m], jaw frame; NaN where there is no depth.
+        likelihood: (K,) in [0, 1].
+    """
+
+    stamp: float
+    points: NDArray
+    likelihood: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Contact:
+    """Where the object touches the jaw.
+
+    Attributes:
+        points: (n, 3) [m], on the undeformed inner surface.
+        weights: (n,), shares of the force.
+        touching: whether object and jaw intersect; None when nobody knows.
+        free: the points say where the object touched first, and the solver follows it from there.
+    """
+
+    points: NDArray
+    weights: NDArray
+    touching: bool | None = None
+    free: bool = False
+
+    @classmethod
+    def fixed(cls, jaw: Jaw, z: float) -> "Contact":
+        """Returns the contact of an object that first touches at height z [m].
+
+        Raises:
+            ContactError: The height is not on the jaw's inner surface.
+        """
+        low, high = jaw.candidates[:, 2].min() - 0.01, jaw.candidates[:, 2].max() + 0.01
+        if not low <= z <= high:
+            raise ContactError(
+                f"contact height {1e3 * z:g} mm, expected {1e3 * low:g} to {1e3 * high:g} mm on the jaw {jaw.name!r}"
+            )
+        return cls(points=np.array([[jaw.inner_face_x, 0.0, z]]), weights=np.ones(1), free=True)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution:
+    """One estimate and how good it is; only a trusted one may be published.
+
+    Attributes:
+        stamp: of the image [s].
+        status: "ok", "unloaded", "waiting", "no_contact", "not_enough_points", "unobservable" or "diverged".
+        message: what to tell the user.
+        force: (3,) [N], jaw frame, what the object applies to the jaw; zero unless trusted.
+        torque: (3,) [N m] about the jaw frame's origin.
+        force_stddev: (3,) [N].
+        torque_stddev: (3,) [N m].
+        magnitude_stddev: of the force's magnitude [N].
+        contact_point: (3,) [m], pressure centre on the deformed surface; NaN without contact.
+        contact_place: (3,) [m], the same point on the undeformed surface; NaN without contact.
+        normal: (3,), direction of the force; NaN without contact.
+        residual: weighted root mean square of the used key points' residuals [m].
+        kkt: how far the returned force is from satisfying its optimality conditions, scaled.
+        keypoints_used: (K,) bool.
+        iterations: Newton iterations of this frame.
+        converged: whether the last iteration changed nothing that matters.
+    """
+
+    stamp: float
+    status: str
+    message: str
+    force: NDArray
+    torque: NDArray
+    force_stddev: NDArray
+    torque_stddev: NDArray
+    magnitude_stddev: float
+    contact_point: NDArray
+    contact_place: NDArray
+    normal: NDArray
+    residual: float
+    kkt: float
+    keypoints_used: NDArray
+    iterations: int
+    converged: bool
+
+    @property
+    def trusted(self) -> bool:
+        """Whether a wrench may be published."""
+        return self.status in TRUSTED
+
+
+def blank_solution(stamp: float, status: str, message: str, used: NDArray, iterations: int = 0) -> Solution:
+    """Returns a solution without force, for whatever is not a contact."""
+    zero, unknown = np.zeros(3), np.full(3, np.nan)
+    return Solution(
+        stamp=stamp,
+        status=status,
+        message=message,
+        force=zero,
+        torque=zero,
+        force_stddev=zero,
+        torque_stddev=zero,
+        magnitude_stddev=0.0,
+        contact_point=unknown,
+        contact_place=unknown,
+        normal=unknown,
+        residual=float("nan"),
+        kkt=float("nan"),
+        keypoints_used=used,
+        iterations=iterations,
+        converged=False,
+    )
+
+
+def check_observation(observation: Observation, count: int, last_stamp: float | None) -> None:
+    """Refuses what cannot be an image's key points.
+
+    Raises:
+        ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], stamps not rising.
+    """
+    points, likelihood = np.asarray(observation.points), np.asarray(observation.likelihood)
+    if points.shape != (count, 3) or likelihood.shape != (count,):
+        raise ObservationError(
+            f"key points of shape {points.shape} with likelihoods of shape {likelihood.shape}, "
+            f"expected ({count}, 3) and ({count},)"
+        )
+    if np.isinf(points).any():
+        raise ObservationError(f"key point {int(np.argwhere(np.isinf(points))[0, 0])} is infinite, expected metres or NaN")
+    if not ((likelihood >= 0) & (likelihood <= 1)).all():
+        raise ObservationError(f"likelihoods from {likelihood.min():g} to {likelihood.max():g}, expected 0 to 1")
+    if not np.isfinite(observation.stamp):
+        raise ObservationError(f"stamp {observation.stamp}, expected seconds")
+    if last_stamp is not None and observation.stamp <= last_stamp:
+        raise ObservationError(
+            f"stamp {observation.stamp:.6f} s after {last_stamp:.6f} s, expected rising stamps; reset for a new recording"
+        )
+
+
+def check_contact(contact: Contact, jaw: Jaw) -> None:
+    """Refuses what cannot be a contact.
+
+    Raises:
+        ContactError: Wrong shapes, points off the inner face, weights that are negative or all zero.
+    """
+    points, weights = np.asarray(contact.points), np.asarray(contact.weights)
+    if points.ndim != 2 or points.shape[1:] != (3,) or weights.shape != (len(points),):
+        raise ContactError(f"contact points {points.shape} with weights {weights.shape}, expected (n, 3) and (n,)")
+    if not np.isfinite(points).all() or (len(points) and np.abs(points[:, 0] - jaw.inner_face_x).max() > 1e-3):
+        raise ContactError(f"contact points off the undeformed inner surface x = {jaw.inner_face_x:g} m")
+    if len(weights) and not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
+        raise ContactError(f"contact weights {weights}, expected non-negative numbers that are not all zero")

@@ -1,0 +1,68 @@
+"""The finger's relaxation: a linear viscoelastic filter from elastic to measured force; knows no shape.
+
+The force of the shape is F_e; the material adds overstresses that decay, F = F_e + sum_i h_i with
+h_i' = -h_i / tau_i + g_i F_e' (generalised Maxwell model, Simo and Hughes, Computational Inelasticity, 1998, ch. 10).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelaxationTerm:
+    """One branch: share g of the elastic stiffness [-] that relaxes with time constant tau [s]."""
+
+    share: float
+    time_constant: float
+
+
+class Relaxation:
+    """The state of all branches for a force of three components."""
+
+    def __init__(self, terms: Sequence[RelaxationTerm]) -> None:
+        """Starts relaxed."""
+        self._share = np.array([term.share for term in terms])[:, None]
+        self._tau = np.array([term.time_constant for term in terms])[:, None]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the past."""
+        self._over = np.zeros((len(self._share), 3))
+        self._elastic = np.zeros(3)
+
+    def update(self, elastic: NDArray, dt: float) -> NDArray:
+        """Returns the measured force (3,) [N] for the elastic force (3,) [N] after dt [s], exact for a ramp between."""
+        change, self._elastic = elastic - self._elastic, elastic
+        if len(self._share):
+            decay, gain = _ramp_factors(dt, self._tau)
+            self._over = self._over * decay + self._share * gain * change
+        total = elastic + self._over.sum(0)
+        # contact cannot pull: the overstress may take the whole force away, never turn it round
+        return total if total @ elastic > 0 else np.zeros(3)
+
+    @property
+    def gain(self) -> float:
+        """How much a sudden change of the elastic force is magnified."""
+        return float(1.0 + self._share.sum())
+
+
+def invert_relaxation(measured: NDArray, stamps: NDArray, terms: Sequence[RelaxationTerm]) -> NDArray:
+    """Returns the elastic forces (n,) [N] that relax into measured ones (n,) [N] at stamps (n,) [s]."""
+    share = np.array([term.share for term in terms])
+    tau = np.array([term.time_constant for term in terms])
+    elastic, over = np.zeros(len(measured)), np.zeros(len(share))
+    for i in range(1, len(measured)):
+        decay, gain = _ramp_factors(stamps[i] - stamps[i - 1], tau)
+        rest = measured[i] - (over * decay).sum() + (share * gain).sum() * elastic[i - 1]
+        elastic[i] = rest / (1.0 + (share * gain).sum())
+        over = over * decay + share * gain * (elastic[i] - elastic[i - 1])
+    return elastic
+
+
+def _ramp_factors(dt: float, tau: NDArray) -> tuple[NDArray, NDArray]:
+    decay = np.exp(-dt / tau)
+    ratio = np.maximum(dt / tau, 1e-12)
+    return decay, -np.expm1(-ratio) / ratio

@@ -1,0 +1,63 @@
+"""The inner surface of a jaw as a dense set of points where an object can touch; knows no object."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.errors import MeshError
+from finforce_ifea.jaw import Jaw
+from finforce_ifea.mesh import VolumeMesh
+from finforce_ifea.model import JawModel
+
+_SPACING = 0.25e-3
+_ON_FACE = 1e-4
+# Penalty per height [N/m per m]: 10 N spread over 2 mm sink in by 17 um, far below what a camera sees.
+_STIFFNESS = 5e7
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ContactSurface:
+    """Where an object can touch.
+
+    Attributes:
+        points: on the undeformed inner surface (p, 3) [m], rising z, all y of one height together.
+        heights: the distinct heights (h,) [m].
+        across: points per height.
+        stiffness: penalty of each point (p,) [N/m].
+        probe: the model's probe of the points.
+    """
+
+    points: NDArray
+    heights: NDArray
+    across: int
+    stiffness: NDArray
+    probe: Any
+
+
+def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, symmetric: bool) -> ContactSurface:
+    """Returns contact points every half millimetre along the inner surface, two or four across it.
+
+    Args:
+        jaw: the jaw.
+        mesh: its undeformed mesh, whose nodes on the inner face bound the surface.
+        model: its mechanics.
+        symmetric: put points on y > 0 only, each standing for its mirror image too.
+
+    Raises:
+        MeshError: The mesh has no nodes on the plane of the inner face.
+    """
+    face = mesh.nodes[np.abs(mesh.nodes[:, 0] - jaw.inner_face_x) < _ON_FACE]
+    if len(face) < 2:
+        raise MeshError(f"the mesh has no nodes on the inner face x = {jaw.inner_face_x:g} m; check inner_face_x")
+    low, high = face[:, 2].min(), face[:, 2].max()
+    heights = np.arange(low + _SPACING, high - 0.5 * _SPACING, _SPACING)
+    gauss = np.array([0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)])
+    sides = gauss * face[:, 1].max()
+    z, y = np.meshgrid(heights, sides if symmetric else np.r_[gauss[::-1] * face[:, 1].min(), sides], indexing="ij")
+    points = np.stack([np.full(z.size, jaw.inner_face_x), y.ravel(), z.ravel()], axis=1)
+    across = y.shape[1]
+    stiffness = np.full(len(points), _STIFFNESS * _SPACING / across)
+    probe = model.attach(points, 1e-3)
+    return ContactSurface(points=points, heights=heights, across=across, stiffness=stiffness, probe=probe)

@@ -1,0 +1,67 @@
+"""What the unloaded finger tells of its key points: constant offsets and noise; knows no force."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+_FARTHEST_OFFSET = 3e-3
+_FARTHEST_FROM_MEDIAN = 1.8e-3
+_NOISE_FLOOR = 0.02e-3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tare:
+    """Offsets and noise of key points.
+
+    Attributes:
+        offsets: (K, 3) [m], measured minus drawn; zero where a key point was not seen.
+        counts: (K,) frames behind each offset.
+        noise: covariance of one key point in one frame (3, 3) [m^2], pooled over all of them.
+    """
+
+    offsets: NDArray
+    counts: NDArray
+    noise: NDArray
+
+    def offset_variance(self, unseen: float) -> NDArray:
+        """Returns the variance (K,) [m^2] of each offset; `unseen` is the standard deviation without a tare [m]."""
+        seen = np.trace(self.noise) / 3.0 / np.maximum(self.counts, 1)
+        return np.where(self.counts > 0, seen, unseen**2)
+
+
+def blank_tare(count: int, noise: float) -> Tare:
+    """Returns the tare of key points of which nothing is known but their noise [m]."""
+    return Tare(offsets=np.zeros((count, 3)), counts=np.zeros(count), noise=noise**2 * np.eye(3))
+
+
+def compute_tare(frames: Sequence[NDArray], keypoints: NDArray) -> Tare | None:
+    """Averages unloaded frames.
+
+    Points farther than 3 mm from the drawing, or 1.8 mm from their own median, are gross errors. A point seen in less
+    than half of the frames has no offset: what shows it now and then is its cover.
+
+    Args:
+        frames: accepted key points of each frame (K, 3) [m], NaN where hidden.
+        keypoints: drawn (K, 3) [m].
+
+    Returns:
+        The tare, or None when fewer than three points were seen.
+    """
+    deviations = np.stack(frames) - keypoints
+    deviations[np.linalg.norm(deviations, axis=2) > _FARTHEST_OFFSET] = np.nan
+    seen = np.isfinite(deviations[..., 0])
+    middle = np.zeros_like(keypoints)
+    often = seen.sum(0) >= max(2, 0.5 * len(frames))
+    middle[often] = np.nanmedian(deviations[:, often], axis=0)
+    deviations[np.linalg.norm(deviations - middle, axis=2) > _FARTHEST_FROM_MEDIAN] = np.nan
+    counts = np.where(often, np.isfinite(deviations[..., 0]).sum(0), 0)
+    often = counts >= 2
+    if often.sum() < 3:
+        return None
+    offsets = np.zeros_like(keypoints)
+    offsets[often] = np.nanmean(deviations[:, often], axis=0)
+    noise = (deviations - offsets)[:, often].reshape(-1, 3)
+    noise = np.cov(noise[np.isfinite(noise[:, 0])].T) + _NOISE_FLOOR**2 * np.eye(3)
+    return Tare(offsets=offsets, counts=np.where(often, counts, 0), noise=noise)

@@ -1,0 +1,300 @@
+"""What every node shares: messages, parameters, quality of service, start and stop; knows no jaw."""
+
+from __future__ import annotations
+
+import array
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import Field, fields
+from typing import Any, TypeVar
+
+import numpy as np
+import rclpy
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, Vector3, Wrench, WrenchStamped
+from numpy.typing import ArrayLike, NDArray
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import Marker
+
+from finforce_health import NANOSECONDS, Level, Outcome, Report
+from finforce_ifea.errors import FinforceError, ObservationError
+from finforce_ifea.pointcloud import encode_cloud
+
+MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
+RecordT = TypeVar("RecordT")
+
+SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+
+
+class ParameterError(FinforceError, ValueError):
+    """A ROS parameter has a value or a type that its record does not allow."""
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Return a builtin_interfaces/Time as exact integer nanoseconds."""
+    return stamp.sec * NANOSECONDS + stamp.nanosec
+
+
+def stamp_message(stamp: int) -> Time:
+    """Return integer nanoseconds as a builtin_interfaces/Time."""
+    seconds, rest = divmod(stamp, NANOSECONDS)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def cloud_message(header: Header, columns: Mapping[str, ArrayLike]) -> PointCloud2:
+    """Return a cloud of height 1 with one field per column (n,), in their order and type."""
+    encoded = encode_cloud(columns)
+    return PointCloud2(
+        header=header,
+        height=1,
+        width=len(encoded.data) // encoded.point_step,
+        fields=[PointField(**vars(entry)) for entry in encoded.fields],
+        point_step=encoded.point_step,
+        row_step=len(encoded.data),
+        data=array.array("B", encoded.data),  # an ndarray would be checked byte by byte
+        is_dense=all(bool(np.isfinite(values).all()) for values in columns.values()),
+    )
+
+
+def xyz_columns(points: ArrayLike) -> dict[str, NDArray[np.float32]]:
+    """Return points (n, 3) as the float32 columns x, y, z."""
+    return dict(zip("xyz", np.asarray(points, dtype=np.float32).reshape(-1, 3).T, strict=True))
+
+
+def wrench_message(header: Header, force: ArrayLike, torque: ArrayLike = (0.0, 0.0, 0.0)) -> WrenchStamped:
+    """Return a wrench from force (3,) [N] and torque (3,) [N m].
+
+    Raises:
+        ObservationError: a component is not finite; such a wrench must not leave.
+    """
+    numbers = [*map(float, force), *map(float, torque)]
+    if not all(map(math.isfinite, numbers)):
+        raise ObservationError(f"the wrench is not finite: {numbers}")
+    return WrenchStamped(
+        header=header, wrench=Wrench(force=_vector(numbers[:3]), torque=_vector(numbers[3:]))
+    )
+
+
+def _vector(xyz: Sequence[float]) -> Vector3:
+    return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
+
+
+def points_marker(
+    header: Header,
+    name: str,
+    kind: str,
+    points: ArrayLike,
+    *,
+    color: Sequence[float],
+    scale: Sequence[float],
+    colors: Sequence[Sequence[float]] = (),
+) -> Marker:
+    """Return a marker of points (n, 3) [m]: triangles, spheres or an arrow from the first to the second.
+
+    Args:
+        header: stamp and frame.
+        name: the marker's namespace; each holds one marker.
+        kind: "triangles", "spheres" or "arrow".
+        points: in the frame of the header; none of them deletes the marker.
+        color: red, green, blue, opacity.
+        scale: what the kind makes of it [m].
+        colors: one per point, in place of `color`.
+    """
+    known = [Point(x=x, y=y, z=z) for x, y, z in np.asarray(points, dtype=np.float64).reshape(-1, 3).tolist()]
+    return Marker(
+        header=header,
+        ns=name,
+        type=MARKERS[kind],
+        action=Marker.ADD if known else Marker.DELETE,
+        points=known,
+        color=ColorRGBA(**dict(zip("rgba", color, strict=True))),
+        colors=[ColorRGBA(**dict(zip("rgba", entry, strict=True))) for entry in colors],
+        scale=_vector(scale),
+    )
+
+
+def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> RecordT:
+    """Declare a read-only ROS parameter for every field of a frozen dataclass and return the record.
+
+    Field metadata: `description`, `unit`, `min`, `max`, `choices`; no range forbids a default of NaN.
+
+    Args:
+        node: the node that gets the parameters.
+        record: the dataclass; every field needs a default.
+        prefix: put before each name, with a dot.
+
+    Raises:
+        ParameterError: a value has the wrong type or is out of bounds.
+    """
+    values = {}
+    for entry in fields(record):
+        name = f"{prefix}.{entry.name}" if prefix else entry.name
+        try:
+            value = node.declare_parameter(name, entry.default, describe_field(entry)).value
+        except ParameterException as error:
+            raise ParameterError(f"parameter {name}: {error}") from error
+        _check_value(name, value, entry)
+        values[entry.name] = value
+    return record(**values)
+
+
+def name_unknown_parameters(node: Node) -> None:
+    """Warn of parameters that were given and that the node does not have: most are misspelt."""
+    for name in node._parameter_overrides:  # rclpy tells of them nowhere else
+        if not node.has_parameter(name):
+            node.get_logger().warning(f"there is no parameter '{name}'; it is ignored")
+
+
+def _check_value(name: str, value: Any, entry: Field) -> None:
+    """Refuse what a ROS range cannot: other choices, and numbers out of bounds where NaN is allowed."""
+    choices, low, high = (entry.metadata.get(key) for key in ("choices", "min", "max"))
+    if choices and value not in choices:
+        raise ParameterError(f"parameter {name} is {value!r}; expected one of {choices}")
+    if (low is not None and value < low) or (high is not None and value > high):
+        raise ParameterError(f"parameter {name} is {value!r}; expected {low} to {high}")
+
+
+def describe_field(entry: Field) -> ParameterDescriptor:
+    """Return the description, unit, range and choices of a field as ROS tools show them."""
+    data, default = entry.metadata, entry.default
+    unit = f" [{data['unit']}]" if data.get("unit") else ""
+    descriptor = ParameterDescriptor(description=f"{data.get('description', '')}{unit}", read_only=True)
+    if choices := data.get("choices"):
+        descriptor.additional_constraints = f"one of {', '.join(map(repr, choices))}"
+    low, high = data.get("min"), data.get("max")
+    if low is None and high is None:
+        return descriptor
+    if default != default:  # NaN, which a range would refuse
+        descriptor.additional_constraints = f"from {low} to {high}, or NaN"
+    elif isinstance(default, float):
+        low, high = -sys.float_info.max if low is None else low, sys.float_info.max if high is None else high
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    else:
+        low, high = -(2**63) if low is None else low, 2**63 - 1 if high is None else high
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+    return descriptor
+
+
+class QosWatch:
+    """Says which connections do not come about because the two ends ask for different service."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._suspects: dict[str, tuple[bool, QoSProfile]] = {}
+
+    def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
+        """Create a watched publisher."""
+        events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
+        return self._node.create_publisher(kind, topic, qos, event_callbacks=events)
+
+    def subscription(self, kind: type, topic: str, callback: Callable, qos: QoSProfile) -> Subscription:
+        """Create a watched subscription."""
+        events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
+        return self._node.create_subscription(kind, topic, callback, qos, event_callbacks=events)
+
+    def _suspect(self, topic: str, writes: bool, qos: QoSProfile) -> None:
+        self._suspects[self._node.resolve_topic_name(topic)] = (writes, qos)
+        for fault in self.faults():
+            self._node.get_logger().error(fault)
+
+    def faults(self) -> list[str]:
+        """Return one sentence per mismatch that still stands."""
+        found = {topic: self._mismatches(topic, *end) for topic, end in self._suspects.items()}
+        self._suspects = {topic: end for topic, end in self._suspects.items() if found[topic]}
+        return [sentence for sentences in found.values() for sentence in sentences]
+
+    def _mismatches(self, topic: str, writes: bool, qos: QoSProfile) -> list[str]:
+        """Compare our end of a topic with every other end that stands against it."""
+        node, sentences = self._node, []
+        look_up = node.get_subscriptions_info_by_topic if writes else node.get_publishers_info_by_topic
+        for end in look_up(topic):
+            pair = (qos, end.qos_profile) if writes else (end.qos_profile, qos)
+            verdict, why = qos_check_compatible(*pair)
+            if verdict == QoSCompatibility.ERROR:
+                sentences.append(f"quality of service of {topic} does not match {end.node_name}: {why}")
+        return sentences
+
+
+def publish_diagnostics(
+    node: Node, qos: QosWatch, name: str, period: float, report: Callable[[list[Outcome]], Report]
+) -> None:
+    """Publish a report on /diagnostics every `period` seconds; mismatches of `qos` are its alarms."""
+    publisher = qos.publisher(DiagnosticArray, "/diagnostics", RESULT)
+
+    def publish() -> None:
+        alarms = [Outcome(level=Level.ERROR, reason="qos", text=fault) for fault in qos.faults()]
+        state = report(alarms)
+        status = DiagnosticStatus(
+            level=bytes([state.level]),
+            name=name,
+            message=state.message,
+            hardware_id=node.get_name(),
+            values=[KeyValue(key=key, value=value) for key, value in state.values.items()],
+        )
+        header = Header(stamp=node.get_clock().now().to_msg())
+        publisher.publish(DiagnosticArray(header=header, status=[status]))
+
+    # on the steady clock: a stopped /clock must show, too
+    node.create_timer(period, publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def serve_trigger(node: Node, name: str, action: Callable[[], str]) -> None:
+    """Offer an action as a std_srvs/Trigger service; what it refuses comes back as the message."""
+
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.success, response.message = True, action()
+        except FinforceError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    node.create_service(Trigger, name, answer)
+
+
+def take_newest(subscription: Subscription, message: Any) -> tuple[Any, int]:
+    """Return the newest message waiting behind `message` and how many were passed over."""
+    passed = 0
+    with (handle := subscription.handle):
+        while (taken := handle.take_message(subscription.msg_type, subscription.raw)) is not None:
+            message, passed = taken[0], passed + 1
+    return message, passed
+
+
+def run_node(
+    name: str,
+    build: Callable[[], Node],
+    args: Sequence[str] | None = None,
+    work: Callable[[Node], None] = rclpy.spin,
+) -> int:
+    """Build a node and let it work until it is done, Ctrl-C or SIGTERM; return 0, or 2 on our errors."""
+    node = None
+    rclpy.init(args=args)
+    try:
+        node = build()
+        work(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except FinforceError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except Exception:
+        if rclpy.ok():  # else the signal took the context away while the node was being built
+            raise
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0

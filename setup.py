@@ -1,0 +1,57 @@
+"""Packages, executables and installed files; name and version stand in package.xml, too."""
+
+from glob import glob
+
+from setuptools import setup
+
+NAME = "finforce"
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Grasp force from the key points of fin-ray jaws, by a mechanical model of the jaw.",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    packages=["finforce_ifea", "finforce_eval"],
+    py_modules=["finforce_ros", "finforce_graph", "finforce_health"],
+    package_data={
+        "finforce_ifea": ["jaws/*", "calibrations/*"],
+        "finforce_eval": ["data/*", "data/*/*", "data/*/*/*"],
+    },
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/launch", glob("launch/*.launch.py")),
+        (f"share/{NAME}/config", glob("config/*.yaml")),
+        (f"share/{NAME}/rviz", glob("rviz/*")),
+    ],
+    zip_safe=False,
+    install_requires=[
+        "numpy",  # arrays
+        "scipy",  # sparse matrices, factorisations, least squares
+        "numba",  # compiles the element loops: a step in milliseconds
+        "pyyaml",  # jaw files, calibrations
+        "meshio",  # volume mesh files of jaws
+        "rosbags",  # recordings, without ROS
+        "matplotlib",  # pictures of the reports
+        "tqdm",  # progress bars
+    ],
+    extras_require={
+        # ROS 2 Jazzy for machines without it; Python 3.10 to 3.13 on x86_64
+        "ros": [
+            "ros-jazzy-rclpy[fastrtps]",
+            "ros-jazzy-rmw-fastrtps-cpp",
+            "ros-jazzy-common-interfaces",
+            "ros-jazzy-ament-index-python",
+        ],
+        "test": ["pytest", "hypothesis"],
+        "lint": ["ruff"],
+    },
+    entry_points={
+        "console_scripts": [
+            "finforce = finforce_eval.cli:main",
+            "ifea_solver = finforce_ifea.node:main",
+            "recording_player = finforce_eval.node:main",
+        ],
+    },
+)

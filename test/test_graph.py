@@ -1,0 +1,152 @@
+"""Claims about the description of the processes, and about the launch files that are made from it."""
+
+import ast
+import json
+import math
+import shlex
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import yaml
+
+from finforce_eval.parameters import PlayerParameters
+from finforce_graph import (
+    BenchOptions,
+    Process,
+    ReplayOptions,
+    bench_processes,
+    options_from_texts,
+    replay_processes,
+)
+from finforce_ifea.parameters import NodeParameters
+from finforce_ifea.settings import EstimatorSettings
+
+ROOT = Path(__file__).resolve().parents[1]
+SOLVER_PARAMETERS = {entry.name for entry in fields(NodeParameters)}
+SOLVER_PARAMETERS |= {f"estimator.{entry.name}" for entry in fields(EstimatorSettings)} | {"use_sim_time"}
+PLAYER_PARAMETERS = {entry.name for entry in fields(PlayerParameters)}
+
+
+def by_name(processes):
+    return {process.name: process for process in processes}
+
+
+def test_one_jaw_completes_the_grasp_by_itself():
+    (solver,) = bench_processes(BenchOptions(jaw="right", contact_height=0.04), ROOT)
+    assert solver.name == "right_ifea_solver"
+    assert solver.parameters["jaw_name"] == "right"
+    assert solver.parameters["completes_grasp"] is True
+    assert solver.parameters["contact_height"] == 0.04
+
+
+def test_of_two_jaws_exactly_one_completes_the_grasp():
+    solvers = by_name(replay_processes(ReplayOptions(jaws="both"), ROOT))
+    assert solvers["left_ifea_solver"].parameters["peer"] == "right"
+    assert "peer" not in solvers["right_ifea_solver"].parameters
+    assert not any("completes_grasp" in solver.parameters for solver in solvers.values())
+
+
+def test_the_player_runs_only_with_a_bag_and_its_end_ends_all():
+    assert len(replay_processes(ReplayOptions(), ROOT)) == 1
+    player = by_name(replay_processes(ReplayOptions(bag="x", rate=2.0), ROOT))["recording_player"]
+    assert player.parameters == {"bag": "x", "rate": 2.0} and player.ends_all
+
+
+def test_what_was_not_asked_for_stays_the_nodes_own():
+    (solver,) = replay_processes(ReplayOptions(), ROOT)
+    assert set(solver.parameters) == {"jaw_name", "completes_grasp", "use_sim_time"}
+
+
+def test_every_parameter_of_the_graph_is_one_of_the_node():
+    given = {
+        "jaw_file": "a",
+        "calibration_file": "b",
+        "contact_height": 0.1,
+        "solver": "frame",
+        "mesh": "fine",
+    }
+    options = ReplayOptions(jaws="both", bag="x", **given)
+    for process in replay_processes(options, ROOT):
+        known = SOLVER_PARAMETERS if process.executable == "ifea_solver" else PLAYER_PARAMETERS
+        assert set(process.parameters) <= known
+
+
+def test_rviz_is_started_with_a_configuration_that_is_there():
+    viewer = by_name(bench_processes(BenchOptions(rviz=True), ROOT))["rviz"]
+    assert Path(viewer.arguments[1]).is_file()
+
+
+def test_a_command_line_carries_values_with_their_types():
+    parameters = {"jaw_file": "1e3", "max_age": 0.5, "completes_grasp": True, "peer": ""}
+    words = Process(
+        executable="e", module="m", name="n", parameters=parameters, remappings={"left/keypoints": "k"}
+    ).command()
+    given = dict(word.split(":=") for word in words if ":=" in word)
+    assert {name: yaml.safe_load(given[name]) for name in parameters} == parameters
+    assert given["__node"] == "n" and given["left/keypoints"] == "k"
+    assert words[1:3] == ["-m", "m"] and shlex.join(words)
+
+
+def test_launch_arguments_become_options():
+    texts = {entry.name: str(entry.default) for entry in fields(ReplayOptions)}
+    options = options_from_texts(ReplayOptions, texts)
+    assert math.isnan(options.contact_height) and options.use_sim_time is True
+    texts |= {"contact_height": "0.04", "use_sim_time": "false", "jaws": "both"}
+    options = options_from_texts(ReplayOptions, texts)
+    assert (options.contact_height, options.use_sim_time, options.jaws) == (0.04, False, "both")
+
+
+@pytest.mark.parametrize(("name", "text"), [("contact_height", "forty"), ("rviz", "yes"), ("rate", "")])
+def test_a_launch_argument_that_means_nothing_is_named(name, text):
+    texts = {entry.name: str(entry.default) for entry in fields(ReplayOptions)} | {name: text}
+    with pytest.raises(ValueError, match=name):
+        options_from_texts(ReplayOptions, texts)
+
+
+def test_every_launch_argument_has_a_description():
+    for record in (BenchOptions, ReplayOptions):
+        assert all(entry.metadata["description"] for entry in fields(record))
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "config").glob("*.yaml")), ids=lambda path: path.name)
+def test_every_key_of_a_configuration_is_a_parameter_and_differs_from_its_default(path):
+    defaults = {entry.name: entry.default for entry in fields(NodeParameters)}
+    defaults |= {f"estimator.{entry.name}": entry.default for entry in fields(EstimatorSettings)}
+    for section in yaml.safe_load(path.read_text(encoding="utf-8")).values():
+        for name, value in section["ros__parameters"].items():
+            assert name in defaults
+            assert value != defaults[name]
+            assert type(value) is type(defaults[name])
+
+
+@pytest.mark.parametrize(
+    ("record", "folder"),
+    [
+        (NodeParameters, "finforce_ifea"),
+        (PlayerParameters, "finforce_eval"),
+        (ReplayOptions, "."),
+        (BenchOptions, "."),
+    ],
+)
+def test_every_field_is_read(record, folder):
+    read = set()
+    for path in (ROOT / folder).glob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        read |= {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    assert {entry.name for entry in fields(record)} <= read
+
+
+def test_the_foxglove_layout_shows_our_topics():
+    layout = json.loads((ROOT / "rviz" / "foxglove_layout.json").read_text(encoding="utf-8"))
+    topics = layout["configById"]["3D!jaw"]["topics"]
+    assert {"/left/markers", "/left/keypoints"} <= set(topics)
+
+
+def test_the_rviz_configuration_shows_our_topics_in_the_jaws_frame():
+    manager = yaml.safe_load((ROOT / "rviz" / "finforce.rviz").read_text(encoding="utf-8"))[
+        "Visualization Manager"
+    ]
+    topics = {display["Topic"]["Value"] for display in manager["Displays"] if "Topic" in display}
+    assert {"/left/markers", "/left/keypoints", "/right/markers"} <= topics
+    assert manager["Global Options"]["Fixed Frame"] == "left_jaw"

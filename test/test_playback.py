@@ -1,0 +1,60 @@
+"""Claims about recorded messages that are published again."""
+
+import pytest
+from eval_fakes import START, make_recording
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
+
+from finforce_eval.errors import RecordingError
+from finforce_eval.playback import RawMessage, read_playback
+from finforce_eval.writer import write_recording
+
+
+@pytest.fixture(scope="module", params=["mcap", "sqlite3"])
+def folder(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("bags") / "case"
+    return write_recording(make_recording(frames=10), path, storage=request.param)
+
+
+def test_messages_come_in_the_order_of_their_receipt_with_their_stamps(folder):
+    messages = read_playback(folder)
+    times = [message.time for message in messages]
+    assert times == sorted(times) and times[0] == START
+    clouds = [message for message in messages if message.topic == "/left/keypoints"]
+    assert len(clouds) == 10
+    assert [message.stamp for message in clouds] == [message.time for message in clouds]
+
+
+def test_topics_can_be_left_out(folder):
+    topics = {message.topic for message in read_playback(folder, without={"/left/keypoints"})}
+    assert "/left/ground_truth_wrench" in topics and "/left/keypoints" not in topics
+
+
+def test_a_new_stamp_changes_nothing_but_the_stamp(folder):
+    message = next(m for m in read_playback(folder) if m.topic == "/left/keypoints")
+    before = deserialize_message(message.data, PointCloud2)
+    after = deserialize_message(message.restamped(1_700_000_000_123_456_789), PointCloud2)
+    assert (after.header.stamp.sec, after.header.stamp.nanosec) == (1_700_000_000, 123_456_789)
+    after.header.stamp = before.header.stamp
+    assert after == before
+
+
+def test_a_message_without_a_header_keeps_its_bytes(folder):
+    message = next(m for m in read_playback(folder) if m.topic == "/bench/phase")
+    assert message.stamp == message.time
+    assert message.restamped(1) == message.data
+    assert deserialize_message(message.data, String).data.startswith("0:load")
+
+
+def test_big_endian_stamps_are_read_and_written():
+    data = bytes([0, 0, 0, 0]) + (7).to_bytes(4, "big") + (5).to_bytes(4, "big") + b"rest"
+    message = RawMessage(0, "/t", "p/msg/N", data, True)
+    assert message.stamp == 7_000_000_005
+    assert message.restamped(8_000_000_006) == data[:4] + b"\0\0\0\x08\0\0\0\x06rest"
+
+
+def test_a_bag_without_anything_to_play_is_refused(folder):
+    every = {message.topic for message in read_playback(folder)}
+    with pytest.raises(RecordingError, match="nothing to be played"):
+        read_playback(folder, without=every)

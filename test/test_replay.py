@@ -1,0 +1,136 @@
+"""Claims about a replay through the real nodes, and about the stop of its processes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+
+from finforce_eval import replay as replaying
+from finforce_eval.live import JawLog, live_result, point_of_application
+from finforce_eval.recording import read_recording
+from finforce_eval.writer import write_recording
+
+SHIPPED = Path(replaying.__file__).parent / "data" / "bench_cyl25_middle"
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """The first seconds of the shipped recording."""
+    recording = read_recording(SHIPPED)
+    start = recording.jaws["left"].keypoints.stamps[0]
+    folder = tmp_path_factory.mktemp("bags") / "short"
+    return write_recording(recording.between(start, start + 4 * SECOND), folder)
+
+
+def run(*words, timeout=240):
+    environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    command = [sys.executable, "-m", "finforce_eval.cli", "replay", *map(str, words)]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=timeout, env=environment, check=False
+    )
+
+
+def solvers_of(domain):
+    """The solver processes on a DDS domain."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (folder / "cmdline").read_bytes()
+            variables = (folder / "environ").read_bytes()
+        except OSError:
+            continue
+        if b"finforce_ifea.node" in words and f"ROS_DOMAIN_ID={domain}\0".encode() in variables:
+            found.append(int(folder.name))
+    return found
+
+
+@pytest.mark.parametrize("clock", [[], ["--rate", "2"]], ids=["shifted stamps", "clock"])
+def test_every_image_of_a_recording_comes_back_as_a_wrench_with_its_stamp(short, tmp_path, clock):
+    out = tmp_path / "scores.json"
+    done = run(short, "--json", out, *clock)
+    assert done.returncode == 0, done.stderr
+    case = json.loads(out.read_text())["cases"]["short"]
+    # the first images are silent until the offsets of the key points are known
+    assert case["frames"] == 120 and case["solved"] > 60
+    assert 0.0 < case["step_ms"]["p50"] < 200.0
+    assert "grasp_wrench" in done.stdout
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_replay_and_its_nodes(number):
+    domain = 50 + number
+    words = [sys.executable, "-m", "finforce_eval.cli", "replay", str(SHIPPED), "--domain", str(domain)]
+    replay = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    until = monotonic() + 120.0
+    while not solvers_of(domain) and monotonic() < until:
+        sleep(0.05)
+    assert solvers_of(domain)
+    sleep(1.0)
+    replay.send_signal(number)
+    output, _ = replay.communicate(timeout=30)
+    assert replay.returncode == 130
+    assert "Traceback" not in output
+    assert not solvers_of(domain)
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["no_such_bag"], "no such recording"),
+        ([SHIPPED, "--rate", "0"], "--rate 0"),
+        ([SHIPPED, "--domain", "500"], "--domain 500"),
+        ([SHIPPED, "--jaw", "no_such_jaw"], "no_such_jaw"),
+        ([SHIPPED, "--jaw", "steel"], "key points"),
+        ([SHIPPED, "--params", "no_such_file"], "no_such_file"),
+    ],
+)
+def test_what_cannot_be_played_ends_with_two_and_one_line(words, reason):
+    done = run(*words)
+    assert done.returncode == 2
+    assert reason in done.stderr and len(done.stderr.strip().splitlines()) == 1
+
+
+class FakeEstimator:
+    """A jaw of four vertices."""
+
+    surface_triangles = np.array([[0, 1, 2], [0, 2, 3]])
+
+    class jaw:  # noqa: N801
+        keypoints = np.zeros((15, 3))
+
+    def surface(self):
+        return np.zeros((4, 3))
+
+
+def test_the_time_series_has_a_gap_where_no_wrench_came():
+    recording = read_recording(SHIPPED)
+    stamps = recording.jaws["left"].keypoints.stamps
+    log = JawLog()
+    for stamp in stamps[::2]:
+        log.force[int(stamp)], log.torque[int(stamp)] = np.array([-2.0, 0, 0]), np.array([0.0, -0.08, 0])
+        log.stddev[int(stamp)], log.latency[int(stamp)] = np.array([0.1, 0.5, 0.5]), 0.002
+    result = live_result(recording, "left", log, likelihood_threshold=0.6, estimator=FakeEstimator())
+    assert result.solved[::2].all() and not result.solved[1::2].any()
+    np.testing.assert_allclose(result.stddev[::2], 0.1)
+    np.testing.assert_allclose(result.step_ms[::2], 2.0)
+    assert np.isnan(result.step_ms[1::2]).all()
+    assert result.scored.any() and not result.scored.all()
+
+
+def test_the_point_of_application_lies_on_the_line_of_action_where_it_enters_the_surface():
+    points = np.stack(np.meshgrid([0.0, 0.014], [0.0], np.linspace(0, 0.08, 81)), -1).reshape(-1, 3)
+    place = np.array([0.014, 0.0, 0.0413])
+    force = np.array([-3.0, 0.0, 0.2])
+    found = point_of_application(force, np.cross(place, force), points)
+    np.testing.assert_allclose(found, place, atol=6e-4)  # half a vertex distance
+
+
+def test_no_force_has_no_point_of_application():
+    assert np.isnan(point_of_application(np.zeros(3), np.zeros(3), np.zeros((4, 3)))).all()
