@@ -1,28 +1,29 @@
-# Each target sets up what it needs in .venv first; see tools/setup_venv.sh.
+# Each target first sets up what it needs in .venv, with the sourced ROS 2 or with wheels; see tools/setup_venv.sh.
 PYTHON := .venv/bin/python
 SET_UP := tools/setup_venv.sh
 DESCRIBED := setup.py setup.cfg pyproject.toml $(SET_UP)
+ROS := $(if $(AMENT_PREFIX_PATH),ament,plain)
 
 .PHONY: demo test lint bench build clean
 
-demo: .venv/.run
-	$(PYTHON) -m finforce_eval.cli demo
+demo: .venv/.$(ROS)-run
+	$(PYTHON) -m finforce_eval.cli demo --report report
 
-test: .venv/.test
+test: .venv/.$(ROS)-test
 	$(PYTHON) -m pytest
 
-lint: .venv/.lint
+lint: .venv/.$(ROS)-lint
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 
-bench: .venv/.run
+bench: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli bench --json report/bench.json
 
-build: .venv/.build
+build: .venv/.$(ROS)-build
 	$(PYTHON) -m colcon build --event-handlers console_cohesion+
 
-.venv/.%: $(DESCRIBED)
-	$(SET_UP) $*
+.venv/.$(ROS)-%: $(DESCRIBED)
+	$(SET_UP) $* $@
 
 clean:
 	rm -rf .venv build install log report *.egg-info .pytest_cache .ruff_cache .hypothesis

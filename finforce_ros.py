@@ -19,7 +19,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.subscription import Subscription
@@ -207,8 +207,7 @@ class QosWatch:
 
     def _suspect(self, topic: str, writes: bool, qos: QoSProfile) -> None:
         self._suspects[self._node.resolve_topic_name(topic)] = (writes, qos)
-        for fault in self.faults():
-            self._node.get_logger().error(fault)
+        self._node.get_logger().error("; ".join(self.faults()))
 
     def faults(self) -> list[str]:
         """Return one sentence per mismatch that still stands."""
@@ -277,14 +276,15 @@ def run_node(
     name: str,
     build: Callable[[], Node],
     args: Sequence[str] | None = None,
-    work: Callable[[Node], None] = rclpy.spin,
+    work: Callable[[Node, Executor], None] = rclpy.spin,
 ) -> int:
     """Build a node and let it work until it is done, Ctrl-C or SIGTERM; return 0, or 2 on our errors."""
-    node = None
     rclpy.init(args=args)
+    # an executor that is made after a signal cannot be taken down quietly; a node takes long to build
+    executor, node = SingleThreadedExecutor(), None
     try:
         node = build()
-        work(node)
+        work(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except FinforceError as error:

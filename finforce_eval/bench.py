@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from finforce_ifea.estimator import Contact, JawEstimator, Observation
-from finforce_ifea.settings import EstimatorSettings
 from numpy.typing import NDArray
 
+from finforce_eval.bench_live import measure_live
+from finforce_eval.commands import write_json
 from finforce_eval.contacts import ContactChoice
 from finforce_eval.errors import OptionError
 from finforce_eval.recording import read_recording
 from finforce_eval.tracks import Recording
+from finforce_ifea.errors import MissingDependencyError
+from finforce_ifea.estimator import Contact, JawEstimator, Observation
 from finforce_ifea.jaw import Jaw, load_jaw
+from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.solid import SolidModel
 
 RECORDING = Path(__file__).parent / "data" / "bench_cyl25_middle"
@@ -46,6 +48,15 @@ class Row:
     p95: float
     p99: float
     max: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures:
+    """Everything that a benchmark measured: times, memory [MB] by name, and what could not be measured."""
+
+    rows: Sequence[Row]
+    memory: Mapping[str, float]
+    notes: Sequence[str]
 
 
 def row_from_times(name: str, times: Sequence[float] | NDArray[np.float64]) -> Row:
@@ -104,18 +115,13 @@ def _time_call(call: Callable[[], Any]) -> float:
 
 MEMORY_PROBE = """
 import sys
-from finforce_eval.bench import measure_steps, RECORDING, resident_bytes
+from finforce_eval.bench import RECORDING, measure_steps
+from finforce_eval.memory import resident_bytes
 from finforce_eval.recording import read_recording
 from finforce_ifea.jaw import load_jaw
 measure_steps(read_recording(RECORDING), load_jaw("bench"), sys.argv[1], sys.argv[2], 300)
 print(resident_bytes())
 """
-
-
-def resident_bytes(process: str = "self") -> int:
-    """Return the resident memory of a process [bytes]; Linux only."""
-    pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def measure_memory(solver: str, mesh: str) -> float:
@@ -170,33 +176,44 @@ def format_rows(rows: Sequence[Row]) -> str:
     return "\n".join([head, "-" * len(head), *lines])
 
 
-def run_bench(options: argparse.Namespace) -> None:
-    """Measure, print the table, write the JSON."""
+def measure_all(frames: int) -> Figures:
+    """Measure everything, under a progress bar; without ROS 2 a note says what was left out."""
     from tqdm import tqdm
 
-    if options.frames < 1:
-        raise OptionError(f"--frames {options.frames}: expected at least 1")
     jaw, recording = load_jaw("bench"), read_recording(RECORDING)
-    rows, memory = [], {}
-    with tqdm(total=2 * len(SOLVERS) + 2, disable=None, leave=False) as bar:
+    rows, memory, notes = [], {}, []
+    with tqdm(total=2 * len(SOLVERS) + 3, disable=None, leave=False) as bar:
         for mesh, name in (("coarse", "522 vertices"), ("default", "default mesh")):
             rows.append(row_from_times(f"SuperLU, {name}", measure_factorisation(jaw, mesh)))
             bar.update()
         for name, solver, mesh in SOLVERS:
             bar.set_description(name)
-            times = measure_steps(recording, jaw, solver, mesh, options.frames)
-            rows.append(row_from_times(f"step: {name}", times))
+            rows.append(row_from_times(f"step: {name}", measure_steps(recording, jaw, solver, mesh, frames)))
             bar.update()
             memory[name] = measure_memory(solver, mesh)
             bar.update()
-    machine = describe_machine()
-    print(format_rows(rows))
+        bar.set_description("both jaws live")
+        try:
+            live = measure_live(RECORDING)
+            rows.append(row_from_times("key points to wrench, both jaws live", live.latency))
+            memory["solver node"] = live.memory / 1e6
+        except MissingDependencyError as error:
+            notes.append(f"both jaws live: not measured: {error}")
+    return Figures(rows=rows, memory=memory, notes=notes)
+
+
+def run_bench(options: argparse.Namespace) -> None:
+    """Measure, print the table, write the JSON."""
+    if options.frames < 1:
+        raise OptionError(f"--frames {options.frames}: expected at least 1")
+    figures, machine = measure_all(options.frames), describe_machine()
+    print(format_rows(figures.rows))
     print("\nresident memory of a process with one solver:")
-    print("\n".join(f"  {name}: {megabytes:.0f} MB" for name, megabytes in memory.items()))
+    print("\n".join(f"  {name}: {megabytes:.0f} MB" for name, megabytes in figures.memory.items()))
+    print("\n".join(figures.notes))
     print(
-        f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}"
+        f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}"
     )
     if options.json:
-        content = {"machine": machine, "times_ms": [asdict(row) for row in rows], "memory_MB": memory}
-        Path(options.json).parent.mkdir(parents=True, exist_ok=True)
-        Path(options.json).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        rows = [asdict(row) for row in figures.rows]
+        write_json(options.json, {"machine": machine, "times_ms": rows, "memory_MB": figures.memory})

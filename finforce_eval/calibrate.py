@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
-from finforce_ifea.calibration import CalibrationCase, CalibrationFit, fit_calibration
-from finforce_ifea.estimator import Contact, Observation
-from finforce_ifea.settings import EstimatorSettings
 
 from finforce_eval.contacts import ContactChoice
 from finforce_eval.evaluate import check_keypoint_count
 from finforce_eval.scoring import match_truth
 from finforce_eval.tracks import Recording
+from finforce_ifea.estimator import Contact, Observation
+from finforce_ifea.identification import CalibrationFit, fit_calibration
 from finforce_ifea.jaw import Jaw
+from finforce_ifea.plateaus import CalibrationCase
+from finforce_ifea.settings import EstimatorSettings
+
+# unit and factor in which each number is printed
+UNITS = {
+    "young_modulus": ("MPa", 1e-6),
+    "clamped_z": ("mm", 1e3),
+    "time_constant_1": ("s", 1.0),
+    "time_constant_2": ("s", 1.0),
+}
 
 
 def calibration_case(recording: Recording, jaw: Jaw, contacts: ContactChoice, side: str) -> CalibrationCase:
@@ -46,13 +56,44 @@ def calibration_case(recording: Recording, jaw: Jaw, contacts: ContactChoice, si
     )
 
 
-def calibrate(
-    recordings: Sequence[Recording], jaw: Jaw, contacts: ContactChoice, settings: EstimatorSettings
-) -> CalibrationFit:
-    """Fit the material to recordings.
+def calibrate(cases: Sequence[CalibrationCase], jaw: Jaw, settings: EstimatorSettings) -> CalibrationFit:
+    """Fit the finger to the cases, showing the falling cost.
 
     Raises:
-        FinforceError: a recording cannot be used, or the fit makes no sense.
+        FinforceError: the cases say nothing about the finger.
     """
-    cases = [calibration_case(recording, jaw, contacts, jaw.side) for recording in recordings]
-    return fit_calibration(jaw, cases, settings)
+    from tqdm import tqdm
+
+    with tqdm(unit="evaluation", desc="fitting", disable=None, leave=False) as bar:
+
+        def show(cost: float) -> None:
+            bar.set_postfix(cost=f"{cost:.5g}", refresh=False)
+            bar.update()
+
+        return fit_calibration(jaw, cases, settings, show)
+
+
+def fitted_values(fit: CalibrationFit) -> dict[str, float]:
+    """Return what was identified under the names of its uncertainties, in SI units."""
+    values = asdict(fit.calibration)
+    for number, term in enumerate(fit.calibration.relaxation, 1):
+        values[f"share_{number}"] = term.share
+        values[f"time_constant_{number}"] = term.time_constant
+    return {name: values[name] for name in fit.uncertainty}
+
+
+def format_fit(fit: CalibrationFit, cases: Sequence[CalibrationCase]) -> str:
+    """Return the fit and its uncertainty as a table, with what is left unexplained."""
+    lines = []
+    for name, value in fitted_values(fit).items():
+        unit, factor = UNITS.get(name, ("", 1.0))
+        spread = fit.uncertainty[name]
+        lines.append(f"{name:<24} {factor * value:9.3f} ± {factor * spread:.3f} {unit}".rstrip())
+    lines.append("")
+    for case, radius in zip(cases, fit.radii, strict=True):
+        lines.append(f"{case.name}: radius of the object {1e3 * radius:.1f} mm")
+    lines.append(
+        f"{fit.plateaus} steady loads of {len(cases)} recordings; left over: force {fit.force_rms:.3f} N "
+        f"({100 * fit.calibration.force_error:.1f} %), key points {1e3 * fit.shape_rms:.3f} mm."
+    )
+    return "\n".join(lines)

@@ -50,6 +50,12 @@ def add_jaw_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
 
 
+def _add_set(parser: argparse.ArgumentParser) -> None:
+    """Add changes of single settings."""
+    text = "change a setting of the estimator, may be repeated; an unknown NAME lists them"
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
+
+
 def _add_evaluate(commands: argparse._SubParsersAction) -> None:
     text = "run the estimator over recordings offline and score it against the measured force"
     parser = commands.add_parser("evaluate", help=text, description=text)
@@ -58,6 +64,7 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--object", metavar="MESH", help="object mesh; used by contact estimators only")
     calibration = "calibration file, or a shipped name; without it the jaw file's own material"
     parser.add_argument("--calibration", metavar="FILE", help=calibration)
+    _add_set(parser)
     parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
     parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
     parser.set_defaults(run="finforce_eval.commands:run_evaluate")
@@ -68,6 +75,7 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("calibrate", help=text, description=text)
     parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
     add_jaw_options(parser)
+    _add_set(parser)
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration to be written")
     parser.set_defaults(run="finforce_eval.commands:run_calibrate")
 
@@ -83,7 +91,7 @@ def _add_bench(commands: argparse._SubParsersAction) -> None:
     text = "measure the time of a solver step and the memory of a solver, single-threaded"
     parser = commands.add_parser("bench", help=text, description=text)
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
-    parser.add_argument("--frames", type=int, default=600, metavar="N", help="frames per solver (600)")
+    parser.add_argument("--frames", type=int, default=1300, metavar="N", help="frames per solver (1300)")
     parser.set_defaults(run="finforce_eval.bench:run_bench")
 
 

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,12 @@ from finforce_eval.results import CaseResult
 from finforce_eval.tables import evaluation_json, format_table
 from finforce_eval.tracks import Recording
 from finforce_ifea.calibration import Calibration, load_calibration, save_calibration
+from finforce_ifea.errors import FinforceError
 from finforce_ifea.estimator import Contact, JawEstimator
 from finforce_ifea.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
+
+TRUTH_VALUES = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,17 +100,42 @@ def make_setup(options: argparse.Namespace) -> Setup:
     """
     contacts = parse_contacts(options.contact)
     jaw = load_jaw(options.jaw)
-    settings = EstimatorSettings(solver=options.solver, mesh=options.mesh)
+    changes = getattr(options, "set", [])
+    settings = parse_settings(options.solver, options.mesh, changes)
     calibration = load_calibration(options.calibration) if options.calibration else None
     about = {
         "jaw": jaw.name,
         "solver": options.solver,
         "mesh": options.mesh,
         "contact": ", ".join(options.contact) or "fixed:case",
+        "settings": ", ".join(changes) or "as they come",
         "calibration": options.calibration or "none",
         "version": version(),
     }
     return Setup(jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about)
+
+
+def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorSettings:
+    """Return the settings of the estimator with `NAME=VALUE` changes.
+
+    Raises:
+        OptionError: a name is unknown, or a value is not of the setting's type or out of its bounds.
+    """
+    values: dict[str, Any] = {"solver": solver, "mesh": mesh}
+    defaults = asdict(EstimatorSettings())
+    for change in changes:
+        name, _, text = change.partition("=")
+        if name not in defaults:
+            raise OptionError(f"--set {change}: unknown setting; expected one of {', '.join(defaults)}")
+        kind = type(defaults[name])
+        try:
+            values[name] = TRUTH_VALUES[text.lower()] if kind is bool else kind(text)
+        except (KeyError, ValueError):
+            raise OptionError(f"--set {change}: '{text}' is no {kind.__name__}") from None
+    try:
+        return EstimatorSettings(**values)
+    except FinforceError as error:
+        raise OptionError(f"settings: {error}") from error
 
 
 def run_evaluate(options: argparse.Namespace) -> None:
@@ -181,12 +209,17 @@ def _evaluate_case(recording: Recording, side: str, setup: Setup, progress: Any)
 
 def run_calibrate(options: argparse.Namespace) -> None:
     """Identify the material and write the calibration."""
-    from finforce_eval.calibrate import calibrate, format_fit
+    from finforce_eval.calibrate import calibrate, calibration_case, format_fit
 
     options.calibration = None
     setup = make_setup(options)
-    fit = calibrate(read_recordings(options.bags), setup.jaw, setup.contacts, setup.settings)
-    print(format_fit(fit))
+    recordings = read_recordings(options.bags)
+    is_left = all("left" in truth_sides(recording) for recording in recordings)
+    setup = setup.side("left" if is_left else "right")
+    jaw, contacts = setup.jaw, setup.contacts
+    cases = [calibration_case(recording, jaw, contacts, jaw.side) for recording in recordings]
     Path(options.output).parent.mkdir(parents=True, exist_ok=True)
-    save_calibration(fit.calibration, Path(options.output))
+    fit = calibrate(cases, jaw, setup.settings)
+    print(format_fit(fit, cases))
+    save_calibration(fit.calibration, options.output, uncertainty=fit.uncertainty)
     print(f"Calibration: {options.output}")

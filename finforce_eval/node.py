@@ -12,7 +12,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
@@ -136,7 +136,7 @@ def open_player(domain: int) -> Iterator[PlayerNode]:
         rclpy.try_shutdown(context=context)
 
 
-def play_recording(node: PlayerNode) -> None:
+def play_recording(node: PlayerNode, _: Executor) -> None:
     """Play the recording that the parameters name, once."""
     parameters = ros.declare_record(node, PlayerParameters)
     messages = read_playback(parameters.bag)

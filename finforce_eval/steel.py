@@ -12,12 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_eval.errors import RecordingError
-from finforce_eval.tracks import JawTrack, KeypointTrack, Recording, WrenchTrack, parse_phases
+from finforce_eval.tracks import JawTrack, KeypointTrack, PhaseTrack, Recording, WrenchTrack, parse_phases
 from finforce_eval.writer import write_recording
 
 SHIPPED = Path(__file__).parent / "data" / "steel" / "finray_steel_r20.json"
 HALF_BASE = 36.62  # mm, half the distance of the two strips at the base
-FRAMES_PER_LEVEL = 10
+SETTLE_FRAMES, RECORD_FRAMES = (
+    60,
+    30,
+)  # per level; the estimator may wait for an unloaded jaw before it starts
+FRAMES_PER_LEVEL = SETTLE_FRAMES + RECORD_FRAMES
 PERIOD = 33_333_333  # ns
 START = 1_000_000_000_000  # ns
 
@@ -43,7 +47,9 @@ def points_from_picture(nodes: Any) -> NDArray[np.float64]:
 
 
 def recording_from_measurement(measurement: Mapping[str, Any], name: str = "steel_r20") -> Recording:
-    """Return a recording in which every displacement level is held for ten frames of its picture.
+    """Return a recording in which every displacement level is held for three seconds of its picture.
+
+    No unloaded picture exists, and none is made up.
 
     Args:
         measurement: `displacement_mm` (n,), `nodes` (n, 8, 2) [mm], `force` (n, 2) [N], `object`.
@@ -70,7 +76,6 @@ def recording_from_measurement(measurement: Mapping[str, Any], name: str = "stee
         likelihood=np.ones((len(stamps), points.shape[1])),
     )
     truth = WrenchTrack(stamps=stamps, force=force, torque=np.zeros_like(force))
-    phases = [f"0:load:{level:g}:record" for level in levels]
     case = {
         "object": {"kind": "cylinder", "diameter": diameter, "z": CONTACT_HEIGHT},
         "ground_truth": GROUND_TRUTH,
@@ -79,9 +84,16 @@ def recording_from_measurement(measurement: Mapping[str, Any], name: str = "stee
         name=name,
         path=Path(name),
         jaws={"left": JawTrack(keypoints=keypoints, truth=truth)},
-        phases=parse_phases(stamps[::FRAMES_PER_LEVEL].tolist(), phases, name),
+        phases=_phases(stamps, levels, name),
         case=case,
     )
+
+
+def _phases(stamps: NDArray[np.int64], levels: NDArray[np.float64], name: str) -> PhaseTrack:
+    """Let every level settle, then record it."""
+    begins = np.stack([stamps[::FRAMES_PER_LEVEL], stamps[SETTLE_FRAMES::FRAMES_PER_LEVEL]], axis=1)
+    texts = [f"0:load:{level:g}:{stage}" for level in levels for stage in ("settle", "record")]
+    return parse_phases(begins.ravel().tolist(), texts, name)
 
 
 def run_convert(options: argparse.Namespace) -> None:

@@ -105,9 +105,9 @@ def _fill_forms(ends, chord, bend_s, bend_a, forms):
         forms[_STRETCH, i + 2], forms[_STRETCH, i + 3] = sign * (ex * vx + ez * vz), 0.0
         forms[_ACROSS, i], forms[_ACROSS, i + 1] = sign * ez, -sign * ex
         forms[_ACROSS, i + 2], forms[_ACROSS, i + 3] = sign * (ez * vx - ex * vz), 0.0
-        forms[_SWAY, i : i + 4] = -forms[_ACROSS, i : i + 4] / chord
-        forms[_SWAY, i + 3] += 0.5
-        forms[_EXTEND, i : i + 4] = forms[_STRETCH, i : i + 4] + bend_a * forms[_SWAY, i : i + 4]
+        for j in range(i, i + 4):
+            forms[_SWAY, j] = (0.5 if j == i + 3 else 0.0) - forms[_ACROSS, j] / chord
+            forms[_EXTEND, j] = forms[_STRETCH, j] + bend_a * forms[_SWAY, j]
         forms[_EXTEND, i + 3] -= 0.5 * sign * bend_s
 
 
@@ -196,13 +196,12 @@ def _add_block(dof, H, storage):
 
 
 @njit(**_OPTIONS)
-def _map_point(beams, points, p, q, ends, J):
+def _map_point(points, p, ends, J):
     """Fills the derivatives J (2, 8) of a point's place by its beam's unknowns; returns the place (x, z).
 
     The centre line c = shape . (P_1, t_1, P_2, t_2) is Hermite's cubic through the ends with their tangents:
     it runs on from beam to beam with the same derivative. The offset turns with the direction of c'.
     """
-    _place_ends(beams, points.beam[p], q, ends)
     w, dw = points.shape[p, 0], points.shape[p, 1]
     cx = cz = tx = tz = 0.0
     for i in range(4):
@@ -232,7 +231,9 @@ def point_positions(beams, points, q):
     full, ends, J = _with_held(q), np.empty((2, 6)), np.empty((2, 8))
     out = points.points.copy()
     for p in range(len(out)):
-        out[p, 0], out[p, 2] = _map_point(beams, points, p, full, ends, J)
+        if p == 0 or points.beam[p] != points.beam[p - 1]:
+            _place_ends(beams, points.beam[p], full, ends)
+        out[p, 0], out[p, 2] = _map_point(points, p, ends, J)
     return out
 
 
@@ -243,7 +244,9 @@ def point_motions(beams, points, q, modes):
     full, ends, J = _with_held(q), np.empty((2, 6)), np.empty((2, 8))
     out = np.zeros((len(points.beam), 3, count))
     for p in range(len(out)):
-        _map_point(beams, points, p, full, ends, J)
+        if p == 0 or points.beam[p] != points.beam[p - 1]:
+            _place_ends(beams, points.beam[p], full, ends)
+        _map_point(points, p, ends, J)
         for i in range(8):
             dof = beams.dof[points.beam[p], i // 4, i % 4]
             if dof < n:
@@ -261,7 +264,8 @@ def point_loads(beams, points, q, forces):
     for p in range(len(forces)):
         if forces[p, 0] == 0.0 and forces[p, 2] == 0.0:
             continue
-        _map_point(beams, points, p, full, ends, J)
+        _place_ends(beams, points.beam[p], full, ends)
+        _map_point(points, p, ends, J)
         for i in range(8):
             out[beams.dof[points.beam[p], i // 4, i % 4]] += J[0, i] * forces[p, 0] + J[1, i] * forces[p, 2]
     return out[: len(q)]
@@ -275,7 +279,8 @@ def add_point_springs(beams, points, q, blocks, storage):
         xx, xz, zz = blocks[p, 0, 0], blocks[p, 0, 2], blocks[p, 2, 2]
         if xx == 0.0 and xz == 0.0 and zz == 0.0:
             continue
-        _map_point(beams, points, p, full, ends, J)
+        _place_ends(beams, points.beam[p], full, ends)
+        _map_point(points, p, ends, J)
         for i in range(8):
             gx, gz = xx * J[0, i] + xz * J[1, i], xz * J[0, i] + zz * J[1, i]
             for j in range(8):

@@ -16,7 +16,6 @@ _KEYS = {
     "relaxation", "force_error", "jaw", "comment", "uncertainty",
 }  # fmt: skip
 
-
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
     """A printed finger as it is, beside its drawing.
@@ -79,10 +78,8 @@ class Calibration:
         )
         return replace(jaw, drawing=drawing, material=material)
 
-
 def _thicken(band, factor: float):
     return replace(band, thickness=band.thickness * factor)
-
 
 def load_calibration(name_or_path: str | Path) -> Calibration:
     """Loads a calibration from its YAML file or a shipped one by its name.
@@ -107,7 +104,6 @@ def load_calibration(name_or_path: str | Path) -> Calibration:
     except (TypeError, CalibrationError) as error:
         raise CalibrationError(f"{path.name}: {error}") from error
 
-
 def _find_file(name_or_path: str | Path) -> Path:
     folder = resources.files("finforce_ifea").joinpath("calibrations")
     shipped = Path(str(folder.joinpath(f"{name_or_path}.yaml")))
@@ -115,7 +111,6 @@ def _find_file(name_or_path: str | Path) -> Path:
     if not path.is_file():
         raise CalibrationError(f"there is no calibration file {str(name_or_path)!r}")
     return path
-
 
 def save_calibration(
     calibration: Calibration, path: str | Path, *, uncertainty: dict[str, float] | None = None

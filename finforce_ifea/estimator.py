@@ -88,6 +88,7 @@ class JawEstimator:
         self._stamp: float | None = None
         self._track: Track | None = None
         self._quiet = 0
+        self._relaxed: float | None = None
         self._height: float | None = None
         self._gate.reset()
         self._relaxation.reset()
@@ -168,7 +169,7 @@ class JawEstimator:
     def _begin(self, used: NDArray, dt: float) -> Solution | None:
         """Collects unloaded frames, then tares, unless the jaw looks loaded; returns None once that is decided."""
         if len(self._recent) < self.settings.tare_frames:
-            self._relaxation.update(np.zeros(3), dt)
+            self._relax(np.zeros(3))
             missing = self.settings.tare_frames - len(self._recent)
             return blank_solution(self._stamp, "waiting", f"{missing} more unloaded frames for the tare", used)
         try:
@@ -238,7 +239,7 @@ class JawEstimator:
         tare = compute_tare([points, points], self.jaw.keypoints + self._tare.offsets)
         quiet = self.tared and tare is not None and self._tracker.significance(tare) < _LOADED_SIGMA
         if quiet:
-            self._relaxation.update(np.zeros(3), dt)
+            self._relax(np.zeros(3))
             return replace(blank_solution(self._stamp, "unloaded", "no object, the jaw is at rest", used), converged=True)
         return self._fail("no_contact", "the jaw is bent but no contact is known", used, dt)
 
@@ -257,8 +258,14 @@ class JawEstimator:
         self._track = track
         if self._tare_open and self.tared:
             self._refine_tare(track.place[DEPTH])
-        force = self._relaxation.update(track.force, dt)
+        force = self._relax(track.force)
         return self._solution(track, force, used)
+
+    def _relax(self, elastic: NDArray) -> NDArray:
+        """Returns the force (3,) [N] that the material gives for an elastic force (3,) [N] now."""
+        dt = 0.0 if self._relaxed is None else self._stamp - self._relaxed
+        self._relaxed = self._stamp
+        return self._relaxation.update(elastic, dt)
 
     def _stddev(self, track: Track, magnitude: float) -> float:
         direction = track.force / magnitude if magnitude > 0 else np.array([-1.0, 0.0, 0.0])

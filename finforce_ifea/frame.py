@@ -26,10 +26,10 @@ from finforce_ifea.mesh import VolumeMesh
 from finforce_ifea.model import Linearization
 
 _SHEAR_CORRECTION = 5.0 / 6.0
-# A stiff joint's band does not bend over a share of the rib's thickness, and the rib bends into the band by a
-# share of its own. Plane finite elements of a T, rib 0.4 to 1 times as thick as the band, nu = 0.45, give 0.32
-# and 0.35 with sharp corners, 0.53 and 0.12 with one quadratic element per thickness, blunt like a fillet.
-_OVERLAP, _ROOT = 0.5, 0.15
+# At a stiff joint the band does not bend over a share of the rib's thickness, and the rib bends into the band
+# by a share of its own. Plane finite elements of a T, the rib 0.4 to 1 times as thick as the band, nu = 0.45,
+# give 0.32 and 0.35 with sharp corners, 0.53 and 0.12 with one quadratic element per thickness.
+_OVERLAP, _ROOT = 0.53, 0.12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,14 +54,12 @@ class FrameModel:
     """A planar co-rotational frame; see `finforce_ifea.model.JawModel` for what its methods take and return.
 
     The unknowns q (size,) are u_x, u_z [m] and the rotation [rad] of each joint, and own rotations of hinged
-    beams, in an order of small bandwidth. A rotation about y is positive from z to x. Nothing moves along y;
-    bands and ribs bend in plane strain.
+    beams, in an order of small bandwidth. A rotation about y is positive from z to x. Bands and ribs are wide
+    and thin: they bend in plane strain, but narrow as they stretch. No point's y changes.
 
     Attributes:
         size: number of unknowns.
         rotations: which unknowns are rotations (size,).
-        bandwidth: of the tangent stiffness.
-        beams: the beams.
     """
 
     def __init__(
@@ -80,21 +78,17 @@ class FrameModel:
             mesh: whose nodes `vertices` moves; without one there are no vertices.
             divisions: how many beams; None for 4 between ribs and 3 along a rib.
         """
-        self.drawing = drawing
         sketch = _Sketch(drawing, divisions or FrameDivisions())
+        self.drawing, self.size = drawing, sketch.count
         self.beams, self._parts = sketch.number_beams(material), sketch.parts
-        self.size = sketch.count
         dof = self.beams.dof.reshape(-1, 8)
-        self.bandwidth = int((np.where(dof < self.size, dof, -1).max(1) - dof.min(1)).max())
-        turning = np.zeros(self.size + 1, bool)
-        turning[self.beams.dof[:, :, 2:]] = True
-        self.rotations = turning[: self.size]
+        self.bandwidth = int(np.where(dof < self.size, dof - dof.min(1, keepdims=True), 0).max())
+        self.rotations = np.isin(np.arange(self.size), self.beams.dof[:, :, 2:])
         self._vertices = None if mesh is None else self.attach(mesh.nodes)
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
         """Evaluates internal force, energy and, unless `tangent` is False, the tangent stiffness at q."""
-        force = np.zeros(self.size + 1)
-        storage = np.zeros((self.bandwidth + 1, self.size), order="F")
+        force, storage = np.zeros(self.size + 1), np.zeros((self.bandwidth + 1, self.size), order="F")
         energy, smallest = add_beams(self.beams, q, tangent, force, storage)
         storage = storage if tangent else None
         return Linearization(force=force[:-1], energy=energy, smallest_det=smallest, tangent=storage)
@@ -110,10 +104,9 @@ class FrameModel:
         away = np.flatnonzero(~(distances <= max_distance))
         if len(away):
             row = away[distances[away].argmax()]
-            at, distance = np.round(1e3 * points[row], 3).tolist(), 1e3 * distances[row]
             raise MeshError(
-                f"point {row} at {at} mm is {distance:.3g} mm away from the finger, "
-                f"expected at most {1e3 * max_distance:.3g} mm"
+                f"point {row} at {np.round(1e3 * points[row], 3).tolist()} mm is {1e3 * distances[row]:.3g} "
+                f"mm away from the finger, expected at most {1e3 * max_distance:.3g} mm"
             )
         return _attach_to_beams(self.beams, self._parts, points)
 
@@ -154,8 +147,7 @@ class _Joint(NamedTuple):
 class _Part(NamedTuple):
     """A band or a rib: its centre line, thickness [m], and beams; points use low <= xi <= 1 of them."""
 
-    start: NDArray
-    end: NDArray
+    axis: NDArray
     thickness: float
     beams: NDArray
     low: float = 0.0
@@ -173,13 +165,12 @@ class _Sketch:
         self._bands = (drawing.inner, drawing.outer)
         middle = np.mean([band.centre_x(drawing.length) for band in self._bands])
         self._tip = self._add_joint(np.array([middle, drawing.length]))
-        first, second = (list(points) for points in drawing.junctions)
-        inner = [self._add_joint(point) for point in first]
-        outer = inner if self._welded else [self._add_joint(point) for point in second]
+        inner = [self._add_joint(point) for point in drawing.junctions[0]]
+        outer = inner if self._welded else [self._add_joint(point) for point in drawing.junctions[1]]
         self._add_band(0, inner)
         self._add_band(1, outer)
-        for number in range(len(drawing.ribs)):
-            self._add_rib(number, (inner[number], outer[number]))
+        for number, joints in enumerate(zip(inner, outer, strict=True)):
+            self._add_rib(number, joints)
 
     def _add_unknowns(self, count: int) -> NDArray:
         self.count += count
@@ -201,10 +192,9 @@ class _Sketch:
         own = [joint.dof[2] if turn is None else turn for joint, turn in zip(chain, turns, strict=True)]
         dof = [[*joint.dof, turn] for joint, turn in zip(chain, own, strict=True)]
         arms = points - [joint.point for joint in chain]
-        for k in range(count):
-            self._dof.append(dof[k : k + 2])
-            self._ends.append(points[k : k + 2])
-            self._arms.append(arms[k : k + 2])
+        self._dof += zip(dof[:-1], dof[1:], strict=True)
+        self._ends += zip(points[:-1], points[1:], strict=True)
+        self._arms += zip(arms[:-1], arms[1:], strict=True)
         self._thickness += [thickness] * count
         return np.arange(len(self._dof) - count, len(self._dof))
 
@@ -221,33 +211,32 @@ class _Sketch:
             beams.append(self._add_chain((joint, upper), (base, point - half), thickness, count))
             joint, base = upper, point + half
         beams.append(self._add_chain((joint, self._tip), (base, top), thickness, count))
-        self.parts.append(_Part(start, end, thickness, np.concatenate(beams)))
+        self.parts.append(_Part(np.stack([start, end]), thickness, np.concatenate(beams)))
 
     def _rigid_half(self, rib: Rib, side: int) -> float:
         """Returns how far from a junction a band does not bend [m]; the foot of a rigid bar clamps it."""
-        share = {"stiff": _OVERLAP, "hinged": 0.0}[self.drawing.joints]
-        share = 1.0 if self.drawing.bars == "rigid" else share
+        share = 1.0 if self.drawing.bars == "rigid" else _OVERLAP * (self.drawing.joints == "stiff")
         return 0.5 * share * float(np.linalg.norm(np.ptp(self.drawing.rib_edges(rib)[:, side], axis=0)))
 
     def _add_rib(self, number: int, joints: tuple[_Joint, _Joint]) -> None:
         """Adds a rib from back to back of the bands, or the bar that stands for it."""
         rib, hinged = self.drawing.ribs[number], self.drawing.joints == "hinged"
-        first, second = self.drawing.junctions[:, number]
+        axis = self.drawing.junctions[:, number]
         if self._welded:
             below = self.parts[0].beams[[(number + 1) * self.divisions.between_ribs - 1]]
-            self.parts.append(_Part(first, second, rib.thickness, below, 1.0))
+            self.parts.append(_Part(axis, rib.thickness, below, low=1.0))
             return
-        along = (second - first) / np.linalg.norm(second - first)
+        along = (axis[1] - axis[0]) / np.linalg.norm(axis[1] - axis[0])
         root = 0.0 if hinged else _ROOT * rib.thickness
         backs = [0.5 * band.thickness / abs(along[0] - band.slope * along[1]) for band in self._bands]
         arms = [max(back - root, 0.0) if rib.thickness > 0.0 else 0.0 for back in backs]
-        ends = (first + arms[0] * along, second - arms[1] * along)
+        ends = (axis[0] + arms[0] * along, axis[1] - arms[1] * along)
         if self.drawing.bars == "rigid":
             beams = self._add_chain(joints, ends, 0.0, 1, (-1, -1))
         else:
             turns = tuple(self._add_unknowns(2)) if hinged else (None, None)
             beams = self._add_chain(joints, ends, rib.thickness, self.divisions.along_rib, turns)
-        self.parts.append(_Part(first, second, rib.thickness, beams))
+        self.parts.append(_Part(axis, rib.thickness, beams))
 
     def number_beams(self, material: Material) -> Beams:
         """Returns the beams with their unknowns in reverse Cuthill-McKee order."""
@@ -266,15 +255,15 @@ class _Sketch:
 
 
 def _beam_stiffness(length: NDArray, thickness: NDArray, width: float, material: Material) -> NDArray:
-    """Returns the stiffness (m, 5) of Timoshenko beams in plane strain; see `add_beams`.
+    """Returns the stiffness (m, 5) of Timoshenko beams that bend in plane strain; see `add_beams`.
 
     A beam without thickness is a bar, made as stiff as the thickest band is along itself, so that no larger
-    number enters: the steel finger's stretch by 0.5 um under 10 N, and its strips bend 10,000 times as easily.
+    number enters: the steel finger's stretch by 0.5 um under 10 N; its strips bend 10,000 times as easily.
     """
     ratio, bar = material.poisson_ratio, thickness == 0.0
-    EA = material.young_modulus / (1.0 - ratio**2) * np.where(bar, thickness.max(), thickness) * width
-    EI = EA * thickness**2 / 12.0
-    GA = _SHEAR_CORRECTION * 0.5 * (1.0 - ratio) * EA
+    EA = material.young_modulus * np.where(bar, thickness.max(), thickness) * width
+    EI = EA * thickness**2 / (12.0 * (1.0 - ratio**2))
+    GA = _SHEAR_CORRECTION * EA / (2.0 * (1.0 + ratio))
     shear = 1.0 + 12.0 * EI / (GA * length**2)
     bends = np.where(bar, 0.0, length)
     k_n, k_s, k_a = EA / length, 4.0 * EI / length, 12.0 * EI / (length * shear)
@@ -282,7 +271,7 @@ def _beam_stiffness(length: NDArray, thickness: NDArray, width: float, material:
 
 
 def _attach_to_beams(beams: Beams, parts: list[_Part], points: NDArray) -> BeamPoints:
-    """Returns what carries points (p, 3): the nearest place on the centre line of the part that they lie in."""
+    """Returns what carries points (p, 3): the nearest place on the centre line of the part they lie in."""
     xz = points[:, [0, 2]]
     # rounded, so that a point where two parts meet belongs to the first of them, the band, on every machine
     nearest = np.argmin([_distance_to_part(part, xz).round(12) for part in parts], axis=0)
@@ -304,8 +293,8 @@ def _attach_to_beams(beams: Beams, parts: list[_Part], points: NDArray) -> BeamP
 
 def _distance_to_part(part: _Part, xz: NDArray) -> NDArray:
     """Returns how far points (p, 2) lie outside the rectangle around a part's centre line (p,) [m]."""
-    length = np.linalg.norm(part.end - part.start)
-    along, rest = (part.end - part.start) / length, xz - part.start
+    length = np.linalg.norm(part.axis[1] - part.axis[0])
+    along, rest = (part.axis[1] - part.axis[0]) / length, xz - part.axis[0]
     place, side = rest @ along, np.abs(rest[:, 0] * along[1] - rest[:, 1] * along[0])
     beyond = np.maximum(np.abs(place - 0.5 * length) - 0.5 * length, 0.0)
     return np.hypot(np.maximum(side - 0.5 * part.thickness, 0.0), beyond)

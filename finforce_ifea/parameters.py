@@ -87,4 +87,6 @@ def build_estimator(jaw: Jaw, parameters: NodeParameters, settings: EstimatorSet
 
     file = parameters.calibration_file
     calibration = load_calibration(file) if file else None
-    return JawEstimator(jaw, settings=settings, calibration=calibration)
+    estimator = JawEstimator(jaw, settings=settings, calibration=calibration)
+    estimator.warm_up()
+    return estimator

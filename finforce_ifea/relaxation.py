@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 
@@ -53,12 +54,38 @@ def invert_relaxation(measured: NDArray, stamps: NDArray, terms: Sequence[Relaxa
     """Returns the elastic forces (n,) [N] that relax into measured ones (n,) [N] at stamps (n,) [s]."""
     share = np.array([term.share for term in terms])
     tau = np.array([term.time_constant for term in terms])
+    return _invert(np.asarray(measured, float), np.asarray(stamps, float), share, tau)
+
+
+def apply_relaxation(elastic: NDArray, stamps: NDArray, terms: Sequence[RelaxationTerm]) -> NDArray:
+    """Returns the measured forces (n,) [N] for elastic ones (n,) [N] at stamps (n,) [s]; see `Relaxation.update`."""
+    share = np.array([term.share for term in terms])
+    tau = np.array([term.time_constant for term in terms])
+    return _relax(np.asarray(elastic, float), np.asarray(stamps, float), share, tau)
+
+
+@njit(cache=True)
+def _relax(elastic, stamps, share, tau):
+    total, over = elastic.copy(), np.zeros(len(share))
+    for i in range(1, len(elastic)):
+        ratio = np.maximum((stamps[i] - stamps[i - 1]) / tau, 1e-12)
+        over = over * np.exp(-ratio) - share * np.expm1(-ratio) / ratio * (elastic[i] - elastic[i - 1])
+        total[i] = max(0.0, elastic[i] + over.sum())
+    return total
+
+
+@njit(cache=True)
+def _invert(measured, stamps, share, tau):
     elastic, over = np.zeros(len(measured)), np.zeros(len(share))
     for i in range(1, len(measured)):
-        decay, gain = _ramp_factors(stamps[i] - stamps[i - 1], tau)
-        rest = measured[i] - (over * decay).sum() + (share * gain).sum() * elastic[i - 1]
-        elastic[i] = rest / (1.0 + (share * gain).sum())
-        over = over * decay + share * gain * (elastic[i] - elastic[i - 1])
+        rest, stiffness = measured[i], 1.0
+        ratio = np.maximum((stamps[i] - stamps[i - 1]) / tau, 1e-12)
+        decay, gain = np.exp(-ratio), -np.expm1(-ratio) / ratio * share
+        for k in range(len(share)):
+            rest += gain[k] * elastic[i - 1] - over[k] * decay[k]
+            stiffness += gain[k]
+        elastic[i] = rest / stiffness
+        over = over * decay + gain * (elastic[i] - elastic[i - 1])
     return elastic
 
 

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.factor import Factor
 from finforce_ifea.model import JawModel
 from finforce_ifea.penalty import press_cylinder
 from finforce_ifea.surface import ContactSurface
 
 DEPTH, LOG_RADIUS, HEIGHT = 0, 1, 2
 _LARGEST_STEP = 2e-3
+_BISECTIONS = 10
+_TOUCH = 2e-5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,8 +83,20 @@ class RollingContact:
             smallest_det=state.smallest_det,
         )
 
-    def settle(self, q: NDArray, place: NDArray, *, tolerance: float = 1e-7, iterations: int = 60) -> tuple:
-        raise NotImplementedError
+    def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
+        """Returns the step of a jaw that has lost contact, cut where its surface meets the cylinder again."""
+        radius = float(np.exp(place[LOG_RADIUS]))
+        centre = np.array([self.face_x + radius - place[DEPTH], place[HEIGHT]])
+        low, high = 0.0, 1.0
+        for _ in range(_BISECTIONS):
+            share = 0.5 * (low + high)
+            points = self.model.positions(self.surface.probe, q + share * step)
+            gap = np.sqrt(((points[:, [0, 2]] - centre) ** 2).sum(1)).min() - radius
+            if gap < -_TOUCH:
+                high = share
+            else:
+                low = share
+        return high * step
 
 
 def limit_step(step: NDArray) -> NDArray:

@@ -25,6 +25,7 @@ _SETTLED_CORRECTION = 1e-4
 _RADIUS_RANGE = np.log([3e-3, 0.2])
 _LEAST_WEIGHT = 0.02
 _FRAMES_RELEASED = 15
+_LOST_STDDEV = 1e-3
 # Standard deviation of an offset that all key points share [m]: a depth scale wrong by 1 % at 0.15 m.
 _COMMON_OFFSET = 1.5e-3
 
@@ -90,6 +91,7 @@ class PlaceTracker:
         self.q = np.zeros(self.contact.model.size)
         self._prior = np.array([np.log(self.settings.radius), height])
         self._motion, self._motion_covariance = np.zeros(2), np.diag([0.1e-3, 1e-3]) ** 2
+        self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
         self._released = 0
         self._forget_place()
 
@@ -111,23 +113,24 @@ class PlaceTracker:
         """Takes the key points (K, 3) [m], NaN where unused, dt [s] after the last; None when too few agree."""
         motion, spread = self._predict(dt)
         reference = np.r_[motion[0], self._slow]
-        place, q = reference.copy(), self.q
+        place, q = reference.copy(), self.q + self._modes @ (_reachable(reference) - self._reached)
         measured = points - tare.offsets
         for iteration in range(1, self.settings.iterations + 1):
-            mechanical = np.r_[max(place[DEPTH], _LEAST_DEPTH), place[1:]]
+            mechanical = _reachable(place)
             state = self.contact.linearize(q, mechanical)
-            q = q + limit_step(state.correction)
             if not state.forces.any():
+                q = q + self.contact.approach(q, state.correction, mechanical)
                 continue
+            q = q + limit_step(state.correction)
             data = self._residuals(q, state, measured, tare, place - reference, spread[0, 0], place[0] - mechanical[0])
             if (data.weights > 0).sum() < self.settings.minimum_keypoints:
-                return None
+                return self._lose()
             step = self._solve(data, reference, motion, spread)
             change = np.clip(step.place - place, -_LARGEST_CHANGE, _LARGEST_CHANGE)
             complete = np.array_equal(change, step.place - place)
             place = place + change
             place[LOG_RADIUS] = np.clip(place[LOG_RADIUS], *_RADIUS_RANGE)
-            moved = np.r_[max(place[DEPTH], _LEAST_DEPTH), place[1:]] - mechanical
+            moved = _reachable(place) - mechanical
             q = q + limit_step(state.modes @ moved)
             settled = (np.abs(moved) < _SETTLED_CHANGE).all() and np.abs(state.correction).max() < _SETTLED_CORRECTION
             if complete and settled:
@@ -135,8 +138,8 @@ class PlaceTracker:
         else:
             settled = False
             if not state.forces.any():
-                return None
-        self._keep(q, place, step, spread)
+                return self._lose()
+        self._keep(q, place, step, spread, state.modes)
         return self._report(state, moved, data.weights, step, iteration, settled)
 
     def significance(self, tare: Tare) -> float:
@@ -233,9 +236,15 @@ class PlaceTracker:
         kkt = np.abs(hessian @ shift - gradient).max() / max(np.abs(gradient).max(), 1e-30)
         return covariance, np.clip(shift[1:], -_LARGEST_CHANGE[1:], _LARGEST_CHANGE[1:]), float(kkt)
 
-    def _keep(self, q: NDArray, place: NDArray, step: "_Step", spread: NDArray) -> None:
+    def _lose(self) -> None:
+        """Widens the search for the next frame."""
+        self._motion[1] = 0.0
+        self._motion_covariance[0, 0] += _LOST_STDDEV**2
+
+    def _keep(self, q: NDArray, place: NDArray, step: "_Step", spread: NDArray, modes: NDArray) -> None:
         """Keeps what the next frame starts from; a released jaw expects any object again."""
-        self.q, self._slow = q, place[1:].copy()
+        self.q, self._modes, self._reached = q, modes, _reachable(place)
+        self._slow = place[1:].copy()
         self._motion = np.array([place[DEPTH], step.motion[1]])
         self._motion_covariance = spread - np.outer(step.gain, spread[0])
         self._mean, self._count = step.mean, step.count
@@ -272,6 +281,11 @@ class _Step:
     covariance: NDArray
     kkt: float
     residual: float
+
+
+def _reachable(place: NDArray) -> NDArray:
+    """Returns the place (3,) at which the mechanics stands for `place`."""
+    return np.r_[max(place[DEPTH], _LEAST_DEPTH), place[1:]]
 
 
 def condition_on_width(noise: NDArray) -> tuple[NDArray, NDArray]:

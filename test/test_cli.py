@@ -147,6 +147,22 @@ def test_unknown_solver_and_missing_bag_are_refused(capsys, bag):
     assert_refused(capsys, ["calibrate", bag], "-o/--output")
 
 
+@pytest.mark.parametrize(
+    "change", ["magic=1", "iterations=many", "automatic_tare=perhaps", "iterations=0", "gate"]
+)
+def test_setting_that_cannot_be_is_refused(capsys, bag, change):
+    assert_refused(capsys, ["evaluate", bag, "--set", change], change.split("=")[0])
+
+
+def test_settings_take_the_type_of_their_default():
+    from finforce_eval.commands import parse_settings
+
+    settings = parse_settings("solid", "coarse", ["iterations=3", "gate=2", "automatic_tare=No"])
+    assert (settings.solver, settings.mesh) == ("solid", "coarse")
+    assert (settings.iterations, settings.gate, settings.automatic_tare) == (3, 2.0, False)
+    assert isinstance(settings.gate, float)
+
+
 def test_all_key_points_hidden_is_refused(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("finforce_eval.commands.JawEstimator", lambda *_, **__: FakeEstimator([None] * 60))
     bag = write_recording(bench_recording(), tmp_path / "bag")

@@ -96,7 +96,7 @@ def test_what_a_process_has_started_ends_with_it():
 
 
 def test_an_early_end_is_reported_with_the_last_words():
-    code = "import sys; print('first'); print('no such jaw', file=sys.stderr); sys.exit(2)"
+    code = "import sys; print('first', flush=True); print('no such jaw', file=sys.stderr); sys.exit(2)"
     with ProcessGroup([Script("solver", code)], {}) as group:
         wait_for(lambda: fails(group))
         with pytest.raises(ProcessError, match="solver ended with status 2: no such jaw"):

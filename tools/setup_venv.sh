@@ -1,36 +1,43 @@
 #!/usr/bin/env bash
 # Makes or refreshes the virtual environment .venv for one purpose:
-#   tools/setup_venv.sh lint|run|test|build
+#   tools/setup_venv.sh lint|run|test|build [STAMP]
 # A sourced ROS 2 is used as it is; without one, ROS 2 Jazzy comes from wheels. Needs nothing but Python.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 purpose=${1:?lint, run, test or build}
+stamp=${2:-.venv/.$purpose}
 venv=.venv
 
-fail() { printf 'finforce set-up: %s\n' "$*" >&2; exit 1; }
-say() { printf 'finforce set-up: %s\n' "$*"; }
-works() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; }
+say() { printf 'finforce set-up: %s\n' "$*" >&2; }
+fail() { say "$*"; exit 1; }
+fits() { "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 14))' 2>/dev/null; }
 
-# Prints a Python, 3.10 or later. The wheels exist for 3.10 to 3.13; a sourced ROS 2 asks for its own.
-choose_python() {
-  local name
-  if sourced_ros; then echo python3; return; fi
-  for name in ${FINFORCE_PYTHON:-} python3 python3.12 python3.11 python3.10 python3.13; do
-    if works "$name" && "$name" -c 'import sys; sys.exit(sys.version_info >= (3, 14))'; then
-      command -v "$name"; return
-    fi
-  done
-  fail "no Python from 3.10 to 3.13 is on the path, and there are ROS 2 wheels for no other." \
-    "Install one (Debian, Ubuntu: sudo apt-get install python3 python3-venv) or set FINFORCE_PYTHON."
+# A ROS 2 of its own, not the wheels of an activated .venv.
+has_sourced_ros() {
+  [ -n "${AMENT_PREFIX_PATH:-}" ] && python3 - 2>/dev/null <<'PY'
+import importlib.util, sys
+import rclpy
+sys.exit(importlib.util.find_spec("ros_wheels_bootstrapper") is not None)
+PY
 }
 
-sourced_ros() { [ -n "${AMENT_PREFIX_PATH:-}" ] && python3 -c 'import rclpy' 2>/dev/null; }
+# Prints a Python from 3.10 to 3.13, for which there are wheels; a sourced ROS 2 has its own.
+choose_python() {
+  local name
+  if [ "$ros" = sourced ]; then command -v python3; return; fi
+  for name in ${FINFORCE_PYTHON:-} python3 python3.12 python3.11 python3.10 python3.13; do
+    if fits "$name"; then command -v "$name"; return; fi
+  done
+  fail "no Python from 3.10 to 3.13 is on the path, and for no other are there ROS 2 wheels." \
+    "Install one (Debian, Ubuntu: sudo apt-get install -y python3 python3-venv) or name one in FINFORCE_PYTHON."
+}
 
-# Installs Debian packages as root; else prints the one line that would do.
+# Installs Debian packages as root; otherwise, or if that fails, prints the one line that would do.
 install_packages() {
   if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
-    apt-get install -y "$@" >/dev/null 2>&1 ||
-      { apt-get update >/dev/null 2>&1 && apt-get install -y "$@" >/dev/null 2>&1; } && return 0
+    say "installs $*"
+    if apt-get install -y "$@" >/dev/null 2>&1; then return; fi
+    if apt-get update >/dev/null 2>&1 && apt-get install -y "$@" >/dev/null 2>&1; then return; fi
   fi
   say "please run: sudo apt-get install -y $*"
   return 1
@@ -39,43 +46,47 @@ install_packages() {
 make_venv() {
   local python version options=()
   python=$(choose_python)
-  if sourced_ros; then
+  version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+  if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+    install_packages "python$version-venv" || fail "$python cannot make a virtual environment without it."
+  fi
+  if [ "$ros" = sourced ]; then
     options=(--system-site-packages)
     say "uses the sourced ROS 2 ${ROS_DISTRO:-}"
   fi
-  version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
-  if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
-    install_packages "python$version-venv" || fail "$python cannot make virtual environments yet"
-  fi
-  say "makes $venv with Python $version ($python)"
-  "$python" -m venv --clear "${options[@]}" "$venv"
+  say "makes $venv with Python $version"
+  "$python" -m venv --clear ${options[@]+"${options[@]}"} "$venv"
+  echo "$ros" >"$venv/.ros"
 }
 
-# What open3d loads when it is imported; a machine without a display often lacks them.
+# What open3d loads when it is imported; machines without a display often lack them.
 check_system_libraries() {
   local pair missing=()
   for pair in libgl1=libGL.so.1 libgomp1=libgomp.so.1 libx11-6=libX11.so.6; do
-    { ldconfig -p 2>/dev/null || /sbin/ldconfig -p; } | grep -q "${pair#*=} " || missing+=("${pair%%=*}")
+    PATH=$PATH:/sbin:/usr/sbin ldconfig -p | grep -qF "${pair#*=} " || missing+=("${pair%%=*}")
   done
-  [ ${#missing[@]} = 0 ] || install_packages "${missing[@]}" ||
-    say "goes on without ${missing[*]}: only the work with object meshes will miss them"
+  if [ ${#missing[@]} -gt 0 ] && ! install_packages "${missing[@]}"; then
+    say "goes on without ${missing[*]}: only work with object meshes will miss them"
+  fi
 }
 
 install() { "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "$@"; }
 
 install_product() {
-  local extras=${1:-}
-  sourced_ros || extras="ros${extras:+,$extras}"
+  local extras=$1
+  if [ "$ros" = wheels ]; then extras="ros${extras:+,$extras}"; fi
   install setuptools wheel
   install --no-build-isolation --editable ".${extras:+[$extras]}"
 }
 
-[ -x "$venv/bin/python" ] && works "$venv/bin/python" || make_venv
+ros=wheels
+if has_sourced_ros; then ros=sourced; fi
+if ! fits "$venv/bin/python" || [ "$(cat "$venv/.ros" 2>/dev/null)" != "$ros" ]; then make_venv; fi
 case $purpose in
   lint) install ruff ;;
-  run) check_system_libraries; install_product ;;
+  run) check_system_libraries; install_product "" ;;
   test) check_system_libraries; install_product test ;;
-  build) install_product; install colcon-common-extensions ;;
+  build) install_product ""; install colcon-common-extensions ;;
   *) fail "unknown purpose $purpose" ;;
 esac
-touch "$venv/.$purpose"
+touch "$stamp"

@@ -1,0 +1,310 @@
+"""Identification of a finger from recordings with true forces: stiffness, effective thicknesses, clamp, relaxation.
+
+Shape tells the geometry, force the modulus, and the forces' course at steady shape the relaxation. All are found
+together by least squares over the steady loads; the depth of each load and the object's radius of each recording
+are found along the way.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from finforce_ifea.calibration import Calibration
+from finforce_ifea.errors import CalibrationError
+from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.jaw import Jaw
+from finforce_ifea.mechanics import Mechanics, build_mechanics
+from finforce_ifea.plateaus import INSTANTS, CalibrationCase, Plateau, find_plateaus
+from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation, invert_relaxation
+from finforce_ifea.rolling import DEPTH, limit_step
+from finforce_ifea.settings import EstimatorSettings
+
+_NAMES = (
+    "young_modulus", "inner_thickness_factor", "outer_thickness_factor", "rib_thickness_factor", "clamped_z",
+    "share_1", "time_constant_1", "share_2", "time_constant_2",
+)  # fmt: skip
+# Prior means and standard deviations: log modulus about the jaw file's, factors, clamp [mm], shares, log times [s].
+_PRIOR = np.array([0.0, 1.0, 1.0, 1.0, 0.2, 0.1, np.log(1.0), 0.1, np.log(10.0)])
+_PRIOR_STDDEV = np.array([1.0, 0.1, 0.1, 0.1, 0.4, 0.3, 1.5, 0.3, 1.5])
+_LOW = np.array([-3.0, 0.6, 0.6, 0.6, 0.0, 0.0, np.log(0.02), 0.0, np.log(0.1)])
+_HIGH = np.array([3.0, 1.5, 1.5, 1.5, 2.0, 2.0, np.log(1e3), 2.0, np.log(1e4)])
+_DIFFERENCE = np.array([1e-3, 2e-3, 2e-3, 4e-3, 2e-2, 1e-3, 1e-2, 1e-3, 1e-2])
+_GEOMETRY = slice(1, 5)
+_FORCE_ERROR, _FORCE_FLOOR = 0.015, 0.01
+_SHAPE_ERROR = 0.05e-3
+_ITERATIONS = 12
+_PER_CASE = 14
+_LOADED_FORCE = 0.3
+# Errors of neighbouring frames are alike; this many count as one.
+_CORRELATED_FRAMES = 30
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CalibrationFit:
+    """The outcome of an identification.
+
+    Attributes:
+        calibration: the identified finger.
+        uncertainty: standard deviation of each number, in its unit.
+        radii: radius of curvature of each recording's object [m].
+        force_rms: root mean square force residual over the steady loads [N].
+        shape_rms: root mean square key point residual [m].
+        plateaus: how many steady loads were used.
+    """
+
+    calibration: Calibration
+    uncertainty: dict[str, float]
+    radii: tuple[float, ...]
+    force_rms: float
+    shape_rms: float
+    plateaus: int
+
+
+def fit_calibration(
+    jaw: Jaw,
+    cases: Sequence[CalibrationCase],
+    settings: EstimatorSettings | None = None,
+    progress: Callable[[float], None] = lambda cost: None,
+) -> CalibrationFit:
+    """Identifies a finger.
+
+    Args:
+        jaw: as drawn.
+        cases: recordings with true forces that start unloaded and hold loads steady.
+        settings: solver and mesh for which the calibration is made.
+        progress: called with the cost after every evaluation of the mechanics.
+
+    Raises:
+        CalibrationError: No cases, or recordings that say nothing about the finger.
+    """
+    if not cases:
+        raise CalibrationError("calibration: no recordings, expected at least one")
+    settings = settings or EstimatorSettings()
+    fit = _Fit(jaw, cases, settings, progress)
+    result = least_squares(
+        fit.residuals, fit.start, jac=fit.jacobian, bounds=(fit.low, fit.high), x_scale=fit.stddev,
+        max_nfev=_ITERATIONS, ftol=1e-4, xtol=1e-4,
+    )  # fmt: skip
+    covariance = np.linalg.inv(result.jac.T @ result.jac)
+    rough = fit.report(result.x, np.sqrt(np.diag(covariance)))
+    return _refine_relaxation(jaw, cases, settings, rough, progress)
+
+
+def _refine_relaxation(
+    jaw: Jaw, cases: Sequence[CalibrationCase], settings: EstimatorSettings, rough: CalibrationFit,
+    progress: Callable[[float], None],
+) -> CalibrationFit:  # fmt: skip
+    """Fits modulus and relaxation again to the whole course of force, ramps included, at the found geometry."""
+    courses = []
+    for case in cases:
+        courses.append(_track_course(jaw, case, settings, rough.calibration))
+        progress(float("nan"))
+    fit = least_squares(_course_residuals, np.r_[0.0, _PRIOR[5:]], bounds=(_LOW[[0, *range(5, 9)]], _HIGH[[0, *range(5, 9)]]),
+                        x_scale=_PRIOR_STDDEV[[0, *range(5, 9)]], args=(courses,))  # fmt: skip
+    model = [np.exp(fit.x[0]) * apply_relaxation(course.elastic, course.stamps, _terms(fit.x[1:])) for course in courses]
+    loaded = [course.true > _LOADED_FORCE for course in courses]
+    errors = np.concatenate([(m - c.true)[k] for m, c, k in zip(model, courses, loaded, strict=True)])
+    relative = np.concatenate([((m - c.true) / c.true)[k] for m, c, k in zip(model, courses, loaded, strict=True)])
+    stddev = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac + 1e-12 * np.eye(5))))
+    names = ("share_1", "time_constant_1", "share_2", "time_constant_2")
+    scale = [1.0, np.exp(fit.x[2]), 1.0, np.exp(fit.x[4])]
+    return replace(
+        rough,
+        calibration=replace(
+            rough.calibration,
+            young_modulus=float(rough.calibration.young_modulus * np.exp(fit.x[0])),
+            relaxation=_terms(fit.x[1:]),
+            force_error=float(np.clip(1.48 * np.median(np.abs(relative)), 0.005, 0.5)),
+        ),
+        uncertainty={**rough.uncertainty, **dict(zip(names, (stddev[1:] * scale).tolist(), strict=True))},
+        force_rms=float(np.sqrt(np.mean(errors**2))),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Course:
+    """Stamps [s], elastic force estimates and true forces (n,) [N] of one recording."""
+
+    stamps: NDArray
+    elastic: NDArray
+    true: NDArray
+
+
+def _track_course(
+    jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration
+) -> _Course:
+    """Estimates the elastic force of every frame."""
+    estimator = JawEstimator(jaw, settings=settings, calibration=replace(calibration, relaxation=()))
+    solutions = [estimator.update(observation, case.contact) for observation in case.observations]
+    trusted = [solution for solution in solutions if solution.trusted]
+    stamps = np.array([solution.stamp for solution in trusted])
+    true = np.interp(stamps, case.stamps_true, np.linalg.norm(case.forces_true, axis=1))
+    return _Course(stamps=stamps, elastic=np.array([np.linalg.norm(s.force) for s in trusted]), true=true)
+
+
+def _terms(x: NDArray) -> tuple[RelaxationTerm, ...]:
+    """Returns the branches of shares and log time constants, the faster one first."""
+    terms = [RelaxationTerm(share=float(x[k]), time_constant=float(np.exp(x[k + 1]))) for k in (0, 2)]
+    return tuple(sorted(terms, key=lambda term: term.time_constant))
+
+
+def _course_residuals(x: NDArray, courses: Sequence[_Course]) -> NDArray:
+    """Returns the force residuals of all frames, over 2 % and 0.03 N, with the prior of the branches."""
+    rows = []
+    for course in courses:
+        model = np.exp(x[0]) * apply_relaxation(course.elastic, course.stamps, _terms(x[1:]))
+        rows.append((model - course.true) / (0.02 * course.true + 0.03))
+    weight = np.sqrt(_CORRELATED_FRAMES)
+    return np.concatenate([np.concatenate(rows) / weight, (x[1:] - _PRIOR[5:]) / _PRIOR_STDDEV[5:]])
+
+
+class _Fit:
+    """Residuals of all parameters: the finger's, then one log radius per recording."""
+
+    def __init__(
+        self, jaw: Jaw, cases: Sequence[CalibrationCase], settings: EstimatorSettings, progress: Callable[[float], None]
+    ) -> None:
+        self.jaw, self.cases, self.settings, self.progress = jaw, cases, settings, progress
+        self.plateaus = find_plateaus(cases, jaw, settings, per_case=_PER_CASE)
+        self._starts: list[_PlateauShape | None] = [None] * len(self.plateaus)
+        count = len(cases)
+        self.mean = np.r_[_PRIOR, np.full(count, np.log(settings.radius))]
+        self.stddev = np.r_[_PRIOR_STDDEV, np.full(count, settings.radius_log_stddev)]
+        self.low = np.r_[_LOW, np.full(count, np.log(2e-3))]
+        self.high = np.r_[_HIGH, np.full(count, np.log(0.3))]
+        self.difference = np.r_[_DIFFERENCE, np.full(count, 1e-2)]
+        self.start = self.mean.copy()
+        self.forces = [np.linalg.norm(case.forces_true, axis=1) for case in cases]
+        self._shapes: dict[bytes, tuple[NDArray, NDArray]] = {}
+
+    def calibration(self, x: NDArray) -> Calibration:
+        """Returns the parameters as a calibration."""
+        return Calibration(
+            young_modulus=float(self.jaw.material.young_modulus * np.exp(x[0])),
+            inner_thickness_factor=float(x[1]),
+            outer_thickness_factor=float(x[2]),
+            rib_thickness_factor=float(x[3]),
+            clamped_z=float(1e-3 * x[4]),
+            relaxation=_terms(x[5:9]),
+            jaw=self.jaw.name,
+        )
+
+    def residuals(self, x: NDArray) -> NDArray:
+        """Returns shape, force and prior residuals, each over its standard deviation."""
+        shapes, forces = self._solve_shapes(x)
+        elastic = self._elastic_forces(x)
+        model = np.exp(x[0]) * forces
+        rows = [((target - value) / self._force_stddev(value)) for target, value in zip(elastic, model, strict=True)]
+        total = np.concatenate([shapes, *rows, (x - self.mean) / self.stddev])
+        self.progress(float(total @ total))
+        return total
+
+    def _force_stddev(self, force: float) -> float:
+        return np.sqrt(INSTANTS) * (_FORCE_ERROR * force + _FORCE_FLOOR)
+
+    def _elastic_forces(self, x: NDArray) -> list[NDArray]:
+        """Returns the elastic forces [N] behind the true ones at the instants of each plateau."""
+        terms = self.calibration(x).relaxation
+        elastic = [
+            invert_relaxation(force, case.stamps_true, terms) for force, case in zip(self.forces, self.cases, strict=True)
+        ]
+        return [elastic[plateau.case][plateau.instants] for plateau in self.plateaus]
+
+    def _solve_shapes(self, x: NDArray) -> tuple[NDArray, NDArray]:
+        """Returns the shape residuals and the magnitudes [N] at the drawn modulus; remembers them per geometry."""
+        key = np.r_[x[_GEOMETRY], x[len(_NAMES) :]].tobytes()
+        if key not in self._shapes:
+            finger = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus).apply(self.jaw)
+            mechanics = build_mechanics(finger, self.settings)
+            rest = mechanics.model.attach(self.jaw.keypoints, 1e-3)
+            solver = _PlateauSolver(mechanics, rest)
+            solved = []
+            for plateau, start in zip(self.plateaus, self._starts, strict=True):
+                height = float(self.cases[plateau.case].contact.points[0, 2])
+                solved.append(solver.solve(plateau, x[len(_NAMES) + plateau.case], height, start))
+            self._starts = solved
+            residuals = np.concatenate([shape.residual for shape in solved])
+            self._shapes = {key: (residuals, np.array([shape.force for shape in solved]))}
+        return self._shapes[key]
+
+    def jacobian(self, x: NDArray) -> NDArray:
+        """Returns forward differences, each in the direction that stays within the bounds."""
+        centre = self.residuals(x)
+        columns = []
+        for i, step in enumerate(self.difference):
+            step = -step if x[i] + step > self.high[i] else step
+            moved = x.copy()
+            moved[i] += step
+            columns.append((self.residuals(moved) - centre) / step)
+        return np.stack(columns, axis=1)
+
+    def report(self, x: NDArray, stddev: NDArray) -> CalibrationFit:
+        """Returns the fit with its residuals in units."""
+        shapes, forces = self._solve_shapes(x)
+        elastic, model = self._elastic_forces(x), np.exp(x[0]) * forces
+        errors = np.concatenate([target - value for target, value in zip(elastic, model, strict=True)])
+        relative = np.concatenate([target / value - 1.0 for target, value in zip(elastic, model, strict=True)])
+        calibration = replace(self.calibration(x), force_error=float(np.clip(np.sqrt(np.mean(relative**2)), 0.005, 0.5)))
+        scale = np.ones(len(_NAMES))
+        scale[[0, 4, 6, 8]] = calibration.young_modulus, 1e-3, np.exp(x[6]), np.exp(x[8])
+        return CalibrationFit(
+            calibration=calibration,
+            uncertainty=dict(zip(_NAMES, (scale * stddev[: len(_NAMES)]).tolist(), strict=True)),
+            radii=tuple(np.exp(x[len(_NAMES) :]).tolist()),
+            force_rms=float(np.sqrt(np.mean(errors**2))),
+            shape_rms=float(_SHAPE_ERROR * np.sqrt(np.mean(shapes**2))),
+            plateaus=len(self.plateaus),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _PlateauShape:
+    """A solved steady load: unknowns, depth [m], weighted shape residuals, force [N]."""
+
+    q: NDArray
+    depth: float
+    residual: NDArray
+    force: float
+
+
+class _PlateauSolver:
+    """Finds the depth at which the jaw's shape comes closest to the key points of a steady load."""
+
+    def __init__(self, mechanics: Mechanics, probe: Any) -> None:
+        self._contact, self._model, self._probe = mechanics.contact, mechanics.model, probe
+        self._rest = self._model.positions(probe, np.zeros(self._model.size))
+
+    def solve(self, plateau: Plateau, log_radius: float, height: float, start: _PlateauShape | None) -> _PlateauShape:
+        """Returns the closest shape, found by Gauss-Newton from `start` or from the unloaded jaw.
+
+        Raises:
+            CalibrationError: No shape of the jaw comes close.
+        """
+        q = np.zeros(self._model.size) if start is None else start.q
+        place = np.array([0.5e-3 if start is None else start.depth, log_radius, height])
+        seen = np.isfinite(plateau.keypoints[:, 0])
+        stddev = np.sqrt(plateau.variance[seen, None] + _SHAPE_ERROR**2)
+        for _ in range(60):
+            state = self._contact.linearize(q, place)
+            if not state.forces.any():
+                q = q + self._contact.approach(q, state.correction, place)
+                continue
+            q = q + limit_step(state.correction)
+            moved = self._model.positions(self._probe, q) - self._rest
+            mode = self._model.project(self._probe, q, state.modes)[seen][:, [0, 2], DEPTH] / stddev
+            residual = (plateau.keypoints[seen] - moved[seen][:, [0, 2]]) / stddev
+            change = float(np.clip((mode * residual).sum() / (mode**2).sum(), -0.5e-3, 0.5e-3))
+            change = max(change, 3e-5 - place[DEPTH])
+            place[DEPTH] += change
+            q = q + limit_step(state.modes[:, DEPTH] * change)
+            if abs(change) < 1e-6 and np.abs(state.correction).max() < 1e-6:
+                force = state.forces.sum(0) + state.force_modes[:, DEPTH] * change + state.force_correction
+                left = (residual - mode * change).ravel()
+                return _PlateauShape(q=q, depth=float(place[DEPTH]), residual=left, force=float(np.linalg.norm(force)))
+        if start is not None:
+            return self.solve(plateau, log_radius, height, None)
+        raise CalibrationError("calibration: no shape of the jaw comes near the key points; is it the right jaw file?")
