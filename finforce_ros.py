@@ -26,7 +26,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from std_srvs.srv import Trigger
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray  # noqa: F401 - for those who publish
 
 from finforce_health import NANOSECONDS, Level, Outcome, Report
 from finforce_ifea.errors import FinforceError, ObservationError

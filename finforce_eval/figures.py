@@ -97,17 +97,18 @@ def draw_unity(results: Sequence[CaseResult]) -> Figure:
     columns = min(len(results), 3)
     rows = -(-len(results) // columns)
     figure = new_figure(3.4 * columns + 0.8, 3.4 * rows + 0.6)
-    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
-    counted = [np.r_[r.true_magnitude[r.counted], r.magnitude[r.counted]] for r in results]
-    limit = 1.06 * max(float(values.max(initial=0.1)) for values in counted)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, result in zip(panels, results, strict=False):
         _style(axes)
+        counted = np.r_[result.true_magnitude[result.counted], result.magnitude[result.counted]]
+        limit = 1.06 * float(counted.max(initial=0.1))
         axes.plot([0, limit], [0, limit], color=GREY, linewidth=1.0, dashes=(4, 2))
         for direction, colour in [*COLOURS.items(), ("", BLUE)]:
             chosen = result.counted & (result.direction == direction)
             style = {"color": colour, "alpha": 0.35, "markersize": 3, "markeredgewidth": 0}
             axes.plot(result.true_magnitude[chosen], result.magnitude[chosen], "o", **style)
         axes.set(xlim=(0, limit), ylim=(0, limit), aspect="equal")
+        axes.locator_params(nbins=6)
         axes.set_title(result.name, fontsize=10)
     for axes in panels[len(results) :]:
         axes.set_visible(False)

@@ -164,14 +164,12 @@ def _score(recording: Recording, setup: Setup, log: ReplayLog) -> Evaluation:
     Raises:
         RecordingError: there are none.
     """
-    from finforce_ifea.estimator import JawEstimator
-
     results: list[CaseResult] = []
     sides = truth_sides(recording)
     for side in sides:
         if not log.jaws[side].force:
             raise RecordingError(f"{recording.name}: no wrench came on {side}/wrench: {_words(log, side)}")
-        estimator = JawEstimator(setup.side(side).jaw, settings=setup.settings)
+        estimator = setup.side(side).estimator()
         threshold = setup.settings.likelihood_threshold
         result = live_result(
             recording, side, log.jaws[side], likelihood_threshold=threshold, estimator=estimator
@@ -191,7 +189,10 @@ def format_replay(result: Replay) -> str:
     lines.append("Step times are from key points out to wrench in, over the middleware and back.")
     lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {_largest(result.grasp):.2f} N.")
     for name, state in result.health.items():
-        lines.append(f"{name}: {state['message']}; refused: {state.get('refused', '-')}")
+        own = " / ".join(state.get(f"callback to published {part} [ms]", "-") for part in ("p50", "p95"))
+        lines.append(
+            f"{name}: {state['message']}; refused: {state.get('refused', '-')}; in the node {own} ms"
+        )
     return "\n".join(lines)
 
 

@@ -42,11 +42,16 @@ def write_report(
     draw_unity(results).savefig(folder / "unity.png")
     draw_violins(results).savefig(folder / "violins.png")
     sections = [_write_case(result, folder, keypoint_names) for result in results]
-    lines = [
-        f"# {title}",
-        "",
-        *(f"- {key}: {value}" for key, value in about.items()),
-        "",
+    page = folder / "README.md"
+    head = [f"# {title}", "", *(f"- {key}: {value}" for key, value in about.items()), ""]
+    lines = [*head, *_overview(evaluation), *(line for section in sections for line in section)]
+    page.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return page
+
+
+def _overview(evaluation: Evaluation) -> list[str]:
+    """Return the table and the pictures of all cases together."""
+    return [
         markdown_table(evaluation),
         "",
         *summary_lines(evaluation),
@@ -55,11 +60,7 @@ def write_report(
         "",
         "![Estimated against measured force](unity.png)",
         "![Distribution of the error per case](violins.png)",
-        *(line for section in sections for line in section),
     ]
-    page = folder / "README.md"
-    page.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return page
 
 
 def _write_case(result: CaseResult, folder: Path, keypoint_names: Sequence[str]) -> list[str]:

@@ -18,10 +18,10 @@ def format_number(value: float | None, digits: int = 2) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _format_spread(spread: Spread, digits: int) -> str:
+def _format_spread(spread: Spread) -> str:
     """Return mean and standard deviation over the cycles."""
-    mean = format_number(spread.mean, digits)
-    return mean if spread.std is None else f"{mean}±{spread.std:.{digits}f}"
+    mean = format_number(spread.mean)
+    return mean if spread.std is None else f"{mean}±{spread.std:.2f}"
 
 
 def score_cells(score: CaseScore, phase: str) -> list[str]:
@@ -29,8 +29,8 @@ def score_cells(score: CaseScore, phase: str) -> list[str]:
     cycles = score.cycles[phase]
     stats: Stats = getattr(score, phase)
     return [
-        _format_spread(cycles.rmse_N, 2),
-        _format_spread(cycles.nrmsd_pct, 1),
+        _format_spread(cycles.rmse_N),
+        _format_spread(cycles.nrmsd_pct),
         format_number(stats.max_error_N),
     ]
 
@@ -68,9 +68,11 @@ def summary_lines(evaluation: Evaluation) -> list[str]:
     """Return what the table's numbers mean, and the times."""
     total = evaluation.total
     step = total.step_ms
-    count = len(evaluation.scores)
+    rmse = {name: score.all.rmse_N for name, score in evaluation.scores.items()}
+    worst = max(rmse, key=lambda name: rmse[name] or 0.0)
     return [
-        f"Mean RMSE of {count} case{'s' if count > 1 else ''}: {format_number(total.mean_rmse_N)} N. "
+        f"Mean RMSE of {len(rmse)} case{'s' if rmse.keys() - {worst} else ''}: "
+        f"{format_number(total.mean_rmse_N, 3)} N, worst {format_number(rmse[worst], 3)} N ({worst}). "
         f"RMSE and NRMSD: mean ± standard deviation over the cycles, {total.cycles['all'].n} in all; "
         f"NRMSD: over the force range {evaluation.span:.2f} N.",
         f"{total.frames} frames, {total.solved} solved, {total.skipped} skipped; in the record phases "

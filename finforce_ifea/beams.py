@@ -133,10 +133,9 @@ def add_beams(beams, q, with_tangent, force, storage):
 
     Source: Crisfield, Non-linear Finite Element Analysis of Solids and Structures 1 (1991), chapter 7.
     """
-    full = _with_held(q)
+    full, energy, smallest = _with_held(q), 0.0, 1e300
     ends, strain, forms, H = np.empty((2, 6)), np.empty(3), np.empty((4, 8)), np.empty((8, 8))
     f, weights = np.empty(8), np.empty(5)
-    energy, smallest = 0.0, 1e300
     for e in range(len(beams.length)):
         k_n, k_s, k_a, b_s, b_a = beams.stiffness[e]
         _place_ends(beams, e, full, ends)

@@ -19,10 +19,10 @@ from finforce_ifea.observation import (
     check_contact,
     check_observation,
 )
+from finforce_ifea.point_tracking import PointTracker
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare, blank_tare, compute_tare
-from finforce_ifea.rolling import DEPTH
 from finforce_ifea.tracking import PlaceTracker, Track
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
@@ -32,7 +32,6 @@ _LOADED_SIGMA = 3.5
 _DELAY_FRAMES = 15
 _LONGEST_GAP = 1.0
 _UNLOADED_FORCE = 0.02
-_QUIET_DEPTH, _LOADED_DEPTH = 0.15e-3, 0.5e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,7 +73,9 @@ class JawEstimator:
         self.calibration = calibration
         self.jaw = calibration.apply(jaw) if calibration else jaw
         self.mechanics: Mechanics = build_mechanics(self.jaw, self.settings)
-        self._tracker = PlaceTracker(self.mechanics.contact, self.jaw.keypoints, self.settings)
+        self._rolling = PlaceTracker(self.mechanics.contact, self.jaw.keypoints, self.settings)
+        self._pointed = PointTracker(self.jaw, self.mechanics, self.settings)
+        self._tracker: PlaceTracker | PointTracker = self._rolling
         self._gate = KeypointGate(self.jaw, self.settings)
         self._relaxation = Relaxation(calibration.relaxation if calibration else ())
         self._force_error = calibration.force_error if calibration else 0.1
@@ -89,20 +90,15 @@ class JawEstimator:
         self._track: Track | None = None
         self._quiet = 0
         self._relaxed: float | None = None
-        self._height: float | None = None
         self._gate.reset()
         self._relaxation.reset()
-        self._tracker.reset(float(np.median(self.jaw.candidates[:, 2])))
+        self._rolling.reset()
+        self._pointed.reset()
 
     def warm_up(self) -> None:
         """Compiles what is compiled on first use, and leaves no trace."""
-        z = float(np.median(self.jaw.candidates[:, 2]))
-        for frame in range(2):
-            observation = Observation(
-                stamp=float(frame), points=self.jaw.keypoints, likelihood=np.ones(len(self.jaw.keypoints))
-            )
-            self._tracker.reset(z)
-            self._tracker.update(observation.points, self._tare, 0.03)
+        for tracker in (self._rolling, self._pointed):
+            tracker.update(self.jaw.keypoints.copy(), self._tare, 0.03)
         self.reset()
 
     @property
@@ -155,16 +151,15 @@ class JawEstimator:
         return self._conclude(track, points, used, dt)
 
     def _follow(self, contact: Contact) -> None:
-        """Takes the height of a contact over into the tracker."""
+        """Hands a contact to the tracker that it is for."""
         if not len(contact.points):
             return
-        height = float(np.average(contact.points[:, 2], weights=contact.weights))
-        if self._height is None or abs(height - self._height) > 1e-6:
-            if self._height is None:
-                self._tracker.reset(height)
-            else:
-                self._tracker.move_height(height)
-            self._height = height
+        free = contact.free and self.settings.solver != "paper"
+        chosen = self._rolling if free else self._pointed
+        if chosen is not self._tracker:
+            chosen.reset()
+            chosen.q, self._tracker = self._tracker.q.copy(), chosen
+        chosen.follow(contact)
 
     def _begin(self, used: NDArray, dt: float) -> Solution | None:
         """Collects unloaded frames, then tares, unless the jaw looks loaded; returns None once that is decided."""
@@ -216,8 +211,6 @@ class JawEstimator:
     def _set_tare(self, tare: Tare) -> None:
         self._tare = tare
         self._track = None
-        if self._height is not None:
-            self._tracker.reset(self._height)
 
     def _check_unloaded(self, tare: Tare) -> None:
         """Refuses offsets that a force explains far better than chance."""
@@ -225,10 +218,10 @@ class JawEstimator:
         if sigma > _LOADED_SIGMA:
             raise UnderLoadError(f"cannot tare: the key points look loaded ({sigma:.1f} standard deviations)")
 
-    def _refine_tare(self, depth: float) -> None:
+    def _refine_tare(self, track: Track) -> None:
         """Averages more frames until the first load; what is newer than half a second is left out."""
-        self._quiet = self._quiet + 1 if depth < _QUIET_DEPTH else 0
-        if depth > _LOADED_DEPTH or len(self._recent) > self.settings.tare_memory:
+        self._quiet = self._quiet + 1 if track.quiet else 0
+        if track.loaded or len(self._recent) > self.settings.tare_memory:
             self._tare_open = False
         elif self._quiet >= 2 * _DELAY_FRAMES and self._quiet % _DELAY_FRAMES == 0:
             tare = compute_tare(list(self._recent)[:-_DELAY_FRAMES], self.jaw.keypoints)
@@ -253,11 +246,11 @@ class JawEstimator:
             return self._fail("not_enough_points", "too few key points agree with the jaw's shape", used, dt)
         used = track.weights > 0
         if not track.sound:
-            self._tracker.reset(self._height)
+            self._tracker.reset()
             return self._fail("diverged", "the shape cannot be reached by the jaw", used, dt, track.iterations)
         self._track = track
         if self._tare_open and self.tared:
-            self._refine_tare(track.place[DEPTH])
+            self._refine_tare(track)
         force = self._relax(track.force)
         return self._solution(track, force, used)
 

@@ -202,7 +202,7 @@ class _Sketch:
         """Adds a band from the clamped height over its junctions to the tip."""
         drawing, band = self.drawing, self._bands[side]
         thickness, count = band.normal_thickness, self.divisions.between_ribs
-        top = drawing.length if drawing.tip_z is None else drawing.tip_z + _ROOT * thickness
+        top = drawing.length if drawing.tip_z is None else drawing.tip_z
         heights = (drawing.clamped_z, top, 0.0, drawing.length)
         base, top, start, end = (np.array([band.centre_x(z), z]) for z in heights)
         joint, beams = _Joint(base, np.full(3, -1)), []
@@ -232,7 +232,7 @@ class _Sketch:
         arms = [max(back - root, 0.0) if rib.thickness > 0.0 else 0.0 for back in backs]
         ends = (axis[0] + arms[0] * along, axis[1] - arms[1] * along)
         if self.drawing.bars == "rigid":
-            beams = self._add_chain(joints, ends, 0.0, 1, (-1, -1))
+            beams = self._add_chain(joints, ends, 0.0, 1)
         else:
             turns = tuple(self._add_unknowns(2)) if hinged else (None, None)
             beams = self._add_chain(joints, ends, rib.thickness, self.divisions.along_rib, turns)

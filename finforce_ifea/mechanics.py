@@ -10,6 +10,7 @@ from finforce_ifea.rolling import RollingContact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.solid import SolidModel
 from finforce_ifea.surface import build_contact_surface
+from finforce_ifea.tetrahedra import to_tet4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,8 +29,10 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
         JawFileError: The jaw cannot be described by that model.
         MeshError: The mesh cannot be built.
     """
-    mesh = jaw.build_mesh(settings.mesh if jaw.drawing is not None else None)
     name = jaw.model if settings.solver == "default" else settings.solver
+    mesh = jaw.build_mesh(settings.mesh if jaw.drawing is not None else None)
+    if name == "paper":
+        mesh = to_tet4(jaw.build_mesh("coarse")) if jaw.drawing is not None else mesh
     if name == "frame":
         if jaw.drawing is None:
             raise JawFileError(f"the jaw {jaw.name!r} is a volume mesh; a frame needs a drawing")
@@ -40,7 +43,7 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
     else:
         if jaw.drawing is not None and not jaw.drawing.is_solid:
             raise JawFileError(f"the jaw {jaw.name!r} has hinges or rigid bars; only the frame describes it")
-        model = SolidModel(mesh, jaw.material)
+        model = SolidModel(mesh, jaw.material, symmetric=settings.force_axes == "normal")
         symmetric = model.symmetric
     surface = build_contact_surface(jaw, mesh, model, symmetric=symmetric)
     return Mechanics(mesh=mesh, model=model, contact=RollingContact(model, surface, jaw.inner_face_x))

@@ -6,6 +6,9 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from finforce_ifea.contact_feed import ContactFeed
+from finforce_ifea.observation import Contact
+
 if TYPE_CHECKING:
     from finforce_ifea.estimator import JawEstimator
     from finforce_ifea.jaw import Jaw
@@ -59,11 +62,6 @@ class NodeParameters:
         """The frame of this jaw's messages."""
         return self.jaw_frame or f"{self.jaw_name}_jaw"
 
-    @property
-    def is_contact_fixed(self) -> bool:
-        """Whether the contact is a parameter and not a topic."""
-        return not math.isnan(self.contact_height)
-
 
 def load_parameter_jaw(parameters: NodeParameters) -> Jaw:
     """Load the jaw that the parameters name.
@@ -74,6 +72,21 @@ def load_parameter_jaw(parameters: NodeParameters) -> Jaw:
     from finforce_ifea.jaw import load_jaw
 
     return load_jaw(parameters.jaw_file, parameters.jaw_name)
+
+
+def build_contact_feed(jaw: Jaw, parameters: NodeParameters) -> ContactFeed:
+    """Return the source of contacts that the parameters ask for.
+
+    Raises:
+        ContactError: the fixed height is not on the jaw.
+    """
+    height = parameters.contact_height
+    return ContactFeed(
+        frame=parameters.frame,
+        fixed=None if math.isnan(height) else Contact.fixed(jaw, height),
+        free=parameters.contact_free,
+        max_age=round(1e9 * parameters.max_age),
+    )
 
 
 def build_estimator(jaw: Jaw, parameters: NodeParameters, settings: EstimatorSettings) -> JawEstimator:

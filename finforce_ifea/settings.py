@@ -41,7 +41,7 @@ class EstimatorSettings:
     iterations: int = _setting(8, "1", 1, 50, "most Newton iterations per frame")
     energy_weight: float = _setting(1e-3, "1", 0.0, 1e9, "the paper's epsilon, used by solver 'paper' alone")
     energy_form: str = _choice("sofa", ("paper", "sofa"), "epsilon as the paper prints it or as SOFA scales it")
-    force_axes: str = _choice("normal", ("normal", "three"), "solver 'paper': force along the normal or in three axes")
+    force_axes: str = _choice("normal", ("normal", "three"), "given contacts: force along the normal of the deformed surface, or in three axes")
 
     def __post_init__(self) -> None:
         """Refuses values out of bounds.

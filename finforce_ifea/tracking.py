@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.observation import Contact
 from finforce_ifea.rolling import DEPTH, HEIGHT, LOG_RADIUS, PressedState, RollingContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
@@ -17,6 +18,7 @@ from finforce_ifea.tare import Tare
 # The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
 _LEAST_DEPTH = 3e-5
 _TOUCH_DEPTH = 0.15e-3
+_LOADED_DEPTH = 0.5e-3
 _MODEL_FLOOR = 0.02e-3
 _DEPTH_DRIFT = 0.01e-3
 _LARGEST_CHANGE = np.array([0.7e-3, 0.15, 0.3e-3])
@@ -35,10 +37,9 @@ class Track:
     """The outcome of one frame.
 
     Attributes:
-        place: depth [m], log radius, height [m].
-        covariance: of the place (3, 3).
+        covariance: of what was estimated (m, m): depth [m], log radius and height [m], or a given contact's force [N].
         force: elastic contact force on the jaw (3,) [N].
-        force_modes: derivative of the force by the place (3, 3).
+        force_modes: derivative of the force by what was estimated (3, m).
         pressure_point: pressure centre on the deformed surface (3,) [m].
         pressure_place: the same on the undeformed surface (3,) [m].
         weights: of the key points (K,), 0 for what was not used.
@@ -47,9 +48,10 @@ class Track:
         iterations: Newton iterations.
         converged: whether the last one changed nothing that matters.
         sound: whether the mesh is in order and the numbers are finite.
+        quiet: whether nothing seems to press.
+        loaded: whether something surely presses.
     """
 
-    place: NDArray
     covariance: NDArray
     force: NDArray
     force_modes: NDArray
@@ -61,6 +63,8 @@ class Track:
     iterations: int
     converged: bool
     sound: bool
+    quiet: bool
+    loaded: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,10 +88,12 @@ class PlaceTracker:
         self.probe = contact.model.attach(keypoints, 1e-3)
         self._rest = contact.model.positions(self.probe, np.zeros(contact.model.size))
         self._prior_stddev = np.array([settings.radius_log_stddev, settings.height_stddev])
-        self.reset(0.0)
+        self.reset()
 
-    def reset(self, height: float) -> None:
-        """Starts anew, unloaded, with an object that will first touch at `height` [m]."""
+    def reset(self, height: float | None = None) -> None:
+        """Starts anew, unloaded, with an object that will first touch at `height` [m], the middle if None."""
+        self._given = height
+        height = float(np.median(self.contact.surface.heights)) if height is None else height
         self.q = np.zeros(self.contact.model.size)
         self._prior = np.array([np.log(self.settings.radius), height])
         self._motion, self._motion_covariance = np.zeros(2), np.diag([0.1e-3, 1e-3]) ** 2
@@ -99,15 +105,6 @@ class PlaceTracker:
         self._slow = self._prior.copy()
         self._mean = np.zeros((len(self._rest), 2))
         self._count = np.zeros(len(self._rest))
-
-    @property
-    def height(self) -> float:
-        """Given height of first touch [m]."""
-        return float(self._prior[1])
-
-    def move_height(self, height: float) -> None:
-        """Takes another height of first touch [m]."""
-        self._prior[1] = height
 
     def update(self, points: NDArray, tare: Tare, dt: float) -> Track | None:
         """Takes the key points (K, 3) [m], NaN where unused, dt [s] after the last; None when too few agree."""
@@ -143,21 +140,18 @@ class PlaceTracker:
         return self._report(state, moved, data.weights, step, iteration, settled)
 
     def significance(self, tare: Tare) -> float:
-        """Returns by how many standard deviations a force explains the offsets of a tare.
-
-        The rest is chance: of every key point, and of all together (a wrong depth scale moves them alike).
-        """
+        """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
         q = np.zeros(self.contact.model.size)
         state = self.contact.linearize(q, np.r_[_LEAST_DEPTH, self._prior])
         modes = self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
-        seen = tare.counts > 0
-        deviation = np.sqrt(self.settings.offset_stddev**2 + tare.offset_variance(0.0)[seen, None])
-        common = np.broadcast_to(np.eye(2), (int(seen.sum()), 2, 2))
-        design = np.concatenate([modes[seen][:, :, None], common], axis=2) / deviation[:, :, None]
-        design = np.concatenate([design.reshape(-1, 3), np.diag([0.0, 1.0, 1.0]) / _COMMON_OFFSET])
-        target = np.append((tare.offsets[seen][:, [0, 2]] / deviation).ravel(), np.zeros(3))
-        covariance = np.linalg.pinv(design.T @ design)
-        return float((covariance @ design.T @ target)[0] / np.sqrt(max(covariance[0, 0], 1e-300)))
+        return explain_offsets(modes, tare, self.settings.offset_stddev)
+
+    def follow(self, contact: Contact) -> None:
+        """Takes a contact's height as that of first touch."""
+        height = float(np.average(contact.points[:, 2], weights=contact.weights))
+        if self._given is None:
+            self.reset(height)
+        self._given = self._prior[1] = height
 
     def _predict(self, dt: float) -> tuple[NDArray, NDArray]:
         """Returns depth and its speed dt [s] later, with covariance, under white acceleration."""
@@ -262,10 +256,11 @@ class PlaceTracker:
         share = share / share.sum()
         sound = bool(state.smallest_det > 0 and np.isfinite(force).all() and np.isfinite(step.place).all())
         return Track(
-            place=step.place, covariance=step.covariance, force=force, force_modes=state.force_modes,
+            covariance=step.covariance, force=force, force_modes=state.force_modes,
             pressure_point=share @ state.points, pressure_place=share @ self.contact.surface.points,
             weights=weights, residual=step.residual, kkt=step.kkt, iterations=iterations,
-            converged=settled, sound=sound,
+            converged=settled, sound=sound, quiet=bool(step.place[DEPTH] < _TOUCH_DEPTH),
+            loaded=bool(step.place[DEPTH] > _LOADED_DEPTH),
         )  # fmt: skip
 
 
@@ -281,6 +276,21 @@ class _Step:
     covariance: NDArray
     kkt: float
     residual: float
+
+
+def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
+    """Returns by how many standard deviations one mode (K, 2) explains the offsets of a tare.
+
+    The rest is chance: of every key point [m], and of all together, as a wrong depth scale moves them alike.
+    """
+    seen = tare.counts > 0
+    deviation = np.sqrt(offset_stddev**2 + tare.offset_variance(0.0)[seen, None])
+    common = np.broadcast_to(np.eye(2), (int(seen.sum()), 2, 2))
+    design = np.concatenate([modes[seen][:, :, None], common], axis=2) / deviation[:, :, None]
+    design = np.concatenate([design.reshape(-1, 3), np.diag([0.0, 1.0, 1.0]) / _COMMON_OFFSET])
+    target = np.append((tare.offsets[seen][:, [0, 2]] / deviation).ravel(), np.zeros(3))
+    covariance = np.linalg.pinv(design.T @ design)
+    return float((covariance @ design.T @ target)[0] / np.sqrt(max(covariance[0, 0], 1e-300)))
 
 
 def _reachable(place: NDArray) -> NDArray:

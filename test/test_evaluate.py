@@ -193,6 +193,17 @@ def test_tables_have_a_row_per_case_and_one_for_all():
     assert f"{score.cycles['load'].rmse_N.mean:.2f}±{score.cycles['load'].rmse_N.std:.2f}" in rows[1]
 
 
+def test_table_of_a_case_without_counted_frames_has_dashes():
+    recording = make_recording()
+    result, _ = run(recording, truth_of(recording))
+    nothing = replace(
+        result, truth=np.full_like(result.truth, np.nan), step_ms=np.full_like(result.step_ms, np.nan)
+    )
+    text = format_table(score_results([nothing], [recording]))
+    assert "worst - N (case)" in text
+    assert "p50 -" in text
+
+
 def test_height_comes_from_the_option_then_from_the_case():
     recording = make_recording("pressed")
     assert parse_contacts([]).height(recording) == pytest.approx(0.040)

@@ -31,7 +31,7 @@ def one_jaw(probe, estimator=None, **parameters):
     probe.hear("left/wrench")
     out = probe.speak("left/keypoints")
     probe.connected(out)
-    probe.wait_for(lambda: node.wrench.get_subscription_count() == 1)
+    probe.wait_for(lambda: node.out.wrench.get_subscription_count() == 1)
     return node, out
 
 
@@ -219,7 +219,9 @@ def two_jaws(probe, right_force=(-3.0, 0.0, 0.5)):
     for out in outs.values():
         probe.connected(out)
     probe.wait_for(
-        lambda: left.grasp.get_subscription_count() == 1 and right.wrench.get_subscription_count() == 2
+        lambda: (
+            left.out.grasp.get_subscription_count() == 1 and right.out.wrench.get_subscription_count() == 2
+        )
     )
     return outs
 
@@ -295,7 +297,7 @@ def contact_jaw(probe, **parameters):
 def test_a_contact_by_topic_reaches_the_estimator(probe):
     estimator, node, out, contact = contact_jaw(probe)
     contact.publish(contact_cloud([[0.014, 0.0, 0.038], [0.014, 0.0, 0.043]]))
-    probe.wait_for(lambda: node.contact is not None)
+    probe.wait_for(lambda: node.contacts._contact is not None)
     out.publish(keypoint_cloud())
     probe.wait_for(lambda: estimator.contacts)
     np.testing.assert_allclose(estimator.contacts[0].points[:, 2], [0.038, 0.043], atol=1e-8)
@@ -305,7 +307,7 @@ def test_a_contact_by_topic_reaches_the_estimator(probe):
 def test_no_rows_say_that_there_is_no_object(probe):
     estimator, node, out, contact = contact_jaw(probe)
     contact.publish(contact_cloud(np.empty((0, 3))))
-    probe.wait_for(lambda: node.contact is not None)
+    probe.wait_for(lambda: node.contacts._contact is not None)
     out.publish(keypoint_cloud())
     probe.wait_for(lambda: estimator.contacts)
     assert estimator.contacts[0].points.shape == (0, 3)
@@ -315,7 +317,7 @@ def test_no_rows_say_that_there_is_no_object(probe):
 def test_an_old_contact_is_none(probe):
     estimator, node, out, contact = contact_jaw(probe)
     contact.publish(contact_cloud([[0.014, 0.0, 0.038]], stamp=time_ns() - SECOND))
-    probe.wait_for(lambda: node.contact is not None)
+    probe.wait_for(lambda: node.contacts._contact is not None)
     out.publish(keypoint_cloud())
     probe.wait_for(lambda: estimator.contacts)
     assert estimator.contacts[0] is None
@@ -325,7 +327,7 @@ def test_a_contact_that_is_not_finite_is_refused(probe):
     estimator, node, out, contact = contact_jaw(probe)
     contact.publish(contact_cloud([[0.014, np.nan, 0.038]]))
     probe.diagnosis(word="nothing has arrived")
-    assert node.contact is None
+    assert node.contacts._contact is None
 
 
 def test_a_fixed_contact_needs_no_topic(probe):
@@ -340,20 +342,21 @@ def test_a_fixed_contact_needs_no_topic(probe):
 def test_markers_show_jaw_key_points_contact_and_force_to_listeners_only(probe):
     node, out = one_jaw(probe)
     sent = []
-    node.markers.publish, publish = sent.append, node.markers.publish
+    markers = node.out.markers
+    publish, markers.publish = markers.publish, sent.append
     out.publish(keypoint_cloud())
     probe.wait_for(lambda: probe.got["left/wrench"])
     assert not sent
-    node.markers.publish = publish
+    markers.publish = publish
     probe.hear("left/markers", MarkerArray)
-    probe.wait_for(lambda: node.markers.get_subscription_count() == 1)
+    probe.wait_for(lambda: markers.get_subscription_count() == 1)
     out.publish(keypoint_cloud())
     probe.wait_for(lambda: probe.got["left/markers"])
-    markers = {marker.ns: marker for marker in probe.got["left/markers"][0].markers}
-    assert markers["surface"].type == Marker.TRIANGLE_LIST and len(markers["surface"].points) == 6
-    assert len(markers["keypoints"].points) == len(markers["keypoints"].colors) == 15
-    assert len(markers["contact"].points) == 1
-    start, end = markers["force"].points
+    shown = {marker.ns: marker for marker in probe.got["left/markers"][0].markers}
+    assert shown["surface"].type == Marker.TRIANGLE_LIST and len(shown["surface"].points) == 6
+    assert len(shown["keypoints"].points) == len(shown["keypoints"].colors) == 15
+    assert len(shown["contact"].points) == 1
+    start, end = shown["force"].points
     assert end.x - start.x < 0.0 < end.z - start.z  # along the force, (-2, 0, 0.5)
 
 

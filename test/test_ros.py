@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
-from finforce_ifea.settings import EstimatorSettings
 from hypothesis import given
 from hypothesis import strategies as st
 from node_fakes import ros_domain
@@ -21,6 +20,7 @@ from finforce_eval.parameters import PlayerParameters
 from finforce_ifea.errors import FinforceError, ObservationError
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.pointcloud import decode_keypoints
+from finforce_ifea.settings import EstimatorSettings
 
 RECORDS = (NodeParameters, EstimatorSettings, PlayerParameters)
 

@@ -1,0 +1,166 @@
+"""The forward problem: a jaw pressed on a rigid object step by step; knows no key points and no camera."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.errors import ContactError
+from finforce_ifea.model import JawModel
+from finforce_ifea.penalty import PenaltyContact, press_box, press_cylinder
+from finforce_ifea.rolling import limit_step
+from finforce_ifea.surface import ContactSurface
+
+_TOLERANCE = 1e-8
+_ITERATIONS = 60
+_LONGEST_STEP = 0.5e-3
+_SHORTEST_STEP = 1e-6
+
+
+class RigidObject(Protocol):
+    """A rigid object, endless along y; its nearest point to the jaw comes first into the jaw."""
+
+    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
+        """Returns the contact with points (p, 3) [m] of an object sunk by depth [m] below x = face_x at height [m]."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylinder:
+    """A cylinder with its axis along y; radius [m]."""
+
+    radius: float
+
+    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
+        """See `RigidObject`."""
+        return press_cylinder(points, stiffness, face_x + self.radius - depth, height, self.radius)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """A box with rounded edges, its faces along the jaw's axes; sizes along x and z and edge radius [m]."""
+
+    size_x: float
+    size_z: float
+    edge_radius: float
+
+    def __post_init__(self) -> None:
+        """Refuses sizes that are no box.
+
+        Raises:
+            ContactError: A size is not positive, or the edges are rounder than the box is wide.
+        """
+        if not 0.0 < self.edge_radius <= 0.5 * min(self.size_x, self.size_z):
+            raise ContactError(f"{self}: expected an edge radius above zero and at most half of the smaller size")
+
+    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
+        """See `RigidObject`."""
+        half = (0.5 * self.size_x, 0.5 * self.size_z)
+        return press_box(points, stiffness, (face_x + half[0] - depth, height), half, self.edge_radius)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Press:
+    """One equilibrium of the pressed jaw.
+
+    Attributes:
+        depth: of the object below the undeformed inner face [m].
+        q: unknowns of the model.
+        force: on the jaw (3,) [N].
+        torque: of the contact forces about the jaw frame's origin (3,) [N m].
+        pressure_centre: on the deformed surface (3,) [m]; NaN without contact.
+        pressure_place: the same material point on the undeformed surface (3,) [m].
+        energy: elastic energy [J].
+        iterations: Newton iterations since the last returned depth.
+    """
+
+    depth: float
+    q: NDArray
+    force: NDArray
+    torque: NDArray
+    pressure_centre: NDArray
+    pressure_place: NDArray
+    energy: float
+    iterations: int
+
+
+def press_jaw(
+    model: JawModel, surface: ContactSurface, face_x: float, rigid: RigidObject, height: float, depths: Sequence[float]
+) -> list[Press]:
+    """Presses a rigid object into the inner surface, displacement driven, frictionless.
+
+    Args:
+        model: the jaw's mechanics.
+        surface: its contact points.
+        face_x: plane of the undeformed inner surface [m].
+        rigid: the object.
+        height: of its centre above the clamped base [m].
+        depths: rising depths [m]; steps between them are cut to half a millimetre, and further where needed.
+
+    Raises:
+        ContactError: No equilibrium is found; the message says at which depth.
+    """
+    q, reached, results = np.zeros(model.size), 0.0, []
+    for depth in depths:
+        iterations, step = 0, _LONGEST_STEP
+        while reached < depth - 1e-12:
+            target = min(reached + step, depth)
+            trial = _find_equilibrium(model, surface, q, face_x, rigid, target, height)
+            if trial is not None:
+                q, reached, iterations = trial.q, target, iterations + trial.iterations
+                continue
+            step *= 0.5
+            if step < _SHORTEST_STEP:
+                raise ContactError(f"no equilibrium beyond a depth of {1e3 * reached:.3f} mm: the jaw buckles or slips off")
+        results.append(_describe(model, surface, q, face_x, rigid, depth, height, iterations))
+    return results
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Trial:
+    q: NDArray
+    iterations: int
+
+
+def _find_equilibrium(
+    model: JawModel, surface: ContactSurface, q: NDArray, face_x: float, rigid: RigidObject, depth: float, height: float
+) -> _Trial | None:
+    """Returns the equilibrium at `depth` by Newton's method, or None when it does not converge."""
+    for iteration in range(1, _ITERATIONS + 1):
+        points = model.positions(surface.probe, q)
+        contact = rigid.press(points, surface.stiffness, face_x, depth, height)
+        state = model.linearize(q)
+        if not state.smallest_det > 0:
+            return None
+        model.stiffen(state.tangent, surface.probe, q, contact.springs)
+        load = model.load(surface.probe, q, contact.forces)
+        step = limit_step(model.factorise(state.tangent).solve(load - state.force))
+        q = q + step
+        if not np.isfinite(q).all():
+            return None
+        if np.abs(step).max() < _TOLERANCE:
+            return _Trial(q=q, iterations=iteration)
+    return None
+
+
+def _describe(
+    model: JawModel, surface: ContactSurface, q: NDArray, face_x: float, rigid: RigidObject, depth: float, height: float,
+    iterations: int,
+) -> Press:  # fmt: skip
+    points = model.positions(surface.probe, q)
+    forces = rigid.press(points, surface.stiffness, face_x, depth, height).forces
+    size = np.linalg.norm(forces, axis=1)
+    share = size / size.sum() if size.any() else np.full(len(size), np.nan)
+    in_plane = np.array([1.0, 0.0, 1.0])
+    return Press(
+        depth=depth,
+        q=q,
+        force=forces.sum(0),
+        torque=np.cross(points * in_plane, forces).sum(0),
+        pressure_centre=(share @ points) * in_plane,
+        pressure_place=(share @ surface.points) * in_plane,
+        energy=model.linearize(q, tangent=False).energy,
+        iterations=iterations,
+    )

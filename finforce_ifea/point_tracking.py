@@ -1,0 +1,143 @@
+"""Force at a given contact from key points, frame after frame: the load sits where it is told to."""
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.errors import NotEnoughDataError
+from finforce_ifea.inverse import InverseResult, Problem, solve_inverse
+from finforce_ifea.jaw import Jaw
+from finforce_ifea.mechanics import Mechanics
+from finforce_ifea.observation import Contact
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tare import Tare
+from finforce_ifea.tracking import Track, condition_on_width, explain_offsets
+
+_NEIGHBOUR = 1e-3
+_QUIET_SIGMA = 3.0
+
+
+class PointTracker:
+    """Solves the inverse problem of each frame from the last state.
+
+    With solver "paper" the load is a point force on the nearest candidate, all accepted key points count alike, and
+    each frame makes one linear step; otherwise the load spreads across the width at the contact's own height, key
+    points are weighted by their agreement, and the state is brought to equilibrium.
+    """
+
+    def __init__(self, jaw: Jaw, mechanics: Mechanics, settings: EstimatorSettings) -> None:
+        """Attaches the key points; raises MeshError when one is off the mesh."""
+        self.jaw, self.mechanics, self.settings = jaw, mechanics, settings
+        self.paper = settings.solver == "paper"
+        self.probe = mechanics.model.attach(jaw.keypoints, 1e-3)
+        self._rest = mechanics.model.positions(self.probe, np.zeros(mechanics.model.size))
+        self._load = lru_cache(maxsize=256)(self._build_load)
+        self.reset()
+
+    def reset(self) -> None:
+        """Starts anew, unloaded, with the middle candidate."""
+        self.q = np.zeros(self.mechanics.model.size)
+        self._heights = (float(np.median(self.jaw.candidates[:, 2])),)
+        self._weights: NDArray | None = np.ones(1)
+
+    def follow(self, contact: Contact) -> None:
+        """Takes a contact over: its heights and weights."""
+        heights = contact.points[:, 2]
+        if self.paper:
+            nearest = int(np.argmin(np.abs(self.jaw.candidates[:, 2] - np.average(heights, weights=contact.weights))))
+            self._heights, self._weights = (float(self.jaw.candidates[nearest, 2]),), np.ones(1)
+            return
+        self._heights, self._weights = tuple(np.round(heights, 5).tolist()), np.asarray(contact.weights, float)
+
+    def _build_load(self, height: float) -> tuple[NDArray, NDArray]:
+        """Returns the points of a load at one height and their neighbours along the finger."""
+        surface = self.mechanics.contact.surface
+        if self.paper:
+            points = np.array([[self.jaw.inner_face_x, 0.0, height]])
+        else:
+            row = int(np.argmin(np.abs(surface.heights - height)))
+            points = surface.points[row * surface.across : (row + 1) * surface.across].copy()
+            points[:, 2] = np.clip(height, surface.heights[0], surface.heights[-1])
+        low, high = surface.heights[0], surface.heights[-1]
+        shifted = np.repeat(points, 2, axis=0)
+        shifted[::2, 2] = np.clip(points[:, 2] - _NEIGHBOUR, low, high)
+        shifted[1::2, 2] = np.clip(points[:, 2] + _NEIGHBOUR, low, high)
+        return points, shifted
+
+    def _problem(self, targets: NDArray, precision: NDArray | None) -> Problem:
+        parts = [self._load(height) for height in self._heights]
+        points = np.concatenate([part[0] for part in parts])
+        shares = np.repeat(self._weights, [len(part[0]) for part in parts])
+        key = tuple(self._heights)
+        contacts, neighbours = self._probes(key, points, np.concatenate([part[1] for part in parts]))
+        return Problem(
+            effectors=self.probe, targets=targets, contacts=contacts, neighbours=neighbours, weights=shares,
+            axes="three" if self.settings.force_axes == "three" else "normal", precision=precision,
+            energy_weight=self.settings.energy_weight if self.paper else 0.0, energy_form=self.settings.energy_form,
+        )  # fmt: skip
+
+    def _probes(self, key: tuple[float, ...], points: NDArray, neighbours: NDArray) -> tuple[Any, Any]:
+        if getattr(self, "_probe_key", None) != key:
+            model = self.mechanics.model
+            self._probe_key, self._probe_pair = key, (model.attach(points, 1e-3), model.attach(neighbours, 1e-3))
+        return self._probe_pair
+
+    def update(self, points: NDArray, tare: Tare, dt: float) -> Track | None:
+        """Takes the key points (K, 3) [m], NaN where unused; returns None when they do not tell the force."""
+        targets = points - tare.offsets
+        known = np.isfinite(targets[:, 0])
+        noise = condition_on_width(tare.noise)[0]
+        variance = np.trace(noise) / 2.0 + tare.offset_variance(self.settings.offset_stddev)
+        weights = known.astype(float)
+        try:
+            for _ in range(1 if self.paper else 2):
+                result = self._solve(targets, None if self.paper else weights / variance)
+                weights = known * 1.0 if self.paper else self._reweigh(targets, result.q, variance, known)
+        except NotEnoughDataError:
+            return None
+        self.q = result.q
+        return self._report(result, targets, weights, variance)
+
+    def _solve(self, targets: NDArray, precision: NDArray | None) -> InverseResult:
+        steps = 1 if self.paper else self.settings.iterations
+        problem = self._problem(targets, precision)
+        return solve_inverse(self.mechanics.model, problem, self.q, iterations=steps, tolerance=1e-6)
+
+    def _reweigh(self, targets: NDArray, q: NDArray, variance: NDArray, known: NDArray) -> NDArray:
+        """Returns weights (K,) that fall with the distance from the shape found; the median sets their scale."""
+        miss = np.where(known[:, None], self.mechanics.model.positions(self.probe, q) - targets, 0.0)
+        distance = (miss**2).sum(1) / variance
+        scale = max(1.0, float(np.median(distance[known])) / 2.4)
+        return np.where(known, 1.0 / (1.0 + distance / scale / self.settings.gate**2) ** 2, 0.0)
+
+    def _report(self, result: InverseResult, targets: NDArray, weights: NDArray, variance: NDArray) -> Track:
+        force = result.forces.sum(0)
+        size = np.linalg.norm(result.forces, axis=1)
+        share = size / size.sum() if size.any() else np.full(len(size), 1.0 / len(size))
+        undeformed = np.concatenate([self._load(height)[0] for height in self._heights])
+        deformed = self.mechanics.model.positions(self._probe_pair[0], result.q)
+        seen = np.isfinite(targets[:, 0])
+        information = (result.compliance.reshape(int(seen.sum()), -1) ** 2).sum(1)
+        if self.paper:
+            information = information / variance[seen]
+        stddev = 1.0 / np.sqrt(max(float(information.sum()), 1e-300))
+        magnitude = float(np.linalg.norm(force))
+        direction = force / magnitude if magnitude > 0 else np.array([-1.0, 0.0, 0.0])
+        return Track(
+            covariance=np.array([[stddev**2]]), force=force, force_modes=direction[:, None],
+            pressure_point=share @ deformed, pressure_place=share @ undeformed, weights=weights,
+            residual=result.residual, kkt=result.kkt, iterations=result.iterations, converged=result.converged,
+            sound=bool(np.isfinite(result.q).all() and np.isfinite(force).all() and np.abs(result.q).max() < 0.2),
+            quiet=magnitude < _QUIET_SIGMA * stddev, loaded=magnitude > 2.0 * _QUIET_SIGMA * stddev,
+        )  # fmt: skip
+
+    def significance(self, tare: Tare) -> float:
+        """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
+        model, q = self.mechanics.model, np.zeros(self.mechanics.model.size)
+        problem = self._problem(np.array(self._rest), None)
+        load = model.load(problem.contacts, q, np.tile([-1.0, 0.0, 0.0], (len(problem.weights), 1)))
+        mode = model.factorise(model.linearize(q).tangent).solve(load)
+        modes = model.project(self.probe, q, mode[:, None])[:, [0, 2], 0]
+        return explain_offsets(modes, tare, self.settings.offset_stddev)
