@@ -23,7 +23,8 @@ from finforce_ifea.point_tracking import PointTracker
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare, blank_tare, compute_tare
-from finforce_ifea.tracking import PlaceTracker, Track
+from finforce_ifea.track import Track
+from finforce_ifea.tracking import PlaceTracker
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 
@@ -279,7 +280,7 @@ class JawEstimator:
             status="ok" if loaded else "unloaded",
             message="" if self.tared else "no tare: the jaw was loaded from the start; key point offsets are unknown",
             force=force,
-            torque=np.cross(arm, force),
+            torque=np.array([-arm[2] * force[1], arm[2] * force[0] - arm[0] * force[2], arm[0] * force[1]]),
             force_stddev=stddev,
             torque_stddev=np.array([0.0, np.hypot(arm[0] * stddev[2], arm[2] * stddev[0]), 0.0]),
             magnitude_stddev=float(total),

@@ -136,7 +136,7 @@ def _find_equilibrium(
             return None
         model.stiffen(state.tangent, surface.probe, q, contact.springs)
         load = model.load(surface.probe, q, contact.forces)
-        step = limit_step(model.factorise(state.tangent).solve(load - state.force))
+        step = limit_step(model, model.factorise(state.tangent).solve(load - state.force))
         q = q + step
         if not np.isfinite(q).all():
             return None

@@ -290,19 +290,19 @@ class _PlateauSolver:
         stddev = np.sqrt(plateau.variance[seen, None] + _SHAPE_ERROR**2)
         for _ in range(60):
             state = self._contact.linearize(q, place)
-            if not state.forces.any():
+            if not state.touches:
                 q = q + self._contact.approach(q, state.correction, place)
                 continue
-            q = q + limit_step(state.correction)
+            q = q + limit_step(self._model, state.correction)
             moved = self._model.positions(self._probe, q) - self._rest
             mode = self._model.project(self._probe, q, state.modes)[seen][:, [0, 2], DEPTH] / stddev
             residual = (plateau.keypoints[seen] - moved[seen][:, [0, 2]]) / stddev
             change = float(np.clip((mode * residual).sum() / (mode**2).sum(), -0.5e-3, 0.5e-3))
             change = max(change, 3e-5 - place[DEPTH])
             place[DEPTH] += change
-            q = q + limit_step(state.modes[:, DEPTH] * change)
+            q = q + limit_step(self._model, state.modes[:, DEPTH] * change)
             if abs(change) < 1e-6 and np.abs(state.correction).max() < 1e-6:
-                force = state.forces.sum(0) + state.force_modes[:, DEPTH] * change + state.force_correction
+                force = state.force + state.force_modes[:, DEPTH] * change
                 left = (residual - mode * change).ravel()
                 return _PlateauShape(q=q, depth=float(place[DEPTH]), residual=left, force=float(np.linalg.norm(force)))
         if start is not None:

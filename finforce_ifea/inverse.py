@@ -96,7 +96,7 @@ def solve_inverse(
     for iteration in range(1, iterations + 1):
         step = _linear_step(model, problem, q, active)
         solution = solve_program(step.hessian, step.gradient, step.lower)
-        change = limit_step(step.free + step.modes @ solution.multipliers)
+        change = limit_step(model, step.free + step.modes @ solution.multipliers)
         q = q + change
         multipliers = solution.multipliers
         if np.abs(change).max() < tolerance:

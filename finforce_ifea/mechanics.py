@@ -9,7 +9,7 @@ from finforce_ifea.model import JawModel
 from finforce_ifea.rolling import RollingContact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.solid import SolidModel
-from finforce_ifea.surface import build_contact_surface
+from finforce_ifea.surface import Across, build_contact_surface
 from finforce_ifea.tetrahedra import to_tet4
 
 
@@ -39,11 +39,11 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
         from finforce_ifea.frame import FrameModel
 
         model: JawModel = FrameModel(jaw.drawing, jaw.material, mesh=mesh)
-        symmetric = True
+        across: Across = "middle"
     else:
         if jaw.drawing is not None and not jaw.drawing.is_solid:
             raise JawFileError(f"the jaw {jaw.name!r} has hinges or rigid bars; only the frame describes it")
         model = SolidModel(mesh, jaw.material, symmetric=settings.force_axes == "normal")
-        symmetric = model.symmetric
-    surface = build_contact_surface(jaw, mesh, model, symmetric=symmetric)
+        across = "half" if model.symmetric else "both"
+    surface = build_contact_surface(jaw, mesh, model, across=across)
     return Mechanics(mesh=mesh, model=model, contact=RollingContact(model, surface, jaw.inner_face_x))

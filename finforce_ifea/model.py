@@ -26,9 +26,15 @@ class Linearization:
 
 
 class JawModel(Protocol):
-    """A geometrically nonlinear jaw with unknowns q, shape (size,) [m or rad]."""
+    """A geometrically nonlinear jaw with unknowns q, shape (size,) [m or rad].
+
+    Attributes:
+        size: number of unknowns.
+        rotations: which unknowns are rotations (size,) bool; None when all are displacements.
+    """
 
     size: int
+    rotations: NDArray | None
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
         """Evaluates internal force, energy and, unless `tangent` is False, the tangent stiffness at q."""

@@ -13,7 +13,7 @@ from finforce_ifea.mechanics import Mechanics
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
-from finforce_ifea.tracking import Track, condition_on_width, explain_offsets
+from finforce_ifea.track import Track, condition_on_width, explain_offsets
 
 _NEIGHBOUR = 1e-3
 _QUIET_SIGMA = 3.0

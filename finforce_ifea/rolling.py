@@ -14,7 +14,7 @@ from finforce_ifea.penalty import press_cylinder
 from finforce_ifea.surface import ContactSurface
 
 DEPTH, LOG_RADIUS, HEIGHT = 0, 1, 2
-_LARGEST_STEP = 2e-3
+_LARGEST_STEP, _LARGEST_TURN = 2e-3, 0.3
 _BISECTIONS = 10
 _TOUCH = 2e-5
 
@@ -24,23 +24,23 @@ class PressedState:
     """Linearised equilibrium of one state of jaw and cylinder.
 
     Attributes:
-        forces: contact forces on the surface points (p, 3) [N].
-        points: deformed surface points (p, 3) [m].
+        touches: whether any surface point is in contact.
         correction: Newton step of the unknowns towards equilibrium (size,).
         modes: motions of the unknowns by depth [per m], log radius [-] and height [per m], (size, 3).
-        force_modes: derivatives of the total contact force (3, 3), columns as in modes.
-        force_correction: change of the total contact force that `correction` brings (3,) [N].
-        imbalance: largest unbalanced nodal force [N].
+        force: total contact force on the jaw after `correction` (3,) [N].
+        force_modes: its derivatives (3, 3), columns as in modes.
+        pressure_point: pressure centre on the deformed surface (3,) [m]; NaN without contact.
+        pressure_place: the same on the undeformed surface (3,) [m]; NaN without contact.
         smallest_det: smallest det F of all elements [-].
     """
 
-    forces: NDArray
-    points: NDArray
+    touches: bool
     correction: NDArray
     modes: NDArray
+    force: NDArray
     force_modes: NDArray
-    force_correction: NDArray
-    imbalance: float
+    pressure_point: NDArray
+    pressure_place: NDArray
     smallest_det: float
 
 
@@ -54,34 +54,37 @@ class RollingContact:
         self.face_x = face_x
 
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
-        """Linearises the equilibrium f_int(q) = J^T p(J q, place) at unknowns q and place (depth, ln radius, height)."""
-        radius = float(np.exp(place[LOG_RADIUS]))
-        points = self.model.positions(self.surface.probe, q)
+        """Linearises the equilibrium f_int(q) = J^T p(J q, place) at unknowns q and place (depth, ln radius, height).
+
+        With S the springs of all points and e_x, e_z unit motions of the object, the loads by depth and height are
+        -J^T S e_x and J^T S e_z; as S is symmetric, the same loads give the forces that the jaw's own motion takes away.
+        """
+        model, probe, radius = self.model, self.surface.probe, float(np.exp(place[LOG_RADIUS]))
+        points = model.positions(probe, q)
         contact = press_cylinder(
             points, self.surface.stiffness, self.face_x + radius - place[DEPTH], place[HEIGHT], radius
         )
-        by_place = np.empty((len(points), 3, 3))
-        by_place[:, :, DEPTH] = -contact.springs[:, :, 0]
-        by_place[:, :, LOG_RADIUS] = radius * (contact.by_size + contact.springs[:, :, 0])
-        by_place[:, :, HEIGHT] = contact.springs[:, :, 2]
-        state = self.model.linearize(q)
-        self.model.stiffen(state.tangent, self.surface.probe, q, contact.springs)
-        factor = self.model.factorise(state.tangent)
-        loads = [self.model.load(self.surface.probe, q, contact.forces) - state.force]
-        loads += [self.model.load(self.surface.probe, q, np.ascontiguousarray(by_place[:, :, k])) for k in range(3)]
-        steps = factor.solve(np.stack(loads, axis=1))
-        motions = self.model.project(self.surface.probe, q, steps)
-        relief = -np.einsum("pab,pbk->ak", contact.springs, motions)
+        state = model.linearize(q)
+        model.stiffen(state.tangent, probe, q, contact.springs)
+        along_x = np.ascontiguousarray(contact.springs[:, :, 0])
+        along_z = np.ascontiguousarray(contact.springs[:, :, 2])
+        by_radius = radius * (contact.by_size + along_x)
+        load_x, load_z = model.load(probe, q, along_x), model.load(probe, q, along_z)
+        imbalance = model.load(probe, q, contact.forces) - state.force
+        loads = np.stack([imbalance, -load_x, model.load(probe, q, by_radius), load_z], axis=1)
+        steps = model.factorise(state.tangent).solve(loads)
+        modes, size = steps[:, 1:], np.hypot(contact.forces[:, 0], contact.forces[:, 2])
+        total = size.sum()
+        share = size / total if total > 0 else np.full(len(size), np.nan)
+        force_modes = np.stack([-along_x.sum(0), by_radius.sum(0), along_z.sum(0)], axis=1)
+        force_modes[0] -= load_x @ modes
+        force_modes[2] -= load_z @ modes
+        relief = np.array([load_x @ steps[:, 0], 0.0, load_z @ steps[:, 0]])
         return PressedState(
-            forces=contact.forces,
-            points=points,
-            correction=steps[:, 0],
-            modes=steps[:, 1:],
-            force_modes=by_place.sum(0) + relief[:, 1:],
-            force_correction=relief[:, 0],
-            imbalance=float(np.abs(loads[0]).max(initial=0.0)),
+            touches=bool(total > 0), correction=steps[:, 0], modes=modes, force=contact.forces.sum(0) - relief,
+            force_modes=force_modes, pressure_point=share @ points, pressure_place=share @ self.surface.points,
             smallest_det=state.smallest_det,
-        )
+        )  # fmt: skip
 
     def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
         """Returns the step of a jaw that has lost contact, cut where its surface meets the cylinder again."""
@@ -99,7 +102,10 @@ class RollingContact:
         return high * step
 
 
-def limit_step(step: NDArray) -> NDArray:
-    """Returns a step of the unknowns shortened so that no node moves more than 2 mm at once."""
-    largest = np.abs(step).max(initial=0.0)
+def limit_step(model: JawModel, step: NDArray) -> NDArray:
+    """Returns a step of the unknowns shortened so that no node moves by more than 2 mm or turns by 0.3 rad at once."""
+    size = np.abs(step)
+    if model.rotations is not None:
+        size = np.where(model.rotations, size * (_LARGEST_STEP / _LARGEST_TURN), size)
+    largest = size.max(initial=0.0)
     return step if largest <= _LARGEST_STEP else step * (_LARGEST_STEP / largest)

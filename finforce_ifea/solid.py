@@ -58,6 +58,7 @@ class SolidModel:
             symmetric: halve the mesh where it mirrors itself in y = 0.
         """
         self.mesh = mesh
+        self.rotations = None
         mirror = find_mirror_nodes(mesh) if symmetric else None
         self.symmetric = mirror is not None
         elements = mesh.elements

@@ -1,7 +1,7 @@
 """The inner surface of a jaw as a dense set of points where an object can touch; knows no object."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from finforce_ifea.jaw import Jaw
 from finforce_ifea.mesh import VolumeMesh
 from finforce_ifea.model import JawModel
 
+Across = Literal["middle", "half", "both"]
 _SPACING = 0.25e-3
 _ON_FACE = 1e-4
 # Penalty per height [N/m per m]: 10 N spread over 2 mm sink in by 17 um, far below what a camera sees.
@@ -36,14 +37,15 @@ class ContactSurface:
     probe: Any
 
 
-def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, symmetric: bool) -> ContactSurface:
-    """Returns contact points every half millimetre along the inner surface, two or four across it.
+def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across: Across) -> ContactSurface:
+    """Returns contact points every quarter millimetre along the inner surface.
 
     Args:
         jaw: the jaw.
         mesh: its undeformed mesh, whose nodes on the inner face bound the surface.
         model: its mechanics.
-        symmetric: put points on y > 0 only, each standing for its mirror image too.
+        across: where along y the points stand: in the "middle" for a planar model, on "half" of the width where each
+            stands for its mirror image too, or on "both" halves.
 
     Raises:
         MeshError: The mesh has no nodes on the plane of the inner face.
@@ -54,10 +56,10 @@ def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, symmet
     low, high = face[:, 2].min(), face[:, 2].max()
     heights = np.arange(low + _SPACING, high - 0.5 * _SPACING, _SPACING)
     gauss = np.array([0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)])
-    sides = gauss * face[:, 1].max()
-    z, y = np.meshgrid(heights, sides if symmetric else np.r_[gauss[::-1] * face[:, 1].min(), sides], indexing="ij")
+    right, left = gauss * face[:, 1].max(), gauss[::-1] * face[:, 1].min()
+    sides = {"middle": np.zeros(1), "half": right, "both": np.r_[left, right]}[across]
+    z, y = np.meshgrid(heights, sides, indexing="ij")
     points = np.stack([np.full(z.size, jaw.inner_face_x), y.ravel(), z.ravel()], axis=1)
-    across = y.shape[1]
-    stiffness = np.full(len(points), _STIFFNESS * _SPACING / across)
+    stiffness = np.full(len(points), _STIFFNESS * _SPACING / len(sides))
     probe = model.attach(points, 1e-3)
-    return ContactSurface(points=points, heights=heights, across=across, stiffness=stiffness, probe=probe)
+    return ContactSurface(points=points, heights=heights, across=len(sides), stiffness=stiffness, probe=probe)
