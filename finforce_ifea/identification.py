@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from finforce_ifea.calibration import Calibration
 from finforce_ifea.errors import CalibrationError
 from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.jaw import Jaw
+from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import Mechanics, build_mechanics
 from finforce_ifea.plateaus import INSTANTS, CalibrationCase, Plateau, find_plateaus
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation, invert_relaxation
@@ -220,7 +220,7 @@ class _Fit:
         if key not in self._shapes:
             finger = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus).apply(self.jaw)
             mechanics = build_mechanics(finger, self.settings)
-            rest = mechanics.model.attach(self.jaw.keypoints, 1e-3)
+            rest = mechanics.model.attach(self.jaw.keypoints, KEYPOINT_DISTANCE)
             solver = _PlateauSolver(mechanics, rest)
             solved = []
             for plateau, start in zip(self.plateaus, self._starts, strict=True):

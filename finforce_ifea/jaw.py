@@ -28,7 +28,7 @@ from finforce_ifea.meshing import MeshDensity, mesh_drawing
 __all__ = ["Jaw", "Material", "list_shipped_jaws", "load_jaw"]
 
 # How far a key point may lie outside the jaw, and a candidate off its surface [m].
-_KEYPOINT_DISTANCE = 1e-3
+KEYPOINT_DISTANCE = 3e-3
 _CANDIDATE_DISTANCE = 1e-4
 _KEYS = (
     "name",
@@ -220,18 +220,18 @@ def _check_points(jaw: Jaw) -> None:
     if jaw.drawing is not None:
         distances = jaw.drawing.distance_to(jaw.keypoints)
         worst = int(distances.argmax())
-        if distances[worst] > _KEYPOINT_DISTANCE:
+        if distances[worst] > KEYPOINT_DISTANCE:
             raise JawFileError(
                 f"keypoints.{jaw.keypoint_names[worst]} at {_millimetres(jaw.keypoints[worst])} lies "
                 f"{1e3 * distances[worst]:.3g} mm off the jaw, "
-                f"expected at most {1e3 * _KEYPOINT_DISTANCE:g} mm"
+                f"expected at most {1e3 * KEYPOINT_DISTANCE:g} mm"
             )
         return
     mesh = jaw.build_mesh()
     names = [f"keypoints.{name}" for name in jaw.keypoint_names]
     candidate_names = [f"candidates[{number}]" for number in range(len(jaw.candidates))]
     try:
-        attach_points(mesh, jaw.keypoints, _KEYPOINT_DISTANCE, names)
+        attach_points(mesh, jaw.keypoints, KEYPOINT_DISTANCE, names)
         attach_surface_points(mesh, jaw.candidates, _CANDIDATE_DISTANCE, candidate_names)
     except MeshError as error:
         raise JawFileError(str(error)) from error

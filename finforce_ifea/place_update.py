@@ -180,13 +180,20 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
     n = len(count)
     det = data.noise[0, 0] * data.noise[1, 1] - data.noise[0, 1] ** 2
     p00, p11, p01 = data.noise[1, 1] / det, data.noise[0, 0] / det, -data.noise[0, 1] / det
+    along, norm = 0.0, 1e-300
+    for k in range(n):
+        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
+        along += count[k] * ((p00 * h0 + p01 * h1) * mean[k, 0] + (p01 * h0 + p11 * h1) * mean[k, 1])
+        norm += count[k] * (p00 * h0 * h0 + 2.0 * p01 * h0 * h1 + p11 * h1 * h1)
+    # what all points have in common along the depth is depth, not bias
+    along /= norm
     information, innovation = 0.0, 0.0
     pull = np.zeros(3)
     for k in range(n):
         h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
         w0, w1 = data.weights[k] * (p00 * h0 + p01 * h1), data.weights[k] * (p01 * h0 + p11 * h1)
         information += w0 * h0 + w1 * h1
-        innovation += w0 * (data.r[k, 0] - mean[k, 0]) + w1 * (data.r[k, 1] - mean[k, 1])
+        innovation += w0 * (data.r[k, 0] - mean[k, 0] + along * h0) + w1 * (data.r[k, 1] - mean[k, 1] + along * h1)
         for i in range(1, 3):
             pull[i] += w0 * data.modes[k, 0, i] + w1 * data.modes[k, 1, i]
     innovation /= information

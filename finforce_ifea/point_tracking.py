@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.errors import NotEnoughDataError
 from finforce_ifea.inverse import InverseResult, Problem, solve_inverse
-from finforce_ifea.jaw import Jaw
+from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import Mechanics
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
@@ -31,7 +31,7 @@ class PointTracker:
         """Attaches the key points; raises MeshError when one is off the mesh."""
         self.jaw, self.mechanics, self.settings = jaw, mechanics, settings
         self.paper = settings.solver == "paper"
-        self.probe = mechanics.model.attach(jaw.keypoints, 1e-3)
+        self.probe = mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
         self._rest = mechanics.model.positions(self.probe, np.zeros(mechanics.model.size))
         self._load = lru_cache(maxsize=256)(self._build_load)
         self.reset()

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.place_update import PlaceUpdate, Residuals, update_place, weigh_residuals
 from finforce_ifea.rolling import DEPTH, HEIGHT, LOG_RADIUS, PressedState, RollingContact, limit_step
@@ -37,7 +38,7 @@ class PlaceTracker:
         """Attaches key points (K, 3) [m, undeformed] to the contact's model; raises MeshError when one is off it."""
         self.contact = contact
         self.settings = settings
-        self.probe = contact.model.attach(keypoints, 1e-3)
+        self.probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
         self._rest = contact.model.positions(self.probe, np.zeros(contact.model.size))
         self._prior_variance = np.array([settings.radius_log_stddev, settings.height_stddev]) ** 2
         self.reset()

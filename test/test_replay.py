@@ -1,10 +1,12 @@
 """Claims about a replay through the real nodes, and about the stop of its processes."""
 
+import argparse
 import json
 import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 from finforce_eval import replay as replaying
+from finforce_eval.commands import make_setup
 from finforce_eval.live import JawLog, live_result, point_of_application
 from finforce_eval.recording import read_recording
 from finforce_eval.writer import write_recording
@@ -134,3 +137,33 @@ def test_the_point_of_application_lies_on_the_line_of_action_where_it_enters_the
 
 def test_no_force_has_no_point_of_application():
     assert np.isnan(point_of_application(np.zeros(3), np.zeros(3), np.zeros((4, 3)))).all()
+
+
+@pytest.fixture(scope="module")
+def two_jaws(tmp_path_factory):
+    """A few seconds under load, seen on both jaws: the right one is the left one's mirror image."""
+    recording = read_recording(SHIPPED)
+    left = recording.jaws["left"]
+    mirror = np.array([1.0, -1.0, 1.0])
+    right = replace(
+        left,
+        keypoints=replace(left.keypoints, points=left.keypoints.points * mirror),
+        truth=replace(left.truth, force=left.truth.force * mirror, torque=-left.truth.torque * mirror),
+    )
+    start = left.keypoints.stamps[0]
+    both = replace(recording, jaws={"left": left, "right": right}).between(start, start + 6 * SECOND)
+    return write_recording(both, tmp_path_factory.mktemp("bags") / "both")
+
+
+def test_two_solvers_answer_alike_and_complete_the_grasp(two_jaws, tmp_path):
+    recording = read_recording(two_jaws)
+    names = argparse.Namespace(
+        jaw="bench", solver="default", mesh="default", contact=[], calibration=None, object=None
+    )
+    result = replaying.replay(recording, make_setup(names))
+    left, right = (result.evaluation.results[f"both/{side}"] for side in ("left", "right"))
+    held = left.solved & right.solved
+    assert held.sum() > 0.5 * len(held)
+    np.testing.assert_allclose(right.force[held], left.force[held] * [1, -1, 1], atol=1e-6)
+    for stamp, magnitude in zip(left.stamps[held], left.magnitude[held], strict=True):
+        assert result.grasp[int(stamp)] == pytest.approx(magnitude, abs=1e-6)
