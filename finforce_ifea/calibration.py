@@ -16,6 +16,7 @@ _KEYS = {
     "relaxation", "force_error", "jaw", "comment", "uncertainty",
 }  # fmt: skip
 
+
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
     """A printed finger as it is, beside its drawing.
@@ -53,10 +54,14 @@ class Calibration:
         for name, (low, high) in bounds.items():
             value = getattr(self, name)
             if not (isinstance(value, (int, float)) and np.isfinite(value) and low <= value <= high):
-                raise CalibrationError(f"calibration: {name} = {value!r}, expected a number from {low:g} to {high:g}")
+                raise CalibrationError(
+                    f"calibration: {name} = {value!r}, expected a number from {low:g} to {high:g}"
+                )
         for term in self.relaxation:
             if not (0.0 <= term.share <= 10.0 and 1e-3 <= term.time_constant <= 1e6):
-                raise CalibrationError(f"calibration: {term}, expected a share from 0 to 10 and 1e-3 to 1e6 s")
+                raise CalibrationError(
+                    f"calibration: {term}, expected a share from 0 to 10 and 1e-3 to 1e6 s"
+                )
 
     def apply(self, jaw: Jaw) -> Jaw:
         """Returns the jaw as it is.
@@ -73,13 +78,17 @@ class Calibration:
             jaw.drawing,
             inner=_thicken(jaw.drawing.inner, self.inner_thickness_factor),
             outer=_thicken(jaw.drawing.outer, self.outer_thickness_factor),
-            ribs=tuple(replace(rib, thickness=rib.thickness * self.rib_thickness_factor) for rib in jaw.drawing.ribs),
+            ribs=tuple(
+                replace(rib, thickness=rib.thickness * self.rib_thickness_factor) for rib in jaw.drawing.ribs
+            ),
             clamped_z=max(jaw.drawing.clamped_z, self.clamped_z),
         )
         return replace(jaw, drawing=drawing, material=material)
 
+
 def _thicken(band, factor: float):
     return replace(band, thickness=band.thickness * factor)
+
 
 def load_calibration(name_or_path: str | Path) -> Calibration:
     """Loads a calibration from its YAML file or a shipped one by its name.
@@ -93,16 +102,21 @@ def load_calibration(name_or_path: str | Path) -> Calibration:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise CalibrationError(f"{path.name}: {str(error).splitlines()[0]}") from error
     if not isinstance(table, dict) or "young_modulus" not in table:
-        raise CalibrationError(f"{path.name}: expected a mapping with young_modulus, as `finforce calibrate` writes it")
+        raise CalibrationError(
+            f"{path.name}: expected a mapping with young_modulus, as `finforce calibrate` writes it"
+        )
     unknown = set(table) - _KEYS
     if unknown:
-        raise CalibrationError(f"{path.name}: unknown key {sorted(unknown)[0]!r}; expected {', '.join(sorted(_KEYS))}")
+        raise CalibrationError(
+            f"{path.name}: unknown key {sorted(unknown)[0]!r}; expected {', '.join(sorted(_KEYS))}"
+        )
     values = {key: value for key, value in table.items() if key not in ("comment", "uncertainty")}
     try:
         terms = tuple(RelaxationTerm(**term) for term in values.pop("relaxation", None) or ())
         return Calibration(relaxation=terms, **values)
     except (TypeError, CalibrationError) as error:
         raise CalibrationError(f"{path.name}: {error}") from error
+
 
 def _find_file(name_or_path: str | Path) -> Path:
     folder = resources.files("finforce_ifea").joinpath("calibrations")
@@ -111,6 +125,7 @@ def _find_file(name_or_path: str | Path) -> Path:
     if not path.is_file():
         raise CalibrationError(f"there is no calibration file {str(name_or_path)!r}")
     return path
+
 
 def save_calibration(
     calibration: Calibration, path: str | Path, *, uncertainty: dict[str, float] | None = None

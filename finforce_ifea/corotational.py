@@ -8,7 +8,11 @@ _OPTIONS = {"cache": True, "fastmath": {"contract", "reassoc", "nsz", "arcp"}, "
 
 @njit(**_OPTIONS)
 def _invert3(A, out):
-    a, b, c = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1], A[1, 2] * A[2, 0] - A[1, 0] * A[2, 2], A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0]
+    a, b, c = (
+        A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1],
+        A[1, 2] * A[2, 0] - A[1, 0] * A[2, 2],
+        A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0],
+    )
     det = A[0, 0] * a + A[0, 1] * b + A[0, 2] * c
     s = 1.0 / det
     out[0, 0], out[1, 0], out[2, 0] = a * s, b * s, c * s
@@ -69,7 +73,13 @@ def corotational_elements(u, conn, X, K0, g, with_tangent, f, Ke):
     """
     m, k = conn.shape
     n = 3 * k
-    F, R, U, H, scratch = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    F, R, U, H, scratch = (
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+    )
     x, d, fl, p = np.empty((k, 3)), np.empty(n), np.empty(n), np.empty(n)
     G, KS, T, B = np.empty((3, n)), np.empty((n, 3)), np.empty((n, n)), np.empty((3, 3))
     energy, smallest = 0.0, 1e300
@@ -90,7 +100,11 @@ def corotational_elements(u, conn, X, K0, g, with_tangent, f, Ke):
         smallest = min(smallest, det)
         for i in range(k):
             node = conn[e, i]
-            w0, w1, w2 = X[e, i, 0] + u[node, 0] - mean0, X[e, i, 1] + u[node, 1] - mean1, X[e, i, 2] + u[node, 2] - mean2
+            w0, w1, w2 = (
+                X[e, i, 0] + u[node, 0] - mean0,
+                X[e, i, 1] + u[node, 1] - mean1,
+                X[e, i, 2] + u[node, 2] - mean2,
+            )
             for a in range(3):
                 x[i, a] = R[0, a] * w0 + R[1, a] * w1 + R[2, a] * w2
                 d[3 * i + a] = x[i, a] - X[e, i, a]
@@ -151,7 +165,11 @@ def corotational_elements(u, conn, X, K0, g, with_tangent, f, Ke):
                 B[a, b] = s
         # L = K0 S + ([p] + [f']) / 2 collects what multiplies G on the right; its transpose stands on the left.
         for i in range(k):
-            q0, q1, q2 = 0.5 * (p[3 * i] + fl[3 * i]), 0.5 * (p[3 * i + 1] + fl[3 * i + 1]), 0.5 * (p[3 * i + 2] + fl[3 * i + 2])
+            q0, q1, q2 = (
+                0.5 * (p[3 * i] + fl[3 * i]),
+                0.5 * (p[3 * i + 1] + fl[3 * i + 1]),
+                0.5 * (p[3 * i + 2] + fl[3 * i + 2]),
+            )
             KS[3 * i, 1] -= q2
             KS[3 * i, 2] += q1
             KS[3 * i + 1, 0] += q2
@@ -178,14 +196,22 @@ def corotational_elements(u, conn, X, K0, g, with_tangent, f, Ke):
             l0, l1, l2 = G[0, i], G[1, i], G[2, i]
             for j in range(3 * (i // 3) + 3):
                 T[i, j] = (
-                    K0[e, i, j] + b0 * G[0, j] + b1 * G[1, j] + b2 * G[2, j] - l0 * KS[j, 0] - l1 * KS[j, 1] - l2 * KS[j, 2]
+                    K0[e, i, j]
+                    + b0 * G[0, j]
+                    + b1 * G[1, j]
+                    + b2 * G[2, j]
+                    - l0 * KS[j, 0]
+                    - l1 * KS[j, 1]
+                    - l2 * KS[j, 2]
                 )
         for i in range(k):
             for j in range(i + 1):
                 for a in range(3):
                     for b in range(3):
                         scratch[a, b] = (
-                            R[a, 0] * T[3 * i, 3 * j + b] + R[a, 1] * T[3 * i + 1, 3 * j + b] + R[a, 2] * T[3 * i + 2, 3 * j + b]
+                            R[a, 0] * T[3 * i, 3 * j + b]
+                            + R[a, 1] * T[3 * i + 1, 3 * j + b]
+                            + R[a, 2] * T[3 * i + 2, 3 * j + b]
                         )
                 for a in range(3):
                     for b in range(3):
@@ -193,4 +219,3 @@ def corotational_elements(u, conn, X, K0, g, with_tangent, f, Ke):
                             scratch[a, 0] * R[b, 0] + scratch[a, 1] * R[b, 1] + scratch[a, 2] * R[b, 2]
                         )
     return energy, smallest
-

@@ -33,6 +33,10 @@ _LOADED_SIGMA = 3.5
 _DELAY_FRAMES = 15
 _LONGEST_GAP = 1.0
 _UNLOADED_FORCE = 0.02
+# Beyond these a force is not reported: misfit of the shape, stiffening, standard deviation [N], its share of the force.
+_LARGEST_MISFIT = 2.0
+_LARGEST_STIFFENING = 5.0
+_VAGUE_FORCE, _VAGUE_SHARE = 1.0, 0.25
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,15 +145,17 @@ class JawEstimator:
         self._recent.append(points)
         used = np.isfinite(points[:, 0])
         if used.sum() < self.settings.minimum_keypoints:
-            return self._fail("not_enough_points", f"{int(used.sum())} of {len(used)} key points can be used", used, dt)
+            return self._fail(
+                "not_enough_points", f"{int(used.sum())} of {len(used)} key points can be used", used
+            )
         if self._tare_open and not self.tared:
-            waiting = self._begin(used, dt)
+            waiting = self._begin(used)
             if waiting is not None:
                 return waiting
         if contact is None or not len(contact.points):
-            return self._without_contact(points, used, dt)
+            return self._without_contact(points, used)
         track = self._tracker.update(points, self._tare, min(dt, _LONGEST_GAP))
-        return self._conclude(track, points, used, dt)
+        return self._conclude(track, used)
 
     def _follow(self, contact: Contact) -> None:
         """Hands a contact to the tracker that it is for."""
@@ -162,12 +168,14 @@ class JawEstimator:
             chosen.q, self._tracker = self._tracker.q.copy(), chosen
         chosen.follow(contact)
 
-    def _begin(self, used: NDArray, dt: float) -> Solution | None:
+    def _begin(self, used: NDArray) -> Solution | None:
         """Collects unloaded frames, then tares, unless the jaw looks loaded; returns None once that is decided."""
         if len(self._recent) < self.settings.tare_frames:
             self._relax(np.zeros(3))
             missing = self.settings.tare_frames - len(self._recent)
-            return blank_solution(self._stamp, "waiting", f"{missing} more unloaded frames for the tare", used)
+            return blank_solution(
+                self._stamp, "waiting", f"{missing} more unloaded frames for the tare", used
+            )
         try:
             self.tare()
         except UnderLoadError:
@@ -188,7 +196,9 @@ class JawEstimator:
             raise UnderLoadError(f"cannot tare: {force:.2f} N press on the jaw")
         frames = list(self._recent)[-self.settings.tare_memory :]
         if len(frames) < min(5, self.settings.tare_frames):
-            raise NotEnoughDataError(f"cannot tare: {len(frames)} frames, expected {self.settings.tare_frames}")
+            raise NotEnoughDataError(
+                f"cannot tare: {len(frames)} frames, expected {self.settings.tare_frames}"
+            )
         tare = compute_tare(frames, self.jaw.keypoints)
         if tare is None:
             raise self._explain_no_tare(frames)
@@ -206,8 +216,12 @@ class JawEstimator:
     def _explain_no_tare(self, frames: list[NDArray]) -> NotEnoughDataError | UnderLoadError:
         seen = np.isfinite(np.stack(frames)[..., 0]).mean(0) >= 0.5
         if seen.sum() < 3:
-            return NotEnoughDataError("cannot tare: fewer than three key points are seen in half of the frames")
-        return UnderLoadError("cannot tare: the key points lie millimetres from where the unloaded jaw has them")
+            return NotEnoughDataError(
+                "cannot tare: fewer than three key points are seen in half of the frames"
+            )
+        return UnderLoadError(
+            "cannot tare: the key points lie millimetres from where the unloaded jaw has them"
+        )
 
     def _set_tare(self, tare: Tare) -> None:
         self._tare = tare
@@ -228,32 +242,49 @@ class JawEstimator:
             tare = compute_tare(list(self._recent)[:-_DELAY_FRAMES], self.jaw.keypoints)
             self._tare = tare or self._tare
 
-    def _without_contact(self, points: NDArray, used: NDArray, dt: float) -> Solution:
+    def _without_contact(self, points: NDArray, used: NDArray) -> Solution:
         """Says what can be said without an object: nothing presses, or it cannot be known where."""
         tare = compute_tare([points, points], self.jaw.keypoints + self._tare.offsets)
         quiet = self.tared and tare is not None and self._tracker.significance(tare) < _LOADED_SIGMA
         if quiet:
             self._relax(np.zeros(3))
-            return replace(blank_solution(self._stamp, "unloaded", "no object, the jaw is at rest", used), converged=True)
-        return self._fail("no_contact", "the jaw is bent but no contact is known", used, dt)
+            return replace(
+                blank_solution(self._stamp, "unloaded", "no object, the jaw is at rest", used), converged=True
+            )
+        return self._fail("no_contact", "the jaw is bent but no contact is known", used)
 
-    def _fail(self, status: str, message: str, used: NDArray, dt: float, iterations: int = 0) -> Solution:
+    def _fail(self, status: str, message: str, used: NDArray, iterations: int = 0) -> Solution:
         """Returns a solution without force."""
         return blank_solution(self._stamp, status, message, used, iterations)
 
-    def _conclude(self, track: Track | None, points: NDArray, used: NDArray, dt: float) -> Solution:
+    def _conclude(self, track: Track | None, used: NDArray) -> Solution:
         """Turns a track into a solution."""
         if track is None:
-            return self._fail("not_enough_points", "too few key points agree with the jaw's shape", used, dt)
+            return self._fail("not_enough_points", "too few key points agree with the jaw's shape", used)
         used = track.weights > 0
         if not track.sound:
             self._tracker.reset()
-            return self._fail("diverged", "the shape cannot be reached by the jaw", used, dt, track.iterations)
+            return self._fail("diverged", "the shape cannot be reached by the jaw", used, track.iterations)
         self._track = track
+        doubt = self._doubt(track)
+        if doubt:
+            return self._fail("unobservable", doubt, used, track.iterations)
         if self._tare_open and self.tared:
             self._refine_tare(track)
         force = self._relax(track.force)
         return self._solution(track, force, used)
+
+    def _doubt(self, track: Track) -> str:
+        """Returns why a track must not be believed, empty when it may."""
+        if track.misfit > _LARGEST_MISFIT:
+            return f"the key points do not fit this contact ({track.misfit:.1f} standard deviations); is its place right?"
+        if track.stiffening > _LARGEST_STIFFENING:
+            return f"the jaw seems {track.stiffening:.0f} times as stiff as at the given height; is the contact elsewhere?"
+        magnitude = float(np.linalg.norm(track.force))
+        stddev = self._stddev(track, magnitude)
+        if not stddev <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
+            return f"the visible key points tell the force only within {stddev:.2g} N"
+        return ""
 
     def _relax(self, elastic: NDArray) -> NDArray:
         """Returns the force (3,) [N] that the material gives for an elastic force (3,) [N] now."""
@@ -269,7 +300,10 @@ class JawEstimator:
     def _solution(self, track: Track, force: NDArray, used: NDArray) -> Solution:
         magnitude = float(np.linalg.norm(force))
         loaded = magnitude > 0.0
-        covariance = track.force_modes @ track.covariance @ track.force_modes.T + np.outer(force, force) * self._force_error**2
+        covariance = (
+            track.force_modes @ track.covariance @ track.force_modes.T
+            + np.outer(force, force) * self._force_error**2
+        )
         stddev = np.sqrt(np.diag(covariance))
         arm = track.pressure_point * [1.0, 0.0, 1.0]
         elastic = float(np.linalg.norm(track.force))
@@ -278,7 +312,9 @@ class JawEstimator:
         return Solution(
             stamp=self._stamp,
             status="ok" if loaded else "unloaded",
-            message="" if self.tared else "no tare: the jaw was loaded from the start; key point offsets are unknown",
+            message=""
+            if self.tared
+            else "no tare: the jaw was loaded from the start; key point offsets are unknown",
             force=force,
             torque=np.array([-arm[2] * force[1], arm[2] * force[0] - arm[0] * force[2], arm[0] * force[1]]),
             force_stddev=stddev,

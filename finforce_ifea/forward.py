@@ -22,7 +22,9 @@ _SHORTEST_STEP = 1e-6
 class RigidObject(Protocol):
     """A rigid object, endless along y; its nearest point to the jaw comes first into the jaw."""
 
-    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
+    def press(
+        self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float
+    ) -> PenaltyContact:
         """Returns the contact with points (p, 3) [m] of an object sunk by depth [m] below x = face_x at height [m]."""
         ...
 
@@ -33,7 +35,9 @@ class Cylinder:
 
     radius: float
 
-    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
+    def press(
+        self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float
+    ) -> PenaltyContact:
         """See `RigidObject`."""
         return press_cylinder(points, stiffness, face_x + self.radius - depth, height, self.radius)
 
@@ -53,9 +57,13 @@ class Box:
             ContactError: A size is not positive, or the edges are rounder than the box is wide.
         """
         if not 0.0 < self.edge_radius <= 0.5 * min(self.size_x, self.size_z):
-            raise ContactError(f"{self}: expected an edge radius above zero and at most half of the smaller size")
+            raise ContactError(
+                f"{self}: expected an edge radius above zero and at most half of the smaller size"
+            )
 
-    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
+    def press(
+        self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float
+    ) -> PenaltyContact:
         """See `RigidObject`."""
         half = (0.5 * self.size_x, 0.5 * self.size_z)
         return press_box(points, stiffness, (face_x + half[0] - depth, height), half, self.edge_radius)
@@ -87,7 +95,12 @@ class Press:
 
 
 def press_jaw(
-    model: JawModel, surface: ContactSurface, face_x: float, rigid: RigidObject, height: float, depths: Sequence[float]
+    model: JawModel,
+    surface: ContactSurface,
+    face_x: float,
+    rigid: RigidObject,
+    height: float,
+    depths: Sequence[float],
 ) -> list[Press]:
     """Presses a rigid object into the inner surface, displacement driven, frictionless.
 
@@ -113,7 +126,9 @@ def press_jaw(
                 continue
             step *= 0.5
             if step < _SHORTEST_STEP:
-                raise ContactError(f"no equilibrium beyond a depth of {1e3 * reached:.3f} mm: the jaw buckles or slips off")
+                raise ContactError(
+                    f"no equilibrium beyond a depth of {1e3 * reached:.3f} mm: the jaw buckles or slips off"
+                )
         results.append(_describe(model, surface, q, face_x, rigid, depth, height, iterations))
     return results
 
@@ -125,7 +140,13 @@ class _Trial:
 
 
 def _find_equilibrium(
-    model: JawModel, surface: ContactSurface, q: NDArray, face_x: float, rigid: RigidObject, depth: float, height: float
+    model: JawModel,
+    surface: ContactSurface,
+    q: NDArray,
+    face_x: float,
+    rigid: RigidObject,
+    depth: float,
+    height: float,
 ) -> _Trial | None:
     """Returns the equilibrium at `depth` by Newton's method, or None when it does not converge."""
     for iteration in range(1, _ITERATIONS + 1):

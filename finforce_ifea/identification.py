@@ -105,10 +105,15 @@ def _refine_relaxation(
         progress(float("nan"))
     fit = least_squares(_course_residuals, np.r_[0.0, _PRIOR[5:]], bounds=(_LOW[[0, *range(5, 9)]], _HIGH[[0, *range(5, 9)]]),
                         x_scale=_PRIOR_STDDEV[[0, *range(5, 9)]], args=(courses,))  # fmt: skip
-    model = [np.exp(fit.x[0]) * apply_relaxation(course.elastic, course.stamps, _terms(fit.x[1:])) for course in courses]
+    model = [
+        np.exp(fit.x[0]) * apply_relaxation(course.elastic, course.stamps, _terms(fit.x[1:]))
+        for course in courses
+    ]
     loaded = [course.true > _LOADED_FORCE for course in courses]
     errors = np.concatenate([(m - c.true)[k] for m, c, k in zip(model, courses, loaded, strict=True)])
-    relative = np.concatenate([((m - c.true) / c.true)[k] for m, c, k in zip(model, courses, loaded, strict=True)])
+    relative = np.concatenate(
+        [((m - c.true) / c.true)[k] for m, c, k in zip(model, courses, loaded, strict=True)]
+    )
     stddev = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac + 1e-12 * np.eye(5))))
     names = ("share_1", "time_constant_1", "share_2", "time_constant_2")
     scale = [1.0, np.exp(fit.x[2]), 1.0, np.exp(fit.x[4])]
@@ -166,7 +171,11 @@ class _Fit:
     """Residuals of all parameters: the finger's, then one log radius per recording."""
 
     def __init__(
-        self, jaw: Jaw, cases: Sequence[CalibrationCase], settings: EstimatorSettings, progress: Callable[[float], None]
+        self,
+        jaw: Jaw,
+        cases: Sequence[CalibrationCase],
+        settings: EstimatorSettings,
+        progress: Callable[[float], None],
     ) -> None:
         self.jaw, self.cases, self.settings, self.progress = jaw, cases, settings, progress
         self.plateaus = find_plateaus(cases, jaw, settings, per_case=_PER_CASE)
@@ -198,7 +207,10 @@ class _Fit:
         shapes, forces = self._solve_shapes(x)
         elastic = self._elastic_forces(x)
         model = np.exp(x[0]) * forces
-        rows = [((target - value) / self._force_stddev(value)) for target, value in zip(elastic, model, strict=True)]
+        rows = [
+            ((target - value) / self._force_stddev(value))
+            for target, value in zip(elastic, model, strict=True)
+        ]
         total = np.concatenate([shapes, *rows, (x - self.mean) / self.stddev])
         self.progress(float(total @ total))
         return total
@@ -210,7 +222,8 @@ class _Fit:
         """Returns the elastic forces [N] behind the true ones at the instants of each plateau."""
         terms = self.calibration(x).relaxation
         elastic = [
-            invert_relaxation(force, case.stamps_true, terms) for force, case in zip(self.forces, self.cases, strict=True)
+            invert_relaxation(force, case.stamps_true, terms)
+            for force, case in zip(self.forces, self.cases, strict=True)
         ]
         return [elastic[plateau.case][plateau.instants] for plateau in self.plateaus]
 
@@ -218,7 +231,9 @@ class _Fit:
         """Returns the shape residuals and the magnitudes [N] at the drawn modulus; remembers them per geometry."""
         key = np.r_[x[_GEOMETRY], x[len(_NAMES) :]].tobytes()
         if key not in self._shapes:
-            finger = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus).apply(self.jaw)
+            finger = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus).apply(
+                self.jaw
+            )
             mechanics = build_mechanics(finger, self.settings)
             rest = mechanics.model.attach(self.jaw.keypoints, KEYPOINT_DISTANCE)
             solver = _PlateauSolver(mechanics, rest)
@@ -247,8 +262,12 @@ class _Fit:
         shapes, forces = self._solve_shapes(x)
         elastic, model = self._elastic_forces(x), np.exp(x[0]) * forces
         errors = np.concatenate([target - value for target, value in zip(elastic, model, strict=True)])
-        relative = np.concatenate([target / value - 1.0 for target, value in zip(elastic, model, strict=True)])
-        calibration = replace(self.calibration(x), force_error=float(np.clip(np.sqrt(np.mean(relative**2)), 0.005, 0.5)))
+        relative = np.concatenate(
+            [target / value - 1.0 for target, value in zip(elastic, model, strict=True)]
+        )
+        calibration = replace(
+            self.calibration(x), force_error=float(np.clip(np.sqrt(np.mean(relative**2)), 0.005, 0.5))
+        )
         scale = np.ones(len(_NAMES))
         scale[[0, 4, 6, 8]] = calibration.young_modulus, 1e-3, np.exp(x[6]), np.exp(x[8])
         return CalibrationFit(
@@ -278,7 +297,9 @@ class _PlateauSolver:
         self._contact, self._model, self._probe = mechanics.contact, mechanics.model, probe
         self._rest = self._model.positions(probe, np.zeros(self._model.size))
 
-    def solve(self, plateau: Plateau, log_radius: float, height: float, start: _PlateauShape | None) -> _PlateauShape:
+    def solve(
+        self, plateau: Plateau, log_radius: float, height: float, start: _PlateauShape | None
+    ) -> _PlateauShape:
         """Returns the closest shape, found by Gauss-Newton from `start` or from the unloaded jaw.
 
         Raises:
@@ -304,7 +325,11 @@ class _PlateauSolver:
             if abs(change) < 1e-6 and np.abs(state.correction).max() < 1e-6:
                 force = state.force + state.force_modes[:, DEPTH] * change
                 left = (residual - mode * change).ravel()
-                return _PlateauShape(q=q, depth=float(place[DEPTH]), residual=left, force=float(np.linalg.norm(force)))
+                return _PlateauShape(
+                    q=q, depth=float(place[DEPTH]), residual=left, force=float(np.linalg.norm(force))
+                )
         if start is not None:
             return self.solve(plateau, log_radius, height, None)
-        raise CalibrationError("calibration: no shape of the jaw comes near the key points; is it the right jaw file?")
+        raise CalibrationError(
+            "calibration: no shape of the jaw comes near the key points; is it the right jaw file?"
+        )

@@ -127,7 +127,9 @@ class _LinearStep:
 def _linear_step(model: JawModel, problem: Problem, q: NDArray, active: NDArray) -> _LinearStep:
     state = model.linearize(q)
     directions, lower = _force_directions(model, problem, q)
-    columns = [model.load(problem.contacts, q, np.ascontiguousarray(directions[:, :, j])) for j in range(len(lower))]
+    columns = [
+        model.load(problem.contacts, q, np.ascontiguousarray(directions[:, :, j])) for j in range(len(lower))
+    ]
     G = np.stack(columns, axis=1)
     steps = model.factorise(state.tangent).solve(np.column_stack([G, -state.force]))
     modes, free = steps[:, :-1], steps[:, -1]
@@ -201,10 +203,14 @@ def solve_program(hessian: NDArray, gradient: NDArray, lower: NDArray) -> Progra
     """
     scale = np.sqrt(np.diag(hessian))
     if not (np.isfinite(hessian).all() and (scale > 0).all()):
-        raise NotEnoughDataError("a force moves no active key point; more of them must be seen, or an energy weight given")
+        raise NotEnoughDataError(
+            "a force moves no active key point; more of them must be seen, or an energy weight given"
+        )
     H, g = hessian / np.outer(scale, scale), gradient / scale
     if np.linalg.eigvalsh(H)[0] < _SINGULAR:
-        raise NotEnoughDataError("the active key points do not tell the forces apart; give an energy weight or fewer contacts")
+        raise NotEnoughDataError(
+            "the active key points do not tell the forces apart; give an energy weight or fewer contacts"
+        )
     bound = np.where(lower <= -_UNBOUNDED, -_UNBOUNDED, lower * scale)
     m = len(g)
     size = max(np.abs(g).max(), 1e-300)

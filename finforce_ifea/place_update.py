@@ -15,6 +15,7 @@ _MODEL_FLOOR = 0.02e-3
 _LEAST_WEIGHT = 0.02
 # Depth has no prior; this share of one frame's information keeps the posterior regular while nothing was averaged.
 _DEPTH_SHARE = 1e-3
+_PRIOR_REACH = 4.0
 
 
 class Residuals(NamedTuple):
@@ -49,6 +50,7 @@ class PlaceUpdate(NamedTuple):
         covariance: of the place (3, 3).
         kkt: what is left of the objective's gradient, relative to the gradient before.
         residual: weighted root mean square residual [m].
+        misfit: root mean square of the averaged residuals over their standard deviations; about 1 where the model fits.
     """
 
     place: NDArray
@@ -59,11 +61,22 @@ class PlaceUpdate(NamedTuple):
     covariance: NDArray
     kkt: float
     residual: float
+    misfit: float
 
 
 @njit(**_OPTIONS)
 def weigh_residuals(
-    measured, positions, rest, motions, moved, below, noise, offset_variance, depth_variance, model_error, gate
+    measured,
+    positions,
+    rest,
+    motions,
+    moved,
+    below,
+    noise,
+    offset_variance,
+    depth_variance,
+    model_error,
+    gate,
 ):
     """Returns the in-plane residuals and the weights of key points; see `Residuals`.
 
@@ -110,7 +123,9 @@ def weigh_residuals(
         s00 = plane[0, 0] + bias[k] + h0 * h0 * depth_variance
         s11 = plane[1, 1] + bias[k] + h1 * h1 * depth_variance
         s01 = plane[0, 1] + h0 * h1 * depth_variance
-        square = (s11 * r[k, 0] ** 2 - 2.0 * s01 * r[k, 0] * r[k, 1] + s00 * r[k, 1] ** 2) / (s00 * s11 - s01 * s01)
+        square = (s11 * r[k, 0] ** 2 - 2.0 * s01 * r[k, 0] * r[k, 1] + s00 * r[k, 1] ** 2) / (
+            s00 * s11 - s01 * s01
+        )
         square += off * off / (noise[1, 1] + bias[k])
         weight = 1.0 / (1.0 + square / gate**2) ** 2
         if weight >= _LEAST_WEIGHT:
@@ -155,8 +170,10 @@ def _posterior(data, mean, count, offset, prior_variance, information):
             for j in range(3):
                 hessian[i, j] += a * data.modes[k, 0, j] + b * data.modes[k, 1, j]
     for i in range(2):
-        hessian[i + 1, i + 1] += 1.0 / prior_variance[i]
-        gradient[i + 1] -= offset[i] / prior_variance[i]
+        # far from its mean the prior lets go (Cauchy), for an object may touch first elsewhere than it was said to
+        variance = prior_variance[i] + (offset[i] / _PRIOR_REACH) ** 2
+        hessian[i + 1, i + 1] += 1.0 / variance
+        gradient[i + 1] -= offset[i] / variance
     hessian[0, 0] += _DEPTH_SHARE * information
     return hessian, gradient
 
@@ -193,7 +210,9 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
         h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
         w0, w1 = data.weights[k] * (p00 * h0 + p01 * h1), data.weights[k] * (p01 * h0 + p11 * h1)
         information += w0 * h0 + w1 * h1
-        innovation += w0 * (data.r[k, 0] - mean[k, 0] + along * h0) + w1 * (data.r[k, 1] - mean[k, 1] + along * h1)
+        innovation += w0 * (data.r[k, 0] - mean[k, 0] + along * h0) + w1 * (
+            data.r[k, 1] - mean[k, 1] + along * h1
+        )
         for i in range(1, 3):
             pull[i] += w0 * data.modes[k, 0, i] + w1 * data.modes[k, 1, i]
     innovation /= information
@@ -206,7 +225,9 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
         for a in range(2):
             r = data.r[k, a] - data.modes[k, a, 0] * (depth - reference[0])
             new_mean[k, a] = mean[k, a] + share * (r - mean[k, a])
-    hessian, gradient = _posterior(data, new_mean, new_count, reference[1:] - prior, prior_variance, information)
+    hessian, gradient = _posterior(
+        data, new_mean, new_count, reference[1:] - prior, prior_variance, information
+    )
     covariance = _invert_symmetric(hessian)
     shift = covariance @ gradient
     kkt = np.abs(hessian @ shift - gradient).max() / max(np.abs(gradient).max(), 1e-30)
@@ -229,6 +250,23 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
                     new_mean[k, a] -= data.modes[k, a, i] * (place[i] - reference[i])
             total += data.weights[k] * left * left
     residual = np.sqrt(total / (2.0 * weight))
+    misfit = _compute_misfit(data, new_mean, new_count)
     return PlaceUpdate(
-        place, speed + gain[1] * innovation, gain, new_mean, new_count, covariance, kkt, residual
+        place, speed + gain[1] * innovation, gain, new_mean, new_count, covariance, kkt, residual, misfit
     )
+
+
+@njit(**_OPTIONS)
+def _compute_misfit(data, mean, count):
+    """Returns the root mean square of averaged residuals over their standard deviations."""
+    total, freedom = 0.0, -3.0
+    for k in range(len(count)):
+        if count[k] <= 0.5:
+            continue
+        share = 1.0 / max(count[k], 1.0)
+        s00, s11 = data.noise[0, 0] * share + data.bias[k], data.noise[1, 1] * share + data.bias[k]
+        s01 = data.noise[0, 1] * share
+        m0, m1 = mean[k, 0], mean[k, 1]
+        total += (s11 * m0 * m0 - 2.0 * s01 * m0 * m1 + s00 * m1 * m1) / (s00 * s11 - s01 * s01)
+        freedom += 2.0
+    return np.sqrt(total / max(freedom, 1.0))

@@ -46,10 +46,15 @@ class PointTracker:
         """Takes a contact over: its heights and weights."""
         heights = contact.points[:, 2]
         if self.paper:
-            nearest = int(np.argmin(np.abs(self.jaw.candidates[:, 2] - np.average(heights, weights=contact.weights))))
+            nearest = int(
+                np.argmin(np.abs(self.jaw.candidates[:, 2] - np.average(heights, weights=contact.weights)))
+            )
             self._heights, self._weights = (float(self.jaw.candidates[nearest, 2]),), np.ones(1)
             return
-        self._heights, self._weights = tuple(np.round(heights, 5).tolist()), np.asarray(contact.weights, float)
+        self._heights, self._weights = (
+            tuple(np.round(heights, 5).tolist()),
+            np.asarray(contact.weights, float),
+        )
 
     def _build_load(self, height: float) -> tuple[NDArray, NDArray]:
         """Returns the points of a load at one height and their neighbours along the finger."""
@@ -81,7 +86,10 @@ class PointTracker:
     def _probes(self, key: tuple[float, ...], points: NDArray, neighbours: NDArray) -> tuple[Any, Any]:
         if getattr(self, "_probe_key", None) != key:
             model = self.mechanics.model
-            self._probe_key, self._probe_pair = key, (model.attach(points, 1e-3), model.attach(neighbours, 1e-3))
+            self._probe_key, self._probe_pair = (
+                key,
+                (model.attach(points, 1e-3), model.attach(neighbours, 1e-3)),
+            )
         return self._probe_pair
 
     def update(self, points: NDArray, tare: Tare, dt: float) -> Track | None:
@@ -128,7 +136,7 @@ class PointTracker:
         return Track(
             covariance=np.array([[stddev**2]]), force=force, force_modes=direction[:, None],
             pressure_point=share @ deformed, pressure_place=share @ undeformed, weights=weights,
-            residual=result.residual, kkt=result.kkt, iterations=result.iterations, converged=result.converged,
+            stiffening=1.0, residual=result.residual, misfit=1.0, kkt=result.kkt, iterations=result.iterations, converged=result.converged,
             sound=bool(np.isfinite(result.q).all() and np.isfinite(force).all() and np.abs(result.q).max() < 0.2),
             quiet=magnitude < _QUIET_SIGMA * stddev, loaded=magnitude > 2.0 * _QUIET_SIGMA * stddev,
         )  # fmt: skip

@@ -23,6 +23,8 @@ class Track:
         pressure_place: the same on the undeformed surface (3,) [m].
         weights: of the key points (K,), 0 for what was not used.
         residual: weighted root mean square residual [m].
+        stiffening: force over depth beside that of first touch [-]; large where the place has run to the base.
+        misfit: averaged residuals over their standard deviations, about 1 where the model fits.
         kkt: gradient of the objective that is left, relative to its parts.
         iterations: Newton iterations.
         converged: whether the last one changed nothing that matters.
@@ -37,7 +39,9 @@ class Track:
     pressure_point: NDArray
     pressure_place: NDArray
     weights: NDArray
+    stiffening: float
     residual: float
+    misfit: float
     kkt: float
     iterations: int
     converged: bool

@@ -39,6 +39,7 @@ class PlaceTracker:
         self.contact = contact
         self.settings = settings
         self.probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
+        self._stiffness: float | None = None
         self._rest = contact.model.positions(self.probe, np.zeros(contact.model.size))
         self._prior_variance = np.array([settings.radius_log_stddev, settings.height_stddev]) ** 2
         self.reset()
@@ -105,7 +106,15 @@ class PlaceTracker:
         height = float(np.average(contact.points[:, 2], weights=contact.weights))
         if self._given is None:
             self.reset(height)
+        if self._given != height or self._stiffness is None:
+            self._stiffness = self._touch_stiffness(height)
         self._given = self._prior[1] = height
+
+    def _touch_stiffness(self, height: float) -> float:
+        """Returns force over depth [N/m] of the undeformed jaw at `height` [m]."""
+        place = np.array([_LEAST_DEPTH, np.log(self.settings.radius), height])
+        state = self.contact.linearize(np.zeros(self.contact.model.size), place)
+        return float(np.linalg.norm(state.force_modes[:, DEPTH]))
 
     def _predict(self, dt: float) -> "_Forecast":
         """Returns the place dt [s] later: constant speed of the depth under white acceleration."""
@@ -119,7 +128,13 @@ class PlaceTracker:
         return _Forecast(place=place, speed=float(speed), spread=spread)
 
     def _update_place(
-        self, q: NDArray, state: PressedState, measured: NDArray, tare: Tare, place: NDArray, forecast: "_Forecast"
+        self,
+        q: NDArray,
+        state: PressedState,
+        measured: NDArray,
+        tare: Tare,
+        place: NDArray,
+        forecast: "_Forecast",
     ) -> tuple[Residuals, PlaceUpdate | None]:
         """Returns the residuals of a state and the place that they ask for; None when too few points agree."""
         model, settings = self.contact.model, self.settings
@@ -141,7 +156,9 @@ class PlaceTracker:
         self._motion[1] = 0.0
         self._motion_covariance[0, 0] += _LOST_STDDEV**2
 
-    def _keep(self, q: NDArray, place: NDArray, update: PlaceUpdate, forecast: "_Forecast", modes: NDArray) -> None:
+    def _keep(
+        self, q: NDArray, place: NDArray, update: PlaceUpdate, forecast: "_Forecast", modes: NDArray
+    ) -> None:
         """Keeps what the next frame starts from; a released jaw expects any object again."""
         self.q, self._modes, self._reached = q, modes, _reachable(place)
         self._slow = place[1:].copy()
@@ -159,14 +176,22 @@ class PlaceTracker:
         force = state.force + state.force_modes @ moved
         if place[DEPTH] < _LEAST_DEPTH:
             force = force * max(0.0, place[DEPTH] / _LEAST_DEPTH)
-        finite = np.isfinite(force).all() and np.isfinite(update.covariance).all() and np.isfinite(self.q).all()
+        finite = (
+            np.isfinite(force).all() and np.isfinite(update.covariance).all() and np.isfinite(self.q).all()
+        )
         return Track(
-            covariance=update.covariance, force=force, force_modes=state.force_modes,
+            covariance=update.covariance * max(1.0, update.misfit**2), force=force, force_modes=state.force_modes,
             pressure_point=state.pressure_point, pressure_place=state.pressure_place, weights=data.weights,
-            residual=update.residual, kkt=update.kkt, iterations=iterations, converged=settled,
+            stiffening=self._stiffening(force, place), residual=update.residual, misfit=update.misfit, kkt=update.kkt, iterations=iterations, converged=settled,
             sound=bool(finite and state.smallest_det > 0), quiet=bool(place[DEPTH] < _TOUCH_DEPTH),
             loaded=bool(place[DEPTH] > _LOADED_DEPTH),
         )  # fmt: skip
+
+    def _stiffening(self, force: NDArray, place: NDArray) -> float:
+        """Returns how much stiffer the pressed jaw is than at first touch; 1 until it is surely pressed."""
+        if self._stiffness is None or place[DEPTH] < _LOADED_DEPTH:
+            return 1.0
+        return float(np.linalg.norm(force) / (self._stiffness * place[DEPTH]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

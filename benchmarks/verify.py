@@ -1,0 +1,272 @@
+"""Verifies the mechanics of the bench finger against an independent program; writes docs/verification.md.
+
+    python benchmarks/verify.py [--json report/verification.json] [--markdown docs/verification.md]
+
+The truth (test/data) was computed with CalculiX: 20-node hexahedra, large displacements, frictionless contact.
+"""
+
+import argparse
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from finforce_ifea.calibration import Calibration, load_calibration
+from finforce_ifea.errors import ContactError
+from finforce_ifea.estimator import Contact, JawEstimator, Observation
+from finforce_ifea.forward import Cylinder, press_jaw
+from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw, load_jaw
+from finforce_ifea.mechanics import build_mechanics
+from finforce_ifea.settings import EstimatorSettings
+
+ROOT = Path(__file__).resolve().parents[1]
+LINEAR = ROOT / "test" / "data" / "pressed_bench.npz"
+MOONEY = ROOT / "test" / "data" / "pressed_bench_mooney.npz"
+HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
+YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45  # of the St. Venant-Kirchhoff truth
+SHOWN_DEPTHS = (2, 5, 10)
+FORCE_AIM, FRAME_AIM, KEYPOINT_AIM = 0.03, 0.06, 0.15e-3
+PERIOD = 1.0 / 30.0
+REST_FRAMES, RAMP_FRAMES, HOLD_FRAMES = 60, 15, 45
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """One pressed finger: depths (n,) [m], forces (n,) [N], key point displacements (n, K, 3) [m]."""
+
+    name: str
+    height: str
+    radius: float
+    depth: NDArray
+    force: NDArray
+    moved: NDArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """One way to describe the finger; `calibration` lends its thicknesses and its clamp, never its modulus."""
+
+    title: str
+    solver: str
+    mesh: str = "default"
+    calibration: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForwardCase:
+    """Relative force errors and largest key point errors [m] of one case, depth by depth [mm]."""
+
+    case: str
+    height: str
+    depth_mm: tuple[float, ...]
+    force: tuple[float, ...]
+    keypoints: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class InverseCase:
+    """True and estimated forces [N] of one case, level by level."""
+
+    case: str
+    height: str
+    true: tuple[float, ...]
+    estimated: tuple[float, ...]
+
+
+MODELS = (
+    Model(title="solid, default mesh", solver="solid"),
+    Model(title="solid, 522 vertices", solver="solid", mesh="coarse"),
+    Model(title="solid, fine mesh", solver="solid", mesh="fine"),
+    Model(title="frame", solver="frame"),
+    Model(title="linear tetrahedra, 522 vertices", solver="paper", mesh="coarse"),
+    Model(title="solid, default mesh, with thicknesses and clamp of the calibration", solver="solid", calibration="bench"),
+)
+INVERSE_MODELS = (MODELS[0], MODELS[3], Model(title="--solver paper", solver="paper"))
+
+
+def load_truth(path: Path) -> list[Truth]:
+    """Returns the cases of an extract: lengths in it are in millimetres, forces in newtons."""
+    data = np.load(path)
+    cases = []
+    for key in sorted(name.removesuffix("_depth") for name in data if name.endswith("_depth")):
+        diameter, height = key.split("_")
+        moved = 1e-3 * (data[f"{key}_keypoints"].astype(float) - data["keypoints0"])
+        force = np.linalg.norm(data[f"{key}_force"].astype(float), axis=1)
+        depth = 1e-3 * data[f"{key}_depth"].astype(float)
+        name = f"Ø{diameter} {height}"
+        cases.append(Truth(name=name, height=height, radius=5e-4 * float(diameter), depth=depth, force=force, moved=moved))
+    return cases
+
+
+def finger(model: Model) -> Jaw:
+    """Returns the bench finger of the linear truth as a model sees it."""
+    jaw = load_jaw("bench")
+    if model.calibration:
+        jaw = load_calibration(model.calibration).apply(jaw)
+    return replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
+
+
+def press_model(model: Model, cases: Sequence[Truth], progress: Callable[[], object]) -> list[ForwardCase]:
+    """Returns the errors of a model pressed as the truth was."""
+    jaw = finger(model)
+    mechanics = build_mechanics(jaw, EstimatorSettings(solver=model.solver, mesh=model.mesh))
+    probe = mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
+    rest = mechanics.model.positions(probe, np.zeros(mechanics.model.size))
+    results = []
+    for truth in cases:
+        presses = _press_as_deep_as_it_goes(mechanics, jaw.inner_face_x, truth)
+        force = np.array([np.linalg.norm(press.force) for press in presses]) / truth.force[: len(presses)] - 1.0
+        moved = np.stack([mechanics.model.positions(probe, press.q) - rest for press in presses])
+        miss = np.linalg.norm(moved - truth.moved[: len(presses)], axis=2).max(1)
+        depth = tuple((1e3 * truth.depth[: len(presses)]).round(3).tolist())
+        results.append(
+            ForwardCase(case=truth.name, height=truth.height, depth_mm=depth, force=tuple(force), keypoints=tuple(miss))
+        )
+        progress()
+    return results
+
+
+def _press_as_deep_as_it_goes(mechanics, face_x: float, truth: Truth):
+    """Returns the equilibria up to the depth at which the model buckles."""
+    for count in range(len(truth.depth), 0, -1):
+        try:
+            return press_jaw(
+                mechanics.model, mechanics.contact.surface, face_x, Cylinder(radius=truth.radius),
+                HEIGHTS[truth.height], truth.depth[:count],
+            )  # fmt: skip
+        except ContactError:
+            continue
+    raise ContactError(f"{truth.name}: no equilibrium at any depth")
+
+
+def invert_model(model: Model, cases: Sequence[Truth], progress: Callable[[], object]) -> list[InverseCase]:
+    """Returns the forces that an estimator finds in noise-free shapes, its relaxation switched off."""
+    calibration = replace(load_calibration("bench"), relaxation=())
+    settings = EstimatorSettings(solver=model.solver, mesh=model.mesh)
+    results = []
+    for truth in cases:
+        levels = np.flatnonzero(np.isin((1e3 * truth.depth).round(), (2, 4, 6, 8, 10)))
+        found = _hold_levels(settings, calibration, truth, levels)
+        results.append(
+            InverseCase(
+                case=truth.name, height=truth.height, true=tuple(truth.force[levels].tolist()), estimated=tuple(found)
+            )
+        )
+        progress()
+    return results
+
+
+def _hold_levels(settings: EstimatorSettings, calibration: Calibration, truth: Truth, levels: NDArray) -> list[float]:
+    """Returns the forces [N] at the end of each held level; between levels the shapes are interpolated."""
+    jaw = load_jaw("bench")
+    estimator = JawEstimator(jaw, settings=settings, calibration=calibration)
+    contact = Contact.fixed(jaw, HEIGHTS[truth.height])
+    depths = np.r_[0.0, truth.depth]
+    shapes = np.concatenate([np.zeros((1, *jaw.keypoints.shape)), truth.moved])
+    course = [np.zeros(REST_FRAMES)]
+    for level in levels:
+        ramp = int(RAMP_FRAMES * 1e3 * (truth.depth[level] - course[-1][-1]))
+        course += [np.linspace(course[-1][-1], truth.depth[level], ramp), np.full(HOLD_FRAMES, truth.depth[level])]
+    ends = np.cumsum([len(part) for part in course])[2::2] - 1
+    forces = []
+    for number, depth in enumerate(np.concatenate(course)):
+        low = min(int(np.searchsorted(depths, depth, side="right")) - 1, len(depths) - 2)
+        share = (depth - depths[low]) / (depths[low + 1] - depths[low])
+        points = jaw.keypoints + (1.0 - share) * shapes[low] + share * shapes[low + 1]
+        observation = Observation(stamp=1.0 + number * PERIOD, points=points, likelihood=np.ones(len(points)))
+        solution = estimator.update(observation, contact)
+        if number in ends:
+            forces.append(float(np.linalg.norm(solution.force)) if solution.trusted else float("nan"))
+    return forces
+
+
+def best_factor(cases: Sequence[InverseCase]) -> float:
+    """Returns the factor for the estimates that leaves the least squared error."""
+    true, estimated = _stack(cases)
+    return float(true @ estimated / (estimated @ estimated))
+
+
+def rms_error(cases: Sequence[InverseCase], factor: float = 1.0) -> float:
+    """Returns the root mean square error [N]."""
+    true, estimated = _stack(cases)
+    return float(np.sqrt(np.mean((factor * estimated - true) ** 2)))
+
+
+def _stack(cases: Sequence[InverseCase]) -> tuple[NDArray, NDArray]:
+    return np.concatenate([c.true for c in cases]), np.concatenate([c.estimated for c in cases])
+
+
+def largest(cases: Sequence[ForwardCase], height: str = "") -> tuple[float, float]:
+    """Returns the largest force error [-] and key point error [m] of all cases, or of those of one height."""
+    kept = [case for case in cases if height in ("", case.height)]
+    force = max(max(map(abs, case.force)) for case in kept)
+    return force, max(max(case.keypoints) for case in kept)
+
+
+def forward_table(cases: Sequence[ForwardCase]) -> list[str]:
+    """Returns the Markdown table of one model."""
+    lines = [
+        "| case | force, worst | " + " | ".join(f"at {d} mm" for d in SHOWN_DEPTHS) + " | key points, worst | at 5 mm |",
+        "|---" + "|---:" * (len(SHOWN_DEPTHS) + 3) + "|",
+    ]
+    for case in cases:
+        at = dict(zip(case.depth_mm, case.force, strict=True))
+        points = dict(zip(case.depth_mm, case.keypoints, strict=True))
+        worst = max(case.force, key=abs)
+        shown = [f"{100 * at[d]:+.1f} %" if d in at else "buckled" for d in SHOWN_DEPTHS]
+        cells = [f"{100 * worst:+.1f} %", *shown, f"{1e3 * max(case.keypoints):.3f} mm", f"{1e3 * points[5]:.3f} mm"]
+        lines.append(f"| {case.case} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def inverse_table(results: Mapping[str, Sequence[InverseCase]]) -> list[str]:
+    """Returns the Markdown table of the noise-free inverse problem."""
+    factors = {title: best_factor(cases) if "paper" in title else 1.0 for title, cases in results.items()}
+    heads = [f"{title}: RMSE | worst" for title in results]
+    lines = ["| case | forces | " + " | ".join(heads) + " |", "|---" + "|---:" * (2 * len(results) + 1) + "|"]
+    for rows in zip(*results.values(), strict=True):
+        cells = [f"{rows[0].true[0]:.2f} to {rows[0].true[-1]:.2f} N"]
+        for title, case in zip(results, rows, strict=True):
+            errors = factors[title] * np.array(case.estimated) - np.array(case.true)
+            cells += [f"{np.sqrt((errors**2).mean()):.3f} N", f"{errors[np.abs(errors).argmax()]:+.3f} N"]
+        lines.append(f"| {rows[0].case} | " + " | ".join(cells) + " |")
+    totals = [f"{rms_error(cases, factors[title]):.3f} N | " for title, cases in results.items()]
+    return [*lines, "| all | | " + " | ".join(totals) + "|"]
+
+
+def main() -> None:
+    """Presses, inverts, prints and writes."""
+    from verify_page import write_page
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", default=str(ROOT / "report" / "verification.json"), metavar="OUT")
+    parser.add_argument("--markdown", default=str(ROOT / "docs" / "verification.md"), metavar="OUT")
+    options = parser.parse_args()
+    linear, mooney = load_truth(LINEAR), load_truth(MOONEY)
+    total = len(MODELS) * len(linear) + len(INVERSE_MODELS) * len(mooney)
+    forward, inverse = {}, {}
+    with tqdm(total=total, unit="case", disable=None, leave=False) as bar:
+        for model in MODELS:
+            bar.set_description(model.title)
+            forward[model.title] = press_model(model, linear, bar.update)
+        for model in INVERSE_MODELS:
+            bar.set_description(f"inverse, {model.title}")
+            inverse[model.title] = invert_model(model, mooney, bar.update)
+    page = write_page(forward, inverse)
+    print(page)
+    Path(options.markdown).write_text(page, encoding="utf-8")
+    Path(options.json).parent.mkdir(parents=True, exist_ok=True)
+    content = {"forward": _plain(forward), "inverse": _plain(inverse)}
+    Path(options.json).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def _plain(results: Mapping[str, Sequence[ForwardCase | InverseCase]]) -> dict:
+    return {title: [asdict(case) for case in cases] for title, cases in results.items()}
+
+
+if __name__ == "__main__":
+    main()
