@@ -211,9 +211,8 @@ class QosWatch:
 
     def faults(self) -> list[str]:
         """Return one sentence per mismatch that still stands."""
-        found = {topic: self._mismatches(topic, *end) for topic, end in self._suspects.items()}
-        self._suspects = {topic: end for topic, end in self._suspects.items() if found[topic]}
-        return [sentence for sentences in found.values() for sentence in sentences]
+        found = [self._mismatches(topic, *end) for topic, end in self._suspects.items()]
+        return [sentence for sentences in found for sentence in sentences]
 
     def _mismatches(self, topic: str, writes: bool, qos: QoSProfile) -> list[str]:
         """Compare our end of a topic with every other end that stands against it."""

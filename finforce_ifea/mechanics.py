@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw import Jaw
+from finforce_ifea.locking import warn_of_locking
 from finforce_ifea.mesh import VolumeMesh
 from finforce_ifea.model import JawModel
 from finforce_ifea.rolling import RollingContact
@@ -43,6 +44,8 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
     else:
         if jaw.drawing is not None and not jaw.drawing.is_solid:
             raise JawFileError(f"the jaw {jaw.name!r} has hinges or rigid bars; only the frame describes it")
+        if name != "paper":
+            warn_of_locking(jaw, mesh)
         model = SolidModel(mesh, jaw.material, symmetric=settings.force_axes == "normal")
         across = "half" if model.symmetric else "both"
     surface = build_contact_surface(jaw, mesh, model, across=across)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mechanics_fakes import BENCH, bench_mechanics
-from scipy.optimize import lsq_linear, minimize
+from scipy.optimize import lsq_linear
 
 from finforce_ifea.errors import ContactError, NotEnoughDataError
 from finforce_ifea.inverse import (
@@ -24,10 +24,13 @@ MODELS = {"solid": ("coarse", "solid"), "frame": ("default", "frame"), "whole": 
 UNBOUNDED = -1e30
 
 
-def line(heights, shift=0.0):
+SIDES = (-0.00577, 0.00577)
+MIDDLE = (0.0,)
+
+
+def line(heights, sides):
     """Points across the width at some heights [m], those of one height together."""
-    sides = np.array([-0.00577, 0.00577])
-    return np.array([[FACE, y, z + shift] for z in heights for y in sides])
+    return np.array([[FACE, y, z] for z in heights for y in sides])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +43,10 @@ class Loaded:
     q: np.ndarray
 
 
-def load_finger(name, heights, forces_of, **options):
+def load_finger(name, heights, forces_of, *, sides=SIDES, **options):
     """Finds the equilibrium under forces_of(outward normals) by Newton's method, without the inverse solver."""
     model = bench_mechanics(*MODELS[name]).model
-    points = line(heights)
+    points = line(heights, sides)
     neighbours = np.repeat(points, 2, axis=0)
     neighbours[::2, 2] -= 1e-3
     neighbours[1::2, 2] += 1e-3
@@ -77,9 +80,9 @@ def test_known_force_is_recovered_at_a_candidate_and_between_candidates(name, he
     loaded = load_finger(name, [height], lambda normals: -0.5 * 2.5 * normals, weights=equal_weights(1))
     assert np.abs(loaded.problem.targets - BENCH.keypoints).max() > 2e-3
     result = recover(loaded)
-    np.testing.assert_allclose(result.forces, loaded.forces, atol=1e-7)
+    np.testing.assert_allclose(result.forces, loaded.forces, atol=1e-6)
     assert result.converged
-    assert result.residual < 1e-10
+    assert result.residual < 1e-9
     assert result.kkt < 1e-8
     np.testing.assert_allclose(result.q, loaded.q, atol=1e-9)
 
@@ -104,15 +107,21 @@ def test_shared_force_is_recovered_with_its_weights():
 def test_several_forces_are_told_apart():
     sizes = np.array([0.4, 0.4, 0.7, 0.7])
     loaded = load_finger("whole", [0.025, 0.060], lambda normals: -sizes[:, None] * normals)
-    contacts = [loaded.model.attach(line([z])[[0]] * [1, 0, 1], 1e-3) for z in (0.025, 0.060)]
-    assert len(contacts) == 2
+    np.testing.assert_allclose(recover(loaded).forces, loaded.forces, atol=2e-5)
+
+
+def test_forces_at_all_candidates_are_told_apart_when_there_is_no_noise():
+    sizes = np.array([0.1] * 6 + [0.3] + [0.1] * 7)
+    loaded = load_finger("solid", BENCH.candidates[:, 2], lambda n: -sizes[:, None] * n, sides=MIDDLE)
     result = recover(loaded)
-    np.testing.assert_allclose(result.forces, loaded.forces, atol=2e-5)
+    # the program's condition is 1e10: rounding comes back as some per cent of single forces, hardly of their sum
+    np.testing.assert_allclose(result.forces, loaded.forces, atol=0.01)
+    np.testing.assert_allclose(result.forces.sum(0), loaded.forces.sum(0), atol=1e-4)
 
 
 def test_force_in_three_axes_is_recovered():
     force = np.array([-1.2, 0.3, -0.5])
-    loaded = load_finger("whole", [0.040], lambda normals: np.tile(0.5 * force, (2, 1)), weights=equal_weights(1), axes="three")
+    loaded = load_finger("whole", [0.040], lambda _: force[None], sides=MIDDLE, weights=np.ones(1), axes="three")
     result = recover(loaded)
     np.testing.assert_allclose(result.forces.sum(0), force, atol=1e-7)
     assert result.converged and result.residual < 1e-10
@@ -155,7 +164,7 @@ def test_contact_never_pulls(name):
 def test_tangential_forces_may_have_either_sign_in_three_axes():
     for sign in (-1, 1):
         force = np.array([-1.0, 0.0, 0.4 * sign])
-        loaded = load_finger("whole", [0.050], lambda normals: np.tile(0.5 * force, (2, 1)), weights=equal_weights(1), axes="three")
+        loaded = load_finger("whole", [0.050], lambda _: force[None], sides=MIDDLE, weights=np.ones(1), axes="three")
         np.testing.assert_allclose(recover(loaded).forces.sum(0), force, atol=1e-7)
 
 
@@ -195,7 +204,7 @@ def test_scaled_energy_takes_a_share_eps_of_a_force_along_one_axis(epsilon):
     loaded = small_load()
     found = recover(loaded, energy_weight=epsilon, energy_form="sofa").forces
     # 1e-4: the geometry is nonlinear even at a millinewton
-    np.testing.assert_allclose(found, loaded.forces / (1 + epsilon), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(found[:, 0], loaded.forces[:, 0] / (1 + epsilon), rtol=1e-4)
 
 
 @pytest.mark.parametrize("epsilon", [1e-3, 1e-1])
@@ -208,7 +217,7 @@ def test_printed_energy_biases_by_compliances(epsilon):
     W_aa = pushes @ model.factorise(model.linearize(loaded.q).tangent).solve(pushes)
     expected = W_ea @ W_ea / (W_ea @ W_ea + epsilon * W_aa)
     found = recover(loaded, energy_weight=epsilon, energy_form="paper").forces
-    np.testing.assert_allclose(found, loaded.forces * expected, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(found[:, 0], loaded.forces[:, 0] * expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("form", ["paper", "sofa"])
@@ -252,10 +261,6 @@ def test_two_forces_at_one_place_cannot_be_told_apart():
     loaded = load_finger("solid", [0.040, 0.040], lambda normals: -0.3 * normals)
     with pytest.raises(NotEnoughDataError, match="tell the forces apart"):
         recover(loaded)
-    # an energy weight makes the answer one of its own
-    result = recover(loaded, energy_weight=1e-3, energy_form="sofa")
-    assert result.converged
-    np.testing.assert_allclose(result.forces[0], result.forces[2], atol=1e-6)
 
 
 def test_problem_without_contact_is_refused():
@@ -285,7 +290,7 @@ def test_program_meets_its_optimality_conditions_and_agrees_with_a_second_solver
     scale = np.linalg.norm(A, axis=0)
     other = lsq_linear(A / scale, b, (np.where(lower == 0.0, 0.0, -np.inf), np.inf), method="bvls", tol=1e-14).x
     assert solution.kkt < 1e-8
-    assert (solution.multipliers[lower == 0.0] >= 0.0).all()
+    assert (scale * solution.multipliers)[lower == 0.0].min() > -1e-12 * np.linalg.norm(b)
     np.testing.assert_allclose(scale * solution.multipliers, other, atol=1e-7 * max(np.abs(other).max(), np.linalg.norm(b)))
 
 

@@ -325,9 +325,13 @@ def test_an_old_contact_is_none(probe):
 
 def test_a_contact_that_is_not_finite_is_refused(probe):
     estimator, node, out, contact = contact_jaw(probe)
+    contact.publish(contact_cloud([[0.014, 0.0, 0.038]]))
+    probe.wait_for(lambda: node.contacts._contact is not None)
     contact.publish(contact_cloud([[0.014, np.nan, 0.038]]))
-    probe.diagnosis(word="nothing has arrived")
-    assert node.contacts._contact is None
+    probe.diagnosis(level=Level.ERROR, word="contact has coordinates")
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: estimator.contacts)
+    assert estimator.contacts == [None]
 
 
 def test_a_fixed_contact_needs_no_topic(probe):
