@@ -25,7 +25,6 @@ class Process:
     Attributes:
         package: that holds the executable.
         executable: as `ros2 run` finds it.
-        module: as `python -m` finds it; empty for a program that is not ours.
         name: of the node.
         parameters: ROS parameters that differ from the node's defaults.
         parameter_file: YAML file with more of them, overruled by `parameters`; empty for none.
@@ -36,7 +35,6 @@ class Process:
 
     package: str = "finforce"
     executable: str
-    module: str = ""
     name: str
     parameters: Mapping[str, Any] = field(default_factory=dict)
     parameter_file: str = ""
@@ -45,8 +43,8 @@ class Process:
     ends_all: bool = False
 
     def command(self) -> list[str]:
-        """Return the command line that runs the process with this Python, without `ros2`."""
-        words = [sys.executable, "-m", self.module, *self.arguments]
+        """Return the command line that runs one of our nodes with this Python, without `ros2`."""
+        words = [sys.executable, "-m", "finforce_start", self.executable, *self.arguments]
         words += ["--ros-args", "-r", f"__node:={self.name}"]
         if self.parameter_file:
             words += ["--params-file", self.parameter_file]
@@ -107,7 +105,6 @@ def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Proc
     given = {name: value for name, value in asked.items() if value not in ("", None)}
     return Process(
         executable="ifea_solver",
-        module="finforce_ifea.node",
         name=f"{side}_ifea_solver",
         parameters={"jaw_name": side, **given, **parameters, "use_sim_time": options.use_sim_time},
         parameter_file=options.parameter_file,
@@ -130,7 +127,6 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
         solvers = [solver_process(options.jaws, options, completes_grasp=True)]
     player = Process(
         executable="recording_player",
-        module="finforce_eval.node",
         name="recording_player",
         parameters={"bag": options.bag, "rate": options.rate},
         ends_all=True,

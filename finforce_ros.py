@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import math
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields
@@ -285,7 +286,7 @@ def run_node(
         node = build()
         work(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a launch sends it again after the terminal
     except FinforceError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2

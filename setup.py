@@ -13,7 +13,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=["finforce_ifea", "finforce_eval"],
-    py_modules=["finforce_ros", "finforce_graph", "finforce_health"],
+    py_modules=["finforce_graph", "finforce_health", "finforce_ros", "finforce_start"],
     package_data={
         "finforce_ifea": ["jaws/*", "calibrations/*"],
         "finforce_eval": ["data/*", "data/*/*", "data/*/*/*"],
@@ -51,8 +51,8 @@ setup(
     entry_points={
         "console_scripts": [
             "finforce = finforce_eval.cli:main",
-            "ifea_solver = finforce_ifea.node:main",
-            "recording_player = finforce_eval.node:main",
+            "ifea_solver = finforce_start:ifea_solver",
+            "recording_player = finforce_start:recording_player",
         ],
     },
 )

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
+from verification_page import ForwardCase, InverseCase, format_page
 
 from finforce_ifea.calibration import Calibration, load_calibration
 from finforce_ifea.errors import ContactError
@@ -28,8 +29,6 @@ LINEAR = ROOT / "test" / "data" / "pressed_bench.npz"
 MOONEY = ROOT / "test" / "data" / "pressed_bench_mooney.npz"
 HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
 YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45  # of the St. Venant-Kirchhoff truth
-SHOWN_DEPTHS = (2, 5, 10)
-FORCE_AIM, FRAME_AIM, KEYPOINT_AIM = 0.03, 0.06, 0.15e-3
 PERIOD = 1.0 / 30.0
 REST_FRAMES, RAMP_FRAMES, HOLD_FRAMES = 60, 15, 45
 
@@ -54,27 +53,6 @@ class Model:
     solver: str
     mesh: str = "default"
     calibration: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ForwardCase:
-    """Relative force errors and largest key point errors [m] of one case, depth by depth [mm]."""
-
-    case: str
-    height: str
-    depth_mm: tuple[float, ...]
-    force: tuple[float, ...]
-    keypoints: tuple[float, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class InverseCase:
-    """True and estimated forces [N] of one case, level by level."""
-
-    case: str
-    height: str
-    true: tuple[float, ...]
-    estimated: tuple[float, ...]
 
 
 MODELS = (
@@ -123,11 +101,23 @@ def press_model(model: Model, cases: Sequence[Truth], progress: Callable[[], obj
         moved = np.stack([mechanics.model.positions(probe, press.q) - rest for press in presses])
         miss = np.linalg.norm(moved - truth.moved[: len(presses)], axis=2).max(1)
         depth = tuple((1e3 * truth.depth[: len(presses)]).round(3).tolist())
+        turn = tuple(_turn(jaw, truth.height, shape) for shape in (moved[-1], truth.moved[len(presses) - 1]))
         results.append(
-            ForwardCase(case=truth.name, height=truth.height, depth_mm=depth, force=tuple(force), keypoints=tuple(miss))
-        )
+            ForwardCase(
+                case=truth.name, height=truth.height, depth_mm=depth, force=tuple(force.tolist()),
+                keypoints=tuple(miss.tolist()), turn=turn,
+            )
+        )  # fmt: skip
         progress()
     return results
+
+
+def _turn(jaw: Jaw, height: str, moved: NDArray) -> float:
+    """Returns the mean turn [rad] of the inner band above the contact, from displacements (K, 3) [m]."""
+    inner = np.array([name.startswith("inner") for name in jaw.keypoint_names])
+    above = inner & (jaw.keypoints[:, 2] > HEIGHTS[height] + 5e-3)
+    now = jaw.keypoints[above] + moved[above]
+    return float(-np.polyfit(now[:, 2], now[:, 0], 1)[0])
 
 
 def _press_as_deep_as_it_goes(mechanics, face_x: float, truth: Truth):
@@ -184,64 +174,8 @@ def _hold_levels(settings: EstimatorSettings, calibration: Calibration, truth: T
     return forces
 
 
-def best_factor(cases: Sequence[InverseCase]) -> float:
-    """Returns the factor for the estimates that leaves the least squared error."""
-    true, estimated = _stack(cases)
-    return float(true @ estimated / (estimated @ estimated))
-
-
-def rms_error(cases: Sequence[InverseCase], factor: float = 1.0) -> float:
-    """Returns the root mean square error [N]."""
-    true, estimated = _stack(cases)
-    return float(np.sqrt(np.mean((factor * estimated - true) ** 2)))
-
-
-def _stack(cases: Sequence[InverseCase]) -> tuple[NDArray, NDArray]:
-    return np.concatenate([c.true for c in cases]), np.concatenate([c.estimated for c in cases])
-
-
-def largest(cases: Sequence[ForwardCase], height: str = "") -> tuple[float, float]:
-    """Returns the largest force error [-] and key point error [m] of all cases, or of those of one height."""
-    kept = [case for case in cases if height in ("", case.height)]
-    force = max(max(map(abs, case.force)) for case in kept)
-    return force, max(max(case.keypoints) for case in kept)
-
-
-def forward_table(cases: Sequence[ForwardCase]) -> list[str]:
-    """Returns the Markdown table of one model."""
-    lines = [
-        "| case | force, worst | " + " | ".join(f"at {d} mm" for d in SHOWN_DEPTHS) + " | key points, worst | at 5 mm |",
-        "|---" + "|---:" * (len(SHOWN_DEPTHS) + 3) + "|",
-    ]
-    for case in cases:
-        at = dict(zip(case.depth_mm, case.force, strict=True))
-        points = dict(zip(case.depth_mm, case.keypoints, strict=True))
-        worst = max(case.force, key=abs)
-        shown = [f"{100 * at[d]:+.1f} %" if d in at else "buckled" for d in SHOWN_DEPTHS]
-        cells = [f"{100 * worst:+.1f} %", *shown, f"{1e3 * max(case.keypoints):.3f} mm", f"{1e3 * points[5]:.3f} mm"]
-        lines.append(f"| {case.case} | " + " | ".join(cells) + " |")
-    return lines
-
-
-def inverse_table(results: Mapping[str, Sequence[InverseCase]]) -> list[str]:
-    """Returns the Markdown table of the noise-free inverse problem."""
-    factors = {title: best_factor(cases) if "paper" in title else 1.0 for title, cases in results.items()}
-    heads = [f"{title}: RMSE | worst" for title in results]
-    lines = ["| case | forces | " + " | ".join(heads) + " |", "|---" + "|---:" * (2 * len(results) + 1) + "|"]
-    for rows in zip(*results.values(), strict=True):
-        cells = [f"{rows[0].true[0]:.2f} to {rows[0].true[-1]:.2f} N"]
-        for title, case in zip(results, rows, strict=True):
-            errors = factors[title] * np.array(case.estimated) - np.array(case.true)
-            cells += [f"{np.sqrt((errors**2).mean()):.3f} N", f"{errors[np.abs(errors).argmax()]:+.3f} N"]
-        lines.append(f"| {rows[0].case} | " + " | ".join(cells) + " |")
-    totals = [f"{rms_error(cases, factors[title]):.3f} N | " for title, cases in results.items()]
-    return [*lines, "| all | | " + " | ".join(totals) + "|"]
-
-
 def main() -> None:
     """Presses, inverts, prints and writes."""
-    from verify_page import write_page
-
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", default=str(ROOT / "report" / "verification.json"), metavar="OUT")
     parser.add_argument("--markdown", default=str(ROOT / "docs" / "verification.md"), metavar="OUT")
@@ -256,7 +190,7 @@ def main() -> None:
         for model in INVERSE_MODELS:
             bar.set_description(f"inverse, {model.title}")
             inverse[model.title] = invert_model(model, mooney, bar.update)
-    page = write_page(forward, inverse)
+    page = format_page(forward, inverse)
     print(page)
     Path(options.markdown).write_text(page, encoding="utf-8")
     Path(options.json).parent.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.errors import NotEnoughDataError
+from finforce_ifea.errors import NotEnoughDataError, ObservationError
 from finforce_ifea.inverse import InverseResult, Problem, solve_inverse
 from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import Mechanics
@@ -33,28 +33,27 @@ class PointTracker:
         self.paper = settings.solver == "paper"
         self.probe = mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
         self._rest = mechanics.model.positions(self.probe, np.zeros(mechanics.model.size))
+        self._energy_weights = parse_energy_weights(settings, len(jaw.candidates))
         self._load = lru_cache(maxsize=256)(self._build_load)
         self.reset()
 
     def reset(self) -> None:
         """Starts anew, unloaded, with the middle candidate."""
         self.q = np.zeros(self.mechanics.model.size)
-        self._heights = (float(np.median(self.jaw.candidates[:, 2])),)
+        self._candidate = len(self.jaw.candidates) // 2
+        self._heights = (float(self.jaw.candidates[self._candidate, 2]),)
         self._weights: NDArray | None = np.ones(1)
 
     def follow(self, contact: Contact) -> None:
         """Takes a contact over: its heights and weights."""
         heights = contact.points[:, 2]
         if self.paper:
-            nearest = int(
-                np.argmin(np.abs(self.jaw.candidates[:, 2] - np.average(heights, weights=contact.weights)))
-            )
-            self._heights, self._weights = (float(self.jaw.candidates[nearest, 2]),), np.ones(1)
+            middle = np.average(heights, weights=contact.weights)
+            self._candidate = int(np.argmin(np.abs(self.jaw.candidates[:, 2] - middle)))
+            self._heights, self._weights = (float(self.jaw.candidates[self._candidate, 2]),), np.ones(1)
             return
-        self._heights, self._weights = (
-            tuple(np.round(heights, 5).tolist()),
-            np.asarray(contact.weights, float),
-        )
+        self._heights = tuple(np.round(heights, 5).tolist())
+        self._weights = np.asarray(contact.weights, float)
 
     def _build_load(self, height: float) -> tuple[NDArray, NDArray]:
         """Returns the points of a load at one height and their neighbours along the finger."""
@@ -80,7 +79,7 @@ class PointTracker:
         return Problem(
             effectors=self.probe, targets=targets, contacts=contacts, neighbours=neighbours, weights=shares,
             axes="three" if self.settings.force_axes == "three" else "normal", precision=precision,
-            energy_weight=self.settings.energy_weight if self.paper else 0.0, energy_form=self.settings.energy_form,
+            energy_weight=self._energy_weights[self._candidate] if self.paper else 0.0, energy_form=self.settings.energy_form,
         )  # fmt: skip
 
     def _probes(self, key: tuple[float, ...], points: NDArray, neighbours: NDArray) -> tuple[Any, Any]:
@@ -149,3 +148,20 @@ class PointTracker:
         mode = model.factorise(model.linearize(q).tangent).solve(load)
         modes = model.project(self.probe, q, mode[:, None])[:, [0, 2], 0]
         return explain_offsets(modes, tare, self.settings.offset_stddev)
+
+
+def parse_energy_weights(settings: EstimatorSettings, count: int) -> NDArray:
+    """Returns the energy weight of each of `count` candidates (count,).
+
+    Raises:
+        ObservationError: `energy_weights` is not empty and does not hold one number, zero or above, per candidate.
+    """
+    if not settings.energy_weights.strip():
+        return np.full(count, settings.energy_weight)
+    try:
+        weights = np.array([float(part) for part in settings.energy_weights.split(",")])
+    except ValueError as error:
+        raise ObservationError(f"energy_weights: {error}, expected {count} numbers") from error
+    if len(weights) != count or not (np.isfinite(weights).all() and (weights >= 0).all()):
+        raise ObservationError(f"energy_weights: got {len(weights)} numbers, expected {count} of zero or above")
+    return weights

@@ -60,6 +60,7 @@ class EstimatorSettings:
     )
     iterations: int = _setting(8, "1", 1, 50, "most Newton iterations per frame")
     energy_weight: float = _setting(1e-3, "1", 0.0, 1e9, "the paper's epsilon, used by solver 'paper' alone")
+    energy_weights: str = _setting("", "1", None, None, "epsilon of each candidate, comma-separated; empty: energy_weight")
     energy_form: str = _choice(
         "sofa", ("paper", "sofa"), "epsilon as the paper prints it or as SOFA scales it"
     )

@@ -1,7 +1,7 @@
 """Small meshes, and the bench finger's mechanics, built once for all tests."""
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 
@@ -31,19 +31,21 @@ def block(counts, size, *, kind="hex", distort=0.0, clamp=lambda nodes: nodes[:,
         inner = tuple(slice(1, -1) if count > 1 else slice(None) for count in counts)
         grid[inner] += distort * spacing * random.uniform(-1, 1, grid[inner].shape)
     number = np.arange(grid[..., 0].size).reshape(grid.shape[:3])
-    corner = [number[i : i + counts[0], j : j + counts[1], k : k + counts[2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    corner = [
+        number[i : i + counts[0], j : j + counts[1], k : k + counts[2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)
+    ]
     order = [0, 4, 6, 2, 1, 5, 7, 3]
     hexes = np.stack([corner[i].ravel() for i in order], axis=1)
     nodes = grid.reshape(-1, 3)
     return KINDS[kind](build_volume_mesh(nodes=nodes, hexes=hexes, clamped=np.flatnonzero(clamp(nodes))))
 
 
-@lru_cache(maxsize=None)
+@cache
 def bench_mechanics(mesh="coarse", solver="solid", axes="normal"):
     return build_mechanics(BENCH, EstimatorSettings(solver=solver, mesh=mesh, force_axes=axes))
 
 
-@lru_cache(maxsize=None)
+@cache
 def bench_press(mesh, solver, diameter, height, depths):
     """Equilibria of the bench finger, mm for diameter, height and depths."""
     mechanics = bench_mechanics(mesh, solver)

@@ -93,7 +93,9 @@ def test_centre_gradient_differentiates_linear_fields(distorted):
     corners = distorted.nodes[distorted.elements]
     values = corners @ gradient.T
     np.testing.assert_allclose(
-        np.einsum("mna,mnb->mab", values, centre_gradient(corners)), np.broadcast_to(gradient, (len(corners), 3, 3)), atol=1e-9
+        np.einsum("mna,mnb->mab", values, centre_gradient(corners)),
+        np.broadcast_to(gradient, (len(corners), 3, 3)),
+        atol=1e-9,
     )
 
 

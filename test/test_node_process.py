@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-COMMAND = [sys.executable, "-m", "finforce_ifea.node", "--ros-args"]
+COMMAND = [sys.executable, "-m", "finforce_start", "ifea_solver", "--ros-args"]
 PATIENCE = 240.0  # s; a first start compiles
 
 
@@ -50,8 +50,29 @@ def test_a_signal_ends_the_node_cleanly(number):
     ],
 )
 def test_what_cannot_be_set_up_ends_with_two_and_one_line(given, reason):
-    done = subprocess.run(
-        [*COMMAND, "-p", given], capture_output=True, text=True, timeout=PATIENCE, env=environment()
-    )
+    done = subprocess.run([*COMMAND, "-p", given], capture_output=True, text=True, timeout=PATIENCE, env=environment())
     assert done.returncode == 2
     assert reason in done.stderr and len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_signal_while_the_node_loads_ends_it_without_a_word():
+    slow = "import finforce_start, os, signal; finforce_start.import_module = lambda _: os.kill(os.getpid(), 2)"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{slow}; finforce_start.start('ifea_solver')"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_without_ros_a_node_says_how_to_get_it():
+    missing = "import sys; sys.modules['rclpy'] = None; import finforce_start"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{missing}; sys.exit(finforce_start.ifea_solver())"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert done.returncode == 2
+    assert "pip install 'finforce[ros]'" in done.stderr and len(done.stderr.splitlines()) == 1

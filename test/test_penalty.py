@@ -87,7 +87,9 @@ def test_force_derivative_by_the_radius():
 )
 def test_box_pushes_out_of_its_nearest_face_and_of_its_rounded_edges(place, direction):
     force = box(np.array([[CENTRE[0] + place[0], 0.0, CENTRE[1] + place[1]]])).forces[0]
-    np.testing.assert_allclose(force[[0, 2]] / np.linalg.norm(force), np.array(direction) / np.linalg.norm(direction), atol=1e-9)
+    np.testing.assert_allclose(
+        force[[0, 2]] / np.linalg.norm(force), np.array(direction) / np.linalg.norm(direction), atol=1e-9
+    )
 
 
 def test_corner_of_a_box_is_rounded():

@@ -49,7 +49,7 @@ def solvers_of(domain):
             variables = (folder / "environ").read_bytes()
         except OSError:
             continue
-        if b"finforce_ifea.node" in words and f"ROS_DOMAIN_ID={domain}\0".encode() in variables:
+        if b"finforce_start\0ifea_solver" in words and f"ROS_DOMAIN_ID={domain}\0".encode() in variables:
             found.append(int(folder.name))
     return found
 

@@ -148,7 +148,9 @@ def test_halved_and_whole_finger_agree():
     half, whole = bench_mechanics("coarse"), bench_mechanics("coarse", axes="three")
     assert half.model.symmetric and not whole.model.symmetric
     results = [
-        press_jaw(part.model, part.contact.surface, BENCH.inner_face_x, Cylinder(radius=0.0125), 0.040, [0.002, 0.005])[-1]
+        press_jaw(part.model, part.contact.surface, BENCH.inner_face_x, Cylinder(radius=0.0125), 0.040, [0.002, 0.005])[
+            -1
+        ]
         for part in (half, whole)
     ]
     # twice as many contact points over the same width: only rounding and the surface's own corners differ
@@ -237,7 +239,9 @@ def test_points_of_a_probe_lie_where_they_are_attached():
 
 def line_stiffness(model, height):
     """N/mm of the unloaded finger under a line load along -x across its inner face at a height [m]."""
-    points = np.stack([np.full(21, BENCH.inner_face_x), np.linspace(-0.00999, 0.00999, 21), np.full(21, height)], axis=1)
+    points = np.stack(
+        [np.full(21, BENCH.inner_face_x), np.linspace(-0.00999, 0.00999, 21), np.full(21, height)], axis=1
+    )
     probe, q = model.attach(points, 1e-4), np.zeros(model.size)
     mode = solve_linear(model, model.load(probe, q, np.tile([-1.0 / 21, 0.0, 0.0], (21, 1))))
     return -1e-3 / model.project(probe, q, mode[:, None])[:, 0, 0].mean()
@@ -294,7 +298,9 @@ def test_refinement_converges_at_large_deflection():
 def test_mesh_file_gives_the_same_jaw_as_the_drawing(tmp_path):
     jaw = replace(load_jaw(write_mesh_jaw(tmp_path)), material=TPU)
     mechanics = build_mechanics(jaw, EstimatorSettings())
-    results = press_jaw(mechanics.model, mechanics.contact.surface, jaw.inner_face_x, Cylinder(radius=0.0125), 0.040, [0.002, 0.008])
+    results = press_jaw(
+        mechanics.model, mechanics.contact.surface, jaw.inner_face_x, Cylinder(radius=0.0125), 0.040, [0.002, 0.008]
+    )
     expected = bench_press("coarse", "solid", 25, 40, (2, 8))
     for result, drawn in zip(results, expected, strict=True):
         np.testing.assert_allclose(result.force, drawn.force, rtol=1e-6, atol=1e-6)

@@ -5,7 +5,7 @@ frictionless contact, St. Venant-Kirchhoff, E = 30 MPa, nu = 0.45) at depths of 
 35 mm at heights of 20, 40 and 60 mm. The bounds are what was measured, rounded up.
 """
 
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,7 @@ def test_truth_is_of_this_finger():
     np.testing.assert_allclose(1e-3 * TRUTH["keypoints0"], BENCH.keypoints, atol=1e-5)
 
 
-@lru_cache(maxsize=None)
+@cache
 def compare(mesh, solver, diameter, place):
     """Errors of the force's magnitude [%] and direction [deg], and of each key point [mm], by depth."""
     results = bench_press(mesh, solver, diameter, round(1e3 * HEIGHTS[place]), DEPTHS)
