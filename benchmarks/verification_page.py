@@ -15,39 +15,42 @@ PAPER = "--solver paper"
 
 HEAD = """# Verification of the mechanics
 
-Written by `python benchmarks/verify.py`; every figure on this page comes from that run.
+Written by `.venv/bin/python benchmarks/verify.py`; every figure on this page comes from one run of it.
 
-The bench finger is pressed on rigid cylinders (diameter 15, 25, 35 mm) at three heights (lower, middle, upper: 20, 40, 60 mm
-above the clamp) by 1 to 10 mm, frictionless. The truth is that of an independent program (CalculiX: 20-node hexahedra, large
-displacements, surface contact), of which `test/data` holds an extract. It shares no line of code with this package.
+The bench finger is pressed on rigid cylinders (diameter 15, 25, 35 mm) at three heights (lower, middle, upper: 20, 40,
+60 mm above the clamp) by 1 to 10 mm, without friction. The truth is that of an independent program (CalculiX: 20-node
+hexahedra, large displacements, surface contact), of which `test/data` holds an extract. It shares no line of code with
+this package.
 
 ## Forward: pressed to a depth, force and shape compared
 
-St. Venant-Kirchhoff truth, E = 30 MPa, ν = 0.45, which the models get as they are; nothing is fitted. Force: |F| of the model over
-|F| of the truth, minus one; "worst" over the depths 1, 2 … 10 mm. Key points: the largest distance, in three dimensions, of any of
-the 15 key points from where the truth has it, over all depths and at 5 mm.
+St. Venant-Kirchhoff truth, E = 30 MPa, ν = 0.45, which the models get as they are; nothing is fitted. Force: |F| of the
+model over |F| of the truth, minus one; "worst" over the depths 1, 2, … 10 mm. Key points: the largest distance, in three
+dimensions, of any of the 15 key points from where the truth has it, over all depths and at 5 mm.
 """
 
 LOWER = """### The difference at the lower height
 
-Near the clamp the two programs do not quite agree, and refinement of our mesh reduces the difference without removing it. At
-the greatest depth the part of the inner band above the contact has turned by these angles:
+Near the clamp the two programs do not quite agree, and refining our mesh makes the difference smaller without removing
+it. At the greatest depth the inner band above the contact has turned towards the object by these angles:
 """
 
 LOWER_END = """
-The independent program's finger turns less: it is stiffer between the clamp and the contact. The missing turn, times the length
-above the contact, is the key points' error; it grows towards the tip, and where the contact is at the middle or higher it is not
-there. Clamping the lowest 0.3 mm, or thickening the outer band by some per cent, has the same effect as the difference: this is
-what a calibration learns from shapes (last block above). Which of the two programs is nearer to a real finger is not known.
+The independent program's finger turns a little more; the missing turn, times the length above the contact, is the key
+points' error at the lower height, and grows towards the tip. At 2 mm depth that finger is also stiffer there by what the
+column "at 2 mm" shows. A finger that is clamped a little higher and has a thicker outer band (last block above: what the
+shipped calibration learnt) comes closer in both, so that the independent finger behaves as one that is stiffer next to
+the clamp. More than that was not found out, nor which of the two is nearer to a printed finger; a calibration takes
+the difference up.
 """
 
 INVERSE_HEAD = """
 ## Inverse: noise-free shapes, force recovered
 
-Mooney-Rivlin truth, the material of the recordings. Each recording of key points is made up from the truth alone: two seconds
-unloaded, then ramps at 2 mm/s to 2, 4, 6, 8, 10 mm (as far as the finger goes before it buckles), each held for 45 frames; all 15
-key points, no noise. Calibration `bench`, made for the solid at the default mesh, its relaxation switched off; contact
-`fixed` at the height of first touch. The force is read at the end of each level.
+Mooney-Rivlin truth, the material of the recordings. The key points of each case are made from the truth alone: two
+seconds unloaded, then ramps at 2 mm/s to 2, 4, 6, 8, 10 mm (as far as the finger goes before it buckles), each held
+for 45 frames; all 15 key points, no noise. Calibration `bench`, made for the solid at the default mesh, with its
+relaxation switched off; contact `fixed` at the height of first touch. The force is read at the end of each level.
 """
 
 
@@ -61,7 +64,7 @@ class ForwardCase:
         depth_mm: depths that the model reached [mm].
         force: relative errors of the force.
         keypoints: largest errors of a key point [m].
-        turn: of the inner band above the contact at the last depth [rad]: the model's and the truth's.
+        turn: of the inner band above the contact at the last depth [rad]: towards the object: the model's and the truth's.
     """
 
     case: str
@@ -82,9 +85,7 @@ class InverseCase:
     estimated: tuple[float, ...]
 
 
-def format_page(
-    forward: Mapping[str, Sequence[ForwardCase]], inverse: Mapping[str, Sequence[InverseCase]]
-) -> str:
+def format_page(forward: Mapping[str, Sequence[ForwardCase]], inverse: Mapping[str, Sequence[InverseCase]]) -> str:
     """Returns the page."""
     lines = [HEAD, *_summary(forward), "", *_claims(forward)]
     for title, cases in forward.items():
@@ -121,9 +122,9 @@ def _claims(forward: Mapping[str, Sequence[ForwardCase]]) -> list[str]:
         _, above = largest(forward[title], ("middle", "upper"))
         _, lower = largest(forward[title], ("lower",))
         aim = 1e3 * KEYPOINT_AIM
-        lines.append(f"- **{title}, key points within {aim:.2f} mm**: middle and upper {_judge(1e3 * above, aim, 'mm')};")
-        lines[-1] += f" lower {_judge(1e3 * lower, aim, 'mm')}."
-        lines[-1] += f" Up to {_depth_within(forward[title])} mm of depth it holds everywhere."
+        parts = f"middle and upper {_judge(1e3 * above, aim, 'mm')}; lower {_judge(1e3 * lower, aim, 'mm')}"
+        held = f"up to {_depth_within(forward[title]):g} mm of depth it holds everywhere"
+        lines.append(f"- **{title}, key points within {aim:.2f} mm**: {parts}; {held}.")
     return lines
 
 
@@ -142,10 +143,8 @@ def _depth_within(cases: Sequence[ForwardCase]) -> float:
 
 
 def _forward_table(cases: Sequence[ForwardCase]) -> list[str]:
-    lines = [
-        "| case | force, worst | " + " | ".join(f"at {d} mm" for d in SHOWN_DEPTHS) + " | key points, worst | at 5 mm |",
-        "|---" + "|---:" * (len(SHOWN_DEPTHS) + 3) + "|",
-    ]
+    heads = ["case", "force, worst", *(f"at {d} mm" for d in SHOWN_DEPTHS), "key points, worst", "at 5 mm"]
+    lines = ["| " + " | ".join(heads) + " |", "|---" + "|---:" * (len(heads) - 1) + "|"]
     for case in cases:
         force = dict(zip(case.depth_mm, case.force, strict=True))
         points = dict(zip(case.depth_mm, case.keypoints, strict=True))
@@ -209,8 +208,8 @@ def _inverse_words(inverse: Mapping[str, Sequence[InverseCase]]) -> list[str]:
     by_height = np.sqrt(sum(squares) / len(_stack(cases)[0]))
     shown = ", ".join(f"{factor:.3f}" for factor in factors)
     return [
-        f"`{PAPER}` (linear tetrahedra on 522 vertices and those of the clamped strip, energy weight 1e-3 scaled as SOFA does, one "
-        f"point force on the nearest candidate) answers with forces that are too large, since the elements lock: RMSE {_rms(cases):.1f} N. "
-        f"The column has them times {_factors(inverse)[PAPER]:.3f}, the one factor that is best for all nine cases. With one factor per "
-        f"height ({shown}), which is what an energy weight per candidate can do, {by_height:.2f} N remain."
+        f"`{PAPER}` (linear tetrahedra on the coarse mesh, energy weight 1e-3 scaled as SOFA does, one point force on the",
+        f"nearest candidate) answers with forces that are far too large, since the elements lock: RMSE {_rms(cases):.1f} N.",
+        f"The column has them times {_factors(inverse)[PAPER]:.3f}, the one factor that is best for all nine cases. With one",
+        f"factor per height ({shown}), which is what an energy weight per candidate amounts to, {by_height:.2f} N remain.",
     ]

@@ -61,7 +61,9 @@ MODELS = (
     Model(title="solid, fine mesh", solver="solid", mesh="fine"),
     Model(title="frame", solver="frame"),
     Model(title="linear tetrahedra, 522 vertices", solver="paper", mesh="coarse"),
-    Model(title="solid, default mesh, with thicknesses and clamp of the calibration", solver="solid", calibration="bench"),
+    Model(
+        title="solid, default mesh, with thicknesses and clamp of the calibration", solver="solid", calibration="bench"
+    ),
 )
 INVERSE_MODELS = (MODELS[0], MODELS[3], Model(title="--solver paper", solver="paper"))
 
@@ -76,7 +78,9 @@ def load_truth(path: Path) -> list[Truth]:
         force = np.linalg.norm(data[f"{key}_force"].astype(float), axis=1)
         depth = 1e-3 * data[f"{key}_depth"].astype(float)
         name = f"Ø{diameter} {height}"
-        cases.append(Truth(name=name, height=height, radius=5e-4 * float(diameter), depth=depth, force=force, moved=moved))
+        cases.append(
+            Truth(name=name, height=height, radius=5e-4 * float(diameter), depth=depth, force=force, moved=moved)
+        )
     return cases
 
 
@@ -113,11 +117,11 @@ def press_model(model: Model, cases: Sequence[Truth], progress: Callable[[], obj
 
 
 def _turn(jaw: Jaw, height: str, moved: NDArray) -> float:
-    """Returns the mean turn [rad] of the inner band above the contact, from displacements (K, 3) [m]."""
+    """Returns the turn [rad] of the inner band above the contact towards the object, from displacements (K, 3) [m]."""
     inner = np.array([name.startswith("inner") for name in jaw.keypoint_names])
     above = inner & (jaw.keypoints[:, 2] > HEIGHTS[height] + 5e-3)
     now = jaw.keypoints[above] + moved[above]
-    return float(-np.polyfit(now[:, 2], now[:, 0], 1)[0])
+    return float(np.polyfit(now[:, 2], now[:, 0], 1)[0])
 
 
 def _press_as_deep_as_it_goes(mechanics, face_x: float, truth: Truth):

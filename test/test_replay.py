@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 
 from finforce_eval import replay as replaying
+from finforce_eval.bench_live import with_both_jaws
 from finforce_eval.commands import make_setup
 from finforce_eval.live import JawLog, live_result, point_of_application
 from finforce_eval.recording import read_recording
@@ -142,17 +142,8 @@ def test_no_force_has_no_point_of_application():
 @pytest.fixture(scope="module")
 def two_jaws(tmp_path_factory):
     """A few seconds under load, seen on both jaws: the right one is the left one's mirror image."""
-    recording = read_recording(SHIPPED)
-    left = recording.jaws["left"]
-    mirror = np.array([1.0, -1.0, 1.0])
-    right = replace(
-        left,
-        keypoints=replace(left.keypoints, points=left.keypoints.points * mirror),
-        truth=replace(left.truth, force=left.truth.force * mirror, torque=-left.truth.torque * mirror),
-    )
-    start = left.keypoints.stamps[0]
-    both = replace(recording, jaws={"left": left, "right": right}).between(start, start + 6 * SECOND)
-    return write_recording(both, tmp_path_factory.mktemp("bags") / "both")
+    folder = tmp_path_factory.mktemp("bags") / "both"
+    return write_recording(with_both_jaws(read_recording(SHIPPED), 6.0), folder)
 
 
 def test_two_solvers_answer_alike_and_complete_the_grasp(two_jaws, tmp_path):
