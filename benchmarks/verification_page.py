@@ -25,23 +25,24 @@ this package.
 ## Forward: pressed to a depth, force and shape compared
 
 St. Venant-Kirchhoff truth, E = 30 MPa, ν = 0.45, which the models get as they are; nothing is fitted. Force: |F| of the
-model over |F| of the truth, minus one; "worst" over the depths 1, 2, … 10 mm. Key points: the largest distance, in three
-dimensions, of any of the 15 key points from where the truth has it, over all depths and at 5 mm.
+model over |F| of the truth, minus one; "worst" over the depths 1, 2, … 10 mm. Key points: the largest distance, in
+three dimensions, of any of the 15 key points from where the truth has it, over all depths and at 5 mm.
 """
 
 LOWER = """### The difference at the lower height
 
 Near the clamp the two programs do not quite agree, and refining our mesh makes the difference smaller without removing
-it. At the greatest depth the inner band above the contact has turned towards the object by these angles:
+it. At the greatest depth the line from the first inner key point above the contact to the tip has turned towards the
+object by these angles:
 """
 
 LOWER_END = """
 The independent program's finger turns a little more; the missing turn, times the length above the contact, is the key
-points' error at the lower height, and grows towards the tip. At 2 mm depth that finger is also stiffer there by what the
-column "at 2 mm" shows. A finger that is clamped a little higher and has a thicker outer band (last block above: what the
-shipped calibration learnt) comes closer in both, so that the independent finger behaves as one that is stiffer next to
-the clamp. More than that was not found out, nor which of the two is nearer to a printed finger; a calibration takes
-the difference up.
+points' error at the lower height, and grows towards the tip. At 2 mm depth that finger is also stiffer there, by what
+the column "at 2 mm" shows. A finger that is clamped a little higher and has a thicker outer band (last block above:
+what the shipped calibration learnt) comes closer in both, so that the independent finger behaves as one that is stiffer
+next to the clamp. More than that was not found out, nor which of the two is nearer to a printed finger; a calibration
+takes the difference up.
 """
 
 INVERSE_HEAD = """
@@ -64,7 +65,7 @@ class ForwardCase:
         depth_mm: depths that the model reached [mm].
         force: relative errors of the force.
         keypoints: largest errors of a key point [m].
-        turn: of the inner band above the contact at the last depth [rad]: towards the object: the model's and the truth's.
+        turn: of the finger above the contact towards the object at the last depth [rad], model's and truth's.
     """
 
     case: str
@@ -208,8 +209,9 @@ def _inverse_words(inverse: Mapping[str, Sequence[InverseCase]]) -> list[str]:
     by_height = np.sqrt(sum(squares) / len(_stack(cases)[0]))
     shown = ", ".join(f"{factor:.3f}" for factor in factors)
     return [
-        f"`{PAPER}` (linear tetrahedra on the coarse mesh, energy weight 1e-3 scaled as SOFA does, one point force on the",
-        f"nearest candidate) answers with forces that are far too large, since the elements lock: RMSE {_rms(cases):.1f} N.",
-        f"The column has them times {_factors(inverse)[PAPER]:.3f}, the one factor that is best for all nine cases. With one",
-        f"factor per height ({shown}), which is what an energy weight per candidate amounts to, {by_height:.2f} N remain.",
+        f"`{PAPER}` (linear tetrahedra on the coarse mesh, energy weight 1e-3 scaled as SOFA does, one point force on",
+        "the nearest candidate) answers with forces that are far too large, since the elements lock: RMSE",
+        f"{_rms(cases):.1f} N. The column has them times {_best_factor(cases):.3f}, the one factor that is best for",
+        f"all nine cases. With one factor per height ({shown}), which is what an energy weight",
+        f"per candidate amounts to, {by_height:.2f} N remain.",
     ]

@@ -117,11 +117,12 @@ def press_model(model: Model, cases: Sequence[Truth], progress: Callable[[], obj
 
 
 def _turn(jaw: Jaw, height: str, moved: NDArray) -> float:
-    """Returns the turn [rad] of the inner band above the contact towards the object, from displacements (K, 3) [m]."""
-    inner = np.array([name.startswith("inner") for name in jaw.keypoint_names])
-    above = inner & (jaw.keypoints[:, 2] > HEIGHTS[height] + 5e-3)
-    now = jaw.keypoints[above] + moved[above]
-    return float(np.polyfit(now[:, 2], now[:, 0], 1)[0])
+    """Returns the turn of the finger above the contact towards the object [rad], from displacements (K, 3) [m]."""
+    names = jaw.keypoint_names
+    above = [k for k, name in enumerate(names) if name.startswith("inner") and jaw.keypoints[k, 2] > HEIGHTS[height]]
+    ends = [above[0], names.index("tip")]
+    rest, now = np.diff(jaw.keypoints[ends], axis=0)[0], np.diff((jaw.keypoints + moved)[ends], axis=0)[0]
+    return float(np.arctan2(now[0], now[2]) - np.arctan2(rest[0], rest[2]))
 
 
 def _press_as_deep_as_it_goes(mechanics, face_x: float, truth: Truth):

@@ -115,9 +115,7 @@ def find_closest_surface(mesh: VolumeMesh, points: NDArray) -> SurfacePoint:
     results = [_closest_on_triangles(point, corners) for point in points]
     triangles = np.array([result[0] for result in results], dtype=np.int64)
     closest = np.array([result[1] for result in results]).reshape(-1, 3)
-    return SurfacePoint(
-        points=closest, distances=np.linalg.norm(closest - points, axis=1), triangles=triangles
-    )
+    return SurfacePoint(points=closest, distances=np.linalg.norm(closest - points, axis=1), triangles=triangles)
 
 
 def _closest_on_triangles(point: NDArray, corners: NDArray) -> tuple[int, NDArray]:
@@ -208,9 +206,7 @@ def _check_points(points: NDArray) -> NDArray:
     return points
 
 
-def _check_distances(
-    points: NDArray, distances: NDArray, names: Sequence[str], max_distance: float, part: str
-) -> None:
+def _check_distances(points: NDArray, distances: NDArray, names: Sequence[str], max_distance: float, part: str) -> None:
     """Refuse points (p, 3) that are too far away, naming the farthest."""
     if len(distances) == 0 or distances.max() <= max_distance:
         return

@@ -12,9 +12,17 @@ from finforce_ifea.jaw import Jaw
 from finforce_ifea.relaxation import RelaxationTerm
 
 _KEYS = {
-    "young_modulus", "inner_thickness_factor", "outer_thickness_factor", "rib_thickness_factor", "clamped_z",
-    "relaxation", "force_error", "jaw", "comment", "uncertainty",
-}  # fmt: skip
+    "young_modulus",
+    "inner_thickness_factor",
+    "outer_thickness_factor",
+    "rib_thickness_factor",
+    "clamped_z",
+    "relaxation",
+    "force_error",
+    "jaw",
+    "comment",
+    "uncertainty",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,20 +56,20 @@ class Calibration:
             CalibrationError: A number is not finite or out of bounds; the message names it.
         """
         bounds = {
-            "young_modulus": (1e4, 1e12), "inner_thickness_factor": (0.3, 3.0), "outer_thickness_factor": (0.3, 3.0),
-            "rib_thickness_factor": (0.3, 3.0), "clamped_z": (0.0, 0.05), "force_error": (0.0, 1.0),
-        }  # fmt: skip
+            "young_modulus": (1e4, 1e12),
+            "inner_thickness_factor": (0.3, 3.0),
+            "outer_thickness_factor": (0.3, 3.0),
+            "rib_thickness_factor": (0.3, 3.0),
+            "clamped_z": (0.0, 0.05),
+            "force_error": (0.0, 1.0),
+        }
         for name, (low, high) in bounds.items():
             value = getattr(self, name)
             if not (isinstance(value, (int, float)) and np.isfinite(value) and low <= value <= high):
-                raise CalibrationError(
-                    f"calibration: {name} = {value!r}, expected a number from {low:g} to {high:g}"
-                )
+                raise CalibrationError(f"calibration: {name} = {value!r}, expected a number from {low:g} to {high:g}")
         for term in self.relaxation:
             if not (0.0 <= term.share <= 10.0 and 1e-3 <= term.time_constant <= 1e6):
-                raise CalibrationError(
-                    f"calibration: {term}, expected a share from 0 to 10 and 1e-3 to 1e6 s"
-                )
+                raise CalibrationError(f"calibration: {term}, expected a share from 0 to 10 and 1e-3 to 1e6 s")
 
     def apply(self, jaw: Jaw) -> Jaw:
         """Returns the jaw as it is.
@@ -78,9 +86,7 @@ class Calibration:
             jaw.drawing,
             inner=_thicken(jaw.drawing.inner, self.inner_thickness_factor),
             outer=_thicken(jaw.drawing.outer, self.outer_thickness_factor),
-            ribs=tuple(
-                replace(rib, thickness=rib.thickness * self.rib_thickness_factor) for rib in jaw.drawing.ribs
-            ),
+            ribs=tuple(replace(rib, thickness=rib.thickness * self.rib_thickness_factor) for rib in jaw.drawing.ribs),
             clamped_z=max(jaw.drawing.clamped_z, self.clamped_z),
         )
         return replace(jaw, drawing=drawing, material=material)
@@ -102,14 +108,10 @@ def load_calibration(name_or_path: str | Path) -> Calibration:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise CalibrationError(f"{path.name}: {str(error).splitlines()[0]}") from error
     if not isinstance(table, dict) or "young_modulus" not in table:
-        raise CalibrationError(
-            f"{path.name}: expected a mapping with young_modulus, as `finforce calibrate` writes it"
-        )
+        raise CalibrationError(f"{path.name}: expected a mapping with young_modulus, as `finforce calibrate` writes it")
     unknown = set(table) - _KEYS
     if unknown:
-        raise CalibrationError(
-            f"{path.name}: unknown key {sorted(unknown)[0]!r}; expected {', '.join(sorted(_KEYS))}"
-        )
+        raise CalibrationError(f"{path.name}: unknown key {sorted(unknown)[0]!r}; expected {', '.join(sorted(_KEYS))}")
     values = {key: value for key, value in table.items() if key not in ("comment", "uncertainty")}
     try:
         terms = tuple(RelaxationTerm(**term) for term in values.pop("relaxation", None) or ())

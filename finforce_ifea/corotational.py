@@ -3,8 +3,8 @@
 With F = sum (X_i + u_i) g_i^T = R U, x' = R^T x and d = x' - X (about the element's centroid) an element's energy is
 d.K0.d / 2. Its gradient is f_i = R (f'_i - G_i^T m) with f' = K0 d, m = sum x'_i x f'_i and
 G_i = (tr(U) I - U)^-1 [g_i]; the spin of the element is sum G_i R^T du_i. The tangent is
-R (P^T K0 P - [p] G - G^T [f']^T P) R^T, symmetrised, with P = I - S G and S w = w x x'. As K0 does not feel rotations of
-the undeformed shape, K0 S is formed from d alone.
+R (P^T K0 P - [p] G - G^T [f']^T P) R^T, symmetrised, with P = I - S G and S w = w x x'. As K0 does not feel rotations
+of the undeformed shape, K0 S is formed from d alone.
 
 Source: Felippa, Haugen, A unified formulation of small-strain corotational finite elements, CMAME 194 (2005).
 """
@@ -57,7 +57,7 @@ def _rotate(F, R, inverse):
 
 @njit(**_OPTIONS)
 def _shape(u, nodes, X, g, F, R, scratch, x, d):
-    """Writes deformation gradient, rotation, rotated-back coordinates x (k, 3) and deformation d (3 k); returns det F."""
+    """Writes deformation gradient, rotation, turned-back coordinates x (k, 3) and deformation d (3 k); returns det F."""
     k = len(nodes)
     F[:] = 0.0
     F[0, 0] = F[1, 1] = F[2, 2] = 1.0

@@ -217,9 +217,7 @@ def _check_bands(drawing: Drawing) -> None:
     """Refuse bands that overlap, and an inner band that is not upright."""
     inner, outer = drawing.inner, drawing.outer
     if inner.slope != 0.0:
-        raise JawFileError(
-            f"drawing.inner_band: its face leans by {inner.slope:.3g}, expected the plane x = const"
-        )
+        raise JawFileError(f"drawing.inner_band: its face leans by {inner.slope:.3g}, expected the plane x = const")
     # A rigid tip joins the two centre lines in one point; below it the bands must stay apart.
     last_rib_z = max((rib.outer_z for rib in drawing.ribs), default=0.0)
     end_z = last_rib_z if drawing.tip_z is None else drawing.length
@@ -232,9 +230,7 @@ def _check_bands(drawing: Drawing) -> None:
                 "thickness"
             )
     if outer.centre_x(drawing.length) > inner.centre_x(drawing.length) + 1e-9:
-        raise JawFileError(
-            "drawing: the bands cross below the tip; expected them to meet there at the earliest"
-        )
+        raise JawFileError("drawing: the bands cross below the tip; expected them to meet there at the earliest")
 
 
 def _check_ribs(drawing: Drawing) -> None:

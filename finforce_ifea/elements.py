@@ -50,9 +50,7 @@ def strain_displacement(gradient: NDArray) -> NDArray:
     n = gradient.shape[-2]
     B = np.zeros((*gradient.shape[:-2], 6, n, 3))
     x, y, z = gradient[..., 0], gradient[..., 1], gradient[..., 2]
-    for row, entries in enumerate(
-        [[(0, x)], [(1, y)], [(2, z)], [(0, y), (1, x)], [(1, z), (2, y)], [(2, x), (0, z)]]
-    ):
+    for row, entries in enumerate([[(0, x)], [(1, y)], [(2, z)], [(0, y), (1, x)], [(1, z), (2, y)], [(2, x), (0, z)]]):
         for axis, values in entries:
             B[..., row, :, axis] = values
     return B.reshape(*gradient.shape[:-2], 6, 3 * n)
@@ -83,10 +81,7 @@ def hex_stiffness(corners: NDArray, D: NDArray) -> NDArray:
     _, det_centre = _physical_gradient(corners, hex_shape_gradient(np.zeros((1, 3))))
     jacobian_centre = np.einsum("pnk,mni->mpik", hex_shape_gradient(np.zeros((1, 3))), corners)[:, 0]
     modes = -2 * points[:, :, None] * np.eye(3)
-    modes = (
-        np.einsum("pak,mki->mpai", modes, np.linalg.inv(jacobian_centre))
-        * (det_centre / det)[..., None, None]
-    )
+    modes = np.einsum("pak,mki->mpai", modes, np.linalg.inv(jacobian_centre)) * (det_centre / det)[..., None, None]
     B, G = strain_displacement(gradient), strain_displacement(modes)
     weigh = lambda left, right: np.einsum("mp,mpai,ab,mpbj->mij", det, left, D, right, optimize=True)  # noqa: E731
     coupling, internal = weigh(G, B), weigh(G, G)

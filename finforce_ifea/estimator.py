@@ -1,13 +1,12 @@
 """Key points and a contact in, force out, one image after the other: the entry for nodes and for evaluation."""
 
-from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.calibration import Calibration
-from finforce_ifea.errors import NotEnoughDataError, UnderLoadError
+from finforce_ifea.errors import NotEnoughDataError
 from finforce_ifea.gate import KeypointGate
 from finforce_ifea.jaw import Jaw
 from finforce_ifea.mechanics import Mechanics, build_mechanics
@@ -22,45 +21,18 @@ from finforce_ifea.observation import (
 from finforce_ifea.point_tracking import PointTracker
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tare import Tare, blank_tare, compute_tare
+from finforce_ifea.taring import TareKeeper, TareReport
 from finforce_ifea.track import Track
 from finforce_ifea.tracking import PlaceTracker
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 
-# A tare looks loaded when the force that explains the offsets exceeds this many standard deviations.
-_LOADED_SIGMA = 3.5
-_DELAY_FRAMES = 15
 _LONGEST_GAP = 1.0
-_UNLOADED_FORCE = 0.02
+_UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
 # Beyond these a force is not reported: misfit of the shape, stiffening, standard deviation [N], its share of the force.
 _LARGEST_MISFIT = 2.0
 _LARGEST_STIFFENING = 5.0
 _VAGUE_FORCE, _VAGUE_SHARE = 1.0, 0.25
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TareReport:
-    """What a tare found.
-
-    Attributes:
-        frames: averaged.
-        keypoints: that have an offset now.
-        largest_offset: [m].
-        noise: standard deviation of one key point along one axis [m].
-    """
-
-    frames: int
-    keypoints: int
-    largest_offset: float
-    noise: float
-
-    def __str__(self) -> str:
-        """Returns the report as one sentence."""
-        return (
-            f"tared {self.keypoints} key points over {self.frames} frames: largest offset "
-            f"{1e3 * self.largest_offset:.2f} mm, noise {1e3 * self.noise:.2f} mm"
-        )
 
 
 class JawEstimator:
@@ -84,17 +56,15 @@ class JawEstimator:
         self._gate = KeypointGate(self.jaw, self.settings)
         self._relaxation = Relaxation(calibration.relaxation if calibration else ())
         self._force_error = calibration.force_error if calibration else 0.1
+        self._taring = TareKeeper(self.jaw.keypoints, self.settings, lambda tare: self._tracker.significance(tare))
         self.reset()
 
     def reset(self) -> None:
         """Forgets everything but the jaw: offsets, place, relaxation, stamps."""
-        self._tare = blank_tare(len(self.jaw.keypoints), self.settings.noise)
-        self._recent: deque[NDArray] = deque(maxlen=self.settings.tare_memory + _DELAY_FRAMES)
-        self._tare_open = self.settings.automatic_tare
         self._stamp: float | None = None
         self._track: Track | None = None
-        self._quiet = 0
         self._relaxed: float | None = None
+        self._taring.reset()
         self._gate.reset()
         self._relaxation.reset()
         self._rolling.reset()
@@ -103,13 +73,13 @@ class JawEstimator:
     def warm_up(self) -> None:
         """Compiles what is compiled on first use, and leaves no trace."""
         for tracker in (self._rolling, self._pointed):
-            tracker.update(self.jaw.keypoints.copy(), self._tare, 0.03)
+            tracker.update(self.jaw.keypoints.copy(), self._taring.tare, 0.03)
         self.reset()
 
     @property
     def tared(self) -> bool:
         """Whether the key points' offsets are known."""
-        return bool(self._tare.counts.any())
+        return self._taring.tared
 
     @property
     def surface_triangles(self) -> NDArray:
@@ -142,20 +112,38 @@ class JawEstimator:
             self._follow(contact)
         self._stamp = observation.stamp
         points = self._gate.accept(observation)
-        self._recent.append(points)
+        self._taring.add(points, apart=contact is not None and contact.touching is False)
         used = np.isfinite(points[:, 0])
         if used.sum() < self.settings.minimum_keypoints:
-            return self._fail(
-                "not_enough_points", f"{int(used.sum())} of {len(used)} key points can be used", used
-            )
-        if self._tare_open and not self.tared:
-            waiting = self._begin(used)
-            if waiting is not None:
-                return waiting
+            seen = f"{int(used.sum())} of {len(used)} key points can be used"
+            return self._fail("not_enough_points", seen, used)
+        waiting = self._await_tare()
+        if waiting:
+            return self._fail("waiting", waiting, used)
         if contact is None or not len(contact.points):
             return self._without_contact(points, used)
-        track = self._tracker.update(points, self._tare, min(dt, _LONGEST_GAP))
+        track = self._tracker.update(points, self._taring.tare, min(dt, _LONGEST_GAP))
         return self._conclude(track, used)
+
+    def tare(self) -> TareReport:
+        """Takes the last frames as unloaded and learns each key point's offset.
+
+        Raises:
+            NotEnoughDataError: Too few unloaded frames or visible key points.
+            UnderLoadError: The jaw is, or looks, loaded.
+        """
+        return self._taring.take()
+
+    def _await_tare(self) -> str:
+        """Returns what is missing for the first tare, empty when it is done or not due."""
+        if self._taring.missing:
+            self._relax(np.zeros(3))
+            return f"{self._taring.missing} more unloaded frames for the tare"
+        try:
+            self._taring.begin()
+        except NotEnoughDataError as error:
+            return str(error)
+        return ""
 
     def _follow(self, contact: Contact) -> None:
         """Hands a contact to the tracker that it is for."""
@@ -168,89 +156,13 @@ class JawEstimator:
             chosen.q, self._tracker = self._tracker.q.copy(), chosen
         chosen.follow(contact)
 
-    def _begin(self, used: NDArray) -> Solution | None:
-        """Collects unloaded frames, then tares, unless the jaw looks loaded; returns None once that is decided."""
-        if len(self._recent) < self.settings.tare_frames:
-            self._relax(np.zeros(3))
-            missing = self.settings.tare_frames - len(self._recent)
-            return blank_solution(
-                self._stamp, "waiting", f"{missing} more unloaded frames for the tare", used
-            )
-        try:
-            self.tare()
-        except UnderLoadError:
-            self._tare_open = False
-        except NotEnoughDataError as error:
-            return blank_solution(self._stamp, "waiting", str(error), used)
-        return None
-
-    def tare(self) -> TareReport:
-        """Takes the last frames as unloaded and learns each key point's offset.
-
-        Raises:
-            NotEnoughDataError: Too few frames or visible key points.
-            UnderLoadError: The jaw is, or looks, loaded.
-        """
-        force = 0.0 if self._track is None else float(np.linalg.norm(self._track.force))
-        if self.tared and force > _UNLOADED_FORCE:
-            raise UnderLoadError(f"cannot tare: {force:.2f} N press on the jaw")
-        frames = list(self._recent)[-self.settings.tare_memory :]
-        if len(frames) < min(5, self.settings.tare_frames):
-            raise NotEnoughDataError(
-                f"cannot tare: {len(frames)} frames, expected {self.settings.tare_frames}"
-            )
-        tare = compute_tare(frames, self.jaw.keypoints)
-        if tare is None:
-            raise self._explain_no_tare(frames)
-        if not self.tared:
-            self._check_unloaded(tare)
-        self._set_tare(tare)
-        seen = tare.counts > 0
-        return TareReport(
-            frames=len(frames),
-            keypoints=int(seen.sum()),
-            largest_offset=float(np.linalg.norm(tare.offsets, axis=1).max()),
-            noise=float(np.sqrt(np.trace(tare.noise) / 3.0)),
-        )
-
-    def _explain_no_tare(self, frames: list[NDArray]) -> NotEnoughDataError | UnderLoadError:
-        seen = np.isfinite(np.stack(frames)[..., 0]).mean(0) >= 0.5
-        if seen.sum() < 3:
-            return NotEnoughDataError(
-                "cannot tare: fewer than three key points are seen in half of the frames"
-            )
-        return UnderLoadError(
-            "cannot tare: the key points lie millimetres from where the unloaded jaw has them"
-        )
-
-    def _set_tare(self, tare: Tare) -> None:
-        self._tare = tare
-        self._track = None
-
-    def _check_unloaded(self, tare: Tare) -> None:
-        """Refuses offsets that a force explains far better than chance."""
-        sigma = self._tracker.significance(tare)
-        if sigma > _LOADED_SIGMA:
-            raise UnderLoadError(f"cannot tare: the key points look loaded ({sigma:.1f} standard deviations)")
-
-    def _refine_tare(self, track: Track) -> None:
-        """Averages more frames until the first load; what is newer than half a second is left out."""
-        self._quiet = self._quiet + 1 if track.quiet else 0
-        if track.loaded or len(self._recent) > self.settings.tare_memory:
-            self._tare_open = False
-        elif self._quiet >= 2 * _DELAY_FRAMES and self._quiet % _DELAY_FRAMES == 0:
-            tare = compute_tare(list(self._recent)[:-_DELAY_FRAMES], self.jaw.keypoints)
-            self._tare = tare or self._tare
-
     def _without_contact(self, points: NDArray, used: NDArray) -> Solution:
         """Says what can be said without an object: nothing presses, or it cannot be known where."""
-        tare = compute_tare([points, points], self.jaw.keypoints + self._tare.offsets)
-        quiet = self.tared and tare is not None and self._tracker.significance(tare) < _LOADED_SIGMA
-        if quiet:
+        if self._taring.is_at_rest(points):
+            self._taring.note(quiet=True, loaded=False)
             self._relax(np.zeros(3))
-            return replace(
-                blank_solution(self._stamp, "unloaded", "no object, the jaw is at rest", used), converged=True
-            )
+            rest = blank_solution(self._stamp, "unloaded", "no object, the jaw is at rest", used)
+            return replace(rest, converged=True)
         return self._fail("no_contact", "the jaw is bent but no contact is known", used)
 
     def _fail(self, status: str, message: str, used: NDArray, iterations: int = 0) -> Solution:
@@ -269,17 +181,20 @@ class JawEstimator:
         doubt = self._doubt(track)
         if doubt:
             return self._fail("unobservable", doubt, used, track.iterations)
-        if self._tare_open and self.tared:
-            self._refine_tare(track)
+        self._taring.note(quiet=track.quiet, loaded=track.loaded)
         force = self._relax(track.force)
         return self._solution(track, force, used)
 
     def _doubt(self, track: Track) -> str:
         """Returns why a track must not be believed, empty when it may."""
         if track.misfit > _LARGEST_MISFIT:
-            return f"the key points do not fit this contact ({track.misfit:.1f} standard deviations); is its place right?"
+            return (
+                f"the key points do not fit this contact ({track.misfit:.1f} standard deviations); is its place right?"
+            )
         if track.stiffening > _LARGEST_STIFFENING:
-            return f"the jaw seems {track.stiffening:.0f} times as stiff as at the given height; is the contact elsewhere?"
+            return (
+                f"the jaw seems {track.stiffening:.0f} times as stiff as at the given height; is the contact elsewhere?"
+            )
         magnitude = float(np.linalg.norm(track.force))
         stddev = self._stddev(track, magnitude)
         if not stddev <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
@@ -301,8 +216,7 @@ class JawEstimator:
         magnitude = float(np.linalg.norm(force))
         loaded = magnitude > 0.0
         covariance = (
-            track.force_modes @ track.covariance @ track.force_modes.T
-            + np.outer(force, force) * self._force_error**2
+            track.force_modes @ track.covariance @ track.force_modes.T + np.outer(force, force) * self._force_error**2
         )
         stddev = np.sqrt(np.diag(covariance))
         arm = track.pressure_point * [1.0, 0.0, 1.0]
@@ -312,9 +226,7 @@ class JawEstimator:
         return Solution(
             stamp=self._stamp,
             status="ok" if loaded else "unloaded",
-            message=""
-            if self.tared
-            else "no tare: the jaw was loaded from the start; key point offsets are unknown",
+            message="" if self.tared else _UNTARED,
             force=force,
             torque=np.array([-arm[2] * force[1], arm[2] * force[0] - arm[0] * force[2], arm[0] * force[1]]),
             force_stddev=stddev,

@@ -32,9 +32,7 @@ class SparseFactor:
     """LU factor of any regular symmetric matrix, for wide bands and for states beyond a buckling point."""
 
     def __init__(self, matrix: sparse.csc_matrix) -> None:
-        self._lu = splu(
-            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1, options={"SymmetricMode": True}
-        )
+        self._lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.1, options={"SymmetricMode": True})
 
     def solve(self, b: NDArray) -> NDArray:
         """Returns K^-1 b for b of shape (n,) or (n, k)."""
@@ -50,9 +48,7 @@ def factorise_banded(storage: NDArray) -> BandedFactor | None:
 def sparse_from_banded(storage: NDArray) -> sparse.csc_matrix:
     """Returns the full symmetric matrix of lower banded storage (width + 1, n)."""
     width, n = storage.shape[0] - 1, storage.shape[1]
-    lower = sparse.diags(
-        [storage[k, : n - k] for k in range(width + 1)], [-k for k in range(width + 1)], format="csc"
-    )
+    lower = sparse.diags([storage[k, : n - k] for k in range(width + 1)], [-k for k in range(width + 1)], format="csc")
     full = lower + sparse.tril(lower, -1).T
     full.eliminate_zeros()
     return full.tocsc()

@@ -22,9 +22,7 @@ _SHORTEST_STEP = 1e-6
 class RigidObject(Protocol):
     """A rigid object, endless along y; its nearest point to the jaw comes first into the jaw."""
 
-    def press(
-        self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float
-    ) -> PenaltyContact:
+    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
         """Returns the contact with points (p, 3) [m] of an object sunk by depth [m] below x = face_x at height [m]."""
         ...
 
@@ -35,9 +33,7 @@ class Cylinder:
 
     radius: float
 
-    def press(
-        self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float
-    ) -> PenaltyContact:
+    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
         """See `RigidObject`."""
         return press_cylinder(points, stiffness, face_x + self.radius - depth, height, self.radius)
 
@@ -57,13 +53,9 @@ class Box:
             ContactError: A size is not positive, or the edges are rounder than the box is wide.
         """
         if not 0.0 < self.edge_radius <= 0.5 * min(self.size_x, self.size_z):
-            raise ContactError(
-                f"{self}: expected an edge radius above zero and at most half of the smaller size"
-            )
+            raise ContactError(f"{self}: expected an edge radius above zero and at most half of the smaller size")
 
-    def press(
-        self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float
-    ) -> PenaltyContact:
+    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
         """See `RigidObject`."""
         half = (0.5 * self.size_x, 0.5 * self.size_z)
         return press_box(points, stiffness, (face_x + half[0] - depth, height), half, self.edge_radius)
@@ -167,9 +159,15 @@ def _find_equilibrium(
 
 
 def _describe(
-    model: JawModel, surface: ContactSurface, q: NDArray, face_x: float, rigid: RigidObject, depth: float, height: float,
+    model: JawModel,
+    surface: ContactSurface,
+    q: NDArray,
+    face_x: float,
+    rigid: RigidObject,
+    depth: float,
+    height: float,
     iterations: int,
-) -> Press:  # fmt: skip
+) -> Press:
     points = model.positions(surface.probe, q)
     forces = rigid.press(points, surface.stiffness, face_x, depth, height).forces
     size = np.linalg.norm(forces, axis=1)

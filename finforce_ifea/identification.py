@@ -24,9 +24,16 @@ from finforce_ifea.rolling import DEPTH, limit_step
 from finforce_ifea.settings import EstimatorSettings
 
 _NAMES = (
-    "young_modulus", "inner_thickness_factor", "outer_thickness_factor", "rib_thickness_factor", "clamped_z",
-    "share_1", "time_constant_1", "share_2", "time_constant_2",
-)  # fmt: skip
+    "young_modulus",
+    "inner_thickness_factor",
+    "outer_thickness_factor",
+    "rib_thickness_factor",
+    "clamped_z",
+    "share_1",
+    "time_constant_1",
+    "share_2",
+    "time_constant_2",
+)
 # Prior means and standard deviations: log modulus about the jaw file's, factors, clamp [mm], shares, log times [s].
 _PRIOR = np.array([0.0, 1.0, 1.0, 1.0, 0.2, 0.1, np.log(1.0), 0.1, np.log(10.0)])
 _PRIOR_STDDEV = np.array([1.0, 0.1, 0.1, 0.1, 0.4, 0.3, 1.5, 0.3, 1.5])
@@ -86,34 +93,45 @@ def fit_calibration(
     settings = settings or EstimatorSettings()
     fit = _Fit(jaw, cases, settings, progress)
     result = least_squares(
-        fit.residuals, fit.start, jac=fit.jacobian, bounds=(fit.low, fit.high), x_scale=fit.stddev,
-        max_nfev=_ITERATIONS, ftol=1e-4, xtol=1e-4,
-    )  # fmt: skip
+        fit.residuals,
+        fit.start,
+        jac=fit.jacobian,
+        bounds=(fit.low, fit.high),
+        x_scale=fit.stddev,
+        max_nfev=_ITERATIONS,
+        ftol=1e-4,
+        xtol=1e-4,
+    )
     covariance = np.linalg.inv(result.jac.T @ result.jac)
     rough = fit.report(result.x, np.sqrt(np.diag(covariance)))
     return _refine_relaxation(jaw, cases, settings, rough, progress)
 
 
 def _refine_relaxation(
-    jaw: Jaw, cases: Sequence[CalibrationCase], settings: EstimatorSettings, rough: CalibrationFit,
+    jaw: Jaw,
+    cases: Sequence[CalibrationCase],
+    settings: EstimatorSettings,
+    rough: CalibrationFit,
     progress: Callable[[float], None],
-) -> CalibrationFit:  # fmt: skip
+) -> CalibrationFit:
     """Fits modulus and relaxation again to the whole course of force, ramps included, at the found geometry."""
     courses = []
     for case in cases:
         courses.append(_track_course(jaw, case, settings, rough.calibration))
         progress(float("nan"))
-    fit = least_squares(_course_residuals, np.r_[0.0, _PRIOR[5:]], bounds=(_LOW[[0, *range(5, 9)]], _HIGH[[0, *range(5, 9)]]),
-                        x_scale=_PRIOR_STDDEV[[0, *range(5, 9)]], args=(courses,))  # fmt: skip
+    fit = least_squares(
+        _course_residuals,
+        np.r_[0.0, _PRIOR[5:]],
+        bounds=(_LOW[[0, *range(5, 9)]], _HIGH[[0, *range(5, 9)]]),
+        x_scale=_PRIOR_STDDEV[[0, *range(5, 9)]],
+        args=(courses,),
+    )
     model = [
-        np.exp(fit.x[0]) * apply_relaxation(course.elastic, course.stamps, _terms(fit.x[1:]))
-        for course in courses
+        np.exp(fit.x[0]) * apply_relaxation(course.elastic, course.stamps, _terms(fit.x[1:])) for course in courses
     ]
     loaded = [course.true > _LOADED_FORCE for course in courses]
     errors = np.concatenate([(m - c.true)[k] for m, c, k in zip(model, courses, loaded, strict=True)])
-    relative = np.concatenate(
-        [((m - c.true) / c.true)[k] for m, c, k in zip(model, courses, loaded, strict=True)]
-    )
+    relative = np.concatenate([((m - c.true) / c.true)[k] for m, c, k in zip(model, courses, loaded, strict=True)])
     stddev = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac + 1e-12 * np.eye(5))))
     names = ("share_1", "time_constant_1", "share_2", "time_constant_2")
     scale = [1.0, np.exp(fit.x[2]), 1.0, np.exp(fit.x[4])]
@@ -139,9 +157,7 @@ class _Course:
     true: NDArray
 
 
-def _track_course(
-    jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration
-) -> _Course:
+def _track_course(jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration) -> _Course:
     """Estimates the elastic force of every frame."""
     estimator = JawEstimator(jaw, settings=settings, calibration=replace(calibration, relaxation=()))
     solutions = [estimator.update(observation, case.contact) for observation in case.observations]
@@ -207,10 +223,7 @@ class _Fit:
         shapes, forces = self._solve_shapes(x)
         elastic = self._elastic_forces(x)
         model = np.exp(x[0]) * forces
-        rows = [
-            ((target - value) / self._force_stddev(value))
-            for target, value in zip(elastic, model, strict=True)
-        ]
+        rows = [((target - value) / self._force_stddev(value)) for target, value in zip(elastic, model, strict=True)]
         total = np.concatenate([shapes, *rows, (x - self.mean) / self.stddev])
         self.progress(float(total @ total))
         return total
@@ -231,9 +244,7 @@ class _Fit:
         """Returns the shape residuals and the magnitudes [N] at the drawn modulus; remembers them per geometry."""
         key = np.r_[x[_GEOMETRY], x[len(_NAMES) :]].tobytes()
         if key not in self._shapes:
-            finger = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus).apply(
-                self.jaw
-            )
+            finger = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus).apply(self.jaw)
             mechanics = build_mechanics(finger, self.settings)
             rest = mechanics.model.attach(self.jaw.keypoints, KEYPOINT_DISTANCE)
             solver = _PlateauSolver(mechanics, rest)
@@ -262,9 +273,7 @@ class _Fit:
         shapes, forces = self._solve_shapes(x)
         elastic, model = self._elastic_forces(x), np.exp(x[0]) * forces
         errors = np.concatenate([target - value for target, value in zip(elastic, model, strict=True)])
-        relative = np.concatenate(
-            [target / value - 1.0 for target, value in zip(elastic, model, strict=True)]
-        )
+        relative = np.concatenate([target / value - 1.0 for target, value in zip(elastic, model, strict=True)])
         calibration = replace(
             self.calibration(x), force_error=float(np.clip(np.sqrt(np.mean(relative**2)), 0.005, 0.5))
         )
@@ -297,9 +306,7 @@ class _PlateauSolver:
         self._contact, self._model, self._probe = mechanics.contact, mechanics.model, probe
         self._rest = self._model.positions(probe, np.zeros(self._model.size))
 
-    def solve(
-        self, plateau: Plateau, log_radius: float, height: float, start: _PlateauShape | None
-    ) -> _PlateauShape:
+    def solve(self, plateau: Plateau, log_radius: float, height: float, start: _PlateauShape | None) -> _PlateauShape:
         """Returns the closest shape, found by Gauss-Newton from `start` or from the unloaded jaw.
 
         Raises:
@@ -325,11 +332,7 @@ class _PlateauSolver:
             if abs(change) < 1e-6 and np.abs(state.correction).max() < 1e-6:
                 force = state.force + state.force_modes[:, DEPTH] * change
                 left = (residual - mode * change).ravel()
-                return _PlateauShape(
-                    q=q, depth=float(place[DEPTH]), residual=left, force=float(np.linalg.norm(force))
-                )
+                return _PlateauShape(q=q, depth=float(place[DEPTH]), residual=left, force=float(np.linalg.norm(force)))
         if start is not None:
             return self.solve(plateau, log_radius, height, None)
-        raise CalibrationError(
-            "calibration: no shape of the jaw comes near the key points; is it the right jaw file?"
-        )
+        raise CalibrationError("calibration: no shape of the jaw comes near the key points; is it the right jaw file?")

@@ -92,23 +92,28 @@ def solve_inverse(
         raise NotEnoughDataError("no key point is active, expected at least one")
     if len(problem.targets) == 0 or problem.contacts is None:
         raise ContactError("the inverse problem has no contact")
-    multipliers, settled = None, False
-    for iteration in range(1, iterations + 1):
+    settled, iteration = False, 0
+    while not settled and iteration < iterations:
+        iteration += 1
         step = _linear_step(model, problem, q, active)
         solution = solve_program(step.hessian, step.gradient, step.lower)
         change = limit_step(model, step.free + step.modes @ solution.multipliers)
         q = q + change
-        multipliers = solution.multipliers
-        if np.abs(change).max() < tolerance:
-            settled = True
-            break
+        settled = bool(np.abs(change).max() < tolerance)
+    multipliers = solution.multipliers
     forces = np.einsum("ncj,j->nc", step.directions, multipliers)
     miss = (model.positions(problem.effectors, q) - problem.targets)[active]
     return InverseResult(
-        q=q, forces=forces, compliance=step.compliance, residual=float(np.sqrt((miss**2).sum(1).mean())),
-        kkt=solution.kkt, condition=float(np.linalg.cond(step.hessian)), iterations=iteration, converged=settled,
+        q=q,
+        forces=forces,
+        compliance=step.compliance,
+        residual=float(np.sqrt((miss**2).sum(1).mean())),
+        kkt=solution.kkt,
+        condition=float(np.linalg.cond(step.hessian)),
+        iterations=iteration,
+        converged=settled,
         multipliers=multipliers,
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,9 +132,7 @@ class _LinearStep:
 def _linear_step(model: JawModel, problem: Problem, q: NDArray, active: NDArray) -> _LinearStep:
     state = model.linearize(q)
     directions, lower = _force_directions(model, problem, q)
-    columns = [
-        model.load(problem.contacts, q, np.ascontiguousarray(directions[:, :, j])) for j in range(len(lower))
-    ]
+    columns = [model.load(problem.contacts, q, np.ascontiguousarray(directions[:, :, j])) for j in range(len(lower))]
     G = np.stack(columns, axis=1)
     steps = model.factorise(state.tangent).solve(np.column_stack([G, -state.force]))
     modes, free = steps[:, :-1], steps[:, -1]
@@ -142,9 +145,14 @@ def _linear_step(model: JawModel, problem: Problem, q: NDArray, active: NDArray)
     Q, W_aa = W_ea.T @ W_ea, G.T @ modes
     hessian = Q + problem.energy_weight * scale_energy(Q, 0.5 * (W_aa + W_aa.T), problem.energy_form)
     return _LinearStep(
-        free=free, modes=modes, hessian=hessian, gradient=W_ea.T @ delta_free, lower=lower, directions=directions,
+        free=free,
+        modes=modes,
+        hessian=hessian,
+        gradient=W_ea.T @ delta_free,
+        lower=lower,
+        directions=directions,
         compliance=W_ea,
-    )  # fmt: skip
+    )
 
 
 def scale_energy(Q: NDArray, W_aa: NDArray, form: EnergyForm) -> NDArray:
@@ -215,9 +223,13 @@ def solve_program(hessian: NDArray, gradient: NDArray, lower: NDArray) -> Progra
     m = len(g)
     size = max(np.abs(g).max(), 1e-300)
     x, _, flag, _ = daqp.solve(
-        np.ascontiguousarray(H), np.ascontiguousarray(g / size), np.zeros((0, m)),
-        np.full(m, _UNBOUNDED), bound / size, np.zeros(m, np.int32),
-    )  # fmt: skip
+        np.ascontiguousarray(H),
+        np.ascontiguousarray(g / size),
+        np.zeros((0, m)),
+        np.full(m, _UNBOUNDED),
+        bound / size,
+        np.zeros(m, np.int32),
+    )
     if flag < 1:
         raise NotEnoughDataError(f"the quadratic program has no solution (daqp exit flag {flag})")
     x = np.asarray(x) * size
@@ -225,7 +237,7 @@ def solve_program(hessian: NDArray, gradient: NDArray, lower: NDArray) -> Progra
 
 
 def compute_kkt_residual(H: NDArray, g: NDArray, lower: NDArray, x: NDArray) -> float:
-    """Returns the largest violation of the optimality conditions of min x^T H x / 2 + g^T x, x >= lower, scaled by |g|."""
+    """Returns the largest violation, over |g|, of the optimality conditions of min x^T H x / 2 + g^T x, x >= lower."""
     slope = H @ x + g
     bounded = lower > -_UNBOUNDED
     violation = np.where(bounded, np.minimum(x - lower, slope), slope)

@@ -94,9 +94,7 @@ class Jaw:
             file = self.mesh_file
             mesh = read_volume_mesh(file.path, scale=file.scale, clamp=file.clamp)
         else:
-            raise MeshError(
-                f"mesh density {density!r}: {self.mesh_file.path.name} has its own; use 'default'"
-            )
+            raise MeshError(f"mesh density {density!r}: {self.mesh_file.path.name} has its own; use 'default'")
         return mesh if self.side == "left" else mesh.mirrored()
 
     def mirrored(self) -> "Jaw":
@@ -161,9 +159,7 @@ def _parse_jaw(table: Table, path: Path) -> Jaw:
     table.expect_keys((), _KEYS)
     source = table.expect_one_of("drawing", "mesh")
     face = ("inner_face_x",) if source == "mesh" else ()
-    table.expect_keys(
-        (source, *face, "material", "keypoints", "candidates"), ("name", "model", "reference_point")
-    )
+    table.expect_keys((source, *face, "material", "keypoints", "candidates"), ("name", "model", "reference_point"))
     drawing = parse_drawing(table.table("drawing")) if source == "drawing" else None
     inner_face_x = drawing.inner_face_x if drawing is not None else table.length("inner_face_x")
     keypoints = parse_keypoints(table.table("keypoints"), drawing)
@@ -192,9 +188,7 @@ def _parse_model(table: Table, drawing: Drawing | None) -> Literal["solid", "fra
     if model == "frame" and drawing is None:
         raise JawFileError("model: got frame, which needs a drawing; expected solid for a mesh file")
     if model == "solid" and not is_solid:
-        raise JawFileError(
-            "model: got solid, expected frame: this drawing has hinges, rigid bars or a rigid tip"
-        )
+        raise JawFileError("model: got solid, expected frame: this drawing has hinges, rigid bars or a rigid tip")
     return model
 
 

@@ -1,5 +1,6 @@
 """Typed reading of a jaw file's YAML, with errors that say what would do; knows nothing of jaws."""
 
+import contextlib
 import difflib
 import math
 from collections.abc import Iterable
@@ -205,10 +206,8 @@ def _parse_number(value: Any, name: str) -> float:
     """Return a finite number; texts such as 26e6, which YAML does not take for numbers, are read too."""
     number = value
     if isinstance(value, str):
-        try:
+        with contextlib.suppress(ValueError):
             number = float(value)
-        except ValueError:
-            pass
     if not isinstance(number, (int, float)) or isinstance(number, bool):
         raise JawFileError(f"{name}: got {_describe(value)}, expected a number")
     if not math.isfinite(number):
@@ -221,8 +220,7 @@ def _parse_length(value: Any, name: str, largest: float = 1.0) -> float:
     length = _parse_number(value, name)
     if abs(length) > largest:
         raise JawFileError(
-            f"{name}: got {length:g}, which looks like millimetres; expected metres, such as "
-            f"{length / 1000:g}"
+            f"{name}: got {length:g}, which looks like millimetres; expected metres, such as {length / 1000:g}"
         )
     return length
 

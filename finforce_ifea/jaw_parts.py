@@ -55,13 +55,9 @@ def parse_material(table: Table) -> Material:
     if modulus <= 0.0:
         raise JawFileError(f"{name}: got {modulus:g}, expected a positive number of Pa")
     if modulus < 1e4:
-        raise JawFileError(
-            f"{name}: got {modulus:g}, which looks like MPa; expected Pa, such as {modulus * 1e6:.3e}"
-        )
+        raise JawFileError(f"{name}: got {modulus:g}, which looks like MPa; expected Pa, such as {modulus * 1e6:.3e}")
     if not -1.0 < ratio < 0.5:
-        raise JawFileError(
-            f"{table.name('poisson_ratio')}: got {ratio:g}, expected more than -1 and less than 0.5"
-        )
+        raise JawFileError(f"{table.name('poisson_ratio')}: got {ratio:g}, expected more than -1 and less than 0.5")
     return Material(young_modulus=modulus, poisson_ratio=ratio)
 
 
@@ -71,9 +67,7 @@ def parse_drawing(table: Table) -> Drawing:
     Raises:
         JawFileError: It does not describe a finger.
     """
-    table.expect_keys(
-        ("length", "width", "inner_band", "outer_band", "tip"), ("ribs", "clamped_z", "joints", "bars")
-    )
+    table.expect_keys(("length", "width", "inner_band", "outer_band", "tip"), ("ribs", "clamped_z", "joints", "bars"))
     length = table.length("length")
     if length <= 0.0:
         raise JawFileError(f"{table.name('length')}: got {length:g}, expected a positive length in metres")
@@ -111,9 +105,7 @@ def _parse_tip(table: Table) -> float | None:
     if table.values["tip"] == "rigid":
         return None
     if not isinstance(table.values["tip"], dict):
-        raise JawFileError(
-            f"{table.name('tip')}: got {table.values['tip']!r}, expected rigid or {{solid_from_z: ...}}"
-        )
+        raise JawFileError(f"{table.name('tip')}: got {table.values['tip']!r}, expected rigid or {{solid_from_z: ...}}")
     tip = table.table("tip")
     tip.expect_keys(("solid_from_z",))
     return tip.length("solid_from_z")
@@ -165,12 +157,8 @@ def _parse_clamp(table: Table) -> ClampRule:
     value = table.values[rule]
     if rule == "box":
         if not isinstance(value, list) or len(value) != 2:
-            raise JawFileError(
-                f"{table.name(rule)}: expected two corners [[x, y, z], [x, y, z]], lowest first"
-            )
-        corners = np.array(
-            [parse_point(corner, f"{table.name(rule)}[{i}]") for i, corner in enumerate(value)]
-        )
+            raise JawFileError(f"{table.name(rule)}: expected two corners [[x, y, z], [x, y, z]], lowest first")
+        corners = np.array([parse_point(corner, f"{table.name(rule)}[{i}]") for i, corner in enumerate(value)])
         if (corners[0] > corners[1]).any():
             raise JawFileError(f"{table.name(rule)}: got {value}, expected the lowest corner first")
         return ClampRule(box=corners)
@@ -193,9 +181,7 @@ def parse_keypoints(table: Table, drawing: Drawing | None) -> dict[str, NDArray]
     table.expect_keys(("rule", "side_y"), ("tip",))
     table.choice("rule", ("rib_junctions",), "rib_junctions")
     if drawing is None:
-        raise JawFileError(
-            f"{table.name('rule')}: rib_junctions needs a drawing; list the points as name: [x, y, z]"
-        )
+        raise JawFileError(f"{table.name('rule')}: rib_junctions needs a drawing; list the points as name: [x, y, z]")
     return _junction_points(drawing, table.length("side_y"), table.switch("tip", drawing.tip_z is not None))
 
 

@@ -35,8 +35,8 @@ def warn_of_locking(jaw: Jaw, mesh: VolumeMesh) -> None:
         return
     factor = measure_locking(jaw, mesh)
     warnings.warn(
-        f"jaw {jaw.name!r}: its 4-node tetrahedra lock, they are {factor:.1f} times as stiff as 10-node ones on the same "
-        "mesh; forces are overestimated accordingly unless the modulus is calibrated. Use 10-node tetrahedra or hexahedra",
+        f"jaw {jaw.name!r}: its 4-node tetrahedra lock, they are {factor:.1f} times as stiff as 10-node ones on the "
+        "same mesh; forces are too large accordingly. Use 10-node tetrahedra or hexahedra",
         LockingWarning,
         stacklevel=3,
     )

@@ -23,9 +23,7 @@ CONTACT_DIAMETER = 0.005
 ARROW = (0.002, 0.004, 0.005)  # shaft, head, head length
 
 
-def build_markers(
-    header: Any, observation: Observation, solution: Solution, estimator: JawEstimator
-) -> list[Any]:
+def build_markers(header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> list[Any]:
     """Return the markers of one image, in the jaw frame: contact and force only where they are trusted."""
     triangles = np.asarray(estimator.surface())[np.asarray(estimator.surface_triangles)].reshape(-1, 3)
     seen = np.isfinite(observation.points).all(axis=1)

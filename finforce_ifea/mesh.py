@@ -153,8 +153,7 @@ def _check_nodes(nodes: NDArray) -> None:
     extent = np.ptp(nodes, axis=0).max()
     if extent > 1.0:
         raise MeshError(
-            f"the mesh is {extent:.4g} m long, expected at most 1 m: it looks like millimetres; "
-            "give scale: 0.001"
+            f"the mesh is {extent:.4g} m long, expected at most 1 m: it looks like millimetres; give scale: 0.001"
         )
     if extent < 1e-3:
         raise MeshError(f"the mesh is {extent:.4g} m long, expected at least 1 mm: check its scale")

@@ -114,9 +114,7 @@ def _merge_cells(cells: list[tuple[str, NDArray]], path: Path) -> tuple[str, NDA
     if unsupported:
         raise MeshError(f"{path.name}: got {', '.join(unsupported)}, expected only one of {supported}")
     if len(kinds) > 1:
-        raise MeshError(
-            f"{path.name}: got a mixture of {', '.join(kinds)}, expected one kind of volume element"
-        )
+        raise MeshError(f"{path.name}: got a mixture of {', '.join(kinds)}, expected one kind of volume element")
     return kinds[0], np.concatenate([np.asarray(block) for kind, block in cells if kind == kinds[0]])
 
 

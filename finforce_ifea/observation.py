@@ -143,14 +143,13 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
             f"key point {int(np.argwhere(np.isinf(points))[0, 0])} is infinite, expected metres or NaN"
         )
     if not ((likelihood >= 0) & (likelihood <= 1)).all():
-        raise ObservationError(
-            f"likelihoods from {likelihood.min():g} to {likelihood.max():g}, expected 0 to 1"
-        )
+        raise ObservationError(f"likelihoods from {likelihood.min():g} to {likelihood.max():g}, expected 0 to 1")
     if not np.isfinite(observation.stamp):
         raise ObservationError(f"stamp {observation.stamp}, expected seconds")
     if last_stamp is not None and observation.stamp <= last_stamp:
         raise ObservationError(
-            f"stamp {observation.stamp:.6f} s after {last_stamp:.6f} s, expected rising stamps; reset for a new recording"
+            f"stamp {observation.stamp:.6f} s after {last_stamp:.6f} s, expected rising stamps; "
+            "reset for a new recording"
         )
 
 
@@ -162,12 +161,8 @@ def check_contact(contact: Contact, jaw: Jaw) -> None:
     """
     points, weights = np.asarray(contact.points), np.asarray(contact.weights)
     if points.ndim != 2 or points.shape[1:] != (3,) or weights.shape != (len(points),):
-        raise ContactError(
-            f"contact points {points.shape} with weights {weights.shape}, expected (n, 3) and (n,)"
-        )
-    if not np.isfinite(points).all() or (
-        len(points) and np.abs(points[:, 0] - jaw.inner_face_x).max() > 1e-3
-    ):
+        raise ContactError(f"contact points {points.shape} with weights {weights.shape}, expected (n, 3) and (n,)")
+    if not np.isfinite(points).all() or (len(points) and np.abs(points[:, 0] - jaw.inner_face_x).max() > 1e-3):
         raise ContactError(f"contact points off the undeformed inner surface x = {jaw.inner_face_x:g} m")
     if len(weights) and not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
         raise ContactError(f"contact weights {weights}, expected non-negative numbers that are not all zero")

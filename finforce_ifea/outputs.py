@@ -58,9 +58,7 @@ class SolverOutputs:
             self.grasp.publish(ros.wrench_message(header, grasp.grasp))
             self.manipulation.publish(ros.wrench_message(header, grasp.manipulation))
 
-    def send_shape(
-        self, header: Any, observation: Observation, solution: Solution, estimator: JawEstimator
-    ) -> None:
+    def send_shape(self, header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> None:
         """Send the deformed surface, and markers while someone listens, at their own rate."""
         if self._parameters.publish_surface:
             self.surface.publish(ros.cloud_message(header, ros.xyz_columns(estimator.surface())))

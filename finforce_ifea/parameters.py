@@ -26,9 +26,7 @@ class NodeParameters:
 
     jaw_name: str = _parameter("left", "the jaw that this node solves", choices=("left", "right"))
     jaw_file: str = _parameter("bench", "jaw file, or the name of a shipped jaw")
-    calibration_file: str = _parameter(
-        "", "calibration file, or a shipped name; empty: the material of the jaw file"
-    )
+    calibration_file: str = _parameter("", "calibration file, or a shipped name; empty: the material of the jaw file")
     jaw_frame: str = _parameter("", "frame of key points, contact and wrench; empty: <jaw_name>_jaw")
     gripper_frame: str = _parameter("gripper_base", "frame of grasp_wrench and manipulation_wrench")
     contact_height: float = _parameter(
@@ -39,9 +37,7 @@ class NodeParameters:
         max=1.0,
     )
     contact_free: bool = _parameter(False, "the solver may move a contact that came on the topic")
-    max_age: float = _parameter(
-        0.2, "greatest age of data at the time of publishing", unit="s", min=0.001, max=60.0
-    )
+    max_age: float = _parameter(0.2, "greatest age of data at the time of publishing", unit="s", min=0.001, max=60.0)
     restart_gap: float = _parameter(
         1.0, "stamps that go back by more than this begin a new recording", unit="s", min=0.001, max=3600.0
     )

@@ -123,9 +123,7 @@ def weigh_residuals(
         s00 = plane[0, 0] + bias[k] + h0 * h0 * depth_variance
         s11 = plane[1, 1] + bias[k] + h1 * h1 * depth_variance
         s01 = plane[0, 1] + h0 * h1 * depth_variance
-        square = (s11 * r[k, 0] ** 2 - 2.0 * s01 * r[k, 0] * r[k, 1] + s00 * r[k, 1] ** 2) / (
-            s00 * s11 - s01 * s01
-        )
+        square = (s11 * r[k, 0] ** 2 - 2.0 * s01 * r[k, 0] * r[k, 1] + s00 * r[k, 1] ** 2) / (s00 * s11 - s01 * s01)
         square += off * off / (noise[1, 1] + bias[k])
         weight = 1.0 / (1.0 + square / gate**2) ** 2
         if weight >= _LEAST_WEIGHT:
@@ -179,6 +177,31 @@ def _posterior(data, mean, count, offset, prior_variance, information):
 
 
 @njit(**_OPTIONS)
+def _weigh_depth(data, mean, count):
+    """Returns information on the depth, its weighted innovation, and the pull (3,) of radius and height on it.
+
+    The averaged residuals are taken off as each point's bias; what they have in common along the depth is no bias.
+    """
+    det = data.noise[0, 0] * data.noise[1, 1] - data.noise[0, 1] ** 2
+    p00, p11, p01 = data.noise[1, 1] / det, data.noise[0, 0] / det, -data.noise[0, 1] / det
+    along, norm = 0.0, 1e-300
+    for k in range(len(count)):
+        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
+        along += count[k] * ((p00 * h0 + p01 * h1) * mean[k, 0] + (p01 * h0 + p11 * h1) * mean[k, 1])
+        norm += count[k] * (p00 * h0 * h0 + 2.0 * p01 * h0 * h1 + p11 * h1 * h1)
+    along /= norm
+    information, innovation, pull = 0.0, 0.0, np.zeros(3)
+    for k in range(len(count)):
+        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
+        w0, w1 = data.weights[k] * (p00 * h0 + p01 * h1), data.weights[k] * (p01 * h0 + p11 * h1)
+        information += w0 * h0 + w1 * h1
+        innovation += w0 * (data.r[k, 0] - mean[k, 0] + along * h0) + w1 * (data.r[k, 1] - mean[k, 1] + along * h1)
+        for i in range(1, 3):
+            pull[i] += w0 * data.modes[k, 0, i] + w1 * data.modes[k, 1, i]
+    return information, innovation, pull
+
+
+@njit(**_OPTIONS)
 def update_place(data, mean, count, reference, speed, spread, prior, prior_variance, memory, largest):
     """Returns the place after one frame; see `PlaceUpdate`.
 
@@ -195,26 +218,7 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
         largest: changes of log radius and height allowed at once (2,).
     """
     n = len(count)
-    det = data.noise[0, 0] * data.noise[1, 1] - data.noise[0, 1] ** 2
-    p00, p11, p01 = data.noise[1, 1] / det, data.noise[0, 0] / det, -data.noise[0, 1] / det
-    along, norm = 0.0, 1e-300
-    for k in range(n):
-        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
-        along += count[k] * ((p00 * h0 + p01 * h1) * mean[k, 0] + (p01 * h0 + p11 * h1) * mean[k, 1])
-        norm += count[k] * (p00 * h0 * h0 + 2.0 * p01 * h0 * h1 + p11 * h1 * h1)
-    # what all points have in common along the depth is depth, not bias
-    along /= norm
-    information, innovation = 0.0, 0.0
-    pull = np.zeros(3)
-    for k in range(n):
-        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
-        w0, w1 = data.weights[k] * (p00 * h0 + p01 * h1), data.weights[k] * (p01 * h0 + p11 * h1)
-        information += w0 * h0 + w1 * h1
-        innovation += w0 * (data.r[k, 0] - mean[k, 0] + along * h0) + w1 * (
-            data.r[k, 1] - mean[k, 1] + along * h1
-        )
-        for i in range(1, 3):
-            pull[i] += w0 * data.modes[k, 0, i] + w1 * data.modes[k, 1, i]
+    information, innovation, pull = _weigh_depth(data, mean, count)
     innovation /= information
     gain = spread[:, 0] / (1.0 / information + spread[0, 0])
     depth = reference[0] + gain[0] * innovation
@@ -225,9 +229,7 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
         for a in range(2):
             r = data.r[k, a] - data.modes[k, a, 0] * (depth - reference[0])
             new_mean[k, a] = mean[k, a] + share * (r - mean[k, a])
-    hessian, gradient = _posterior(
-        data, new_mean, new_count, reference[1:] - prior, prior_variance, information
-    )
+    hessian, gradient = _posterior(data, new_mean, new_count, reference[1:] - prior, prior_variance, information)
     covariance = _invert_symmetric(hessian)
     shift = covariance @ gradient
     kkt = np.abs(hessian @ shift - gradient).max() / max(np.abs(gradient).max(), 1e-30)

@@ -76,9 +76,7 @@ def find_plateaus(
     return plateaus
 
 
-def _plateaus_of_case(
-    number: int, case: CalibrationCase, jaw: Jaw, settings: EstimatorSettings
-) -> list[Plateau]:
+def _plateaus_of_case(number: int, case: CalibrationCase, jaw: Jaw, settings: EstimatorSettings) -> list[Plateau]:
     gate = KeypointGate(jaw, settings)
     stamps = np.array([observation.stamp for observation in case.observations])
     points = np.stack([gate.accept(observation) for observation in case.observations])
@@ -89,28 +87,25 @@ def _plateaus_of_case(
     start = loaded[0] if len(loaded) else len(force)
     tare = compute_tare(list(points[:start]), jaw.keypoints) if start >= settings.tare_frames // 2 else None
     if tare is None:
-        raise CalibrationError(
-            f"{case.name}: expected at least a second without load at the start, for the tare"
-        )
+        raise CalibrationError(f"{case.name}: expected at least a second without load at the start, for the tare")
     rest = np.where(tare.counts[:, None] > 0, jaw.keypoints + tare.offsets, np.nan)
     found = []
     for first, last in _steady_runs(force):
         mean, count = _robust_mean(points[first:last] - rest)
         mean[count < 0.5 * (last - first)] = np.nan
-        variance = (
-            np.trace(tare.noise) / 3.0 * (1.0 / np.maximum(count, 1) + 1.0 / np.maximum(tare.counts, 1))
-        )
+        variance = np.trace(tare.noise) / 3.0 * (1.0 / np.maximum(count, 1) + 1.0 / np.maximum(tare.counts, 1))
         instants = at[np.linspace(first, last - 1, INSTANTS).round().astype(int)]
         found.append(
             Plateau(
-                case=number, keypoints=mean[:, [0, 2]], variance=variance, instants=instants,
+                case=number,
+                keypoints=mean[:, [0, 2]],
+                variance=variance,
+                instants=instants,
                 force=float(force[first:last].mean()),
             )
-        )  # fmt: skip
-    if not found:
-        raise CalibrationError(
-            f"{case.name}: no load is held steady for {_LEAST_FRAMES} frames; hold each for seconds"
         )
+    if not found:
+        raise CalibrationError(f"{case.name}: no load is held steady for {_LEAST_FRAMES} frames; hold each for seconds")
     return found
 
 

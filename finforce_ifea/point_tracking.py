@@ -77,10 +77,16 @@ class PointTracker:
         key = tuple(self._heights)
         contacts, neighbours = self._probes(key, points, np.concatenate([part[1] for part in parts]))
         return Problem(
-            effectors=self.probe, targets=targets, contacts=contacts, neighbours=neighbours, weights=shares,
-            axes="three" if self.settings.force_axes == "three" else "normal", precision=precision,
-            energy_weight=self._energy_weights[self._candidate] if self.paper else 0.0, energy_form=self.settings.energy_form,
-        )  # fmt: skip
+            effectors=self.probe,
+            targets=targets,
+            contacts=contacts,
+            neighbours=neighbours,
+            weights=shares,
+            axes="three" if self.settings.force_axes == "three" else "normal",
+            precision=precision,
+            energy_weight=self._energy_weights[self._candidate] if self.paper else 0.0,
+            energy_form=self.settings.energy_form,
+        )
 
     def _probes(self, key: tuple[float, ...], points: NDArray, neighbours: NDArray) -> tuple[Any, Any]:
         if getattr(self, "_probe_key", None) != key:
@@ -133,12 +139,22 @@ class PointTracker:
         magnitude = float(np.linalg.norm(force))
         direction = force / magnitude if magnitude > 0 else np.array([-1.0, 0.0, 0.0])
         return Track(
-            covariance=np.array([[stddev**2]]), force=force, force_modes=direction[:, None],
-            pressure_point=share @ deformed, pressure_place=share @ undeformed, weights=weights,
-            stiffening=1.0, residual=result.residual, misfit=1.0, kkt=result.kkt, iterations=result.iterations, converged=result.converged,
+            covariance=np.array([[stddev**2]]),
+            force=force,
+            force_modes=direction[:, None],
+            pressure_point=share @ deformed,
+            pressure_place=share @ undeformed,
+            weights=weights,
+            stiffening=1.0,
+            residual=result.residual,
+            misfit=1.0,
+            kkt=result.kkt,
+            iterations=result.iterations,
+            converged=result.converged,
             sound=bool(np.isfinite(result.q).all() and np.isfinite(force).all() and np.abs(result.q).max() < 0.2),
-            quiet=magnitude < _QUIET_SIGMA * stddev, loaded=magnitude > 2.0 * _QUIET_SIGMA * stddev,
-        )  # fmt: skip
+            quiet=magnitude < _QUIET_SIGMA * stddev,
+            loaded=magnitude > 2.0 * _QUIET_SIGMA * stddev,
+        )
 
     def significance(self, tare: Tare) -> float:
         """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""

@@ -57,7 +57,7 @@ class RollingContact:
         """Linearises the equilibrium f_int(q) = J^T p(J q, place) at unknowns q and place (depth, ln radius, height).
 
         With S the springs of all points and e_x, e_z unit motions of the object, the loads by depth and height are
-        -J^T S e_x and J^T S e_z; as S is symmetric, the same loads give the forces that the jaw's own motion takes away.
+        -J^T S e_x and J^T S e_z; as S is symmetric, the same loads give the forces that the jaw's motion takes away.
         """
         model, probe, radius = self.model, self.surface.probe, float(np.exp(place[LOG_RADIUS]))
         points = model.positions(probe, q)
@@ -81,10 +81,15 @@ class RollingContact:
         force_modes[2] -= load_z @ modes
         relief = np.array([load_x @ steps[:, 0], 0.0, load_z @ steps[:, 0]])
         return PressedState(
-            touches=bool(total > 0), correction=steps[:, 0], modes=modes, force=contact.forces.sum(0) - relief,
-            force_modes=force_modes, pressure_point=share @ points, pressure_place=share @ self.surface.points,
+            touches=bool(total > 0),
+            correction=steps[:, 0],
+            modes=modes,
+            force=contact.forces.sum(0) - relief,
+            force_modes=force_modes,
+            pressure_point=share @ points,
+            pressure_place=share @ self.surface.points,
             smallest_det=state.smallest_det,
-        )  # fmt: skip
+        )
 
     def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
         """Returns the step of a jaw that has lost contact, cut where its surface meets the cylinder again."""

@@ -168,9 +168,7 @@ class SolidModel:
         """Returns the generalised load (size,) [N] of forces (p, 3) [N] at a probe's points."""
         return probe_loads(probe.dof, probe.weights, forces, self.size)
 
-    def stiffen(
-        self, tangent: NDArray | sparse.csc_matrix, probe: SolidProbe, q: NDArray, blocks: NDArray
-    ) -> None:
+    def stiffen(self, tangent: NDArray | sparse.csc_matrix, probe: SolidProbe, q: NDArray, blocks: NDArray) -> None:
         """Adds springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""
         add_probe_springs(probe.dof, probe.weights, blocks, self.size, tangent)
 
@@ -181,9 +179,7 @@ def _order_nodes(elements: NDArray) -> NDArray:
     local = local.reshape(elements.shape)
     pairs = np.broadcast_to(local[:, :, None], (*local.shape, local.shape[1]))
     ones = np.ones(pairs.size)
-    graph = sparse.coo_matrix(
-        (ones, (pairs.ravel(), pairs.transpose(0, 2, 1).ravel())), (len(used), len(used))
-    )
+    graph = sparse.coo_matrix((ones, (pairs.ravel(), pairs.transpose(0, 2, 1).ravel())), (len(used), len(used)))
     return used[reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True)]
 
 

@@ -52,9 +52,7 @@ def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across
     """
     face = mesh.nodes[np.abs(mesh.nodes[:, 0] - jaw.inner_face_x) < _ON_FACE]
     if len(face) < 2:
-        raise MeshError(
-            f"the mesh has no nodes on the inner face x = {jaw.inner_face_x:g} m; check inner_face_x"
-        )
+        raise MeshError(f"the mesh has no nodes on the inner face x = {jaw.inner_face_x:g} m; check inner_face_x")
     low, high = face[:, 2].min(), face[:, 2].max()
     heights = np.arange(low + _SPACING, high - 0.5 * _SPACING, _SPACING)
     gauss = np.array([0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)])

@@ -66,6 +66,4 @@ def to_tet10(mesh: VolumeMesh) -> VolumeMesh:
     nodes = np.concatenate([mesh.nodes, mesh.nodes[ends].mean(axis=1)])
     middles = len(mesh.nodes) + middle.reshape(-1, 6)
     held = len(mesh.nodes) + np.flatnonzero(np.isin(ends, mesh.clamped).all(axis=1))
-    return build_volume_mesh(
-        nodes=nodes, tets=np.hstack([tets, middles]), clamped=np.concatenate([mesh.clamped, held])
-    )
+    return build_volume_mesh(nodes=nodes, tets=np.hstack([tets, middles]), clamped=np.concatenate([mesh.clamped, held]))

@@ -66,8 +66,9 @@ class PlaceTracker:
         place = forecast.place
         q = self.q + self._modes @ (_reachable(place) - self._reached)
         measured = points - tare.offsets
-        update, settled = None, False
-        for iteration in range(1, self.settings.iterations + 1):
+        update, settled, iteration = None, False, 0
+        while not settled and iteration < self.settings.iterations:
+            iteration += 1
             mechanical = _reachable(place)
             state = self.contact.linearize(q, mechanical)
             if not state.touches:
@@ -81,9 +82,7 @@ class PlaceTracker:
             aim[LOG_RADIUS] = min(max(aim[LOG_RADIUS], _RADIUS_RANGE[0]), _RADIUS_RANGE[1])
             moved, place = _reachable(aim) - mechanical, aim
             q = q + limit_step(self.contact.model, state.modes @ moved)
-            if self._is_settled(state, moved, update.place - aim):
-                settled = True
-                break
+            settled = self._is_settled(state, moved, update.place - aim)
         if update is None:
             return self._lose()
         self._keep(q, place, update, forecast, state.modes)
@@ -139,16 +138,32 @@ class PlaceTracker:
         """Returns the residuals of a state and the place that they ask for; None when too few points agree."""
         model, settings = self.contact.model, self.settings
         data = weigh_residuals(
-            measured, model.positions(self.probe, q), self._rest, model.project(self.probe, q, state.modes),
-            place - forecast.place, min(place[DEPTH] - _LEAST_DEPTH, 0.0), tare.noise,
-            tare.offset_variance(settings.offset_stddev), forecast.spread[0, 0], settings.model_error, settings.gate,
-        )  # fmt: skip
+            measured,
+            model.positions(self.probe, q),
+            self._rest,
+            model.project(self.probe, q, state.modes),
+            place - forecast.place,
+            min(place[DEPTH] - _LEAST_DEPTH, 0.0),
+            tare.noise,
+            tare.offset_variance(settings.offset_stddev),
+            forecast.spread[0, 0],
+            settings.model_error,
+            settings.gate,
+        )
         if data.used < settings.minimum_keypoints:
             return data, None
         update = update_place(
-            data, self._mean, self._count, forecast.place, forecast.speed, forecast.spread, self._prior,
-            self._prior_variance, float(settings.memory), _LARGEST_CHANGE[1:],
-        )  # fmt: skip
+            data,
+            self._mean,
+            self._count,
+            forecast.place,
+            forecast.speed,
+            forecast.spread,
+            self._prior,
+            self._prior_variance,
+            float(settings.memory),
+            _LARGEST_CHANGE[1:],
+        )
         return data, update
 
     def _lose(self) -> None:
@@ -156,9 +171,7 @@ class PlaceTracker:
         self._motion[1] = 0.0
         self._motion_covariance[0, 0] += _LOST_STDDEV**2
 
-    def _keep(
-        self, q: NDArray, place: NDArray, update: PlaceUpdate, forecast: "_Forecast", modes: NDArray
-    ) -> None:
+    def _keep(self, q: NDArray, place: NDArray, update: PlaceUpdate, forecast: "_Forecast", modes: NDArray) -> None:
         """Keeps what the next frame starts from; a released jaw expects any object again."""
         self.q, self._modes, self._reached = q, modes, _reachable(place)
         self._slow = place[1:].copy()
@@ -170,22 +183,36 @@ class PlaceTracker:
             self._forget_place()
 
     def _report(
-        self, state: PressedState, place: NDArray, moved: NDArray, data: Residuals, update: PlaceUpdate,
-        iterations: int, settled: bool,
-    ) -> Track:  # fmt: skip
+        self,
+        state: PressedState,
+        place: NDArray,
+        moved: NDArray,
+        data: Residuals,
+        update: PlaceUpdate,
+        iterations: int,
+        settled: bool,
+    ) -> Track:
         force = state.force + state.force_modes @ moved
         if place[DEPTH] < _LEAST_DEPTH:
             force = force * max(0.0, place[DEPTH] / _LEAST_DEPTH)
-        finite = (
-            np.isfinite(force).all() and np.isfinite(update.covariance).all() and np.isfinite(self.q).all()
-        )
+        finite = np.isfinite(force).all() and np.isfinite(update.covariance).all() and np.isfinite(self.q).all()
         return Track(
-            covariance=update.covariance * max(1.0, update.misfit**2), force=force, force_modes=state.force_modes,
-            pressure_point=state.pressure_point, pressure_place=state.pressure_place, weights=data.weights,
-            stiffening=self._stiffening(force, place), residual=update.residual, misfit=update.misfit, kkt=update.kkt, iterations=iterations, converged=settled,
-            sound=bool(finite and state.smallest_det > 0), quiet=bool(place[DEPTH] < _TOUCH_DEPTH),
+            covariance=update.covariance * max(1.0, update.misfit**2),
+            force=force,
+            force_modes=state.force_modes,
+            pressure_point=state.pressure_point,
+            pressure_place=state.pressure_place,
+            weights=data.weights,
+            stiffening=self._stiffening(force, place),
+            residual=update.residual,
+            misfit=update.misfit,
+            kkt=update.kkt,
+            iterations=iterations,
+            converged=settled,
+            sound=bool(finite and state.smallest_det > 0),
+            quiet=bool(place[DEPTH] < _TOUCH_DEPTH),
             loaded=bool(place[DEPTH] > _LOADED_DEPTH),
-        )  # fmt: skip
+        )
 
     def _stiffening(self, force: NDArray, place: NDArray) -> float:
         """Returns how much stiffer the pressed jaw is than at first touch; 1 until it is surely pressed."""

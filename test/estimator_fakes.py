@@ -1,10 +1,14 @@
-"""Recordings of a pressed bench finger, made from a finer mesh than the estimators', with seeded camera noise."""
+"""Recordings of a pressed bench finger: shapes and forces of an independent program, with seeded camera noise.
+
+data/pressed_bench.npz is described in test_truth.py.
+"""
 
 from dataclasses import dataclass, replace
-from functools import cache
+from pathlib import Path
 
 import numpy as np
-from mechanics_fakes import BENCH, MODULUS, bench_mechanics, bench_press
+from mechanics_fakes import BENCH, MODULUS
+from scipy.interpolate import PchipInterpolator
 
 from finforce_ifea.calibration import Calibration
 from finforce_ifea.estimator import JawEstimator
@@ -12,11 +16,13 @@ from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.settings import EstimatorSettings
 
 PERIOD = 1 / 30
-CALIBRATION = Calibration(young_modulus=MODULUS, force_error=0.01)
+TRUTH = np.load(Path(__file__).parent / "data" / "pressed_bench.npz")
+PLACES = {20: "lower", 40: "middle", 60: "upper"}
+# The modulus of the truth; the mechanics is 2 % off on the average, see test_truth.py.
+CALIBRATION = Calibration(young_modulus=MODULUS, force_error=0.02)
 # Standard deviations [m] of a key point across and along the line of sight, and of its constant offset.
 ACROSS, ALONG, OFFSET = 0.2e-3, 0.45e-3, 0.35e-3
 SIGHT = np.array([0.25, -0.95, 0.18]) / np.linalg.norm([0.25, -0.95, 0.18])
-_DEPTHS = tuple(np.arange(0.5, 8.01, 0.5))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,15 +44,14 @@ class Recording:
         return replace(self, observations=observations)
 
 
-@cache
-def true_curve(diameter, height):
-    """Depths (d,) [m], key points (d, K, 3) [m] and forces (d, 3) [N] of a cylinder [mm] at a height [mm]."""
-    model = bench_mechanics("fine").model
-    probe = model.attach(BENCH.keypoints, 1e-3)
-    results = bench_press("fine", "solid", diameter, height, _DEPTHS)
-    points = [BENCH.keypoints] + [model.positions(probe, result.q) for result in results]
-    forces = [np.zeros(3)] + [result.force for result in results]
-    return 1e-3 * np.r_[0.0, _DEPTHS], np.array(points), np.array(forces)
+def true_course(depths, diameter, height):
+    """Key points (n, K, 3) [m] and forces (n, 3) [N] at depths (n,) [m] of a cylinder [mm] at a height [mm]."""
+    name = f"{diameter}_{PLACES[height]}"
+    grid = np.r_[0.0, 1e-3 * TRUTH[f"{name}_depth"]]
+    moved = TRUTH[f"{name}_keypoints"] - TRUTH["keypoints0"]
+    points = PchipInterpolator(grid, np.concatenate([0 * moved[:1], moved]))(depths)
+    forces = PchipInterpolator(grid, np.concatenate([np.zeros((1, 3)), TRUTH[f"{name}_force"]]))(depths)
+    return BENCH.keypoints + 1e-3 * points, forces
 
 
 def ramp(*stops, speed=2e-3, hold=1.0, rest=2.0):
@@ -62,21 +67,18 @@ def ramp(*stops, speed=2e-3, hold=1.0, rest=2.0):
 def record(depths, *, diameter=25, height=40, seed=0, noise=1.0, offsets=1.0, common=np.zeros(3)):
     """Key points of a press with noise and offsets, as shares of the bench's, and an offset common to all [m]."""
     random = np.random.default_rng(seed)
-    grid, points, forces = true_curve(diameter, height)
-    take = lambda table: np.stack(  # noqa: E731
-        [np.interp(depths, grid, column) for column in table.reshape(len(grid), -1).T], axis=1
-    ).reshape(len(depths), *table.shape[1:])
-    clean = take(points)
+    clean, forces = true_course(depths, diameter, height)
     scatter = noise * ACROSS * random.normal(size=clean.shape)
     scatter += noise * ALONG * random.normal(size=(*clean.shape[:2], 1)) * SIGHT
     constant = offsets * OFFSET * random.normal(size=BENCH.keypoints.shape) / np.sqrt(3) + common
     measured = clean + scatter + constant
     likelihood = random.uniform(0.8, 1.0, clean.shape[:2])
     observations = [
-        Observation(stamp=10.0 + PERIOD * (i + 1), points=measured[i], likelihood=likelihood[i]) for i in range(len(depths))
+        Observation(stamp=10.0 + PERIOD * (i + 1), points=measured[i], likelihood=likelihood[i])
+        for i in range(len(depths))
     ]
     return Recording(
-        observations=observations, contact=Contact.fixed(BENCH, 1e-3 * height), depths=depths, forces=take(forces)
+        observations=observations, contact=Contact.fixed(BENCH, 1e-3 * height), depths=depths, forces=forces
     )
 
 
