@@ -84,9 +84,7 @@ def wrench_message(header: Header, force: ArrayLike, torque: ArrayLike = (0.0, 0
     numbers = [*map(float, force), *map(float, torque)]
     if not all(map(math.isfinite, numbers)):
         raise ObservationError(f"the wrench is not finite: {numbers}")
-    return WrenchStamped(
-        header=header, wrench=Wrench(force=_vector(numbers[:3]), torque=_vector(numbers[3:]))
-    )
+    return WrenchStamped(header=header, wrench=Wrench(force=_vector(numbers[:3]), torque=_vector(numbers[3:])))
 
 
 def _vector(xyz: Sequence[float]) -> Vector3:

@@ -39,10 +39,10 @@ object by these angles:
 LOWER_END = """
 The independent program's finger turns a little more; the missing turn, times the length above the contact, is the key
 points' error at the lower height, and grows towards the tip. At 2 mm depth that finger is also stiffer there, by what
-the column "at 2 mm" shows. A finger that is clamped a little higher and has a thicker outer band (last block above:
-what the shipped calibration learnt) comes closer in both, so that the independent finger behaves as one that is stiffer
-next to the clamp. More than that was not found out, nor which of the two is nearer to a printed finger; a calibration
-takes the difference up.
+the column "at 2 mm" shows: it behaves as one that is stiffer next to the clamp. More than that was not found out, nor
+which of the two is nearer to a printed finger. The last block above shows what another clamp height and other band
+thicknesses do, those of the shipped calibration: it belongs to another material and modulus, so that its shapes count
+here and not its forces. A calibration takes such differences up.
 """
 
 INVERSE_HEAD = """

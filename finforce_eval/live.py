@@ -138,9 +138,7 @@ def live_result(
     )
 
 
-def _snapshot(
-    recording: Recording, side: str, log: JawLog, seen: NDArray[np.bool_], estimator: Any
-) -> Snapshot | None:
+def _snapshot(recording: Recording, side: str, log: JawLog, seen: NDArray[np.bool_], estimator: Any) -> Snapshot | None:
     """Return the jaw under the largest force, None if no surface came."""
     if log.surface is None:
         return None

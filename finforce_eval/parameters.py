@@ -9,9 +9,7 @@ from dataclasses import dataclass, field
 class PlayerParameters:
     """What the player is told; units stand in the metadata."""
 
-    bag: str = field(
-        default="", metadata={"description": "recording to be played: rosbag2 folder, .mcap or .db3"}
-    )
+    bag: str = field(default="", metadata={"description": "recording to be played: rosbag2 folder, .mcap or .db3"})
     rate: float = field(
         default=1.0,
         metadata={"description": "speed of playing, 1 as recorded", "unit": "", "min": 0.01, "max": 100.0},

@@ -69,9 +69,7 @@ def read_playback(path: str | Path, without: Collection[str] = ()) -> list[RawMe
     types = get_typestore(Stores.ROS2_JAZZY).fielddefs
     source = bag_source(Path(path))
     with damage_reported(source.name), Reader(source) as reader:
-        chosen = [
-            entry for entry in reader.connections if entry.topic not in without and entry.msgtype in types
-        ]
+        chosen = [entry for entry in reader.connections if entry.topic not in without and entry.msgtype in types]
         headed = {entry.msgtype: _begins_with_header(types[entry.msgtype]) for entry in chosen}
         messages = [
             RawMessage(time, entry.topic, entry.msgtype, bytes(data), headed[entry.msgtype])

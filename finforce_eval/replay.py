@@ -69,9 +69,7 @@ class Replay:
     health: Mapping[str, Mapping[str, str]]
 
 
-def replay(
-    recording: Recording, setup: Setup, *, calibration_file: str = "", playing: Playing | None = None
-) -> Replay:
+def replay(recording: Recording, setup: Setup, *, calibration_file: str = "", playing: Playing | None = None) -> Replay:
     """Play a recording through solver nodes, one process per jaw, and score what they answer.
 
     Nothing outlives the call.
@@ -104,9 +102,7 @@ def _results_of(sides: Sequence[str]) -> set[str]:
     return own | {"/grasp_wrench", "/manipulation_wrench", "/diagnostics", "/clock", "/rosout"}
 
 
-def _graph_options(
-    recording: Recording, setup: Setup, calibration_file: str, playing: Playing
-) -> ReplayOptions:
+def _graph_options(recording: Recording, setup: Setup, calibration_file: str, playing: Playing) -> ReplayOptions:
     """Return what the graph of the solvers is asked for."""
     sides = list(recording.jaws)
     return ReplayOptions(
@@ -121,9 +117,7 @@ def _graph_options(
     )
 
 
-def _run(
-    processes: Sequence[Process], messages: Sequence[RawMessage], log: ReplayLog, playing: Playing
-) -> None:
+def _run(processes: Sequence[Process], messages: Sequence[RawMessage], log: ReplayLog, playing: Playing) -> None:
     """Start the nodes, wait until they listen, play, and end them."""
     try:
         from finforce_eval.node import open_player
@@ -171,9 +165,7 @@ def _score(recording: Recording, setup: Setup, log: ReplayLog) -> Evaluation:
             raise RecordingError(f"{recording.name}: no wrench came on {side}/wrench: {_words(log, side)}")
         estimator = setup.side(side).estimator()
         threshold = setup.settings.likelihood_threshold
-        result = live_result(
-            recording, side, log.jaws[side], likelihood_threshold=threshold, estimator=estimator
-        )
+        result = live_result(recording, side, log.jaws[side], likelihood_threshold=threshold, estimator=estimator)
         results.append(result if len(sides) == 1 else replace(result, name=f"{recording.name}/{side}"))
     return score_results(results, [recording])
 
@@ -190,9 +182,7 @@ def format_replay(result: Replay) -> str:
     lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {_largest(result.grasp):.2f} N.")
     for name, state in result.health.items():
         own = " / ".join(state.get(f"callback to published {part} [ms]", "-") for part in ("p50", "p95"))
-        lines.append(
-            f"{name}: {state['message']}; refused: {state.get('refused', '-')}; in the node {own} ms"
-        )
+        lines.append(f"{name}: {state['message']}; refused: {state.get('refused', '-')}; in the node {own} ms")
     return "\n".join(lines)
 
 

@@ -57,7 +57,7 @@ def _rotate(F, R, inverse):
 
 @njit(**_OPTIONS)
 def _shape(u, nodes, X, g, F, R, scratch, x, d):
-    """Writes deformation gradient, rotation, turned-back coordinates x (k, 3) and deformation d (3 k); returns det F."""
+    """Writes F, R, the turned-back coordinates x (k, 3) and the deformation d (3 k); returns det F."""
     k = len(nodes)
     F[:] = 0.0
     F[0, 0] = F[1, 1] = F[2, 2] = 1.0

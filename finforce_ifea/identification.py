@@ -14,12 +14,19 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from finforce_ifea.calibration import Calibration
+from finforce_ifea.course import (
+    BRANCH_HIGH,
+    BRANCH_LOW,
+    BRANCH_PRIOR,
+    BRANCH_STDDEV,
+    branches_from_parameters,
+    fit_course,
+)
 from finforce_ifea.errors import CalibrationError
-from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import Mechanics, build_mechanics
 from finforce_ifea.plateaus import INSTANTS, CalibrationCase, Plateau, find_plateaus
-from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation, invert_relaxation
+from finforce_ifea.relaxation import invert_relaxation
 from finforce_ifea.rolling import DEPTH, limit_step
 from finforce_ifea.settings import EstimatorSettings
 
@@ -35,19 +42,16 @@ _NAMES = (
     "time_constant_2",
 )
 # Prior means and standard deviations: log modulus about the jaw file's, factors, clamp [mm], shares, log times [s].
-_PRIOR = np.array([0.0, 1.0, 1.0, 1.0, 0.2, 0.1, np.log(1.0), 0.1, np.log(10.0)])
-_PRIOR_STDDEV = np.array([1.0, 0.1, 0.1, 0.1, 0.4, 0.3, 1.5, 0.3, 1.5])
-_LOW = np.array([-3.0, 0.6, 0.6, 0.6, 0.0, 0.0, np.log(0.02), 0.0, np.log(0.1)])
-_HIGH = np.array([3.0, 1.5, 1.5, 1.5, 2.0, 2.0, np.log(1e3), 2.0, np.log(1e4)])
+_PRIOR = np.r_[0.0, 1.0, 1.0, 1.0, 0.2, BRANCH_PRIOR]
+_PRIOR_STDDEV = np.r_[1.0, 0.1, 0.1, 0.1, 0.4, BRANCH_STDDEV]
+_LOW = np.r_[-3.0, 0.6, 0.6, 0.6, 0.0, BRANCH_LOW]
+_HIGH = np.r_[3.0, 1.5, 1.5, 1.5, 2.0, BRANCH_HIGH]
 _DIFFERENCE = np.array([1e-3, 2e-3, 2e-3, 4e-3, 2e-2, 1e-3, 1e-2, 1e-3, 1e-2])
 _GEOMETRY = slice(1, 5)
 _FORCE_ERROR, _FORCE_FLOOR = 0.015, 0.01
 _SHAPE_ERROR = 0.05e-3
 _ITERATIONS = 12
 _PER_CASE = 14
-_LOADED_FORCE = 0.3
-# Errors of neighbouring frames are alike; this many count as one.
-_CORRELATED_FRAMES = 30
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,83 +108,18 @@ def fit_calibration(
     )
     covariance = np.linalg.inv(result.jac.T @ result.jac)
     rough = fit.report(result.x, np.sqrt(np.diag(covariance)))
-    return _refine_relaxation(jaw, cases, settings, rough, progress)
-
-
-def _refine_relaxation(
-    jaw: Jaw,
-    cases: Sequence[CalibrationCase],
-    settings: EstimatorSettings,
-    rough: CalibrationFit,
-    progress: Callable[[float], None],
-) -> CalibrationFit:
-    """Fits modulus and relaxation again to the whole course of force, ramps included, at the found geometry."""
-    courses = []
-    for case in cases:
-        courses.append(_track_course(jaw, case, settings, rough.calibration))
-        progress(float("nan"))
-    fit = least_squares(
-        _course_residuals,
-        np.r_[0.0, _PRIOR[5:]],
-        bounds=(_LOW[[0, *range(5, 9)]], _HIGH[[0, *range(5, 9)]]),
-        x_scale=_PRIOR_STDDEV[[0, *range(5, 9)]],
-        args=(courses,),
-    )
-    model = [
-        np.exp(fit.x[0]) * apply_relaxation(course.elastic, course.stamps, _terms(fit.x[1:])) for course in courses
-    ]
-    loaded = [course.true > _LOADED_FORCE for course in courses]
-    errors = np.concatenate([(m - c.true)[k] for m, c, k in zip(model, courses, loaded, strict=True)])
-    relative = np.concatenate([((m - c.true) / c.true)[k] for m, c, k in zip(model, courses, loaded, strict=True)])
-    stddev = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac + 1e-12 * np.eye(5))))
-    names = ("share_1", "time_constant_1", "share_2", "time_constant_2")
-    scale = [1.0, np.exp(fit.x[2]), 1.0, np.exp(fit.x[4])]
+    course = fit_course(jaw, cases, settings, rough.calibration, progress)
     return replace(
         rough,
         calibration=replace(
             rough.calibration,
-            young_modulus=float(rough.calibration.young_modulus * np.exp(fit.x[0])),
-            relaxation=_terms(fit.x[1:]),
-            force_error=float(np.clip(1.48 * np.median(np.abs(relative)), 0.005, 0.5)),
+            young_modulus=rough.calibration.young_modulus * course.scale,
+            relaxation=course.terms,
+            force_error=float(np.clip(course.relative, 0.005, 0.5)),
         ),
-        uncertainty={**rough.uncertainty, **dict(zip(names, (stddev[1:] * scale).tolist(), strict=True))},
-        force_rms=float(np.sqrt(np.mean(errors**2))),
+        uncertainty={**rough.uncertainty, **dict(zip(_NAMES[5:], course.stddev.tolist(), strict=True))},
+        force_rms=course.force_rms,
     )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Course:
-    """Stamps [s], elastic force estimates and true forces (n,) [N] of one recording."""
-
-    stamps: NDArray
-    elastic: NDArray
-    true: NDArray
-
-
-def _track_course(jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration) -> _Course:
-    """Estimates the elastic force of every frame."""
-    estimator = JawEstimator(jaw, settings=settings, calibration=replace(calibration, relaxation=()))
-    solutions = [estimator.update(observation, case.contact) for observation in case.observations]
-    trusted = [solution for solution in solutions if solution.trusted]
-    stamps = np.array([solution.stamp for solution in trusted])
-    true = np.interp(stamps, case.stamps_true, np.linalg.norm(case.forces_true, axis=1))
-    return _Course(stamps=stamps, elastic=np.array([np.linalg.norm(s.force) for s in trusted]), true=true)
-
-
-def _terms(x: NDArray) -> tuple[RelaxationTerm, ...]:
-    """Returns the branches of shares and log time constants, the faster one first."""
-    terms = [RelaxationTerm(share=float(x[k]), time_constant=float(np.exp(x[k + 1]))) for k in (0, 2)]
-    return tuple(sorted(terms, key=lambda term: term.time_constant))
-
-
-def _course_residuals(x: NDArray, courses: Sequence[_Course]) -> NDArray:
-    """Returns the force residuals of all frames, over 2 % and 0.03 N, with the prior of the branches."""
-    rows = []
-    for course in courses:
-        model = np.exp(x[0]) * apply_relaxation(course.elastic, course.stamps, _terms(x[1:]))
-        rows.append((model - course.true) / (0.02 * course.true + 0.03))
-    weight = np.sqrt(_CORRELATED_FRAMES)
-    return np.concatenate([np.concatenate(rows) / weight, (x[1:] - _PRIOR[5:]) / _PRIOR_STDDEV[5:]])
 
 
 class _Fit:
@@ -214,7 +153,7 @@ class _Fit:
             outer_thickness_factor=float(x[2]),
             rib_thickness_factor=float(x[3]),
             clamped_z=float(1e-3 * x[4]),
-            relaxation=_terms(x[5:9]),
+            relaxation=branches_from_parameters(x[5:9]),
             jaw=self.jaw.name,
         )
 

@@ -33,9 +33,7 @@ def xyz(points):
 
 
 def test_key_points_become_an_observation():
-    observation = observation_from_cloud(
-        cloud_of(**xyz([[1, 2, 3], [4, np.nan, 6]]), likelihood=[0.5, 0.25]), FRAME
-    )
+    observation = observation_from_cloud(cloud_of(**xyz([[1, 2, 3], [4, np.nan, 6]]), likelihood=[0.5, 0.25]), FRAME)
     assert observation.stamp == 7.25
     np.testing.assert_array_equal(observation.points, [[1, 2, 3], [4, np.nan, 6]])
     np.testing.assert_array_equal(observation.likelihood, [0.5, 0.25])
@@ -76,9 +74,7 @@ def test_no_rows_are_no_contact_and_no_error():
     assert contact.points.shape == (0, 3) and contact.touching is False
 
 
-@pytest.mark.parametrize(
-    "rows", [{**xyz([[0.014, np.nan, 0.03]])}, {**xyz([[0.014, 0, 0.03]]), "weight": [np.inf]}]
-)
+@pytest.mark.parametrize("rows", [{**xyz([[0.014, np.nan, 0.03]])}, {**xyz([[0.014, 0, 0.03]]), "weight": [np.inf]}])
 def test_a_contact_that_is_not_finite_is_refused(rows):
     with pytest.raises(ContactError, match="not finite"):
         contact_from_cloud(cloud_of(**rows), FRAME, free=False)

@@ -219,9 +219,7 @@ def two_jaws(probe, right_force=(-3.0, 0.0, 0.5)):
     for out in outs.values():
         probe.connected(out)
     probe.wait_for(
-        lambda: (
-            left.out.grasp.get_subscription_count() == 1 and right.out.wrench.get_subscription_count() == 2
-        )
+        lambda: left.out.grasp.get_subscription_count() == 1 and right.out.wrench.get_subscription_count() == 2
     )
     return outs
 

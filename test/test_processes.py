@@ -23,9 +23,7 @@ class Script:
 
 
 WAIT = "import time; print('up', flush=True); time.sleep(60)"
-STUBBORN = (
-    "import signal, time; signal.signal(2, signal.SIG_IGN); signal.signal(15, signal.SIG_IGN); time.sleep(60)"
-)
+STUBBORN = "import signal, time; signal.signal(2, signal.SIG_IGN); signal.signal(15, signal.SIG_IGN); time.sleep(60)"
 
 
 def is_running(pid):

@@ -35,9 +35,7 @@ def short(tmp_path_factory):
 def run(*words, timeout=240):
     environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     command = [sys.executable, "-m", "finforce_eval.cli", "replay", *map(str, words)]
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=timeout, env=environment, check=False
-    )
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, env=environment, check=False)
 
 
 def solvers_of(domain):
@@ -148,9 +146,7 @@ def two_jaws(tmp_path_factory):
 
 def test_two_solvers_answer_alike_and_complete_the_grasp(two_jaws, tmp_path):
     recording = read_recording(two_jaws)
-    names = argparse.Namespace(
-        jaw="bench", solver="default", mesh="default", contact=[], calibration=None, object=None
-    )
+    names = argparse.Namespace(jaw="bench", solver="default", mesh="default", contact=[], calibration=None, object=None)
     result = replaying.replay(recording, make_setup(names))
     left, right = (result.evaluation.results[f"both/{side}"] for side in ("left", "right"))
     held = left.solved & right.solved

@@ -63,9 +63,7 @@ def test_a_marker_without_points_is_deleted():
 class Example:
     """A record with a field of every kind."""
 
-    limit: float = field(
-        default=0.5, metadata={"description": "a limit", "unit": "s", "min": 0.0, "max": 1.0}
-    )
+    limit: float = field(default=0.5, metadata={"description": "a limit", "unit": "s", "min": 0.0, "max": 1.0})
     height: float = field(default=math.nan, metadata={"description": "a height", "unit": "m", "min": 0.0})
     count: int = field(default=3, metadata={"description": "a count", "min": 1})
     mode: str = field(default="a", metadata={"description": "a mode", "choices": ("a", "b")})
