@@ -211,9 +211,7 @@ def run_bench(options: argparse.Namespace) -> None:
     print("\nresident memory of a process with one solver:")
     print("\n".join(f"  {name}: {megabytes:.0f} MB" for name, megabytes in figures.memory.items()))
     print("\n".join(figures.notes))
-    print(
-        f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}"
-    )
+    print(f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
     if options.json:
         rows = [asdict(row) for row in figures.rows]
         write_json(options.json, {"machine": machine, "times_ms": rows, "memory_MB": figures.memory})

@@ -187,6 +187,8 @@ class JawEstimator:
 
     def _doubt(self, track: Track) -> str:
         """Returns why a track must not be believed, empty when it may."""
+        if not track.converged and self.settings.solver != "paper":
+            return f"the shape has not settled within {track.iterations} iterations"
         if track.misfit > _LARGEST_MISFIT:
             return (
                 f"the key points do not fit this contact ({track.misfit:.1f} standard deviations); is its place right?"

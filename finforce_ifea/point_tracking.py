@@ -17,6 +17,11 @@ from finforce_ifea.track import Track, condition_on_width, explain_offsets
 
 _NEIGHBOUR = 1e-3
 _QUIET_SIGMA = 3.0
+_SETTLED = 1e-5
+# The median of |miss|^2 / variance is this for a normal distribution in three axes.
+_MEDIAN_SQUARE = 2.4
+# A load held at one height leaves more of the shape unexplained than a rolling one does.
+_TOLERATED_MISFIT = 2.0
 
 
 class PointTracker:
@@ -40,6 +45,7 @@ class PointTracker:
     def reset(self) -> None:
         """Starts anew, unloaded, with the middle candidate."""
         self.q = np.zeros(self.mechanics.model.size)
+        self._misfit = 1.0
         self._candidate = len(self.jaw.candidates) // 2
         self._heights = (float(self.jaw.candidates[self._candidate, 2]),)
         self._weights: NDArray | None = np.ones(1)
@@ -103,11 +109,13 @@ class PointTracker:
         known = np.isfinite(targets[:, 0])
         noise = condition_on_width(tare.noise)[0]
         variance = np.trace(noise) / 2.0 + tare.offset_variance(self.settings.offset_stddev)
-        weights = known.astype(float)
         try:
-            for _ in range(1 if self.paper else 2):
-                result = self._solve(targets, None if self.paper else weights / variance)
-                weights = known * 1.0 if self.paper else self._reweigh(targets, result.q, variance, known)
+            if self.paper:
+                result, weights = self._solve(targets, None), known.astype(float)
+            else:
+                before = self._reweigh(targets, self.q, variance, known)
+                result = self._solve(targets, before / variance)
+                weights = self._reweigh(targets, result.q, variance, known)
         except NotEnoughDataError:
             return None
         self.q = result.q
@@ -116,13 +124,14 @@ class PointTracker:
     def _solve(self, targets: NDArray, precision: NDArray | None) -> InverseResult:
         steps = 1 if self.paper else self.settings.iterations
         problem = self._problem(targets, precision)
-        return solve_inverse(self.mechanics.model, problem, self.q, iterations=steps, tolerance=1e-6)
+        return solve_inverse(self.mechanics.model, problem, self.q, iterations=steps, tolerance=_SETTLED)
 
     def _reweigh(self, targets: NDArray, q: NDArray, variance: NDArray, known: NDArray) -> NDArray:
         """Returns weights (K,) that fall with the distance from the shape found; the median sets their scale."""
         miss = np.where(known[:, None], self.mechanics.model.positions(self.probe, q) - targets, 0.0)
         distance = (miss**2).sum(1) / variance
-        scale = max(1.0, float(np.median(distance[known])) / 2.4)
+        scale = max(1.0, float(np.median(distance[known])) / _MEDIAN_SQUARE)
+        self._misfit = np.sqrt(scale) / _TOLERATED_MISFIT
         return np.where(known, 1.0 / (1.0 + distance / scale / self.settings.gate**2) ** 2, 0.0)
 
     def _report(self, result: InverseResult, targets: NDArray, weights: NDArray, variance: NDArray) -> Track:
@@ -147,7 +156,7 @@ class PointTracker:
             weights=weights,
             stiffening=1.0,
             residual=result.residual,
-            misfit=1.0,
+            misfit=self._misfit,
             kkt=result.kkt,
             iterations=result.iterations,
             converged=result.converged,

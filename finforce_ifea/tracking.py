@@ -83,7 +83,7 @@ class PlaceTracker:
             moved, place = _reachable(aim) - mechanical, aim
             q = q + limit_step(self.contact.model, state.modes @ moved)
             settled = self._is_settled(state, moved, update.place - aim)
-        if update is None:
+        if update is None or not state.touches:
             return self._lose()
         self._keep(q, place, update, forecast, state.modes)
         return self._report(state, place, moved, data, update, iteration, settled)
