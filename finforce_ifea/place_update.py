@@ -16,6 +16,7 @@ _LEAST_WEIGHT = 0.02
 # Depth has no prior; this share of one frame's information keeps the posterior regular while nothing was averaged.
 _DEPTH_SHARE = 1e-3
 _PRIOR_REACH = 4.0
+_MANOEUVRE_SIGMA = 3.0
 
 
 class Residuals(NamedTuple):
@@ -28,6 +29,8 @@ class Residuals(NamedTuple):
         noise: of one point in one frame, in plane, (2, 2) [m^2].
         bias: variance that no averaging removes (K,) [m^2].
         used: number of points with a weight.
+        known: number of points that were measured.
+        jump: median of the depths that the points ask for one by one, about the model's own place [m].
     """
 
     r: NDArray
@@ -36,6 +39,8 @@ class Residuals(NamedTuple):
     noise: NDArray
     bias: NDArray
     used: int
+    known: int
+    jump: float
 
 
 class PlaceUpdate(NamedTuple):
@@ -48,6 +53,7 @@ class PlaceUpdate(NamedTuple):
         mean: averaged residuals about the new place (K, 2) [m].
         count: frames that they stand for (K,).
         covariance: of the place (3, 3).
+        depth_variance: of the depth, by this frame and what was before [m^2].
         kkt: what is left of the objective's gradient, relative to the gradient before.
         residual: weighted root mean square residual [m].
         misfit: root mean square of the averaged residuals over their standard deviations; about 1 where the model fits.
@@ -59,6 +65,7 @@ class PlaceUpdate(NamedTuple):
     mean: NDArray
     count: NDArray
     covariance: NDArray
+    depth_variance: float
     kkt: float
     residual: float
     misfit: float
@@ -78,7 +85,9 @@ def weigh_residuals(
     model_error,
     gate,
 ):
-    """Returns the in-plane residuals and the weights of key points; see `Residuals`.
+    """Returns the in-plane residuals about the reference place and the weights of key points; see `Residuals`.
+
+    Weights are those of the residuals that are left at the model's own place.
 
     The motion along y, known to be none, tells of noise that x and z share. A residual of `gate` standard deviations
     keeps a quarter of its weight, w = 1 / (1 + d^2 / gate^2)^2 (Geman and McClure).
@@ -104,7 +113,8 @@ def weigh_residuals(
     plane[0, 1] = plane[1, 0] = noise[0, 2] - gain0 * noise[2, 1]
     r, modes = np.zeros((count, 2)), np.empty((count, 2, 3))
     weights, bias = np.zeros(count), np.empty(count)
-    used = 0
+    asked, say = np.zeros(count), np.zeros(count)
+    used, known = 0, 0
     for k in range(count):
         way = 0.0
         for a in range(3):
@@ -116,6 +126,7 @@ def weigh_residuals(
         off = measured[k, 1] - positions[k, 1]
         r[k, 0] = measured[k, 0] - positions[k, 0] - gain0 * off - modes[k, 0, 0] * below
         r[k, 1] = measured[k, 2] - positions[k, 2] - gain2 * off - modes[k, 1, 0] * below
+        r0, r1 = r[k, 0], r[k, 1]
         for a in range(3):
             r[k, 0] += modes[k, 0, a] * moved[a]
             r[k, 1] += modes[k, 1, a] * moved[a]
@@ -123,7 +134,10 @@ def weigh_residuals(
         s00 = plane[0, 0] + bias[k] + h0 * h0 * depth_variance
         s11 = plane[1, 1] + bias[k] + h1 * h1 * depth_variance
         s01 = plane[0, 1] + h0 * h1 * depth_variance
-        square = (s11 * r[k, 0] ** 2 - 2.0 * s01 * r[k, 0] * r[k, 1] + s00 * r[k, 1] ** 2) / (s00 * s11 - s01 * s01)
+        square = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / (s00 * s11 - s01 * s01)
+        say[k] = h0 * h0 + h1 * h1
+        asked[k] = (h0 * r0 + h1 * r1) / max(say[k], 1e-12)
+        known += 1
         square += off * off / (noise[1, 1] + bias[k])
         weight = 1.0 / (1.0 + square / gate**2) ** 2
         if weight >= _LEAST_WEIGHT:
@@ -131,7 +145,18 @@ def weigh_residuals(
             used += 1
         else:
             r[k, 0] = r[k, 1] = 0.0
-    return Residuals(r, modes, weights, plane, bias, used)
+    return Residuals(r, modes, weights, plane, bias, used, known, _weighted_median(asked, say))
+
+
+@njit(**_OPTIONS)
+def _weighted_median(values, weights):
+    """Returns the value (of n) that has half of the weight on either side; 0 without any weight."""
+    half, total = 0.5 * weights.sum(), 0.0
+    for k in np.argsort(values):
+        total += weights[k]
+        if total >= half and weights[k] > 0.0:
+            return values[k]
+    return 0.0
 
 
 @njit(**_OPTIONS)
@@ -220,7 +245,11 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
     n = len(count)
     information, innovation, pull = _weigh_depth(data, mean, count)
     innovation /= information
-    gain = spread[:, 0] / (1.0 / information + spread[0, 0])
+    # an innovation beyond chance is a manoeuvre: believe the frame
+    variance = max(spread[0, 0], 0.0)
+    if innovation**2 > _MANOEUVRE_SIGMA**2 * (variance + 1.0 / information):
+        variance = innovation**2
+    gain = np.array([variance, spread[1, 0]]) / (1.0 / information + variance)
     depth = reference[0] + gain[0] * innovation
     new_mean, new_count = np.empty((n, 2)), np.empty(n)
     for k in range(n):
@@ -254,7 +283,16 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
     residual = np.sqrt(total / (2.0 * weight))
     misfit = _compute_misfit(data, new_mean, new_count)
     return PlaceUpdate(
-        place, speed + gain[1] * innovation, gain, new_mean, new_count, covariance, kkt, residual, misfit
+        place,
+        speed + gain[1] * innovation,
+        gain,
+        new_mean,
+        new_count,
+        covariance,
+        gain[0] / information,
+        kkt,
+        residual,
+        misfit,
     )
 
 

@@ -40,7 +40,7 @@ class EstimatorSettings:
     radius_log_stddev: float = _setting(0.7, "1", 0.01, 3.0, "uncertainty of the logarithm of that radius")
     acceleration: float = _setting(0.02, "m/s^2", 1e-4, 10.0, "expected acceleration of the object into the jaw")
     memory: int = _setting(45, "frames", 1, 1000, "frames over which the place is averaged while it holds still")
-    iterations: int = _setting(8, "1", 1, 50, "most Newton iterations per frame")
+    iterations: int = _setting(12, "1", 1, 50, "most Newton iterations per frame")
     energy_weight: float = _setting(1e-3, "1", 0.0, 1e9, "the paper's epsilon, used by solver 'paper' alone")
     energy_weights: str = _setting(
         "", "1", None, None, "epsilon of each candidate, comma-separated; empty: energy_weight"

@@ -16,6 +16,7 @@ _LOADED_SIGMA = 3.5
 _DELAY_FRAMES = 15
 _FEWEST_FRAMES = 5
 _LEAST_SEEN = 0.5
+_LEAST_NEAR = 0.75
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,8 +114,11 @@ class TareKeeper:
             raise NotEnoughDataError(f"cannot tare: {count} unloaded frames, expected at least {_FEWEST_FRAMES}")
         frames = list(self._frames)[-count:]
         tare = compute_tare(frames, self._keypoints)
-        if tare is None:
-            raise _explain_no_tare(frames)
+        seen = np.isfinite(np.stack(frames)[..., 0]).mean(0) >= _LEAST_SEEN
+        if seen.sum() < 3:
+            raise NotEnoughDataError("cannot tare: fewer than three key points are seen in half of the frames")
+        if tare is None or (tare.counts > 0).sum() < _LEAST_NEAR * seen.sum():
+            raise UnderLoadError("cannot tare: the key points lie millimetres from where the unloaded jaw has them")
         if not self.tared:
             self._check_unloaded(tare)
         self.tare = tare
@@ -134,10 +138,3 @@ class TareKeeper:
         """Whether key points (K, 3) [m] of one frame are where the tared, unloaded jaw has them."""
         tare = compute_tare([points, points], self._keypoints + self.tare.offsets)
         return self.tared and tare is not None and self._significance(tare) < _LOADED_SIGMA
-
-
-def _explain_no_tare(frames: list[NDArray]) -> NotEnoughDataError | UnderLoadError:
-    seen = np.isfinite(np.stack(frames)[..., 0]).mean(0) >= _LEAST_SEEN
-    if seen.sum() < 3:
-        return NotEnoughDataError("cannot tare: fewer than three key points are seen in half of the frames")
-    return UnderLoadError("cannot tare: the key points lie millimetres from where the unloaded jaw has them")

@@ -29,6 +29,9 @@ _SETTLED_CORRECTION = 1e-4
 _RADIUS_RANGE = np.log([3e-3, 0.2])
 _FRAMES_RELEASED = 15
 _LOST_STDDEV = 1e-3
+# Fewer points in agreement with the forecast than this share call for a leap; a forecast is never wider than this [m].
+_LEAST_AGREEMENT = 0.6
+_WIDEST_FORECAST = 1e-3
 
 
 class PlaceTracker:
@@ -75,9 +78,11 @@ class PlaceTracker:
                 q = q + self.contact.approach(q, state.correction, mechanical)
                 continue
             q = q + limit_step(self.contact.model, state.correction)
-            data, update = self._update_place(q, state, measured, tare, place, forecast)
-            if update is None:
-                break
+            data = self._weigh(q, state, measured, tare, place, forecast)
+            if data.used < max(self.settings.minimum_keypoints, _LEAST_AGREEMENT * data.known):
+                place, q = self._leap(q, state, mechanical, place, data)
+                continue
+            update = self._update_place(data, forecast)
             aim = np.clip(update.place, place - _LARGEST_CHANGE, place + _LARGEST_CHANGE)
             aim[LOG_RADIUS] = min(max(aim[LOG_RADIUS], _RADIUS_RANGE[0]), _RADIUS_RANGE[1])
             moved, place = _reachable(aim) - mechanical, aim
@@ -126,18 +131,12 @@ class PlaceTracker:
         place = np.array([depth + dt * speed, *self._slow])
         return _Forecast(place=place, speed=float(speed), spread=spread)
 
-    def _update_place(
-        self,
-        q: NDArray,
-        state: PressedState,
-        measured: NDArray,
-        tare: Tare,
-        place: NDArray,
-        forecast: "_Forecast",
-    ) -> tuple[Residuals, PlaceUpdate | None]:
-        """Returns the residuals of a state and the place that they ask for; None when too few points agree."""
+    def _weigh(
+        self, q: NDArray, state: PressedState, measured: NDArray, tare: Tare, place: NDArray, forecast: "_Forecast"
+    ) -> Residuals:
+        """Returns the residuals of a state."""
         model, settings = self.contact.model, self.settings
-        data = weigh_residuals(
+        return weigh_residuals(
             measured,
             model.positions(self.probe, q),
             self._rest,
@@ -146,13 +145,14 @@ class PlaceTracker:
             min(place[DEPTH] - _LEAST_DEPTH, 0.0),
             tare.noise,
             tare.offset_variance(settings.offset_stddev),
-            forecast.spread[0, 0],
+            min(forecast.spread[0, 0], _WIDEST_FORECAST**2),
             settings.model_error,
             settings.gate,
         )
-        if data.used < settings.minimum_keypoints:
-            return data, None
-        update = update_place(
+
+    def _update_place(self, data: Residuals, forecast: "_Forecast") -> PlaceUpdate:
+        """Returns the place that the residuals ask for."""
+        return update_place(
             data,
             self._mean,
             self._count,
@@ -161,10 +161,18 @@ class PlaceTracker:
             forecast.spread,
             self._prior,
             self._prior_variance,
-            float(settings.memory),
+            float(self.settings.memory),
             _LARGEST_CHANGE[1:],
         )
-        return data, update
+
+    def _leap(
+        self, q: NDArray, state: PressedState, mechanical: NDArray, place: NDArray, data: Residuals
+    ) -> tuple[NDArray, NDArray]:
+        """Returns place and unknowns moved towards the median depth when the points disagree with the forecast."""
+        jump = float(np.clip(data.jump, -_LARGEST_CHANGE[DEPTH], _LARGEST_CHANGE[DEPTH]))
+        place = place + np.array([jump, 0.0, 0.0])
+        step = state.modes[:, DEPTH] * (_reachable(place)[DEPTH] - mechanical[DEPTH])
+        return place, q + limit_step(self.contact.model, step)
 
     def _lose(self) -> None:
         """Widens the search for the next frame."""
@@ -195,9 +203,11 @@ class PlaceTracker:
         force = state.force + state.force_modes @ moved
         if place[DEPTH] < _LEAST_DEPTH:
             force = force * max(0.0, place[DEPTH] / _LEAST_DEPTH)
+        covariance = update.covariance.copy()
+        covariance[DEPTH, DEPTH] += update.depth_variance
         finite = np.isfinite(force).all() and np.isfinite(update.covariance).all() and np.isfinite(self.q).all()
         return Track(
-            covariance=update.covariance * max(1.0, update.misfit**2),
+            covariance=covariance * max(1.0, update.misfit**2),
             force=force,
             force_modes=state.force_modes,
             pressure_point=state.pressure_point,

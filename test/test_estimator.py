@@ -6,23 +6,25 @@ from functools import cache
 import numpy as np
 import pytest
 from estimator_fakes import CALIBRATION, PERIOD, errors, magnitudes, make_estimator, ramp, record, run, true_course
-from mechanics_fakes import BENCH
+from mechanics_fakes import BENCH, bench_press
 
 from finforce_ifea.errors import CalibrationError, ContactError, JawFileError, ObservationError, UnderLoadError
 from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.jaw import load_jaw
+from finforce_ifea.forward import Cylinder, press_jaw
+from finforce_ifea.jaw import KEYPOINT_DISTANCE, load_jaw
 from finforce_ifea.observation import Contact, Observation, Solution
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
 from finforce_ifea.settings import EstimatorSettings
 
 MODELS = ["solid", "frame"]
-REST, LOADED = 60, slice(105, 240)
 STEPS = ramp(2, 5, 3, 0)
+# Frames: rest to 60, 2 mm from 90, 5 mm from 165, 3 mm from 225, rest from 300 to 330.
+REST, HELD_5 = 60, 190
 
 
 @cache
 def pressed(height=40, *, seed=0, diameter=25):
-    """Two seconds of rest, then 2, 5, 3 and 0 mm at 2 mm/s, each held for a second."""
+    """Two seconds of rest, then 2, 5, 3 and 0 mm at 2 mm/s, each held for a second; see STEPS."""
     return record(STEPS, diameter=diameter, height=height, seed=seed)
 
 
@@ -47,9 +49,9 @@ def statuses(solutions):
 
 
 @pytest.mark.parametrize("solver", MODELS)
-@pytest.mark.parametrize(("height", "bound"), [(20, 0.12), (40, 0.05), (60, 0.05)])
+@pytest.mark.parametrize(("height", "bound"), [(20, 0.15), (40, 0.05), (60, 0.05)])
 def test_force_is_that_of_the_independent_program(height, bound, solver):
-    """Camera noise of the bench, 25 mm; bounds in N of up to 3.8, 1.7 and 2.0, measured 0.10, 0.04, 0.03."""
+    """Camera noise of the bench, 25 mm; bounds in N of up to 3.8, 1.7 and 1.9, measured 0.12, 0.03, 0.03."""
     recording = pressed(height)
     found = errors(recording, solved(height, solver))
     loaded = loaded_frames(recording)
@@ -58,12 +60,13 @@ def test_force_is_that_of_the_independent_program(height, bound, solver):
     assert np.isfinite(found[loaded]).all()
 
 
-@pytest.mark.parametrize("diameter", [15, 35])
-def test_size_of_the_object_need_not_be_known(diameter):
+@pytest.mark.parametrize("solver", MODELS)
+@pytest.mark.parametrize(("diameter", "bound"), [(15, 0.12), (35, 0.22)])
+def test_size_of_the_object_need_not_be_known(diameter, bound, solver):
     recording = pressed(20, diameter=diameter)
-    found = errors(recording, solved(20, diameter=diameter))
-    # measured 0.10 and 0.11 N of up to 3.5 and 4.2
-    assert rms(found[loaded_frames(recording)]) < 0.15
+    found = errors(recording, solved(20, solver, diameter=diameter))
+    # measured 0.07 and 0.17 N of up to 3.5 and 4.1
+    assert rms(found[loaded_frames(recording)]) < bound
 
 
 @pytest.mark.parametrize("shift", [-1.0, 1.0])
@@ -73,10 +76,13 @@ def test_height_of_first_touch_may_be_a_millimetre_off(shift):
     assert rms(found[loaded_frames(recording)]) < 0.20
 
 
-def test_place_of_the_contact_follows_the_object():
-    """Pressed 5 mm at 20 mm, the pressure of a cylinder of 35 mm lies at 16 mm of the undeformed surface."""
-    place = solved(20, diameter=35)[REST + 130].contact_place
-    assert 1e3 * place[2] == pytest.approx(16.0, abs=1.0)
+@pytest.mark.parametrize(("diameter", "height"), [(15, 20), (25, 20), (35, 20), (25, 40), (25, 60), (35, 60)])
+def test_place_of_the_contact_follows_the_object(diameter, height):
+    """As the forward problem has it at 5 mm: from 20 mm down to 19, 18 and 16.5 for growing objects, from 60 up to 61."""
+    place = solved(height, diameter=diameter)[HELD_5].contact_place
+    expected = bench_press("default", "frame", diameter, height, (2, 4, 5))[-1].pressure_place
+    # a millimetre is what offsets of 0.35 mm and the prior of the radius leave
+    assert 1e3 * place[2] == pytest.approx(1e3 * expected[2], abs=1.0)
     assert place[0] == pytest.approx(BENCH.inner_face_x)
 
 
@@ -93,10 +99,12 @@ def test_standard_deviation_is_honest():
 
 
 def test_standard_deviation_grows_with_the_noise_and_with_hidden_points():
-    quiet, loud = (run(record(STEPS, noise=noise), solver="frame")[150].magnitude_stddev for noise in (0.3, 3.0))
-    hidden = pressed().changed(range(REST + 10, 160), lambda _, likelihood: likelihood.put(range(2, 14), 0.1))
-    assert loud > 1.2 * quiet
-    assert run(hidden, solver="frame")[150].magnitude_stddev > 1.2 * solved()[150].magnitude_stddev
+    quiet, loud = (
+        run(record(STEPS, height=20, noise=noise), solver="frame")[150].magnitude_stddev for noise in (0.3, 3.0)
+    )
+    hidden = pressed(20).changed(range(REST + 10, 180), lambda _, likelihood: likelihood.put(range(2, 14), 0.1))
+    assert loud > 1.4 * quiet
+    assert run(hidden, solver="frame")[150].magnitude_stddev > 1.2 * solved(20)[150].magnitude_stddev
 
 
 # --- gross errors, hidden points, holes
@@ -207,12 +215,12 @@ def test_hidden_jaw_gives_no_force(hide):
 
 
 @pytest.mark.parametrize("solver", MODELS)
-@pytest.mark.parametrize(("first", "last"), [(95, 125), (100, 160)])
+@pytest.mark.parametrize(("first", "last"), [(125, 150), (100, 160)])
 def test_force_after_a_gap_is_right_or_not_trusted(first, last, solver):
     """Everything is hidden while the object moves on: what comes first afterwards must not be the force of before."""
     recording = pressed().changed(range(first, last), lambda points, _: points.fill(np.nan))
     solutions = run(recording, solver=solver)
-    assert len(np.unique(recording.depths[first:last])) > 10
+    assert recording.depths[last] - recording.depths[first] > 1.5e-3
     after = errors(recording, solutions)[last : last + 10]
     assert np.nanmax(np.abs(after)) < 0.25
     assert solutions[last + 9].trusted
@@ -246,10 +254,10 @@ def test_force_during_a_jump_is_not_passed_off_as_certain(height):
 def test_tare_removes_the_offsets_of_the_key_points():
     """The same noise with and without offsets gives the same forces; untared, offsets cost far more."""
     clean = magnitudes(run(record(STEPS, offsets=0.0), solver="frame"))
-    offset = record(STEPS, offsets=1.0)
-    assert np.nanmax(np.abs(magnitudes(run(offset, solver="frame")) - clean)) < 0.02
+    offset = record(STEPS, offsets=2.0)
+    assert np.nanmax(np.abs(magnitudes(run(offset, solver="frame")) - clean)) < 0.01
     untared = magnitudes(run(offset, solver="frame", automatic_tare=False))
-    assert np.nanmax(np.abs(untared - clean)) > 0.04
+    assert np.nanmax(np.abs(untared - clean)) > 0.03
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -417,9 +425,9 @@ def test_planar_model_has_no_three_axes():
 @pytest.mark.parametrize("height", [0.060, 0.070])
 def test_contact_far_from_the_truth_is_unobservable(height):
     solutions = run(pressed(20), contact=Contact.fixed(BENCH, height), solver="frame")
-    assert statuses(solutions[150:165]) == {"unobservable"}
-    assert "contact" in solutions[160].message
-    assert not any(solution.force.any() for solution in solutions[150:165])
+    assert statuses(solutions[100:150]) == {"unobservable"}
+    assert "contact" in solutions[120].message
+    assert not any(solution.force.any() for solution in solutions[100:150])
 
 
 @pytest.mark.parametrize(
@@ -488,7 +496,7 @@ def test_malformed_observation_is_refused_with_its_numbers(observation, words):
 def test_stamps_have_to_rise(stamp):
     estimator = make_estimator(solver="frame")
     estimator.update(spoil(stamp=20.0), None)
-    with pytest.raises(ObservationError, match="after 20.0.*rising"):
+    with pytest.raises(ObservationError, match=r"after 20\.0.*rising"):
         estimator.update(spoil(stamp=stamp), None)
     # the refused observation has left no trace, and a new recording may begin
     estimator.update(spoil(stamp=20.1), None)
@@ -569,7 +577,8 @@ def test_force_does_not_depend_on_when_it_was_recorded():
 def test_force_does_not_depend_on_where_the_jaw_lies_along_its_width():
     """A constant shift along y, along which nothing moves, is an offset like any other."""
     shifted = run(record(STEPS, common=np.array([0.0, 1.5e-3, 0.0])), solver="frame")
-    assert np.nanmax(np.abs(magnitudes(shifted) - magnitudes(solved()))) < 1e-6
+    # 2 mN: a few points of the tare lie beyond 3 mm now and do not count
+    assert np.nanmax(np.abs(magnitudes(shifted) - magnitudes(solved()))) < 2e-3
 
 
 # --- solutions
@@ -633,7 +642,8 @@ def test_deformed_surface_and_key_points_follow_the_finger(solver):
     assert estimator.surface_triangles.max() < len(surface)
     moved = np.linalg.norm(surface - estimator.mechanics.mesh.nodes, axis=1)
     assert moved.max() == pytest.approx(5e-3, abs=1e-3)
-    assert moved[estimator.mechanics.mesh.clamped].max() < 1e-12
+    # a planar model turns nothing at the clamp, but knows no single nodes there
+    assert moved[estimator.mechanics.mesh.clamped].max() < 1e-5
 
 
 def test_relaxation_of_the_material_is_added():
@@ -700,8 +710,6 @@ def test_steel_finger_is_no_solid():
 def test_steel_finger_works_with_the_same_estimator():
     """Key points that the model itself has at 12 mm of depth, with a little noise: 3.5 N to a tenth."""
     jaw = load_jaw("steel")
-    from finforce_ifea.forward import Cylinder, press_jaw
-
     maker = JawEstimator(jaw)
     mechanics = maker.mechanics
     results = press_jaw(
@@ -712,7 +720,7 @@ def test_steel_finger_works_with_the_same_estimator():
         0.065,
         [0.004, 0.008, 0.012],
     )
-    probe = mechanics.model.attach(jaw.keypoints, 1e-3)
+    probe = mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
     shapes = [np.array(jaw.keypoints)] + [mechanics.model.positions(probe, result.q) for result in results]
     forces = [0.0] + [np.linalg.norm(result.force) for result in results]
     random, contact, stamp = np.random.default_rng(0), Contact.fixed(jaw, 0.065), 0.0
