@@ -317,9 +317,10 @@ def test_jaw_that_starts_loaded_still_gives_a_force_with_a_wider_standard_deviat
 @pytest.mark.parametrize("height", [40, 60])
 def test_automatic_tare_does_not_take_a_rising_load_for_offsets(height):
     """The object comes after half a second: two thirds of the frames of the tare are already loaded."""
-    recording = record(ramp(5, rest=0.5, hold=2.0), height=height)
-    found = errors(recording, run(recording, solver="frame"))[-40:]
-    assert np.isnan(found).all() or np.abs(np.nanmean(found)) < 0.10
+    recording, estimator = record(ramp(5, rest=0.5, hold=2.0), height=height), make_estimator(solver="frame")
+    found = errors(recording, run(recording, estimator))[-40:]
+    # 0.1 N of 1.7 and 1.9; without any tare, a message and a wide standard deviation say that it may be more
+    assert not estimator.tared or abs(np.nanmean(found)) < 0.10
 
 
 def test_estimator_without_automatic_tare_gives_forces_at_once():
