@@ -33,5 +33,9 @@ class NotEnoughDataError(FinforceError, RuntimeError):
     """Too few observations have arrived for what was asked."""
 
 
+class UnobservableError(NotEnoughDataError):
+    """The key points that are seen do not tell what was asked."""
+
+
 class MissingDependencyError(FinforceError, ImportError):
     """An optional library is needed and not installed."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.calibration import Calibration
-from finforce_ifea.errors import NotEnoughDataError
+from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
 from finforce_ifea.gate import KeypointGate
 from finforce_ifea.jaw import Jaw
 from finforce_ifea.mechanics import Mechanics, build_mechanics
@@ -28,6 +28,7 @@ from finforce_ifea.tracking import PlaceTracker
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 
 _LONGEST_GAP = 1.0
+_BESIDE = 1e-3
 _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
 # Beyond these a force is not reported: misfit of the shape, stiffening, standard deviation [N], its share of the force.
 _LARGEST_MISFIT = 2.0
@@ -56,7 +57,9 @@ class JawEstimator:
         self._gate = KeypointGate(self.jaw, self.settings)
         self._relaxation = Relaxation(calibration.relaxation if calibration else ())
         self._force_error = calibration.force_error if calibration else 0.1
-        self._taring = TareKeeper(self.jaw.keypoints, self.settings, lambda tare: self._tracker.significance(tare))
+        self._taring = TareKeeper(
+            self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
+        )
         self.reset()
 
     def reset(self) -> None:
@@ -122,7 +125,10 @@ class JawEstimator:
             return self._fail("waiting", waiting, used)
         if contact is None or not len(contact.points):
             return self._without_contact(points, used)
-        track = self._tracker.update(points, self._taring.tare, min(dt, _LONGEST_GAP))
+        try:
+            track = self._tracker.update(points, self._taring.tare, min(dt, _LONGEST_GAP))
+        except UnobservableError as error:
+            return self._fail("unobservable", str(error), used)
         return self._conclude(track, used)
 
     def tare(self) -> TareReport:
@@ -149,12 +155,24 @@ class JawEstimator:
         """Hands a contact to the tracker that it is for."""
         if not len(contact.points):
             return
+        self._check_on_surface(contact)
         free = contact.free and self.settings.solver != "paper"
         chosen = self._rolling if free else self._pointed
         if chosen is not self._tracker:
             chosen.reset()
             chosen.q, self._tracker = self._tracker.q.copy(), chosen
         chosen.follow(contact)
+
+    def _check_on_surface(self, contact: Contact) -> None:
+        """Refuses contacts beside the inner surface."""
+        points = self.mechanics.mesh.nodes[np.abs(self.mechanics.mesh.nodes[:, 0] - self.jaw.inner_face_x) < 1e-3]
+        low, high = points.min(0)[1:] - _BESIDE, points.max(0)[1:] + _BESIDE
+        places = contact.points[:, 1:]
+        if ((places < low) | (places > high)).any():
+            raise ContactError(
+                f"contact at y, z = {np.round(1e3 * places, 1).tolist()} mm, expected on the inner surface from "
+                f"{np.round(1e3 * low, 1).tolist()} to {np.round(1e3 * high, 1).tolist()} mm"
+            )
 
     def _without_contact(self, points: NDArray, used: NDArray) -> Solution:
         """Says what can be said without an object: nothing presses, or it cannot be known where."""

@@ -16,7 +16,7 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.errors import ContactError, NotEnoughDataError
+from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
 from finforce_ifea.model import JawModel
 from finforce_ifea.rolling import limit_step
 
@@ -59,7 +59,9 @@ class InverseResult:
     Attributes:
         q: unknowns of the model, in equilibrium with the forces.
         forces: (n, 3) [N] on the jaw at each contact.
-        compliance: W_ea (3 K, m) [m/N] of the active key points, at the last state.
+        compliance: W_ea (3 K, m) [m/N] of the active key points, weighted, at the last state.
+        covariance: of the multipliers (m, m) if each active key point has variance 1 / precision along every axis.
+        directions: total force per unit multiplier (3, m).
         residual: root mean square distance of active key points from their targets [m].
         kkt: largest violation of the program's optimality conditions, scaled by its largest term.
         condition: condition number of the program's matrix.
@@ -70,6 +72,8 @@ class InverseResult:
     q: NDArray
     forces: NDArray
     compliance: NDArray
+    covariance: NDArray
+    directions: NDArray
     residual: float
     kkt: float
     condition: float
@@ -84,7 +88,8 @@ def solve_inverse(
     """Solves an inverse problem, starting from the state q (size,).
 
     Raises:
-        NotEnoughDataError: No key point is active, or the active ones cannot tell the forces apart.
+        NotEnoughDataError: No key point is active.
+        UnobservableError: The active ones do not tell the forces apart.
         ContactError: The problem has no contact.
     """
     active = np.isfinite(problem.targets).all(axis=1)
@@ -107,6 +112,8 @@ def solve_inverse(
         q=q,
         forces=forces,
         compliance=step.compliance,
+        covariance=np.linalg.pinv(step.compliance.T @ step.compliance),
+        directions=step.directions.sum(0),
         residual=float(np.sqrt((miss**2).sum(1).mean())),
         kkt=solution.kkt,
         condition=float(np.linalg.cond(step.hessian)),
@@ -207,16 +214,16 @@ def solve_program(hessian: NDArray, gradient: NDArray, lower: NDArray) -> Progra
         lower: (m,); -1e30 where there is no bound.
 
     Raises:
-        NotEnoughDataError: H is singular: the key points do not tell the forces apart.
+        UnobservableError: H is singular: the key points do not tell the forces apart.
     """
     scale = np.sqrt(np.diag(hessian))
     if not (np.isfinite(hessian).all() and (scale > 0).all()):
-        raise NotEnoughDataError(
+        raise UnobservableError(
             "a force moves no active key point; more of them must be seen, or an energy weight given"
         )
     H, g = hessian / np.outer(scale, scale), gradient / scale
     if np.linalg.eigvalsh(H)[0] < _SINGULAR:
-        raise NotEnoughDataError(
+        raise UnobservableError(
             "the active key points do not tell the forces apart; give an energy weight or fewer contacts"
         )
     bound = np.where(lower <= -_UNBOUNDED, -_UNBOUNDED, lower * scale)
@@ -231,7 +238,7 @@ def solve_program(hessian: NDArray, gradient: NDArray, lower: NDArray) -> Progra
         np.zeros(m, np.int32),
     )
     if flag < 1:
-        raise NotEnoughDataError(f"the quadratic program has no solution (daqp exit flag {flag})")
+        raise UnobservableError(f"the quadratic program has no solution (daqp exit flag {flag})")
     x = np.asarray(x) * size
     return ProgramSolution(multipliers=x / scale, kkt=compute_kkt_residual(H, g, bound, x))
 

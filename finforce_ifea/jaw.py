@@ -57,7 +57,7 @@ class Jaw:
         keypoint_names: (K,), in the order of the key point messages.
         keypoints: (K, 3) [m].
         reference_point: (3,) [m], the point by which the jaw is found in an image.
-        candidates: (C, 3) [m], possible contact candidate_names on the inner surface.
+        candidates: (C, 3) [m], possible contact places on the inner surface.
         inner_face_x: [m], the plane of the inner surface.
         model: what the file recommends: "solid" or "frame".
     """

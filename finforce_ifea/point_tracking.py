@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.errors import NotEnoughDataError, ObservationError
+from finforce_ifea.errors import NotEnoughDataError, ObservationError, UnobservableError
 from finforce_ifea.inverse import InverseResult, Problem, solve_inverse
 from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import Mechanics
@@ -18,6 +18,7 @@ from finforce_ifea.track import Track, condition_on_width, explain_offsets
 _NEIGHBOUR = 1e-3
 _QUIET_SIGMA = 3.0
 _SETTLED = 1e-5
+_FARTHEST_MOVE = 0.2
 # The median of |miss|^2 / variance is this for a normal distribution in three axes.
 _MEDIAN_SQUARE = 2.4
 # A load held at one height leaves more of the shape unexplained than a rolling one does.
@@ -104,7 +105,11 @@ class PointTracker:
         return self._probe_pair
 
     def update(self, points: NDArray, tare: Tare, dt: float) -> Track | None:
-        """Takes the key points (K, 3) [m], NaN where unused; returns None when they do not tell the force."""
+        """Takes the key points (K, 3) [m], NaN where unused; returns None when too few are left.
+
+        Raises:
+            UnobservableError: They do not tell the force.
+        """
         targets = points - tare.offsets
         known = np.isfinite(targets[:, 0])
         noise = condition_on_width(tare.noise)[0]
@@ -116,6 +121,8 @@ class PointTracker:
                 before = self._reweigh(targets, self.q, variance, known)
                 result = self._solve(targets, before / variance)
                 weights = self._reweigh(targets, result.q, variance, known)
+        except UnobservableError:
+            raise
         except NotEnoughDataError:
             return None
         self.q = result.q
@@ -140,17 +147,18 @@ class PointTracker:
         share = size / size.sum() if size.any() else np.full(len(size), 1.0 / len(size))
         undeformed = np.concatenate([self._load(height)[0] for height in self._heights])
         deformed = self.mechanics.model.positions(self._probe_pair[0], result.q)
-        seen = np.isfinite(targets[:, 0])
-        information = (result.compliance.reshape(int(seen.sum()), -1) ** 2).sum(1)
+        covariance = result.covariance
         if self.paper:
-            information = information / variance[seen]
-        stddev = 1.0 / np.sqrt(max(float(information.sum()), 1e-300))
+            covariance = covariance * float(np.mean(variance[np.isfinite(targets[:, 0])]))
         magnitude = float(np.linalg.norm(force))
         direction = force / magnitude if magnitude > 0 else np.array([-1.0, 0.0, 0.0])
+        mode = direction @ result.directions
+        stddev = float(np.sqrt(mode @ covariance @ mode))
+        moves = result.q if self.mechanics.model.rotations is None else result.q[~self.mechanics.model.rotations]
         return Track(
-            covariance=np.array([[stddev**2]]),
+            covariance=covariance,
             force=force,
-            force_modes=direction[:, None],
+            force_modes=result.directions,
             pressure_point=share @ deformed,
             pressure_place=share @ undeformed,
             weights=weights,
@@ -160,19 +168,21 @@ class PointTracker:
             kkt=result.kkt,
             iterations=result.iterations,
             converged=result.converged,
-            sound=bool(np.isfinite(result.q).all() and np.isfinite(force).all() and np.abs(result.q).max() < 0.2),
+            sound=bool(
+                np.isfinite(result.q).all() and np.isfinite(force).all() and np.abs(moves).max() < _FARTHEST_MOVE
+            ),
             quiet=magnitude < _QUIET_SIGMA * stddev,
             loaded=magnitude > 2.0 * _QUIET_SIGMA * stddev,
         )
 
-    def significance(self, tare: Tare) -> float:
+    def significance(self, tare: Tare, stddev: float) -> float:
         """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
         model, q = self.mechanics.model, np.zeros(self.mechanics.model.size)
         problem = self._problem(np.array(self._rest), None)
         load = model.load(problem.contacts, q, np.tile([-1.0, 0.0, 0.0], (len(problem.weights), 1)))
         mode = model.factorise(model.linearize(q).tangent).solve(load)
         modes = model.project(self.probe, q, mode[:, None])[:, [0, 2], 0]
-        return explain_offsets(modes, tare, self.settings.offset_stddev)
+        return explain_offsets(modes, tare, stddev)
 
 
 def parse_energy_weights(settings: EstimatorSettings, count: int) -> NDArray:

@@ -12,7 +12,10 @@ from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare, blank_tare, compute_tare
 
 # A tare looks loaded when the force that explains the offsets exceeds this many standard deviations.
+Significance = Callable[[Tare, float], float]
 _LOADED_SIGMA = 3.5
+# What the noise of an average may leave between the halves of a steady tare [m].
+_STEADY_STDDEV = 0.03e-3
 _DELAY_FRAMES = 15
 _FEWEST_FRAMES = 5
 _LEAST_SEEN = 0.5
@@ -46,8 +49,11 @@ class TareReport:
 class TareKeeper:
     """Collects unloaded frames, tares once there are enough, and goes on averaging until the first load."""
 
-    def __init__(self, keypoints: NDArray, settings: EstimatorSettings, significance: Callable[[Tare], float]) -> None:
-        """Keeps the drawn key points (K, 3) [m] and `significance`, which says how much a tare looks like a load."""
+    def __init__(self, keypoints: NDArray, settings: EstimatorSettings, significance: Significance) -> None:
+        """Keeps the drawn key points (K, 3) [m] and `significance`.
+
+        It says by how many standard deviations a force explains a tare whose points are off by chance by so much [m].
+        """
         self._keypoints, self._settings, self._significance = keypoints, settings, significance
         self.reset()
 
@@ -121,6 +127,7 @@ class TareKeeper:
             raise UnderLoadError("cannot tare: the key points lie millimetres from where the unloaded jaw has them")
         if not self.tared:
             self._check_unloaded(tare)
+            self._check_steady(frames)
         self.tare = tare
         return TareReport(
             frames=count,
@@ -130,11 +137,24 @@ class TareKeeper:
         )
 
     def _check_unloaded(self, tare: Tare) -> None:
-        sigma = self._significance(tare)
+        sigma = self._significance(tare, self._settings.offset_stddev)
         if sigma > _LOADED_SIGMA:
             raise UnderLoadError(f"cannot tare: the key points look loaded ({sigma:.1f} standard deviations)")
+
+    def _check_steady(self, frames: list[NDArray]) -> None:
+        half = len(frames) // 2
+        first, last = compute_tare(frames[:half], self._keypoints), compute_tare(frames[half:], self._keypoints)
+        if half < _FEWEST_FRAMES or first is None or last is None:
+            return
+        counts = np.where((first.counts > 0) & (last.counts > 0), np.minimum(first.counts, last.counts) / 2, 0)
+        change = Tare(offsets=last.offsets - first.offsets, counts=counts, noise=last.noise)
+        sigma = abs(self._significance(change, _STEADY_STDDEV))
+        if sigma > _LOADED_SIGMA:
+            raise UnderLoadError(f"cannot tare: the load is changing ({sigma:.1f} standard deviations)")
 
     def is_at_rest(self, points: NDArray) -> bool:
         """Whether key points (K, 3) [m] of one frame are where the tared, unloaded jaw has them."""
         tare = compute_tare([points, points], self._keypoints + self.tare.offsets)
-        return self.tared and tare is not None and self._significance(tare) < _LOADED_SIGMA
+        return (
+            self.tared and tare is not None and self._significance(tare, self._settings.offset_stddev) < _LOADED_SIGMA
+        )

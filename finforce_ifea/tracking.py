@@ -98,12 +98,12 @@ class PlaceTracker:
         small = (np.abs(moved) < _SETTLED_CHANGE).all() and (np.abs(missing) < _SETTLED_CHANGE).all()
         return bool(small and np.abs(state.correction).max() < _SETTLED_CORRECTION)
 
-    def significance(self, tare: Tare) -> float:
+    def significance(self, tare: Tare, stddev: float) -> float:
         """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
         q = np.zeros(self.contact.model.size)
         state = self.contact.linearize(q, np.r_[_LEAST_DEPTH, self._prior])
         modes = self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
-        return explain_offsets(modes, tare, self.settings.offset_stddev)
+        return explain_offsets(modes, tare, stddev)
 
     def follow(self, contact: Contact) -> None:
         """Takes a contact's height as that of first touch."""

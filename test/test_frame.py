@@ -34,6 +34,8 @@ TRUE_MOTION = [
     *[[-8.03, -1.43], [-5.96, -1.66], [-1.17, 0.20], [-4.02, 0.59], [-7.03, 0.97]],
     *[[-9.24, 1.33], [-9.34, 1.33], [-7.79, 0.71], [-5.78, -0.14], [-2.71, -1.75]],
 ]
+# Where the drawing puts the hinges of the steel finger (8, 3) [m]; the screws of the jaw file sit off the strips.
+HINGES = np.insert(STEEL.drawing.junctions.reshape(-1, 2), 1, 0.0, axis=1)
 # The measured steel finger: base displacements [m] and the sensor's magnitudes [N].
 MEASURED = {0.005: 1.494, 0.010: 2.946, 0.015: 4.670, 0.020: 6.555, 0.025: 9.417, 0.030: 13.624}
 
@@ -136,7 +138,7 @@ def test_motion_is_the_derivative_of_the_position(state, request):
     press = request.getfixturevalue(state)
     model, q = press.model, press.q
     jaw = BENCH if state == "pressed" else STEEL
-    probe = model.attach(np.concatenate([jaw.keypoints, jaw.candidates, jaw.build_mesh().nodes[::7]]), 1e-3)
+    probe = model.attach(np.concatenate([jaw.keypoints, jaw.candidates, jaw.build_mesh().nodes[::7]]), 3e-3)
     modes = np.eye(model.size)
     motion = model.project(probe, q, modes)
     h = 1e-7
@@ -200,7 +202,7 @@ def test_frame_without_a_mesh_has_no_vertices(steel):
 
 def test_rigid_hinged_bars_keep_their_length(pressed_steel):
     model = pressed_steel.model
-    ends = model.attach(STEEL.keypoints)
+    ends = model.attach(HINGES)
     states = (np.zeros(model.size), pressed_steel.q)
     before, after = (model.positions(ends, q).reshape(2, 4, 3) for q in states)
     change = np.linalg.norm(after[0] - after[1], axis=1) - np.linalg.norm(before[0] - before[1], axis=1)
@@ -283,14 +285,10 @@ def test_finer_division_changes_the_force_by_less_than_a_percent(bench):
     np.testing.assert_allclose(forces[0], forces[1], atol=0.01 * np.linalg.norm(forces[1]))
 
 
-def test_measured_force_comes_back_with_feet_on_the_bars():
-    # 64.7 mm is where the pictures place the cylinder; the length of the hinges' feet is fitted to the forces
-    ribs = tuple(replace(rib, thickness=6e-3) for rib in STEEL.drawing.ribs)
-    feet = FrameModel(replace(STEEL.drawing, ribs=ribs), STEEL.material)
-    errors = []
-    for model in (feet, FrameModel(STEEL.drawing, STEEL.material)):
-        press = Press(model, STEEL, 0.020, 0.0647)
-        forces = [np.linalg.norm(press.to(depth).force) for depth in MEASURED]
-        errors.append(np.sqrt(np.mean((np.array(forces) - list(MEASURED.values())) ** 2)))
-    assert errors[0] < 0.3
-    assert errors[1] > 1.0
+def test_measured_force_comes_back_within_a_newton_with_the_constants_as_given():
+    # 66 mm is where the pictures place the cylinder; no force was used for it, nor for the clamp's height
+    press = Press(FrameModel(STEEL.drawing, STEEL.material), STEEL, 0.020, 0.066)
+    forces = np.array([np.linalg.norm(press.to(depth).force) for depth in MEASURED])
+    error = np.sqrt(np.mean((forces - list(MEASURED.values())) ** 2))
+    assert 0.5 < error < 1.0
+    assert (forces < list(MEASURED.values())).all()  # too soft throughout: the hinges' feet are not modelled
