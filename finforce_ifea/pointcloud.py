@@ -178,7 +178,7 @@ def encode_cloud(columns: Mapping[str, ArrayLike]) -> EncodedCloud:
 def decode_keypoints(cloud: Any) -> Keypoints:
     """Return points and likelihood of a key point cloud (any object with the attributes of PointCloud2).
 
-    A cloud without the field `likelihood` gets ones.
+    A cloud without the field `likelihood` gets ones. Rows whose field `valid` is zero, if there is one, become NaN.
 
     Raises:
         ObservationError: the cloud has no x, y, z or its buffer is too short.
@@ -192,11 +192,13 @@ def decode_keypoints(cloud: Any) -> Keypoints:
         row_step=cloud.row_step,
         is_bigendian=cloud.is_bigendian,
         names=("x", "y", "z"),
-        optional=("likelihood",),
+        optional=("likelihood", "valid"),
     )
     points = np.stack([columns["x"], columns["y"], columns["z"]], axis=-1).astype(np.float64)
     if points.ndim != 2:
         raise ObservationError("x, y, z of a key point cloud must be single numbers (count 1)")
-    likelihood = columns.get("likelihood")
+    valid, likelihood = columns.get("valid"), columns.get("likelihood")
+    if valid is not None:
+        points[valid == 0] = np.nan
     ones = np.ones(len(points))
     return Keypoints(points, ones if likelihood is None else likelihood.astype(np.float64))

@@ -16,9 +16,7 @@ from finforce_ifea.meshing import mesh_drawing
 from finforce_ifea.shape_functions import shape_gradients, shape_values
 from finforce_ifea.tetrahedra import to_tet4, to_tet10
 
-TILTED = replace(
-    load_jaw("bench").drawing, ribs=(Rib(inner_z=0.02, outer_z=0.03, thickness=0.001),), clamped_z=0.002
-)
+TILTED = replace(load_jaw("bench").drawing, ribs=(Rib(inner_z=0.02, outer_z=0.03, thickness=0.001),), clamped_z=0.002)
 HEXES = mesh_drawing(TILTED, "coarse")
 MESHES = {"hexes": HEXES, "tets4": to_tet4(HEXES), "tets10": to_tet10(HEXES)}
 
@@ -109,9 +107,7 @@ def test_shape_gradients_are_the_derivatives_of_the_shape_values(count):
 
 
 @settings(max_examples=50, deadline=None)
-@given(
-    x=st.floats(-0.03, 0.03), y=st.floats(-0.02, 0.02), z=st.floats(-0.01, 0.09), seed=st.integers(0, 1000)
-)
+@given(x=st.floats(-0.03, 0.03), y=st.floats(-0.02, 0.02), z=st.floats(-0.01, 0.09), seed=st.integers(0, 1000))
 def test_no_surface_point_is_closer_than_the_closest(x, y, z, seed):
     point = np.array([[x, y, z]])
     closest = find_closest_surface(HEXES, point)
@@ -120,9 +116,7 @@ def test_no_surface_point_is_closer_than_the_closest(x, y, z, seed):
     samples = np.einsum("ts,tsi->ti", rng.dirichlet(np.ones(3), len(corners)), corners)
     assert closest.distances[0] <= np.linalg.norm(samples - point, axis=1).min() + 1e-12
     chosen = corners[closest.triangles[0]]
-    barycentric = np.linalg.lstsq(
-        np.vstack([chosen.T, np.ones(3)]), np.append(closest.points[0], 1.0), rcond=None
-    )[0]
+    barycentric = np.linalg.lstsq(np.vstack([chosen.T, np.ones(3)]), np.append(closest.points[0], 1.0), rcond=None)[0]
     assert (barycentric > -1e-6).all()
 
 

@@ -76,9 +76,7 @@ def test_recordings_that_cannot_be_used_are_refused(jaw):
 
 def test_recordings_of_the_right_jaw_calibrate_its_mirror_image(tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(
-        "finforce_eval.calibrate.fit_calibration", lambda jaw, *_: seen.append(jaw.side) or make_fit()
-    )
+    monkeypatch.setattr("finforce_eval.calibrate.fit_calibration", lambda jaw, *_: seen.append(jaw.side) or make_fit())
     bag = write_recording(bench_recording(side="right"), tmp_path / "bag")
     assert main(["calibrate", str(bag), "-o", str(tmp_path / "finger.yaml")]) == 0
     assert seen == ["right"]

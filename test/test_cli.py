@@ -80,9 +80,7 @@ def test_note_about_unknown_types_goes_to_stderr(tmp_path, exact, capsys, monkey
 
 def test_absent_recording_is_refused(capsys, tmp_path):
     assert_refused(capsys, ["evaluate", tmp_path / "nowhere"], "no such recording")
-    assert_refused(
-        capsys, ["calibrate", tmp_path / "nowhere", "-o", tmp_path / "c.yaml"], "no such recording"
-    )
+    assert_refused(capsys, ["calibrate", tmp_path / "nowhere", "-o", tmp_path / "c.yaml"], "no such recording")
 
 
 def test_empty_folder_is_refused(capsys, tmp_path):
@@ -147,9 +145,7 @@ def test_unknown_solver_and_missing_bag_are_refused(capsys, bag):
     assert_refused(capsys, ["calibrate", bag], "-o/--output")
 
 
-@pytest.mark.parametrize(
-    "change", ["magic=1", "iterations=many", "automatic_tare=perhaps", "iterations=0", "gate"]
-)
+@pytest.mark.parametrize("change", ["magic=1", "iterations=many", "automatic_tare=perhaps", "iterations=0", "gate"])
 def test_setting_that_cannot_be_is_refused(capsys, bag, change):
     assert_refused(capsys, ["evaluate", bag, "--set", change], change.split("=")[0])
 

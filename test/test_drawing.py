@@ -74,9 +74,7 @@ def test_only_the_bench_finger_is_solid():
     assert not replace(BENCH, tip_z=None).is_solid
 
 
-@given(
-    x=st.floats(-0.05, 0.05), y=st.floats(-0.03, 0.03), z=st.floats(-0.02, 0.1), nudge=st.floats(-1e-3, 1e-3)
-)
+@given(x=st.floats(-0.05, 0.05), y=st.floats(-0.03, 0.03), z=st.floats(-0.02, 0.1), nudge=st.floats(-1e-3, 1e-3))
 def test_distance_grows_no_faster_than_the_way_walked(x, y, z, nudge):
     points = np.array([[x, y, z], [x + nudge, y, z], [x, y + nudge, z], [x, y, z + nudge]])
     distances = TILTED.distance_to(points)

@@ -90,9 +90,7 @@ def test_snapshot_is_taken_near_the_largest_force():
     assert np.linalg.norm(result.snapshot.force) > 0.98 * largest
     frame = (result.snapshot.stamp - START) // PERIOD
     # the fake's surface moves by 1 mm a step
-    np.testing.assert_allclose(
-        result.snapshot.surface - result.snapshot.surface0, [[1e-3 * (frame + 1), 0, 0]] * 8
-    )
+    np.testing.assert_allclose(result.snapshot.surface - result.snapshot.surface0, [[1e-3 * (frame + 1), 0, 0]] * 8)
 
 
 def test_truth_sampled_at_other_stamps_is_matched():
@@ -125,9 +123,7 @@ def test_recording_of_another_jaw_is_refused():
 
 
 def test_recording_of_which_nothing_is_solved_is_refused_with_the_reason():
-    with pytest.raises(
-        RecordingError, match=r"none of the frames .* \(30 not_enough_points\): all are hidden"
-    ):
+    with pytest.raises(RecordingError, match=r"none of the frames .* \(30 not_enough_points\): all are hidden"):
         run(make_recording(), [None] * 60)
 
 
@@ -196,9 +192,7 @@ def test_tables_have_a_row_per_case_and_one_for_all():
 def test_table_of_a_case_without_counted_frames_has_dashes():
     recording = make_recording()
     result, _ = run(recording, truth_of(recording))
-    nothing = replace(
-        result, truth=np.full_like(result.truth, np.nan), step_ms=np.full_like(result.step_ms, np.nan)
-    )
+    nothing = replace(result, truth=np.full_like(result.truth, np.nan), step_ms=np.full_like(result.step_ms, np.nan))
     text = format_table(score_results([nothing], [recording]))
     assert "worst - N (case)" in text
     assert "p50 -" in text

@@ -199,9 +199,7 @@ VALUES = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
     max_leaves=8,
 )
-PLACES_IN_FILE = sorted(
-    {place for place, value, _ in BAD_VALUES if value is ...} | {"keypoints", "candidates"}
-)
+PLACES_IN_FILE = sorted({place for place, value, _ in BAD_VALUES if value is ...} | {"keypoints", "candidates"})
 
 
 @settings(max_examples=150, deadline=None)

@@ -16,9 +16,7 @@ from finforce_ifea.meshing import PRESETS, MeshDensity, mesh_drawing
 from finforce_ifea.tetrahedra import split_hexes, to_tet4, to_tet10
 
 BENCH = load_jaw("bench").drawing
-CUBE = np.array(
-    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], dtype=float
-)
+CUBE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], dtype=float)
 
 
 def section_area(drawing):

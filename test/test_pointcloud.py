@@ -69,9 +69,7 @@ def test_several_elements_per_field_become_a_second_axis():
 
 
 def test_empty_cloud_gives_empty_columns():
-    decoded = decode_cloud(
-        (), b"", width=0, height=1, point_step=0, row_step=0, is_bigendian=False, names=("x", "y")
-    )
+    decoded = decode_cloud((), b"", width=0, height=1, point_step=0, row_step=0, is_bigendian=False, names=("x", "y"))
     assert decoded["x"].shape == decoded["y"].shape == (0,)
 
 
@@ -122,3 +120,20 @@ def test_key_points_without_likelihood_are_certain():
     points, likelihood = decode_keypoints(cloud)
     np.testing.assert_array_equal(points, [[1, 2, 3], [np.nan, 2, 3]])
     np.testing.assert_array_equal(likelihood, [1, 1])
+
+
+def test_rows_that_the_detector_calls_invalid_are_not_used():
+    columns = {name: np.arange(3, dtype="<f4") for name in ("x", "y", "z", "likelihood")}
+    encoded = encode_cloud({**columns, "valid": np.array([1, 0, 1], dtype="u1")})
+    cloud = SimpleNamespace(
+        fields=encoded.fields,
+        data=encoded.data,
+        width=3,
+        height=1,
+        point_step=encoded.point_step,
+        row_step=3 * encoded.point_step,
+        is_bigendian=False,
+    )
+    points, _ = decode_keypoints(cloud)
+    assert np.isnan(points[1]).all()
+    np.testing.assert_array_equal(points[[0, 2]], [[0, 0, 0], [2, 2, 2]])

@@ -37,9 +37,7 @@ def assert_same(read, written):
     for side, track in written.jaws.items():
         for part in ("keypoints", "truth", "pose"):
             for name, value in vars(getattr(track, part)).items():
-                np.testing.assert_array_equal(
-                    getattr(getattr(read.jaws[side], part), name), value, err_msg=name
-                )
+                np.testing.assert_array_equal(getattr(getattr(read.jaws[side], part), name), value, err_msg=name)
     for name, value in vars(written.phases).items():
         np.testing.assert_array_equal(getattr(read.phases, name), value, err_msg=name)
     np.testing.assert_array_equal(read.object_pose.position, written.object_pose.position)
@@ -86,9 +84,7 @@ def test_unknown_types_are_skipped_with_a_note(tmp_path, factory, entries):
 
     types = factory.typestore
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        odd = writer.add_connection(
-            "/odd", "own_msgs/msg/Odd", msgdef="own_msgs/Lost part", rihs01="RIHS01_0"
-        )
+        odd = writer.add_connection("/odd", "own_msgs/msg/Odd", msgdef="own_msgs/Lost part", rihs01="RIHS01_0")
         cloud = writer.add_connection("/left/keypoints", CLOUD, typestore=types)
         writer.write(odd, START, b"\x00\x01\x00\x00")
         for entry in entries:
@@ -239,9 +235,7 @@ def test_part_of_a_recording_keeps_the_phase_under_way():
     np.testing.assert_array_equal(keypoints.points, whole.jaws["left"].keypoints.points[7:20])
     assert part.phases.stamps[0] == START + 7 * PERIOD
     row = whole.phases.index_at(keypoints.stamps)
-    assert (
-        part.phases.stage[part.phases.index_at(keypoints.stamps)].tolist() == whole.phases.stage[row].tolist()
-    )
+    assert part.phases.stage[part.phases.index_at(keypoints.stamps)].tolist() == whole.phases.stage[row].tolist()
 
 
 @pytest.mark.parametrize("text", ["{", "[1]"])

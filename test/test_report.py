@@ -28,9 +28,7 @@ def test_report_shows_every_picture_it_names_and_names_every_picture(tmp_path, p
     cases = [evaluate("first", phases=phases), evaluate("second/left", phases=phases, lost=[0, 17])]
     results, recordings = zip(*cases, strict=True)
     evaluation = score_results(results, recordings)
-    page = write_report(
-        evaluation, tmp_path / "new" / "report", keypoint_names="abcd", about={"solver": "fake"}
-    )
+    page = write_report(evaluation, tmp_path / "new" / "report", keypoint_names="abcd", about={"solver": "fake"})
     named = re.findall(r"!\[.*?\]\((.*?)\)", page.read_text())
     assert sorted(named) == sorted(path.name for path in page.parent.glob("*.png"))
     assert len(named) == 2 + 2 * 3

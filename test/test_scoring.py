@@ -121,9 +121,7 @@ def test_step_times_are_percentiles_of_all_steps():
 
 
 def test_steps_that_were_not_timed_are_left_out():
-    times = score_case(
-        make_result(truth=[1.0] * 3, force=[1.0] * 3, step_ms=np.array([np.nan, 2, 4])), span=1.0
-    )
+    times = score_case(make_result(truth=[1.0] * 3, force=[1.0] * 3, step_ms=np.array([np.nan, 2, 4])), span=1.0)
     assert times.step_ms.p50 == pytest.approx(3.0)
     untimed = make_result(truth=[1.0], force=[1.0], step_ms=np.array([np.nan]))
     assert score_case(untimed, span=1.0).step_ms.max is None

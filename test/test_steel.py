@@ -34,9 +34,7 @@ def test_pictures_show_the_key_points_of_the_steel_jaw_in_its_order(measurement)
 
 def test_truth_has_the_measured_magnitude_along_minus_x(measurement):
     truth = recording_from_measurement(measurement).jaws["left"].truth
-    np.testing.assert_allclose(
-        np.linalg.norm(truth.force, axis=1)[::90], np.linalg.norm(measurement["force"], axis=1)
-    )
+    np.testing.assert_allclose(np.linalg.norm(truth.force, axis=1)[::90], np.linalg.norm(measurement["force"], axis=1))
     assert (truth.force[:, 0] < 0).all()
     assert (truth.force[:, 1:] == 0).all()
 
@@ -52,9 +50,7 @@ def test_every_level_settles_and_is_recorded_as_long_as_the_others(measurement):
 def test_recording_survives_a_bag(tmp_path, measurement):
     recording = recording_from_measurement(measurement)
     read = read_recording(write_recording(recording, tmp_path / "steel"))
-    np.testing.assert_allclose(
-        read.jaws["left"].keypoints.points, recording.jaws["left"].keypoints.points, atol=1e-8
-    )
+    np.testing.assert_allclose(read.jaws["left"].keypoints.points, recording.jaws["left"].keypoints.points, atol=1e-8)
     assert read.case == recording.case
 
 
