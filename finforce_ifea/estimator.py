@@ -66,6 +66,7 @@ class JawEstimator:
         """Forgets everything but the jaw: offsets, place, relaxation, stamps."""
         self._stamp: float | None = None
         self._track: Track | None = None
+        self._contact: Contact | None = None
         self._relaxed: float | None = None
         self._taring.reset()
         self._gate.reset()
@@ -110,9 +111,10 @@ class JawEstimator:
         """
         check_observation(observation, len(self.jaw.keypoints), self._stamp)
         dt = 0.0 if self._stamp is None else observation.stamp - self._stamp
-        if contact is not None:
+        if contact is not None and contact is not self._contact:
             check_contact(contact, self.jaw)
             self._follow(contact)
+        self._contact = contact
         self._stamp = observation.stamp
         points = self._gate.accept(observation)
         self._taring.add(points, apart=contact is not None and contact.touching is False)
@@ -194,6 +196,7 @@ class JawEstimator:
         used = track.weights > 0
         if not track.sound:
             self._tracker.reset()
+            self._contact = None
             return self._fail("diverged", "the shape cannot be reached by the jaw", used, track.iterations)
         self._track = track
         doubt = self._doubt(track)

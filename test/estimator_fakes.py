@@ -64,13 +64,15 @@ def ramp(*stops, speed=2e-3, hold=1.0, rest=2.0):
     return np.concatenate(depths)
 
 
-def record(depths, *, diameter=25, height=40, seed=0, noise=1.0, offsets=1.0, common=np.zeros(3)):
+def record(depths, *, diameter=25, height=40, seed=0, noise=1.0, offsets=1.0, common=(0.0, 0.0, 0.0)):
     """Key points of a press with noise and offsets, as shares of the bench's, and an offset common to all [m]."""
     random = np.random.default_rng(seed)
     clean, forces = true_course(depths, diameter, height)
     scatter = noise * ACROSS * random.normal(size=clean.shape)
     scatter += noise * ALONG * random.normal(size=(*clean.shape[:2], 1)) * SIGHT
-    constant = offsets * OFFSET * random.normal(size=BENCH.keypoints.shape) / np.sqrt(3) + common
+    constant = offsets * OFFSET / np.sqrt(3) * np.random.default_rng([seed, 1]).normal(
+        size=BENCH.keypoints.shape
+    ) + np.array(common)
     measured = clean + scatter + constant
     likelihood = random.uniform(0.8, 1.0, clean.shape[:2])
     observations = [

@@ -59,10 +59,11 @@ def test_modes_are_the_derivatives_of_the_equilibrium_by_depth_radius_and_height
     step = STEPS[which] * np.eye(3)[which]
     (up, above), (down, below) = (settle(contact, q, PLACE + sign * step) for sign in (1, -1))
     mode = (up - down) / (2 * STEPS[which])
-    # 2e-3: points enter and leave the contact within the differences
-    assert np.linalg.norm(state.modes[:, which] - mode) < 2e-3 * np.linalg.norm(mode)
+    # a frame leaves out that the arms from its lines to its surface turn under the load: 1 %
+    tolerance = 1e-4 if contact.model.rotations is None else 1.5e-2
+    assert np.linalg.norm(state.modes[:, which] - mode) < tolerance * np.linalg.norm(mode)
     change = (above.force - below.force) / (2 * STEPS[which])
-    np.testing.assert_allclose(state.force_modes[:, which], change, atol=2e-3 * np.linalg.norm(change))
+    np.testing.assert_allclose(state.force_modes[:, which], change, atol=tolerance * np.linalg.norm(change))
 
 
 def test_force_after_the_correction_is_that_of_the_next_state(pressed):
