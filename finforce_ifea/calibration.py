@@ -67,6 +67,8 @@ class Calibration:
             value = getattr(self, name)
             if not (isinstance(value, (int, float)) and np.isfinite(value) and low <= value <= high):
                 raise CalibrationError(f"calibration: {name} = {value!r}, expected a number from {low:g} to {high:g}")
+        if not isinstance(self.jaw, str):
+            raise CalibrationError(f"calibration: jaw = {self.jaw!r}, expected the name of a jaw")
         for term in self.relaxation:
             if not (0.0 <= term.share <= 10.0 and 1e-3 <= term.time_constant <= 1e6):
                 raise CalibrationError(f"calibration: {term}, expected a share from 0 to 10 and 1e-3 to 1e6 s")

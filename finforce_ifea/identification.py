@@ -22,7 +22,7 @@ from finforce_ifea.course import (
     branches_from_parameters,
     fit_course,
 )
-from finforce_ifea.errors import CalibrationError
+from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
 from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import Mechanics, build_mechanics
 from finforce_ifea.plateaus import INSTANTS, CalibrationCase, Plateau, find_plateaus
@@ -183,8 +183,7 @@ class _Fit:
         """Returns the shape residuals and the magnitudes [N] at the drawn modulus; remembers them per geometry."""
         key = np.r_[x[_GEOMETRY], x[len(_NAMES) :]].tobytes()
         if key not in self._shapes:
-            finger = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus).apply(self.jaw)
-            mechanics = build_mechanics(finger, self.settings)
+            mechanics = self._build_finger(x)
             rest = mechanics.model.attach(self.jaw.keypoints, KEYPOINT_DISTANCE)
             solver = _PlateauSolver(mechanics, rest)
             solved = []
@@ -195,6 +194,21 @@ class _Fit:
             residuals = np.concatenate([shape.residual for shape in solved])
             self._shapes = {key: (residuals, np.array([shape.force for shape in solved]))}
         return self._shapes[key]
+
+    def _build_finger(self, x: NDArray) -> Mechanics:
+        """Returns the mechanics of the finger with parameters x, at the drawn modulus.
+
+        Raises:
+            CalibrationError: No finger can look like that; the recordings are of another one.
+        """
+        calibration = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus)
+        try:
+            return build_mechanics(calibration.apply(self.jaw), self.settings)
+        except (JawFileError, MeshError) as error:
+            raise CalibrationError(
+                f"calibration: no shape of the jaw {self.jaw.name!r} comes near the key points ({error}); "
+                "is it the right jaw file?"
+            ) from error
 
     def jacobian(self, x: NDArray) -> NDArray:
         """Returns forward differences, each in the direction that stays within the bounds."""

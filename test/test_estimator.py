@@ -311,6 +311,12 @@ def test_tare_removes_the_offsets_of_the_key_points():
     assert np.nanmax(np.abs(untared - clean)) > 0.03
 
 
+def test_tare_removes_the_offsets_for_a_given_contact_too():
+    contact = Contact(points=np.array([[BENCH.inner_face_x, 0.0, 0.040]]), weights=np.ones(1))
+    clean, offset = (run(record(STEPS, offsets=size), contact=contact, solver="frame") for size in (0.0, 2.0))
+    assert np.nanmax(np.abs(magnitudes(offset) - magnitudes(clean))) < 0.01
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_tare_removes_a_shift_common_to_all_key_points(axis):
     shift = 0.6e-3 * np.eye(3)[axis]
@@ -342,16 +348,16 @@ def test_tare_is_refused_under_load_and_taken_when_unloaded():
 
 
 @pytest.mark.parametrize(
-    ("height", "depth"), [(20, 3), (20, 4), (20, 6), (20, 8), (40, 4), (40, 6), (40, 8), (60, 4), (60, 8)]
+    ("height", "depth"), [(20, 2), (20, 4), (20, 6), (20, 8), (40, 2), (40, 4), (40, 6), (40, 8), (60, 2), (60, 8)]
 )
 def test_automatic_tare_refuses_a_jaw_that_starts_loaded(height, depth):
-    """From 1.3 to 6 N; the deeper ones move half of the key points farther than any offset."""
+    """From 0.7 to 6 N; the deeper ones move half of the key points farther than any offset."""
     recording, estimator = record(np.full(90, 1e-3 * depth), height=height), make_estimator(solver="frame")
     solutions = run(recording, estimator)
     assert not estimator.tared
     with pytest.raises(UnderLoadError):
         estimator.tare()
-    assert np.linalg.norm(recording.forces[-1]) > 1.3
+    assert np.linalg.norm(recording.forces[-1]) > 0.65
     last = solutions[-1]
     assert not last.trusted or "no tare" in last.message
 
@@ -593,11 +599,15 @@ def test_two_runs_are_identical_to_the_bit(solver):
 
 
 def test_reset_forgets_everything():
-    estimator = make_estimator(solver="frame")
-    run(pressed(20, seed=2), estimator)
+    """Offsets, place, hidden points, overstress, stamps: a second recording is as good as a first one."""
+    relaxing = replace(CALIBRATION, relaxation=(RelaxationTerm(share=0.3, time_constant=10.0),))
+    expected = run(pressed(), make_estimator(solver="frame", calibration=relaxing))
+    estimator = make_estimator(solver="frame", calibration=relaxing)
+    before = pressed(20, seed=2).changed(range(170, 200), lambda _, likelihood: likelihood.put([3, 4], 0.1))
+    run(replace(before, observations=before.observations[:200]), estimator)
     estimator.reset()
     assert not estimator.tared
-    assert_identical(run(pressed(), estimator), solved())
+    assert_identical(run(pressed(), estimator), expected)
 
 
 def test_warm_up_leaves_no_trace():

@@ -130,6 +130,18 @@ def test_plateaus_are_the_held_loads():
         assert (np.diff(plateau.instants) > 0).all()
 
 
+def test_truth_may_come_at_a_rate_of_its_own():
+    case = make_case(40)
+    dense = np.linspace(case.stamps_true[0], case.stamps_true[-1], 3 * len(case.stamps_true))
+    forces = np.stack([np.interp(dense, case.stamps_true, column) for column in case.forces_true.T], axis=1)
+    other = replace(case, stamps_true=dense, forces_true=forces)
+    first, second = (find_plateaus([one], BENCH, FRAME, per_case=14) for one in (case, other))
+    assert len(first) == len(second)
+    for left, right in zip(first, second, strict=True):
+        assert right.force == pytest.approx(left.force, rel=0.01)
+        np.testing.assert_allclose(dense[right.instants], case.stamps_true[left.instants], atol=0.2)
+
+
 def test_only_so_many_plateaus_of_a_case_are_taken():
     assert len(find_plateaus([make_case(40), make_case(60)], BENCH, FRAME, per_case=2)) == 4
 

@@ -82,6 +82,10 @@ def test_jaw_that_has_lost_contact_comes_back_to_touch(pressed):
     assert not state.touches
     q = result.q + contact.approach(result.q, state.correction, place)
     assert contact.linearize(q, place).touches
+    # it stops at the object: the whole step would carry it a millimetre into it
+    points = contact.model.positions(contact.surface.probe, q)
+    centre = np.array([contact.face_x + np.exp(place[LOG_RADIUS]) - place[DEPTH], place[HEIGHT]])
+    assert np.linalg.norm(points[:, [0, 2]] - centre, axis=1).min() > np.exp(place[LOG_RADIUS]) - 0.05e-3
     assert settle(contact, q, place)[1].touches
 
 
