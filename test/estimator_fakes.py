@@ -3,7 +3,8 @@
 data/pressed_bench.npz is described in test_truth.py.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.interpolate import PchipInterpolator
 
 from finforce_ifea.calibration import Calibration
 from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.observation import Contact, Observation
+from finforce_ifea.observation import Contact, Observation, Solution
 from finforce_ifea.settings import EstimatorSettings
 
 PERIOD = 1 / 30
@@ -103,3 +104,38 @@ def magnitudes(solutions):
 def errors(recording, solutions):
     """Errors of the magnitudes [N]; NaN where they are not trusted."""
     return magnitudes(solutions) - np.linalg.norm(recording.forces, axis=1)
+
+
+MODELS = ["solid", "frame"]
+STEPS = ramp(2, 5, 3, 0)
+# Frames of STEPS: rest to 60, 2 mm from 90, 5 mm from 165, 3 mm from 225, rest from 300 to 330.
+REST, HELD_5 = 60, 190
+
+
+@cache
+def pressed(height=40, *, seed=0, diameter=25):
+    """Two seconds of rest, then 2, 5, 3 and 0 mm at 2 mm/s, each held for a second."""
+    return record(STEPS, diameter=diameter, height=height, seed=seed)
+
+
+@cache
+def solved(height=40, solver="frame", *, seed=0, diameter=25):
+    return run(pressed(height, seed=seed, diameter=diameter), solver=solver)
+
+
+def loaded_frames(recording):
+    return np.linalg.norm(recording.forces, axis=1) > 0.1
+
+
+def rms(values):
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+def statuses(solutions):
+    return {solution.status for solution in solutions}
+
+
+def assert_identical(first, second):
+    for left, right in zip(first, second, strict=True):
+        for field in fields(Solution):
+            np.testing.assert_array_equal(getattr(left, field.name), getattr(right, field.name), err_msg=field.name)

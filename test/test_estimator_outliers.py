@@ -1,0 +1,216 @@
+"""Claims about gross errors, hidden points, gaps, jumps and garbage in what `JawEstimator` gets."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimator_fakes import (
+    MODELS,
+    REST,
+    STEPS,
+    assert_identical,
+    errors,
+    loaded_frames,
+    magnitudes,
+    make_estimator,
+    pressed,
+    ramp,
+    record,
+    rms,
+    run,
+    solved,
+)
+from mechanics_fakes import BENCH
+
+from finforce_ifea.observation import Contact
+
+# --- gross errors, hidden points, holes
+
+
+def misidentify(count, seed=1):
+    """Moves `count` random points of a frame by 3 to 20 mm and keeps their likelihood high."""
+    random = np.random.default_rng(seed)
+
+    def change(points, likelihood):
+        which = random.choice(len(points), count, replace=False)
+        away = random.normal(size=(count, 3))
+        points[which] += away / np.linalg.norm(away, axis=1, keepdims=True) * random.uniform(3e-3, 20e-3, (count, 1))
+        likelihood[which] = 0.95
+
+    return change
+
+
+def swap(points, likelihood):
+    """Confuses the same three points in every frame with their neighbours."""
+    points[[2, 8, 12]] = points[[3, 9, 13]]
+    likelihood[[2, 8, 12]] = 0.95
+
+
+@pytest.mark.parametrize("solver", MODELS)
+@pytest.mark.parametrize(("height", "bound"), [(20, 0.12), (40, 0.05)])
+@pytest.mark.parametrize("change", [misidentify(3), misidentify(4), swap], ids=["20 %", "27 %", "the same"])
+def test_gross_errors_of_high_likelihood_do_not_move_the_force(change, height, bound, solver):
+    recording = pressed(height)
+    spoilt = recording.changed(range(REST, len(STEPS)), change)
+    moved = magnitudes(run(spoilt, solver=solver)) - magnitudes(solved(height, solver))
+    # measured: at most 0.09 and 0.03 N, where the announced standard deviation is 0.08 and 0.03
+    assert np.isfinite(moved[loaded_frames(recording)]).all()
+    assert np.nanmax(np.abs(moved)) < bound
+
+
+def test_without_the_robust_weights_the_same_gross_errors_do_move_it():
+    spoilt = pressed(20).changed(range(REST, len(STEPS)), misidentify(3))
+    moved = magnitudes(run(spoilt, solver="frame", gate=100.0)) - magnitudes(solved(20))
+    assert np.nanmax(np.abs(moved)) > 0.3
+
+
+def test_gross_errors_are_not_reported_as_used():
+    spoilt = pressed().changed(range(REST, len(STEPS)), swap)
+    solution = run(spoilt, solver="frame")[150]
+    assert not solution.keypoints_used[[2, 8, 12]].any()
+    assert solution.keypoints_used.sum() == 12
+
+
+def test_points_of_low_likelihood_may_be_anywhere():
+    def hide(points, likelihood):
+        likelihood[[3, 4, 10]] = 0.3
+
+    def hide_and_move(points, likelihood):
+        hide(points, likelihood)
+        points[[3, 4, 10]] += [0.005, -0.010, 0.002]
+
+    frames = range(80, len(STEPS))
+    first, second = (run(pressed().changed(frames, change), solver="frame") for change in (hide, hide_and_move))
+    assert_identical(first, second)
+    assert not any(solution.keypoints_used[[3, 4, 10]].any() for solution in second[80:])
+
+
+def test_point_that_appears_once_in_twenty_frames_is_not_believed():
+    hidden = pressed().changed(range(70, len(STEPS)), lambda _, likelihood: likelihood.put([3, 4, 10], 0.1))
+
+    def show(points, likelihood):
+        points[[3, 4, 10]] = BENCH.keypoints[[3, 4, 10]] + [0.002, 0.003, 0.0]
+        likelihood[[3, 4, 10]] = 0.95
+
+    flickering = hidden.changed(range(85, len(STEPS), 20), show)
+    assert_identical(run(hidden, solver="frame"), run(flickering, solver="frame"))
+
+
+def test_holes_in_the_depth_image_are_bridged():
+    random = np.random.default_rng(4)
+
+    def change(points, _):
+        points[random.random(15) < 0.2] = np.nan
+
+    recording = pressed()
+    found = errors(recording, run(recording.changed(range(len(STEPS)), change), solver="frame"))
+    assert rms(found[loaded_frames(recording)]) < 0.06
+
+
+def test_one_coordinate_of_a_point_may_be_missing():
+    def change(points, _):
+        points[5, 2] = np.nan
+
+    solutions = run(pressed().changed(range(len(STEPS)), change), solver="frame")
+    assert not any(solution.keypoints_used[5] for solution in solutions)
+    assert np.nanmax(np.abs(errors(pressed(), solutions))) < 0.15
+
+
+# --- gaps and jumps
+
+
+@pytest.mark.parametrize(
+    "hide", [lambda p, _: p.fill(np.nan), lambda _, likelihood: likelihood.fill(0.1)], ids=["nan", "low"]
+)
+def test_hidden_jaw_gives_no_force(hide):
+    solutions = run(pressed().changed(range(100, 130), hide), solver="frame")
+    for solution in solutions[100:130]:
+        assert solution.status == "not_enough_points"
+        assert not solution.trusted
+        assert not solution.force.any()
+        assert "0 of 15" in solution.message
+
+
+@pytest.mark.parametrize("solver", MODELS)
+@pytest.mark.parametrize(("first", "last"), [(125, 150), (100, 160)])
+def test_force_after_a_gap_is_right_or_not_trusted(first, last, solver):
+    """Everything is hidden while the object moves on: what comes first afterwards must not be the force of before."""
+    recording = pressed().changed(range(first, last), lambda points, _: points.fill(np.nan))
+    solutions = run(recording, solver=solver)
+    assert recording.depths[last] - recording.depths[first] > 1.5e-3
+    after = errors(recording, solutions)[last : last + 10]
+    assert np.nanmax(np.abs(after)) < 0.25
+    assert solutions[last + 9].trusted
+
+
+@pytest.mark.parametrize("solver", MODELS)
+@pytest.mark.parametrize("height", [20, 40])
+def test_jump_of_5_mm_is_followed_within_five_frames(height, solver):
+    depths = 1e-3 * np.r_[np.zeros(60), np.full(40, 1.0), np.full(40, 6.0), np.full(40, 1.0)]
+    recording = record(depths, height=height)
+    solutions = run(recording, solver=solver)
+    true = np.linalg.norm(recording.forces, axis=1)
+    for jump in (100, 140):
+        settled = errors(recording, solutions)[jump + 5 : jump + 35]
+        assert np.isfinite(settled).all()
+        assert np.abs(settled).max() < 0.10 * true.max()
+
+
+@pytest.mark.parametrize("height", [20, 40])
+def test_force_during_a_jump_is_not_passed_off_as_certain(height):
+    depths = 1e-3 * np.r_[np.zeros(60), np.full(40, 1.0), np.full(40, 6.0)]
+    recording = record(depths, height=height)
+    solutions = run(recording, solver="frame")
+    for error, solution in zip(errors(recording, solutions)[100:105], solutions[100:105], strict=True):
+        assert not solution.trusted or abs(error) < 6.0 * solution.magnitude_stddev
+
+
+@pytest.mark.parametrize("height", [20, 60])
+def test_divergence_is_a_state_of_its_own_after_which_the_same_contact_goes_on(height, monkeypatch):
+    """Mechanics that turn inside out for one frame, as no key points of this finger could make them."""
+    recording, estimator = record(ramp(3, hold=3.0), height=height), make_estimator(solver="frame")
+    model, solutions = estimator.mechanics.model, []
+    evaluate = model.linearize
+    for i, observation in enumerate(recording.observations):
+        turned = i == 120
+        monkeypatch.setattr(
+            model, "linearize", lambda q, turned=turned, **options: inside_out(evaluate(q, **options), turned)
+        )
+        solutions.append(estimator.update(observation, recording.contact))
+    assert solutions[120].status == "diverged"
+    assert not solutions[120].force.any()
+    assert "shape" in solutions[120].message
+    found = errors(recording, solutions)[150:]
+    assert np.isfinite(found).all()
+    assert np.abs(found).max() < 0.10 * np.linalg.norm(recording.forces[-1])
+
+
+def inside_out(state, turned):
+    return replace(state, smallest_det=-1.0) if turned else state
+
+
+GARBAGE = {
+    "noise of 5 mm": lambda points, random: points + 5e-3 * random.normal(size=points.shape),
+    "shuffled": lambda points, random: random.permutation(points),
+    "one place": lambda points, random: np.broadcast_to(points.mean(0), points.shape),
+    "2 cm up": lambda points, random: points + [0.0, 0.0, 0.02],
+    "2 cm in": lambda points, random: points - 0.02 * np.outer(np.sin(points[:, 2] / 0.03), [1.0, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("given", [False, True], ids=["followed", "given"])
+@pytest.mark.parametrize("name", GARBAGE)
+def test_garbage_gives_no_force_and_is_forgotten_at_once(name, given):
+    """A second of key points that belong to no shape of the finger, all with a high likelihood."""
+    random = np.random.default_rng(0)
+
+    def change(points, _):
+        points[:] = GARBAGE[name](points.copy(), random)
+
+    recording = record(ramp(3, hold=3.0), height=60)
+    contact = Contact(points=recording.contact.points, weights=np.ones(1)) if given else recording.contact
+    solutions = run(recording.changed(range(120, 150), change), contact=contact, solver="frame")
+    assert not any(solution.trusted for solution in solutions[120:150])
+    after = errors(recording, solutions)[152:]
+    assert np.isfinite(after).all()
+    assert np.abs(after).max() < 0.15

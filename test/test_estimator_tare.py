@@ -1,0 +1,144 @@
+"""Claims about what `JawEstimator` does with a jaw that is not loaded, or should not be."""
+
+import numpy as np
+import pytest
+from estimator_fakes import (
+    MODELS,
+    STEPS,
+    errors,
+    magnitudes,
+    make_estimator,
+    pressed,
+    ramp,
+    record,
+    run,
+    solved,
+    statuses,
+)
+from mechanics_fakes import BENCH
+
+from finforce_ifea.errors import UnderLoadError
+from finforce_ifea.observation import Contact
+
+# --- tare
+
+
+def test_tare_removes_the_offsets_of_the_key_points():
+    """The same noise with and without offsets gives the same forces; untared, offsets cost far more."""
+    clean = magnitudes(run(record(STEPS, offsets=0.0), solver="frame"))
+    offset = record(STEPS, offsets=2.0)
+    assert np.nanmax(np.abs(magnitudes(run(offset, solver="frame")) - clean)) < 0.01
+    untared = magnitudes(run(offset, solver="frame", automatic_tare=False))
+    assert np.nanmax(np.abs(untared - clean)) > 0.03
+
+
+def test_tare_removes_the_offsets_for_a_given_contact_too():
+    contact = Contact(points=np.array([[BENCH.inner_face_x, 0.0, 0.040]]), weights=np.ones(1))
+    clean, offset = (run(record(STEPS, offsets=size), contact=contact, solver="frame") for size in (0.0, 2.0))
+    assert np.nanmax(np.abs(magnitudes(offset) - magnitudes(clean))) < 0.01
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_tare_removes_a_shift_common_to_all_key_points(axis):
+    shift = 0.6e-3 * np.eye(3)[axis]
+    estimator = make_estimator(solver="frame")
+    shifted = run(record(STEPS, common=shift), estimator)
+    assert estimator.tared
+    assert np.nanmax(np.abs(magnitudes(shifted) - magnitudes(solved()))) < 0.02
+
+
+def test_first_frames_wait_for_the_tare():
+    solutions = solved()
+    assert statuses(solutions[:44]) == {"waiting"}
+    assert solutions[45].trusted
+    assert "44 more" in solutions[0].message
+
+
+def test_tare_is_refused_under_load_and_taken_when_unloaded():
+    recording, estimator = pressed(), make_estimator(solver="frame")
+    for i, observation in enumerate(recording.observations):
+        estimator.update(observation, recording.contact)
+        if i in (120, 200):
+            with pytest.raises(UnderLoadError, match="tare"):
+                estimator.tare()
+    report = estimator.tare()
+    assert report.keypoints == 15
+    assert 1e3 * report.noise == pytest.approx(0.32, abs=0.05)
+    assert 0.2e-3 < report.largest_offset < 1.0e-3
+    assert "15 key points" in str(report)
+
+
+@pytest.mark.parametrize(
+    ("height", "depth"), [(20, 2), (20, 4), (20, 6), (20, 8), (40, 2), (40, 4), (40, 6), (40, 8), (60, 2), (60, 8)]
+)
+def test_automatic_tare_refuses_a_jaw_that_starts_loaded(height, depth):
+    """From 0.7 to 6 N; the deeper ones move half of the key points farther than any offset."""
+    recording, estimator = record(np.full(90, 1e-3 * depth), height=height), make_estimator(solver="frame")
+    solutions = run(recording, estimator)
+    assert not estimator.tared
+    with pytest.raises(UnderLoadError):
+        estimator.tare()
+    assert np.linalg.norm(recording.forces[-1]) > 0.65
+    last = solutions[-1]
+    assert not last.trusted or "no tare" in last.message
+
+
+@pytest.mark.parametrize(("height", "depth"), [(20, 4), (40, 4)])
+def test_jaw_that_starts_loaded_still_gives_a_force_with_a_wider_standard_deviation(height, depth):
+    recording = record(np.full(90, 1e-3 * depth), height=height)
+    last = run(recording, solver="frame")[-1]
+    true = np.linalg.norm(recording.forces[-1])
+    assert np.linalg.norm(last.force) == pytest.approx(true, abs=0.15 * true)
+    assert abs(np.linalg.norm(last.force) - true) < 4 * last.magnitude_stddev
+
+
+@pytest.mark.parametrize("height", [40, 60])
+def test_automatic_tare_does_not_take_a_rising_load_for_offsets(height):
+    """The object comes after half a second: two thirds of the frames of the tare are already loaded."""
+    recording, estimator = record(ramp(5, rest=0.5, hold=2.0), height=height), make_estimator(solver="frame")
+    found = errors(recording, run(recording, estimator))[-40:]
+    # 0.1 N of 1.7 and 1.9; without any tare, a message and a wide standard deviation say that it may be more
+    assert not estimator.tared or abs(np.nanmean(found)) < 0.10
+
+
+def test_estimator_without_automatic_tare_gives_forces_at_once():
+    solution = run(pressed(), solver="frame", automatic_tare=False)[0]
+    assert solution.trusted
+    assert "no tare" in solution.message
+
+
+# --- nothing presses
+
+
+@pytest.mark.parametrize("solver", MODELS)
+@pytest.mark.parametrize("height", [20, 40])
+def test_unloaded_jaw_gives_next_to_no_force(height, solver):
+    recording = record(np.zeros(200), height=height)
+    found = magnitudes(run(recording, solver=solver))[45:]
+    # contact can only push, so that noise of some 0.05 mm in depth shows at half of the frames
+    assert found.max() < 0.15
+    assert found.mean() < 0.03
+    assert (found == 0.0).mean() > 0.3
+
+
+def test_released_jaw_returns_to_no_force():
+    assert np.nanmax(magnitudes(solved())[-20:]) < 0.15
+
+
+def test_jaw_at_rest_without_object_is_unloaded_exactly():
+    recording, estimator = record(np.zeros(100)), make_estimator(solver="frame")
+    solutions = [estimator.update(observation, None) for observation in recording.observations]
+    assert statuses(solutions[45:]) == {"unloaded"}
+    assert all(solution.trusted and not solution.force.any() for solution in solutions[45:])
+
+
+@pytest.mark.parametrize(
+    "contact", [None, Contact(points=np.zeros((0, 3)), weights=np.zeros(0))], ids=["None", "empty"]
+)
+def test_bent_jaw_without_known_contact_gives_no_force(contact):
+    recording, estimator = pressed(), make_estimator(solver="frame")
+    solutions = [estimator.update(observation, contact) for observation in recording.observations]
+    held = solutions[160:170]
+    assert statuses(held) == {"no_contact"}
+    assert not any(solution.force.any() or solution.trusted for solution in held)
+    assert statuses(solutions[-15:]) == {"unloaded"}
