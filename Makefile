@@ -1,4 +1,8 @@
 # Each target first sets up what it needs in .venv, with the sourced ROS 2 or with wheels; see tools/setup_venv.sh.
+# Small matrices: a second thread of the linear algebra only gets in the way.
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
 PYTHON := .venv/bin/python
 SET_UP := tools/setup_venv.sh
 DESCRIBED := setup.py setup.cfg pyproject.toml $(SET_UP)

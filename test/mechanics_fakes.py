@@ -11,9 +11,12 @@ from finforce_ifea.jaw_parts import Material
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.mesh import build_volume_mesh
 from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.solid import find_mirror_nodes
 from finforce_ifea.tetrahedra import to_tet4, to_tet10
 
 MODULUS = 30e6
+# Of the small blocks [m].
+EDGE = (0.004, 0.006, 0.008)
 TPU = Material(young_modulus=MODULUS, poisson_ratio=0.45)
 BENCH = replace(load_jaw("bench"), material=TPU)
 HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
@@ -76,3 +79,14 @@ def rotation(axis, angle):
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
     cross = np.cross(np.eye(3), -axis)
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def wobble(model, size, seed=0):
+    """Displacements [m] of every node but the clamped ones, mirrored where the model is."""
+    nodes, random = model.mesh.nodes, np.random.default_rng(seed)
+    u = random.normal(size=nodes.shape)
+    if model.symmetric:
+        mirror = find_mirror_nodes(model.mesh)
+        u = 0.5 * (u + u[mirror] * [1, -1, 1])
+    u[model.mesh.clamped] = 0.0
+    return size * u

@@ -152,5 +152,7 @@ def test_two_solvers_answer_alike_and_complete_the_grasp(two_jaws, tmp_path):
     held = left.solved & right.solved
     assert held.sum() > 0.5 * len(held)
     np.testing.assert_allclose(right.force[held], left.force[held] * [1, -1, 1], atol=0.02)
-    for stamp, magnitude in zip(left.stamps[held], left.magnitude[held], strict=True):
+    # a loaded machine may make one of them drop an image, after which they differ a little
+    weaker = np.minimum(left.magnitude, right.magnitude)
+    for stamp, magnitude in zip(left.stamps[held], weaker[held], strict=True):
         assert result.grasp[int(stamp)] == pytest.approx(magnitude, abs=1e-6)

@@ -1,0 +1,7 @@
+"""Settings of all tests."""
+
+import os
+
+# Before numpy is imported: on small matrices a second thread of the linear algebra only gets in the way.
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
