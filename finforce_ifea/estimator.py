@@ -209,7 +209,7 @@ class JawEstimator:
     def _doubt(self, track: Track) -> str:
         """Returns why a track must not be believed, empty when it may."""
         if not track.converged and self.settings.solver != "paper":
-            return f"the shape has not settled within {track.iterations} iterations"
+            return f"the shape has not settled within {track.iterations} iterations; is the contact's place right?"
         if track.misfit > _LARGEST_MISFIT:
             return (
                 f"the key points do not fit this contact ({track.misfit:.1f} standard deviations); is its place right?"

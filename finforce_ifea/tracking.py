@@ -29,6 +29,8 @@ _SETTLED_CORRECTION = 1e-4
 _RADIUS_RANGE = np.log([3e-3, 0.2])
 _FRAMES_RELEASED = 15
 _LOST_STDDEV = 1e-3
+# The height may leave what was given by this many of its standard deviations; beyond, the contact is another one.
+_FARTHEST_HEIGHT = 8.0
 # Fewer points in agreement with the forecast than this share call for a leap; a forecast is never wider than this [m].
 _LEAST_AGREEMENT = 0.6
 _WIDEST_FORECAST = 1e-3
@@ -85,6 +87,8 @@ class PlaceTracker:
             update = self._update_place(data, forecast)
             aim = np.clip(update.place, place - _LARGEST_CHANGE, place + _LARGEST_CHANGE)
             aim[LOG_RADIUS] = min(max(aim[LOG_RADIUS], _RADIUS_RANGE[0]), _RADIUS_RANGE[1])
+            reach = _FARTHEST_HEIGHT * self.settings.height_stddev
+            aim[HEIGHT] = min(max(aim[HEIGHT], self._prior[1] - reach), self._prior[1] + reach)
             moved, place = _reachable(aim) - mechanical, aim
             q = q + limit_step(self.contact.model, state.modes @ moved)
             settled = self._is_settled(state, moved, update.place - aim)
