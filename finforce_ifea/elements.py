@@ -3,11 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-_HEX_CORNERS = np.array(
-    [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]],
-    float,
-)
-_TET10_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
+from finforce_ifea.shape_functions import shape_gradients
 
 
 def elasticity_matrix(young_modulus: float, poisson_ratio: float) -> NDArray:
@@ -17,32 +13,6 @@ def elasticity_matrix(young_modulus: float, poisson_ratio: float) -> NDArray:
     D = np.diag([2 * shear] * 3 + [shear] * 3)
     D[:3, :3] += lame
     return D
-
-
-def hex_shape(xi: NDArray) -> NDArray:
-    """Returns the 8 trilinear shape functions at local points xi (p, 3), shape (p, 8)."""
-    return np.prod(1 + xi[:, None, :] * _HEX_CORNERS, axis=2) / 8
-
-
-def hex_shape_gradient(xi: NDArray) -> NDArray:
-    """Returns the local gradients of the 8 trilinear shape functions at xi (p, 3), shape (p, 8, 3)."""
-    factors = 1 + xi[:, None, :] * _HEX_CORNERS
-    gradient = np.empty((len(xi), 8, 3))
-    for k in range(3):
-        others = [i for i in range(3) if i != k]
-        gradient[:, :, k] = _HEX_CORNERS[:, k] * factors[..., others[0]] * factors[..., others[1]] / 8
-    return gradient
-
-
-def tet10_shape_gradient(xi: NDArray) -> NDArray:
-    """Returns the local gradients of the 10 quadratic shape functions at xi (p, 3), shape (p, 10, 3)."""
-    corners = np.c_[1 - xi.sum(1), xi]
-    slopes = np.vstack([-np.ones(3), np.eye(3)])
-    gradient = np.empty((len(xi), 10, 3))
-    gradient[:, :4] = (4 * corners[:, :, None] - 1) * slopes
-    for i, (a, b) in enumerate(_TET10_EDGES):
-        gradient[:, 4 + i] = 4 * (corners[:, a, None] * slopes[b] + corners[:, b, None] * slopes[a])
-    return gradient
 
 
 def strain_displacement(gradient: NDArray) -> NDArray:
@@ -77,9 +47,9 @@ def hex_stiffness(corners: NDArray, D: NDArray) -> NDArray:
     Source: Taylor, Beresford, Wilson, A non-conforming element for stress analysis, IJNME 10 (1976).
     """
     points = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / np.sqrt(3)
-    gradient, det = _physical_gradient(corners, hex_shape_gradient(points))
-    _, det_centre = _physical_gradient(corners, hex_shape_gradient(np.zeros((1, 3))))
-    jacobian_centre = np.einsum("pnk,mni->mpik", hex_shape_gradient(np.zeros((1, 3))), corners)[:, 0]
+    gradient, det = _physical_gradient(corners, shape_gradients(8, points))
+    _, det_centre = _physical_gradient(corners, shape_gradients(8, np.zeros((1, 3))))
+    jacobian_centre = np.einsum("pnk,mni->mpik", shape_gradients(8, np.zeros((1, 3))), corners)[:, 0]
     modes = -2 * points[:, :, None] * np.eye(3)
     modes = np.einsum("pak,mki->mpai", modes, np.linalg.inv(jacobian_centre)) * (det_centre / det)[..., None, None]
     B, G = strain_displacement(gradient), strain_displacement(modes)
@@ -96,12 +66,12 @@ def tet_stiffness(corners: NDArray, D: NDArray) -> NDArray:
     """
     if corners.shape[1] == 4:
         points, weight = np.full((1, 3), 0.25), 1 / 6
-        local = np.vstack([-np.ones(3), np.eye(3)])[None]
+        local = shape_gradients(4, points)
     else:
         a, b = (5 - np.sqrt(5)) / 20, (5 + 3 * np.sqrt(5)) / 20
         points, weight = np.full((4, 3), a), 1 / 24
         points[[0, 1, 2], [0, 1, 2]] = b
-        local = tet10_shape_gradient(points)
+        local = shape_gradients(10, points)
     gradient, det = _physical_gradient(corners, local)
     B = strain_displacement(gradient)
     return weight * np.einsum("mp,mpai,ab,mpbj->mij", det, B, D, B, optimize=True)
@@ -109,11 +79,7 @@ def tet_stiffness(corners: NDArray, D: NDArray) -> NDArray:
 
 def centre_gradient(corners: NDArray) -> NDArray:
     """Returns the shape function gradients at the element centres, shape (m, n, 3) [1/m], that define rotation."""
-    n = corners.shape[1]
-    if n == 8:
-        local = hex_shape_gradient(np.zeros((1, 3)))
-    elif n == 4:
-        local = np.vstack([-np.ones(3), np.eye(3)])[None]
-    else:
-        local = tet10_shape_gradient(np.full((1, 3), 0.25))
+    count = corners.shape[1]
+    centre = np.zeros((1, 3)) if count == 8 else np.full((1, 3), 0.25)
+    local = shape_gradients(count, centre)
     return _physical_gradient(corners, local)[0][:, 0]

@@ -22,7 +22,7 @@ from finforce_ifea.point_tracking import PointTracker
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.taring import TareKeeper, TareReport
-from finforce_ifea.track import Track
+from finforce_ifea.track import Track, compute_magnitude_stddev
 from finforce_ifea.tracking import PlaceTracker
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
@@ -65,7 +65,6 @@ class JawEstimator:
     def reset(self) -> None:
         """Forgets everything but the jaw: offsets, place, relaxation, stamps."""
         self._stamp: float | None = None
-        self._track: Track | None = None
         self._contact: Contact | None = None
         self._relaxed: float | None = None
         self._taring.reset()
@@ -198,7 +197,6 @@ class JawEstimator:
             self._tracker.reset()
             self._contact = None
             return self._fail("diverged", "the shape cannot be reached by the jaw", used, track.iterations)
-        self._track = track
         doubt = self._doubt(track)
         if doubt:
             return self._fail("unobservable", doubt, used, track.iterations)
@@ -219,7 +217,7 @@ class JawEstimator:
                 f"the jaw seems {track.stiffening:.0f} times as stiff as at the given height; is the contact elsewhere?"
             )
         magnitude = float(np.linalg.norm(track.force))
-        stddev = self._stddev(track, magnitude)
+        stddev = compute_magnitude_stddev(track.force, track.force_modes, track.covariance)
         if not stddev <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
             return f"the visible key points tell the force only within {stddev:.2g} N"
         return ""
@@ -230,11 +228,6 @@ class JawEstimator:
         self._relaxed = self._stamp
         return self._relaxation.update(elastic, dt)
 
-    def _stddev(self, track: Track, magnitude: float) -> float:
-        direction = track.force / magnitude if magnitude > 0 else np.array([-1.0, 0.0, 0.0])
-        mode = direction @ track.force_modes
-        return float(np.sqrt(mode @ track.covariance @ mode))
-
     def _solution(self, track: Track, force: NDArray, used: NDArray) -> Solution:
         magnitude = float(np.linalg.norm(force))
         loaded = magnitude > 0.0
@@ -243,8 +236,8 @@ class JawEstimator:
         )
         stddev = np.sqrt(np.diag(covariance))
         arm = track.pressure_point * [1.0, 0.0, 1.0]
-        elastic = float(np.linalg.norm(track.force))
-        total = np.hypot(self._stddev(track, elastic), self._force_error * magnitude)
+        fit = compute_magnitude_stddev(track.force, track.force_modes, track.covariance)
+        total = np.hypot(fit, self._force_error * magnitude)
         unknown = np.full(3, np.nan)
         return Solution(
             stamp=self._stamp,

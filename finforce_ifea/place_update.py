@@ -176,15 +176,20 @@ def _invert_symmetric(A):
 
 
 @njit(**_OPTIONS)
+def _averaged_spread(data, count, k):
+    """Returns the entries 00, 11 and 01 of the covariance of point k's averaged residual [m^2]."""
+    share = 1.0 / max(count[k], 1.0)
+    return data.noise[0, 0] * share + data.bias[k], data.noise[1, 1] * share + data.bias[k], data.noise[0, 1] * share
+
+
+@njit(**_OPTIONS)
 def _posterior(data, mean, count, offset, prior_variance, information):
     """Returns Hessian and gradient of the log posterior of the place for averaged residuals."""
     hessian, gradient = np.zeros((3, 3)), np.zeros(3)
     for k in range(len(count)):
         if count[k] <= 0.5:
             continue
-        share = 1.0 / max(count[k], 1.0)
-        s00, s11 = data.noise[0, 0] * share + data.bias[k], data.noise[1, 1] * share + data.bias[k]
-        s01 = data.noise[0, 1] * share
+        s00, s11, s01 = _averaged_spread(data, count, k)
         det = s00 * s11 - s01 * s01
         for i in range(3):
             a = (s11 * data.modes[k, 0, i] - s01 * data.modes[k, 1, i]) / det
@@ -303,9 +308,7 @@ def _compute_misfit(data, mean, count):
     for k in range(len(count)):
         if count[k] <= 0.5:
             continue
-        share = 1.0 / max(count[k], 1.0)
-        s00, s11 = data.noise[0, 0] * share + data.bias[k], data.noise[1, 1] * share + data.bias[k]
-        s01 = data.noise[0, 1] * share
+        s00, s11, s01 = _averaged_spread(data, count, k)
         m0, m1 = mean[k, 0], mean[k, 1]
         total += (s11 * m0 * m0 - 2.0 * s01 * m0 * m1 + s00 * m1 * m1) / (s00 * s11 - s01 * s01)
         freedom += 2.0

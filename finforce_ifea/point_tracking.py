@@ -13,7 +13,7 @@ from finforce_ifea.mechanics import Mechanics
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
-from finforce_ifea.track import Track, condition_on_width, explain_offsets
+from finforce_ifea.track import Track, compute_magnitude_stddev, condition_on_width, explain_offsets
 
 _NEIGHBOUR = 1e-3
 _QUIET_SIGMA = 3.0
@@ -151,9 +151,7 @@ class PointTracker:
         if self.paper:
             covariance = covariance * float(np.mean(variance[np.isfinite(targets[:, 0])]))
         magnitude = float(np.linalg.norm(force))
-        direction = force / magnitude if magnitude > 0 else np.array([-1.0, 0.0, 0.0])
-        mode = direction @ result.directions
-        stddev = float(np.sqrt(mode @ covariance @ mode))
+        stddev = compute_magnitude_stddev(force, result.directions, covariance)
         moves = result.q if self.mechanics.model.rotations is None else result.q[~self.mechanics.model.rotations]
         return Track(
             covariance=covariance,

@@ -11,8 +11,8 @@ from finforce_ifea.errors import NotEnoughDataError, UnderLoadError
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare, blank_tare, compute_tare
 
-# A tare looks loaded when the force that explains the offsets exceeds this many standard deviations.
 Significance = Callable[[Tare, float], float]
+# A tare looks loaded when the force that explains the offsets exceeds this many standard deviations.
 _LOADED_SIGMA = 3.5
 # What the noise of an average may leave between the halves of a steady tare [m].
 _STEADY_STDDEV = 0.03e-3

@@ -50,6 +50,20 @@ class Track:
     loaded: bool
 
 
+def compute_magnitude_stddev(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
+    """Returns the standard deviation [N] of a force (3,) along itself, along -x when it is none.
+
+    Args:
+        force: (3,) [N].
+        modes: derivative of the force by what was estimated (3, m).
+        covariance: of what was estimated (m, m).
+    """
+    magnitude = float(np.linalg.norm(force))
+    direction = force / magnitude if magnitude > 0 else np.array([-1.0, 0.0, 0.0])
+    mode = direction @ modes
+    return float(np.sqrt(mode @ covariance @ mode))
+
+
 def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
     """Returns by how many standard deviations one mode (K, 2) explains the offsets of a tare.
 
