@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-from finforce_ifea.messages import contact_from_cloud
+from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_ifea.observation import Contact
+from finforce_ifea.outline import ObjectOutline
 
 
 class ContactFeed:
-    """Keeps the newest contact and gives it away while it is fresh.
+    """Keeps the newest contact and the object's newest outline, and gives them away while they are fresh.
 
     Args:
         frame: the jaw frame, in which contacts have to come.
@@ -21,7 +23,9 @@ class ContactFeed:
     def __init__(self, *, frame: str, fixed: Contact | None, free: bool, max_age: int) -> None:
         self._frame, self._fixed, self._free, self._max_age = frame, fixed, free, max_age
         self._contact: Contact | None = None
-        self._stamp = 0
+        self._outline: ObjectOutline | None = None
+        self._cut: ObjectOutline | None = None
+        self._stamp = self._outline_stamp = 0
 
     @property
     def is_fixed(self) -> bool:
@@ -38,8 +42,28 @@ class ContactFeed:
         self._contact, self._stamp = None, stamp
         self._contact = contact_from_cloud(cloud, self._frame, free=self._free)
 
+    def take_outline(self, cloud: Any, stamp: int) -> None:
+        """Keep the object's outline of a sensor_msgs/PointCloud2; one that cannot be read leaves none.
+
+        Raises:
+            ObservationError: the frame, the height, the fields or the buffer are wrong.
+            ContactError: the corners are no outline.
+        """
+        self._outline, self._outline_stamp = None, stamp
+        self._outline = outline_from_cloud(cloud, self._frame, self._cut)
+        self._cut = self._outline or self._cut
+
     def at(self, stamp: int) -> Contact | None:
-        """Return the contact for an image [ns], None if none is known or the known one is too old."""
+        """Return the contact for an image [ns], None if none is known or the known one is too old.
+
+        It carries the object's outline while that is fresh; the same messages give the same object again.
+        """
         if self._fixed is not None:
             return self._fixed
-        return self._contact if abs(stamp - self._stamp) <= self._max_age else None
+        if self._contact is None or abs(stamp - self._stamp) > self._max_age:
+            return None
+        fresh = abs(stamp - self._outline_stamp) <= self._max_age and len(self._contact.points)
+        outline = self._outline if fresh else None
+        if outline is not self._contact.outline:
+            self._contact = replace(self._contact, outline=outline)
+        return self._contact

@@ -157,7 +157,7 @@ class JawEstimator:
         if not len(contact.points):
             return
         self._check_on_surface(contact)
-        free = contact.free and self.settings.solver != "paper"
+        free = (contact.free or contact.outline is not None) and self.settings.solver != "paper"
         chosen = self._rolling if free else self._pointed
         if chosen is not self._tracker:
             chosen.reset()

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from finforce_ifea.errors import ContactError, ObservationError
 from finforce_ifea.observation import Contact, Observation
+from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.outline_cloud import COLUMNS, outline_from_columns
 from finforce_ifea.pointcloud import decode_cloud, decode_keypoints
 
 
@@ -60,7 +62,7 @@ def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:
         ContactError: a coordinate or a weight is not finite.
     """
     check_cloud(cloud, frame, "the contact")
-    columns = _contact_columns(cloud)
+    columns = _columns(cloud, ("x", "y", "z"), ("weight", "touching"))
     points = np.stack([columns[name] for name in "xyz"], axis=-1).astype(np.float64).reshape(-1, 3)
     weights = columns.get("weight", np.ones(len(points))).astype(np.float64)
     if not (np.isfinite(points).all() and np.isfinite(weights).all()):
@@ -69,8 +71,24 @@ def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:
     return Contact(points=points, weights=weights, touching=touching if len(points) else False, free=free)
 
 
-def _contact_columns(cloud: Any) -> dict[str, NDArray]:
-    """Decode the fields that a contact has."""
+def outline_from_cloud(cloud: Any, frame: str, previous: ObjectOutline | None) -> ObjectOutline | None:
+    """Return the object's outline of a sensor_msgs/PointCloud2, None when it has no rows.
+
+    Args:
+        cloud: one row per corner, in the jaw frame.
+        frame: the jaw frame.
+        previous: whose polygons are used again when no corner was cut anew.
+
+    Raises:
+        ObservationError: the frame, the height, the fields or the buffer are wrong.
+        ContactError: the corners are no outline.
+    """
+    check_cloud(cloud, frame, "the outline")
+    return outline_from_columns(_columns(cloud, COLUMNS), previous)
+
+
+def _columns(cloud: Any, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, NDArray]:
+    """Decode the named fields of a cloud."""
     return decode_cloud(
         cloud.fields,
         cloud.data,
@@ -79,8 +97,8 @@ def _contact_columns(cloud: Any) -> dict[str, NDArray]:
         point_step=cloud.point_step,
         row_step=cloud.row_step,
         is_bigendian=cloud.is_bigendian,
-        names=("x", "y", "z"),
-        optional=("weight", "touching"),
+        names=names,
+        optional=optional,
     )
 
 

@@ -65,6 +65,7 @@ class IfeaSolverNode(Node):
         """Create the subscriptions; a node that has them is ready."""
         if not self.contacts.is_fixed:
             self.qos.subscription(PointCloud2, f"{side}/contact", self._on_contact, ros.SENSOR)
+            self.qos.subscription(PointCloud2, f"{side}/object_outline", self._on_outline, ros.SENSOR)
         if peer := self.parameters.peer:
             self.qos.subscription(WrenchStamped, f"{peer}/wrench", self._on_peer, ros.RESULT)
         topic = f"{side}/keypoints"
@@ -99,6 +100,11 @@ class IfeaSolverNode(Node):
         """Keep the newest contact."""
         with self._refusals():
             self.contacts.take(cloud, ros.nanoseconds(cloud.header.stamp))
+
+    def _on_outline(self, cloud: PointCloud2) -> None:
+        """Keep the newest outline of the object."""
+        with self._refusals():
+            self.contacts.take_outline(cloud, ros.nanoseconds(cloud.header.stamp))
 
     def _on_peer(self, wrench: WrenchStamped) -> None:
         """Complete the grasp with the other jaw's force."""

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.errors import ContactError, ObservationError
 from finforce_ifea.jaw import Jaw
+from finforce_ifea.outline import ObjectOutline
 
 TRUSTED = ("ok", "unloaded")
 
@@ -35,12 +36,14 @@ class Contact:
         weights: (n,), shares of the force.
         touching: whether object and jaw intersect; None when nobody knows.
         free: the points say where the object touched first, and the solver follows it from there.
+        outline: of the object, whose place the solver finds together with the force; it goes before the points.
     """
 
     points: NDArray
     weights: NDArray
     touching: bool | None = None
     free: bool = False
+    outline: ObjectOutline | None = None
 
     @classmethod
     def fixed(cls, jaw: Jaw, z: float) -> "Contact":

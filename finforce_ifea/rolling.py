@@ -1,7 +1,7 @@
-"""A jaw in equilibrium with a rigid cylinder pressed into its inner surface; knows no key point targets.
+"""A jaw in equilibrium with a rigid object pressed into its inner surface; knows no key point targets.
 
-The cylinder stands for any convex object: its depth, radius and height are enough to place the pressure, which
-moves and spreads along the finger by itself as the finger bends.
+An unknown object is taken for a cylinder: its depth, radius and height are enough to place the pressure. That moves
+and spreads along the finger by itself as the finger bends.
 """
 
 from dataclasses import dataclass
@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.indenter import Indenter, RoundIndenter
 from finforce_ifea.model import JawModel
-from finforce_ifea.penalty import press_cylinder
 from finforce_ifea.surface import ContactSurface
 
-DEPTH, LOG_RADIUS, HEIGHT = 0, 1, 2
 _LARGEST_STEP, _LARGEST_TURN = 2e-3, 0.3
 _BISECTIONS = 10
 _TOUCH = 2e-5
@@ -21,12 +20,12 @@ _TOUCH = 2e-5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PressedState:
-    """Linearised equilibrium of one state of jaw and cylinder.
+    """Linearised equilibrium of one state of jaw and object.
 
     Attributes:
         touches: whether any surface point is in contact.
         correction: Newton step of the unknowns towards equilibrium (size,).
-        modes: motions of the unknowns by depth [per m], log radius [-] and height [per m], (size, 3).
+        modes: motions of the unknowns by depth [per m], shape and height [per m], (size, 3).
         force: total contact force on the jaw after `correction` (3,) [N].
         force_modes: its derivatives (3, 3), columns as in modes.
         pressure_point: pressure centre on the deformed surface (3,) [m]; NaN without contact.
@@ -45,38 +44,36 @@ class PressedState:
 
 
 class RollingContact:
-    """A model and its contact surface; the cylinder's axis is along y at x = face + radius - depth, z = height."""
+    """A model, its contact surface, and the object pressed into it."""
 
     def __init__(self, model: JawModel, surface: ContactSurface, face_x: float) -> None:
         """Keeps the model, its contact surface and the plane x = face_x [m] of the undeformed surface."""
         self.model = model
         self.surface = surface
         self.face_x = face_x
+        self.indenter: Indenter = RoundIndenter()
 
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
-        """Linearises the equilibrium f_int(q) = J^T p(J q, place) at unknowns q and place (depth, ln radius, height).
+        """Linearises the equilibrium f_int(q) = J^T p(J q, place) at unknowns q and place (depth, shape, height).
 
         With S the springs of all points and e_x, e_z unit motions of the object, the loads by depth and height are
         -J^T S e_x and J^T S e_z; as S is symmetric, the same loads give the forces that the jaw's motion takes away.
         """
-        model, probe, radius = self.model, self.surface.probe, float(np.exp(place[LOG_RADIUS]))
+        model, probe = self.model, self.surface.probe
         points = model.positions(probe, q)
-        contact = press_cylinder(
-            points, self.surface.stiffness, self.face_x + radius - place[DEPTH], place[HEIGHT], radius
-        )
+        contact = self.indenter.press(points, self.surface.stiffness, self.face_x, place)
         state = model.linearize(q)
         model.stiffen(state.tangent, probe, q, contact.springs)
         along_x = np.ascontiguousarray(contact.springs[:, :, 0])
         along_z = np.ascontiguousarray(contact.springs[:, :, 2])
-        by_radius = radius * (contact.by_size + along_x)
         load_x, load_z = model.load(probe, q, along_x), model.load(probe, q, along_z)
         imbalance = model.load(probe, q, contact.forces) - state.force
-        loads = np.stack([imbalance, -load_x, model.load(probe, q, by_radius), load_z], axis=1)
+        loads = np.stack([imbalance, -load_x, model.load(probe, q, contact.by_shape), load_z], axis=1)
         steps = model.factorise(state.tangent).solve(loads)
         modes, size = steps[:, 1:], np.hypot(contact.forces[:, 0], contact.forces[:, 2])
         total = size.sum()
         share = size / total if total > 0 else np.full(len(size), np.nan)
-        force_modes = np.stack([-along_x.sum(0), by_radius.sum(0), along_z.sum(0)], axis=1)
+        force_modes = np.stack([-along_x.sum(0), contact.by_shape.sum(0), along_z.sum(0)], axis=1)
         force_modes[0] -= load_x @ modes
         force_modes[2] -= load_z @ modes
         relief = np.array([load_x @ steps[:, 0], 0.0, load_z @ steps[:, 0]])
@@ -92,15 +89,12 @@ class RollingContact:
         )
 
     def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
-        """Returns the step of a jaw that has lost contact, cut where its surface meets the cylinder again."""
-        radius = float(np.exp(place[LOG_RADIUS]))
-        centre = np.array([self.face_x + radius - place[DEPTH], place[HEIGHT]])
+        """Returns the step of a jaw that has lost contact, cut where its surface meets the object again."""
         low, high = 0.0, 1.0
         for _ in range(_BISECTIONS):
             share = 0.5 * (low + high)
             points = self.model.positions(self.surface.probe, q + share * step)
-            gap = np.sqrt(((points[:, [0, 2]] - centre) ** 2).sum(1)).min() - radius
-            if gap < -_TOUCH:
+            if self.indenter.find_gap(points, self.face_x, place) < -_TOUCH:
                 high = share
             else:
                 low = share

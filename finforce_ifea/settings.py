@@ -38,6 +38,9 @@ class EstimatorSettings:
     height_stddev: float = _setting(0.5e-3, "m", 1e-6, 0.05, "uncertainty of the given height of first touch")
     radius: float = _setting(0.012, "m", 0.002, 0.5, "expected radius of curvature of the object where it touches")
     radius_log_stddev: float = _setting(0.7, "1", 0.01, 3.0, "uncertainty of the logarithm of that radius")
+    tilt_stddev: float = _setting(
+        0.02, "rad", 1e-4, 0.5, "uncertainty of a known outline's tilt beside that of its pose"
+    )
     acceleration: float = _setting(0.02, "m/s^2", 1e-4, 10.0, "expected acceleration of the object into the jaw")
     memory: int = _setting(45, "frames", 1, 1000, "frames over which the place is averaged while it holds still")
     iterations: int = _setting(12, "1", 1, 50, "most Newton iterations per frame")

@@ -1,6 +1,7 @@
-"""Depth, radius and height of the pressing object from key points, frame after frame, on the deformed jaw.
+"""Depth, shape and height of the pressing object from key points, frame after frame, on the deformed jaw.
 
-Depth changes fast and is tracked by a Kalman filter with constant velocity. Radius and height change slowly: they are
+The shape of an unknown object is its radius, that of a known outline its tilt. Depth changes fast and is tracked by a
+Kalman filter with constant velocity. Shape and height change slowly: they are
 the maximum a posteriori for the residuals averaged over the last frames, so that their priors count once and errors
 of the mechanics are not mistaken for information.
 """
@@ -10,10 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
 from finforce_ifea.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
+from finforce_ifea.outline import ObjectOutline
 from finforce_ifea.place_update import PlaceUpdate, Residuals, update_place, weigh_residuals
-from finforce_ifea.rolling import DEPTH, HEIGHT, LOG_RADIUS, PressedState, RollingContact, limit_step
+from finforce_ifea.rolling import PressedState, RollingContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
 from finforce_ifea.track import Track, explain_offsets
@@ -23,10 +26,10 @@ _LEAST_DEPTH = 3e-5
 _TOUCH_DEPTH = 0.15e-3
 _LOADED_DEPTH = 0.5e-3
 _DEPTH_DRIFT = 0.01e-3
-_LARGEST_CHANGE = np.array([0.7e-3, 0.15, 0.3e-3])
-_SETTLED_CHANGE = np.array([1e-4, 5e-2, 1e-4])
+_LARGEST_MOVE = 0.7e-3
+_LARGEST_SHIFT = 0.3e-3
+_SETTLED_MOVE = 1e-4
 _SETTLED_CORRECTION = 1e-4
-_RADIUS_RANGE = np.log([3e-3, 0.2])
 _FRAMES_RELEASED = 15
 _LOST_STDDEV = 1e-3
 # The height may leave what was given by this many of its standard deviations; beyond, the contact is another one.
@@ -46,16 +49,24 @@ class PlaceTracker:
         self.probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
         self._stiffness: float | None = None
         self._rest = contact.model.positions(self.probe, np.zeros(contact.model.size))
-        self._prior_variance = np.array([settings.radius_log_stddev, settings.height_stddev]) ** 2
+        self._face = contact.surface.heights[[0, -1]]
         self.reset()
 
     def reset(self, height: float | None = None) -> None:
-        """Starts anew, unloaded, with an object that will first touch at `height` [m], the middle if None."""
+        """Starts anew, unloaded, with an unknown object that will first touch at `height` [m], the middle if None."""
+        settings = self.settings
         self._given = height
         height = float(np.median(self.contact.surface.heights)) if height is None else height
+        self.contact.indenter = RoundIndenter()
+        self._prior = np.array([np.log(settings.radius), height])
+        self._prior_variance = np.array([settings.radius_log_stddev, settings.height_stddev]) ** 2
+        self._begin()
+
+    def _begin(self) -> None:
+        """Starts with the undeformed jaw and an object that just touches."""
         self.q = np.zeros(self.contact.model.size)
-        self._prior = np.array([np.log(self.settings.radius), height])
-        self._motion, self._motion_covariance = np.zeros(2), np.diag([0.1e-3, 1e-3]) ** 2
+        self._motion = np.array([self._find_touch(np.r_[0.0, self._prior]), 0.0])
+        self._motion_covariance = np.diag([0.1e-3, 1e-3]) ** 2
         self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
         self._released = 0
         self._forget_place()
@@ -69,12 +80,12 @@ class PlaceTracker:
         """Takes the key points (K, 3) [m], NaN where unused, dt [s] after the last; None when too few agree."""
         forecast = self._predict(dt)
         place = forecast.place
-        q = self.q + self._modes @ (_reachable(place) - self._reached)
+        q = self.q + self._modes @ (self._reachable(place) - self._reached)
         measured = points - tare.offsets
         update, settled, iteration = None, False, 0
         while not settled and iteration < self.settings.iterations:
             iteration += 1
-            mechanical = _reachable(place)
+            mechanical = self._reachable(place)
             state = self.contact.linearize(q, mechanical)
             if not state.touches:
                 q = q + self.contact.approach(q, state.correction, mechanical)
@@ -85,11 +96,8 @@ class PlaceTracker:
                 place, q = self._leap(q, state, mechanical, place, data)
                 continue
             update = self._update_place(data, forecast)
-            aim = np.clip(update.place, place - _LARGEST_CHANGE, place + _LARGEST_CHANGE)
-            aim[LOG_RADIUS] = min(max(aim[LOG_RADIUS], _RADIUS_RANGE[0]), _RADIUS_RANGE[1])
-            reach = _FARTHEST_HEIGHT * self.settings.height_stddev
-            aim[HEIGHT] = min(max(aim[HEIGHT], self._prior[1] - reach), self._prior[1] + reach)
-            moved, place = _reachable(aim) - mechanical, aim
+            aim = self._bound(update.place, place)
+            moved, place = self._reachable(aim) - mechanical, aim
             q = q + limit_step(self.contact.model, state.modes @ moved)
             settled = self._is_settled(state, moved, update.place - aim)
         if update is None or not state.touches:
@@ -97,26 +105,63 @@ class PlaceTracker:
         self._keep(q, place, update, forecast, state.modes)
         return self._report(state, place, moved, data, update, iteration, settled)
 
+    def _bound(self, asked: NDArray, place: NDArray) -> NDArray:
+        """Returns the place asked for, no farther from the present one than the linearisation holds."""
+        bounds, reach = self.contact.indenter.shape_range, _FARTHEST_HEIGHT * self.settings.height_stddev
+        change = np.array([_LARGEST_MOVE, bounds.largest_change, _LARGEST_SHIFT])
+        aim = np.clip(asked, place - change, place + change)
+        aim[SHAPE] = min(max(aim[SHAPE], bounds.low), bounds.high)
+        aim[HEIGHT] = min(max(aim[HEIGHT], self._prior[1] - reach), self._prior[1] + reach)
+        return aim
+
     def _is_settled(self, state: PressedState, moved: NDArray, missing: NDArray) -> bool:
         """Whether the last iteration changed nothing that matters."""
-        small = (np.abs(moved) < _SETTLED_CHANGE).all() and (np.abs(missing) < _SETTLED_CHANGE).all()
+        change = np.array([_SETTLED_MOVE, self.contact.indenter.shape_range.settled_change, _SETTLED_MOVE])
+        small = (np.abs(moved) < change).all() and (np.abs(missing) < change).all()
         return bool(small and np.abs(state.correction).max() < _SETTLED_CORRECTION)
+
+    def _find_touch(self, place: NDArray) -> float:
+        """Returns the depth [m] at which the object of a place (3,) first touches the undeformed jaw."""
+        return self.contact.indenter.find_touch(place, self._face[0], self._face[1])
+
+    def _reachable(self, place: NDArray) -> NDArray:
+        """Returns the place (3,) at which the mechanics stands for `place`."""
+        return np.array([max(place[DEPTH], self._find_touch(place) + _LEAST_DEPTH), place[SHAPE], place[HEIGHT]])
 
     def significance(self, tare: Tare, stddev: float) -> float:
         """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
         q = np.zeros(self.contact.model.size)
-        state = self.contact.linearize(q, np.r_[_LEAST_DEPTH, self._prior])
+        state = self.contact.linearize(q, self._reachable(np.r_[-1.0, self._prior]))
         modes = self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
         return explain_offsets(modes, tare, stddev)
 
     def follow(self, contact: Contact) -> None:
-        """Takes a contact's height as that of first touch."""
+        """Takes over where a contact's object is: its outline, or its height as that of first touch."""
+        if contact.outline is not None:
+            self._follow_outline(contact.outline)
+            return
         height = float(np.average(contact.points[:, 2], weights=contact.weights))
         if self._given is None:
             self.reset(height)
         if self._given != height or self._stiffness is None:
             self._stiffness = self._touch_stiffness(height)
         self._given = self._prior[1] = height
+
+    def _follow_outline(self, outline: ObjectOutline) -> None:
+        """Takes the outline's tilt and height as what is to be expected; an outline cut anew keeps the place."""
+        before, settings = self.contact.indenter, self.settings
+        self._prior = np.array([outline.tilt, outline.origin[1]])
+        own = np.array([settings.tilt_stddev, settings.height_stddev])
+        self._prior_variance = outline.stddev[[2, 1]] ** 2 + own**2
+        if isinstance(before, OutlineIndenter) and before.describes(outline):
+            return
+        self.contact.indenter = after = OutlineIndenter(outline.polygons)
+        self._given = self._stiffness = None
+        if isinstance(before, OutlineIndenter):
+            self._motion[0] += after.field.front - before.field.front
+            self._reached[DEPTH] += after.field.front - before.field.front
+        else:
+            self._begin()
 
     def _touch_stiffness(self, height: float) -> float:
         """Returns force over depth [N/m] of the undeformed jaw at `height` [m]."""
@@ -146,7 +191,7 @@ class PlaceTracker:
             self._rest,
             model.project(self.probe, q, state.modes),
             place - forecast.place,
-            min(place[DEPTH] - _LEAST_DEPTH, 0.0),
+            place[DEPTH] - max(place[DEPTH], self._find_touch(place) + _LEAST_DEPTH),
             tare.noise,
             tare.offset_variance(settings.offset_stddev),
             min(forecast.spread[0, 0], _WIDEST_FORECAST**2),
@@ -166,16 +211,16 @@ class PlaceTracker:
             self._prior,
             self._prior_variance,
             float(self.settings.memory),
-            _LARGEST_CHANGE[1:],
+            np.array([self.contact.indenter.shape_range.largest_change, _LARGEST_SHIFT]),
         )
 
     def _leap(
         self, q: NDArray, state: PressedState, mechanical: NDArray, place: NDArray, data: Residuals
     ) -> tuple[NDArray, NDArray]:
         """Returns place and unknowns moved towards the median depth when the points disagree with the forecast."""
-        jump = float(np.clip(data.jump, -_LARGEST_CHANGE[DEPTH], _LARGEST_CHANGE[DEPTH]))
+        jump = float(np.clip(data.jump, -_LARGEST_MOVE, _LARGEST_MOVE))
         place = place + np.array([jump, 0.0, 0.0])
-        step = state.modes[:, DEPTH] * (_reachable(place)[DEPTH] - mechanical[DEPTH])
+        step = state.modes[:, DEPTH] * (self._reachable(place)[DEPTH] - mechanical[DEPTH])
         return place, q + limit_step(self.contact.model, step)
 
     def _lose(self) -> None:
@@ -185,12 +230,13 @@ class PlaceTracker:
 
     def _keep(self, q: NDArray, place: NDArray, update: PlaceUpdate, forecast: "_Forecast", modes: NDArray) -> None:
         """Keeps what the next frame starts from; a released jaw expects any object again."""
-        self.q, self._modes, self._reached = q, modes, _reachable(place)
+        self.q, self._modes, self._reached = q, modes, self._reachable(place)
         self._slow = place[1:].copy()
         self._motion = np.array([place[DEPTH], update.speed])
         self._motion_covariance = forecast.spread - np.outer(update.gain, forecast.spread[0])
         self._mean, self._count = update.mean, update.count
-        self._released = self._released + 1 if place[DEPTH] < _TOUCH_DEPTH else 0
+        pressed = place[DEPTH] - self._find_touch(place)
+        self._released = self._released + 1 if pressed < _TOUCH_DEPTH else 0
         if self._released >= _FRAMES_RELEASED:
             self._forget_place()
 
@@ -205,8 +251,9 @@ class PlaceTracker:
         settled: bool,
     ) -> Track:
         force = state.force + state.force_modes @ moved
-        if place[DEPTH] < _LEAST_DEPTH:
-            force = force * max(0.0, place[DEPTH] / _LEAST_DEPTH)
+        pressed = place[DEPTH] - self._find_touch(place)
+        if pressed < _LEAST_DEPTH:
+            force = force * max(0.0, pressed / _LEAST_DEPTH)
         covariance = update.covariance.copy()
         covariance[DEPTH, DEPTH] += update.depth_variance
         finite = np.isfinite(force).all() and np.isfinite(update.covariance).all() and np.isfinite(self.q).all()
@@ -224,8 +271,8 @@ class PlaceTracker:
             iterations=iterations,
             converged=settled,
             sound=bool(finite and state.smallest_det > 0),
-            quiet=bool(place[DEPTH] < _TOUCH_DEPTH),
-            loaded=bool(place[DEPTH] > _LOADED_DEPTH),
+            quiet=bool(pressed < _TOUCH_DEPTH),
+            loaded=bool(pressed > _LOADED_DEPTH),
         )
 
     def _stiffening(self, force: NDArray, place: NDArray) -> float:
@@ -243,7 +290,3 @@ class _Forecast:
     speed: float
     spread: NDArray
 
-
-def _reachable(place: NDArray) -> NDArray:
-    """Returns the place (3,) at which the mechanics stands for `place`."""
-    return np.array([max(place[DEPTH], _LEAST_DEPTH), place[LOG_RADIUS], place[HEIGHT]])
