@@ -174,7 +174,7 @@ def _trace_front(coefficients, low, cell, steps):
 
 @njit(**_OPTIONS)
 def find_leading(segments, c, s, low, high):
-    """Returns the least x [m] of segments (s, 4) turned by (cos, sin) of the tilt, between two heights; 1e9 for none."""
+    """Returns the least x [m] of segments (s, 4) turned by (cos, sin) of the tilt, between two heights, else 1e9."""
     least = 1e9
     for k in range(len(segments)):
         ax, az = c * segments[k, 0] - s * segments[k, 1], s * segments[k, 0] + c * segments[k, 1]

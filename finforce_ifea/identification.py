@@ -23,11 +23,11 @@ from finforce_ifea.course import (
     fit_course,
 )
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
+from finforce_ifea.indenter import DEPTH
 from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import Mechanics, build_mechanics
 from finforce_ifea.plateaus import INSTANTS, CalibrationCase, Plateau, find_plateaus
 from finforce_ifea.relaxation import invert_relaxation
-from finforce_ifea.indenter import DEPTH
 from finforce_ifea.rolling import limit_step
 from finforce_ifea.settings import EstimatorSettings
 

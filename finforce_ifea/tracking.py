@@ -289,4 +289,3 @@ class _Forecast:
     place: NDArray
     speed: float
     spread: NDArray
-
