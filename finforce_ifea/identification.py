@@ -1,8 +1,8 @@
 """Identification of a finger from recordings with true forces: stiffness, effective thicknesses, clamp, relaxation.
 
 Shape tells the geometry, force the modulus, and the forces' course at steady shape the relaxation. All are found
-together by least squares over the steady loads; the depth of each load and the object's radius of each recording
-are found along the way.
+together by least squares over the steady loads; the depth of each load and of each recording the object's radius, or
+the tilt of its known outline, are found along the way.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ from finforce_ifea.course import (
     fit_course,
 )
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
-from finforce_ifea.indenter import DEPTH
+from finforce_ifea.indenter import DEPTH, ExpectedObject, expect_object
 from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import Mechanics, build_mechanics
 from finforce_ifea.plateaus import INSTANTS, CalibrationCase, Plateau, find_plateaus
@@ -62,7 +62,7 @@ class CalibrationFit:
     Attributes:
         calibration: the identified finger.
         uncertainty: standard deviation of each number, in its unit.
-        radii: radius of curvature of each recording's object [m].
+        radii: radius of curvature of each recording's object [m], None where its outline was known.
         force_rms: root mean square force residual over the steady loads [N].
         shape_rms: root mean square key point residual [m].
         plateaus: how many steady loads were used.
@@ -70,7 +70,7 @@ class CalibrationFit:
 
     calibration: Calibration
     uncertainty: dict[str, float]
-    radii: tuple[float, ...]
+    radii: tuple[float | None, ...]
     force_rms: float
     shape_rms: float
     plateaus: int
@@ -124,7 +124,7 @@ def fit_calibration(
 
 
 class _Fit:
-    """Residuals of all parameters: the finger's, then one log radius per recording."""
+    """Residuals of all parameters: the finger's, then the shape (log radius or tilt) of each recording's object."""
 
     def __init__(
         self,
@@ -136,12 +136,13 @@ class _Fit:
         self.jaw, self.cases, self.settings, self.progress = jaw, cases, settings, progress
         self.plateaus = find_plateaus(cases, jaw, settings, per_case=_PER_CASE)
         self._starts: list[_PlateauShape | None] = [None] * len(self.plateaus)
-        count = len(cases)
-        self.mean = np.r_[_PRIOR, np.full(count, np.log(settings.radius))]
-        self.stddev = np.r_[_PRIOR_STDDEV, np.full(count, settings.radius_log_stddev)]
-        self.low = np.r_[_LOW, np.full(count, np.log(2e-3))]
-        self.high = np.r_[_HIGH, np.full(count, np.log(0.3))]
-        self.difference = np.r_[_DIFFERENCE, np.full(count, 1e-2)]
+        self.objects = [expect_object(case.contact, settings) for case in cases]
+        bounds = [item.indenter.shape_range for item in self.objects]
+        self.mean = np.r_[_PRIOR, [item.mean[0] for item in self.objects]]
+        self.stddev = np.r_[_PRIOR_STDDEV, [np.sqrt(item.variance[0]) for item in self.objects]]
+        self.low = np.r_[_LOW, [item.low for item in bounds]]
+        self.high = np.r_[_HIGH, [item.high for item in bounds]]
+        self.difference = np.r_[_DIFFERENCE, [item.largest_change / 15 for item in bounds]]
         self.start = self.mean.copy()
         self.forces = [np.linalg.norm(case.forces_true, axis=1) for case in cases]
         self._shapes: dict[bytes, tuple[NDArray, NDArray]] = {}
@@ -189,8 +190,8 @@ class _Fit:
             solver = _PlateauSolver(mechanics, rest)
             solved = []
             for plateau, start in zip(self.plateaus, self._starts, strict=True):
-                height = float(self.cases[plateau.case].contact.points[0, 2])
-                solved.append(solver.solve(plateau, x[len(_NAMES) + plateau.case], height, start))
+                shape = float(x[len(_NAMES) + plateau.case])
+                solved.append(solver.solve(plateau, self.objects[plateau.case], shape, start))
             self._starts = solved
             residuals = np.concatenate([shape.residual for shape in solved])
             self._shapes = {key: (residuals, np.array([shape.force for shape in solved]))}
@@ -236,7 +237,10 @@ class _Fit:
         return CalibrationFit(
             calibration=calibration,
             uncertainty=dict(zip(_NAMES, (scale * stddev[: len(_NAMES)]).tolist(), strict=True)),
-            radii=tuple(np.exp(x[len(_NAMES) :]).tolist()),
+            radii=tuple(
+                float(np.exp(shape)) if case.contact.outline is None else None
+                for case, shape in zip(self.cases, x[len(_NAMES) :], strict=True)
+            ),
             force_rms=float(np.sqrt(np.mean(errors**2))),
             shape_rms=float(_SHAPE_ERROR * np.sqrt(np.mean(shapes**2))),
             plateaus=len(self.plateaus),
@@ -260,14 +264,17 @@ class _PlateauSolver:
         self._contact, self._model, self._probe = mechanics.contact, mechanics.model, probe
         self._rest = self._model.positions(probe, np.zeros(self._model.size))
 
-    def solve(self, plateau: Plateau, log_radius: float, height: float, start: _PlateauShape | None) -> _PlateauShape:
+    def solve(self, plateau: Plateau, item: ExpectedObject, shape: float, start: _PlateauShape | None) -> _PlateauShape:
         """Returns the closest shape, found by Gauss-Newton from `start` or from the unloaded jaw.
 
         Raises:
             CalibrationError: No shape of the jaw comes close.
         """
+        self._contact.indenter = item.indenter
+        place = np.array([0.0, shape, item.mean[1]])
+        touch = item.indenter.find_touch(place, *self._contact.surface.heights[[0, -1]])
         q = np.zeros(self._model.size) if start is None else start.q
-        place = np.array([0.5e-3 if start is None else start.depth, log_radius, height])
+        place[DEPTH] = touch + 0.5e-3 if start is None else start.depth
         seen = np.isfinite(plateau.keypoints[:, 0])
         stddev = np.sqrt(plateau.variance[seen, None] + _SHAPE_ERROR**2)
         for _ in range(60):
@@ -280,7 +287,7 @@ class _PlateauSolver:
             mode = self._model.project(self._probe, q, state.modes)[seen][:, [0, 2], DEPTH] / stddev
             residual = (plateau.keypoints[seen] - moved[seen][:, [0, 2]]) / stddev
             change = float(np.clip((mode * residual).sum() / (mode**2).sum(), -0.5e-3, 0.5e-3))
-            change = max(change, 3e-5 - place[DEPTH])
+            change = max(change, touch + 3e-5 - place[DEPTH])
             place[DEPTH] += change
             q = q + limit_step(self._model, state.modes[:, DEPTH] * change)
             if abs(change) < 1e-6 and np.abs(state.correction).max() < 1e-6:
@@ -288,5 +295,5 @@ class _PlateauSolver:
                 left = (residual - mode * change).ravel()
                 return _PlateauShape(q=q, depth=float(place[DEPTH]), residual=left, force=float(np.linalg.norm(force)))
         if start is not None:
-            return self.solve(plateau, log_radius, height, None)
+            return self.solve(plateau, item, shape, None)
         raise CalibrationError("calibration: no shape of the jaw comes near the key points; is it the right jaw file?")

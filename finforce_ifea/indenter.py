@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.distance_field import CELL, DistanceField, build_distance_field, find_leading, read_depth
+from finforce_ifea.observation import Contact
 from finforce_ifea.outline import ObjectOutline
 from finforce_ifea.penalty import PenaltyContact, press_cylinder, press_field
+from finforce_ifea.settings import EstimatorSettings
 
 DEPTH, SHAPE, HEIGHT = 0, 1, 2
 
@@ -105,9 +107,44 @@ class OutlineIndenter:
         least = find_leading(self.field.segments, c, s, low - place[HEIGHT], high - place[HEIGHT])
         return least + self.field.front if least < 1.0 else 0.0
 
-    def find_depth(self, outline: ObjectOutline, face_x: float) -> float:
-        """Returns the depth [m] at which an outline's origin stands."""
-        return face_x + self.field.front - float(outline.origin[0])
-
     def _origin(self, face_x: float, place: NDArray) -> NDArray:
         return np.array([face_x + self.field.front - place[DEPTH], place[HEIGHT]])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ExpectedObject:
+    """What a contact says of its object before any key point.
+
+    Attributes:
+        indenter: the object.
+        mean: expected shape and height [m] (2,).
+        variance: of both (2,).
+    """
+
+    indenter: Indenter
+    mean: NDArray
+    variance: NDArray
+
+
+def expect_object(contact: Contact, settings: EstimatorSettings, known: Indenter | None = None) -> ExpectedObject:
+    """Returns the object of a contact: its outline, or a cylinder about the height of the points.
+
+    Args:
+        contact: where the object touches.
+        settings: what is expected of objects.
+        known: the object so far, taken over if it has the contact's outline.
+
+    Raises:
+        ContactError: The outline is too small.
+    """
+    outline = contact.outline
+    if outline is None:
+        height = np.average(contact.points[:, 2], weights=contact.weights)
+        mean = np.array([np.log(settings.radius), height])
+        own = np.array([settings.radius_log_stddev, settings.height_stddev])
+        return ExpectedObject(indenter=RoundIndenter(), mean=mean, variance=own**2)
+    same = isinstance(known, OutlineIndenter) and known.describes(outline)
+    indenter = known if same else OutlineIndenter(outline.polygons)
+    own = np.array([settings.tilt_stddev, settings.height_stddev])
+    mean = np.array([outline.tilt, outline.origin[1]])
+    return ExpectedObject(indenter=indenter, mean=mean, variance=outline.stddev[[2, 1]] ** 2 + own**2)

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
+from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
-from finforce_ifea.outline import ObjectOutline
 from finforce_ifea.place_update import PlaceUpdate, Residuals, update_place, weigh_residuals
 from finforce_ifea.rolling import PressedState, RollingContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
@@ -138,30 +137,28 @@ class PlaceTracker:
     def follow(self, contact: Contact) -> None:
         """Takes over where a contact's object is: its outline, or its height as that of first touch."""
         if contact.outline is not None:
-            self._follow_outline(contact.outline)
+            self._follow_outline(contact)
             return
-        height = float(np.average(contact.points[:, 2], weights=contact.weights))
+        height = float(expect_object(contact, self.settings).mean[1])
         if self._given is None:
             self.reset(height)
         if self._given != height or self._stiffness is None:
             self._stiffness = self._touch_stiffness(height)
         self._given = self._prior[1] = height
 
-    def _follow_outline(self, outline: ObjectOutline) -> None:
+    def _follow_outline(self, contact: Contact) -> None:
         """Takes the outline's tilt and height as what is to be expected; an outline cut anew keeps the place."""
-        before, settings = self.contact.indenter, self.settings
-        self._prior = np.array([outline.tilt, outline.origin[1]])
-        own = np.array([settings.tilt_stddev, settings.height_stddev])
-        self._prior_variance = outline.stddev[[2, 1]] ** 2 + own**2
-        if isinstance(before, OutlineIndenter) and before.describes(outline):
-            return
-        self.contact.indenter = after = OutlineIndenter(outline.polygons)
+        before = self.contact.indenter
+        expected = expect_object(contact, self.settings, before)
+        self._prior, self._prior_variance = expected.mean, expected.variance
+        self.contact.indenter = after = expected.indenter
         self._given = self._stiffness = None
-        if isinstance(before, OutlineIndenter):
-            self._motion[0] += after.field.front - before.field.front
-            self._reached[DEPTH] += after.field.front - before.field.front
-        else:
+        if not isinstance(before, OutlineIndenter):
             self._begin()
+        elif after is not before:
+            change = after.field.front - before.field.front
+            self._motion[0] += change
+            self._reached[DEPTH] += change
 
     def _touch_stiffness(self, height: float) -> float:
         """Returns force over depth [N/m] of the undeformed jaw at `height` [m]."""
