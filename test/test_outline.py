@@ -62,10 +62,9 @@ def test_nothing_is_touched_far_outside():
 
 
 def test_thin_plate_pushes_towards_the_jaw_even_past_its_middle():
-    """The way out of a plate 2 mm thick is the side that faces the jaw."""
-    inside = depth_at(box(0.001, 0.02), [[0.0005, 0.0]])[0]
-    # past its far side the depth falls to the outside within a cell, which the smoothing feels
-    assert inside[0] == pytest.approx(1.5e-3, abs=0.1e-3)
+    """The way out of a plate 4 mm thick is the side that faces the jaw, also nearer to the other side."""
+    inside = depth_at(box(0.002, 0.02), [[0.0007, 0.0]])[0]
+    assert inside[0] == pytest.approx(2.7e-3, abs=0.05e-3)
     assert inside[1] > 0.95
 
 
@@ -170,7 +169,7 @@ def test_force_and_place_are_found_with_a_known_outline(name, height, tilt, off)
     for result, (force, found) in zip(results, sorted(errors.items()), strict=True):
         assert len(found) > 20
         assert abs(np.mean(found[5:])) < 0.04 + 0.02 * force + 0.06 * off
-        assert places[force] == pytest.approx(result.pressure_place[2], abs=2.5e-3)
+        assert places[force] == pytest.approx(result.pressure_place[2], abs=(2.5 + 2.5 * off) * 1e-3)
 
 
 def test_cylinder_of_unknown_radius_misses_the_force_of_a_flat_box():
