@@ -166,8 +166,8 @@ class JawEstimator:
 
     def _check_on_surface(self, contact: Contact) -> None:
         """Refuses contacts beside the inner surface."""
-        points = self.mechanics.mesh.nodes[np.abs(self.mechanics.mesh.nodes[:, 0] - self.jaw.inner_face_x) < 1e-3]
-        low, high = points.min(0)[1:] - _BESIDE, points.max(0)[1:] + _BESIDE
+        surface = self.mechanics.contact.surface
+        low, high = surface.low - _BESIDE, surface.high + _BESIDE
         places = contact.points[:, 1:]
         if ((places < low) | (places > high)).any():
             raise ContactError(

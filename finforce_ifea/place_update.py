@@ -11,36 +11,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-_MODEL_FLOOR = 0.02e-3
-_LEAST_WEIGHT = 0.02
 # Depth has no prior; this share of one frame's information keeps the posterior regular while nothing was averaged.
 _DEPTH_SHARE = 1e-3
 _PRIOR_REACH = 4.0
 _MANOEUVRE_SIGMA = 3.0
-
-
-class Residuals(NamedTuple):
-    """In-plane residuals about the reference place.
-
-    Attributes:
-        r: (K, 2) [m], zero where unused.
-        modes: their derivatives by depth, log radius and height (K, 2, 3).
-        weights: (K,) from 0 to 1.
-        noise: of one point in one frame, in plane, (2, 2) [m^2].
-        bias: variance that no averaging removes (K,) [m^2].
-        used: number of points with a weight.
-        known: number of points that were measured.
-        jump: median of the depths that the points ask for one by one, about the model's own place [m].
-    """
-
-    r: NDArray
-    modes: NDArray
-    weights: NDArray
-    noise: NDArray
-    bias: NDArray
-    used: int
-    known: int
-    jump: float
 
 
 class PlaceUpdate(NamedTuple):
@@ -69,94 +43,6 @@ class PlaceUpdate(NamedTuple):
     kkt: float
     residual: float
     misfit: float
-
-
-@njit(**_OPTIONS)
-def weigh_residuals(
-    measured,
-    positions,
-    rest,
-    motions,
-    moved,
-    below,
-    noise,
-    offset_variance,
-    depth_variance,
-    model_error,
-    gate,
-):
-    """Returns the in-plane residuals about the reference place and the weights of key points; see `Residuals`.
-
-    Weights are those of the residuals that are left at the model's own place.
-
-    The motion along y, known to be none, tells of noise that x and z share. A residual of `gate` standard deviations
-    keeps a quarter of its weight, w = 1 / (1 + d^2 / gate^2)^2 (Geman and McClure).
-
-    Args:
-        measured: (K, 3) [m], NaN where unused.
-        positions: of the deformed model (K, 3) [m].
-        rest: of the undeformed model (K, 3) [m].
-        motions: derivatives of the positions by the place (K, 3, 3).
-        moved: the place at which the model stands minus the reference (3,).
-        below: depth of the place below what the mechanics can reach [m].
-        noise: covariance of one point in one frame (3, 3) [m^2].
-        offset_variance: (K,) [m^2].
-        depth_variance: of the predicted depth [m^2].
-        model_error: share of a point's way.
-        gate: in standard deviations.
-    """
-    count = len(measured)
-    gain0, gain2 = noise[0, 1] / noise[1, 1], noise[2, 1] / noise[1, 1]
-    plane = np.empty((2, 2))
-    plane[0, 0] = noise[0, 0] - gain0 * noise[0, 1]
-    plane[1, 1] = noise[2, 2] - gain2 * noise[2, 1]
-    plane[0, 1] = plane[1, 0] = noise[0, 2] - gain0 * noise[2, 1]
-    r, modes = np.zeros((count, 2)), np.empty((count, 2, 3))
-    weights, bias = np.zeros(count), np.empty(count)
-    asked, say = np.zeros(count), np.zeros(count)
-    used, known = 0, 0
-    for k in range(count):
-        way = 0.0
-        for a in range(3):
-            way += (positions[k, a] - rest[k, a]) ** 2
-            modes[k, 0, a], modes[k, 1, a] = motions[k, 0, a], motions[k, 2, a]
-        bias[k] = _MODEL_FLOOR**2 + model_error**2 * way + offset_variance[k]
-        if not np.isfinite(measured[k, 0] + measured[k, 1] + measured[k, 2]):
-            continue
-        off = measured[k, 1] - positions[k, 1]
-        r[k, 0] = measured[k, 0] - positions[k, 0] - gain0 * off - modes[k, 0, 0] * below
-        r[k, 1] = measured[k, 2] - positions[k, 2] - gain2 * off - modes[k, 1, 0] * below
-        r0, r1 = r[k, 0], r[k, 1]
-        for a in range(3):
-            r[k, 0] += modes[k, 0, a] * moved[a]
-            r[k, 1] += modes[k, 1, a] * moved[a]
-        h0, h1 = modes[k, 0, 0], modes[k, 1, 0]
-        s00 = plane[0, 0] + bias[k] + h0 * h0 * depth_variance
-        s11 = plane[1, 1] + bias[k] + h1 * h1 * depth_variance
-        s01 = plane[0, 1] + h0 * h1 * depth_variance
-        square = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / (s00 * s11 - s01 * s01)
-        say[k] = h0 * h0 + h1 * h1
-        asked[k] = (h0 * r0 + h1 * r1) / max(say[k], 1e-12)
-        known += 1
-        square += off * off / (noise[1, 1] + bias[k])
-        weight = 1.0 / (1.0 + square / gate**2) ** 2
-        if weight >= _LEAST_WEIGHT:
-            weights[k] = weight
-            used += 1
-        else:
-            r[k, 0] = r[k, 1] = 0.0
-    return Residuals(r, modes, weights, plane, bias, used, known, _weighted_median(asked, say))
-
-
-@njit(**_OPTIONS)
-def _weighted_median(values, weights):
-    """Returns the value (of n) that has half of the weight on either side; 0 without any weight."""
-    half, total = 0.5 * weights.sum(), 0.0
-    for k in np.argsort(values):
-        total += weights[k]
-        if total >= half and weights[k] > 0.0:
-            return values[k]
-    return 0.0
 
 
 @njit(**_OPTIONS)
@@ -232,6 +118,39 @@ def _weigh_depth(data, mean, count):
 
 
 @njit(**_OPTIONS)
+def _average(data, mean, count, deeper, memory):
+    """Returns the residuals averaged with this frame's, the depth changed by `deeper` [m], and what they count."""
+    n = len(count)
+    new_mean, new_count = np.empty((n, 2)), np.empty(n)
+    for k in range(n):
+        share = data.weights[k] / (min(count[k], memory) + 1.0)
+        new_count[k] = min(count[k] * (1.0 - 1.0 / memory) + data.weights[k], memory)
+        for a in range(2):
+            new_mean[k, a] = mean[k, a] + share * (data.r[k, a] - data.modes[k, a, 0] * deeper - mean[k, a])
+    return new_mean, new_count
+
+
+@njit(**_OPTIONS)
+def _move_residuals(data, mean, moved, deeper):
+    """Takes averaged residuals to the new place and returns this frame's weighted root mean square there [m].
+
+    The place has moved by `moved` (3,) since this frame's residuals, the depth by `deeper` [m] since the average.
+    """
+    total, weight = 0.0, 0.0
+    for k in range(len(mean)):
+        weight += data.weights[k]
+        for a in range(2):
+            left = data.r[k, a]
+            mean[k, a] -= data.modes[k, a, 0] * deeper
+            for i in range(3):
+                left -= data.modes[k, a, i] * moved[i]
+                if i > 0:
+                    mean[k, a] -= data.modes[k, a, i] * moved[i]
+            total += data.weights[k] * left * left
+    return np.sqrt(total / (2.0 * weight))
+
+
+@njit(**_OPTIONS)
 def update_place(data, mean, count, reference, speed, spread, prior, prior_variance, memory, largest):
     """Returns the place after one frame; see `PlaceUpdate`.
 
@@ -247,7 +166,6 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
         memory: longest average [frames].
         largest: changes of log radius and height allowed at once (2,).
     """
-    n = len(count)
     information, innovation, pull = _weigh_depth(data, mean, count)
     innovation /= information
     # an innovation beyond chance is a manoeuvre: believe the frame
@@ -256,13 +174,7 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
         variance = innovation**2
     gain = np.array([variance, spread[1, 0]]) / (1.0 / information + variance)
     depth = reference[0] + gain[0] * innovation
-    new_mean, new_count = np.empty((n, 2)), np.empty(n)
-    for k in range(n):
-        share = data.weights[k] / (min(count[k], memory) + 1.0)
-        new_count[k] = min(count[k] * (1.0 - 1.0 / memory) + data.weights[k], memory)
-        for a in range(2):
-            r = data.r[k, a] - data.modes[k, a, 0] * (depth - reference[0])
-            new_mean[k, a] = mean[k, a] + share * (r - mean[k, a])
+    new_mean, new_count = _average(data, mean, count, depth - reference[0], memory)
     hessian, gradient = _posterior(data, new_mean, new_count, reference[1:] - prior, prior_variance, information)
     covariance = _invert_symmetric(hessian)
     shift = covariance @ gradient
@@ -274,18 +186,7 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
         place[i] += step
         # radius and height leave the depth that this frame's key points ask for
         place[0] -= pull[i] * step / information
-    total, weight = 0.0, 0.0
-    for k in range(n):
-        weight += data.weights[k]
-        for a in range(2):
-            left = data.r[k, a]
-            new_mean[k, a] += data.modes[k, a, 0] * (depth - place[0])
-            for i in range(3):
-                left -= data.modes[k, a, i] * (place[i] - reference[i])
-                if i > 0:
-                    new_mean[k, a] -= data.modes[k, a, i] * (place[i] - reference[i])
-            total += data.weights[k] * left * left
-    residual = np.sqrt(total / (2.0 * weight))
+    residual = _move_residuals(data, new_mean, place - reference, place[0] - depth)
     misfit = _compute_misfit(data, new_mean, new_count)
     return PlaceUpdate(
         place,

@@ -29,6 +29,8 @@ class ContactSurface:
         across: points per height.
         stiffness: penalty of each point (p,) [N/m].
         probe: the model's probe of the points.
+        low: least y and z of the inner face (2,) [m].
+        high: largest y and z (2,) [m].
     """
 
     points: NDArray
@@ -36,6 +38,8 @@ class ContactSurface:
     across: int
     stiffness: NDArray
     probe: Any
+    low: NDArray
+    high: NDArray
 
 
 def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across: Across) -> ContactSurface:
@@ -54,13 +58,15 @@ def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across
     face = mesh.nodes[np.abs(mesh.nodes[:, 0] - jaw.inner_face_x) < _ON_FACE]
     if len(face) < 2:
         raise MeshError(f"the mesh has no nodes on the inner face x = {jaw.inner_face_x:g} m; check inner_face_x")
-    low, high = face[:, 2].min(), face[:, 2].max()
-    heights = np.arange(low + _SPACING, high - 0.5 * _SPACING, _SPACING)
+    low, high = face[:, 1:].min(0), face[:, 1:].max(0)
+    heights = np.arange(low[1] + _SPACING, high[1] - 0.5 * _SPACING, _SPACING)
     gauss = np.array([0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)])
-    right, left = gauss * face[:, 1].max(), gauss[::-1] * face[:, 1].min()
+    right, left = gauss * high[0], gauss[::-1] * low[0]
     sides = {"middle": np.zeros(1), "half": right, "both": np.r_[left, right]}[across]
     z, y = np.meshgrid(heights, sides, indexing="ij")
     points = np.stack([np.full(z.size, jaw.inner_face_x), y.ravel(), z.ravel()], axis=1)
     stiffness = np.full(len(points), _STIFFNESS * _SPACING / len(sides))
     probe = model.attach(points, 1e-3)
-    return ContactSurface(points=points, heights=heights, across=len(sides), stiffness=stiffness, probe=probe)
+    return ContactSurface(
+        points=points, heights=heights, across=len(sides), stiffness=stiffness, probe=probe, low=low, high=high
+    )

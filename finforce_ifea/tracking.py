@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
-from finforce_ifea.place_update import PlaceUpdate, Residuals, update_place, weigh_residuals
+from finforce_ifea.place_update import PlaceUpdate, update_place
+from finforce_ifea.residuals import Residuals, weigh_residuals
 from finforce_ifea.rolling import PressedState, RollingContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
-from finforce_ifea.track import Track, explain_offsets
+from finforce_ifea.track import Track, condition_on_width, explain_offsets
 
 # The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
 _LEAST_DEPTH = 3e-5
@@ -182,6 +183,7 @@ class PlaceTracker:
     ) -> Residuals:
         """Returns the residuals of a state."""
         model, settings = self.contact.model, self.settings
+        noise, gain = condition_on_width(tare.noise)
         return weigh_residuals(
             measured,
             model.positions(self.probe, q),
@@ -189,7 +191,9 @@ class PlaceTracker:
             model.project(self.probe, q, state.modes),
             place - forecast.place,
             place[DEPTH] - max(place[DEPTH], self._find_touch(place) + _LEAST_DEPTH),
-            tare.noise,
+            noise,
+            gain,
+            tare.noise[1, 1],
             tare.offset_variance(settings.offset_stddev),
             min(forecast.spread[0, 0], _WIDEST_FORECAST**2),
             settings.model_error,

@@ -1,0 +1,128 @@
+"""Compiled in-plane residuals of key points about a place, and how far each can be believed; knows no mechanics."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+_MODEL_FLOOR = 0.02e-3
+_LEAST_WEIGHT = 0.02
+
+
+class Residuals(NamedTuple):
+    """In-plane residuals about the reference place.
+
+    Attributes:
+        r: (K, 2) [m], zero where unused.
+        modes: their derivatives by depth, log radius and height (K, 2, 3).
+        weights: (K,) from 0 to 1.
+        noise: of one point in one frame, in plane, (2, 2) [m^2].
+        bias: variance that no averaging removes (K,) [m^2].
+        used: number of points with a weight.
+        known: number of points that were measured.
+        jump: median of the depths that the points ask for one by one, about the model's own place [m].
+    """
+
+    r: NDArray
+    modes: NDArray
+    weights: NDArray
+    noise: NDArray
+    bias: NDArray
+    used: int
+    known: int
+    jump: float
+
+
+@njit(**_OPTIONS)
+def _square_distance(r0, r1, h0, h1, noise, bias, depth_variance):
+    """Returns the squared Mahalanobis distance of an in-plane residual, the depth being uncertain along (h0, h1)."""
+    s00 = noise[0, 0] + bias + h0 * h0 * depth_variance
+    s11 = noise[1, 1] + bias + h1 * h1 * depth_variance
+    s01 = noise[0, 1] + h0 * h1 * depth_variance
+    return (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / (s00 * s11 - s01 * s01)
+
+
+@njit(**_OPTIONS)
+def weigh_residuals(
+    measured,
+    positions,
+    rest,
+    motions,
+    moved,
+    below,
+    noise,
+    gain,
+    width_variance,
+    offset_variance,
+    depth_variance,
+    model_error,
+    gate,
+):
+    """Returns the in-plane residuals about the reference place and the weights of key points; see `Residuals`.
+
+    Weights are those of the residuals that are left at the model's own place.
+
+    The motion along y, known to be none, tells of noise that x and z share. A residual of `gate` standard deviations
+    keeps a quarter of its weight, w = 1 / (1 + d^2 / gate^2)^2 (Geman and McClure).
+
+    Args:
+        measured: (K, 3) [m], NaN where unused.
+        positions: of the deformed model (K, 3) [m].
+        rest: of the undeformed model (K, 3) [m].
+        motions: derivatives of the positions by the place (K, 3, 3).
+        moved: the place at which the model stands minus the reference (3,).
+        below: depth of the place below what the mechanics can reach [m].
+        noise: in-plane covariance of one point in one frame, its y known (2, 2) [m^2].
+        gain: regression of that noise on y (2,).
+        width_variance: of one point in one frame along y [m^2].
+        offset_variance: (K,) [m^2].
+        depth_variance: of the predicted depth [m^2].
+        model_error: share of a point's way.
+        gate: in standard deviations.
+    """
+    count = len(measured)
+    r, modes = np.zeros((count, 2)), np.empty((count, 2, 3))
+    weights, bias = np.zeros(count), np.empty(count)
+    asked, say = np.zeros(count), np.zeros(count)
+    used, known = 0, 0
+    for k in range(count):
+        way = 0.0
+        for a in range(3):
+            way += (positions[k, a] - rest[k, a]) ** 2
+            modes[k, 0, a], modes[k, 1, a] = motions[k, 0, a], motions[k, 2, a]
+        bias[k] = _MODEL_FLOOR**2 + model_error**2 * way + offset_variance[k]
+        if not np.isfinite(measured[k, 0] + measured[k, 1] + measured[k, 2]):
+            continue
+        off = measured[k, 1] - positions[k, 1]
+        r[k, 0] = measured[k, 0] - positions[k, 0] - gain[0] * off - modes[k, 0, 0] * below
+        r[k, 1] = measured[k, 2] - positions[k, 2] - gain[1] * off - modes[k, 1, 0] * below
+        r0, r1 = r[k, 0], r[k, 1]
+        for a in range(3):
+            r[k, 0] += modes[k, 0, a] * moved[a]
+            r[k, 1] += modes[k, 1, a] * moved[a]
+        h0, h1 = modes[k, 0, 0], modes[k, 1, 0]
+        square = off * off / (width_variance + bias[k])
+        square += _square_distance(r0, r1, h0, h1, noise, bias[k], depth_variance)
+        say[k] = h0 * h0 + h1 * h1
+        asked[k] = (h0 * r0 + h1 * r1) / max(say[k], 1e-12)
+        known += 1
+        weight = 1.0 / (1.0 + square / gate**2) ** 2
+        if weight >= _LEAST_WEIGHT:
+            weights[k] = weight
+            used += 1
+        else:
+            r[k, 0] = r[k, 1] = 0.0
+    return Residuals(r, modes, weights, noise, bias, used, known, _weighted_median(asked, say))
+
+
+@njit(**_OPTIONS)
+def _weighted_median(values, weights):
+    """Returns the value (of n) that has half of the weight on either side; 0 without any weight."""
+    half, total = 0.5 * weights.sum(), 0.0
+    for k in np.argsort(values):
+        total += weights[k]
+        if total >= half and weights[k] > 0.0:
+            return values[k]
+    return 0.0
