@@ -30,6 +30,7 @@ _LARGEST_MOVE = 0.7e-3
 _LARGEST_SHIFT = 0.3e-3
 _SETTLED_MOVE = 1e-4
 _SETTLED_CORRECTION = 1e-4
+_UNDECIDED = 0.2
 _FRAMES_RELEASED = 15
 _LOST_STDDEV = 1e-3
 # The height may leave what was given by this many of its standard deviations; beyond, the contact is another one.
@@ -82,7 +83,7 @@ class PlaceTracker:
         place = forecast.place
         q = self.q + self._modes @ (self._reachable(place) - self._reached)
         measured = points - tare.offsets
-        update, settled, iteration = None, False, 0
+        update, settled, iteration, share, last = None, False, 0, 1.0, np.zeros(3)
         while not settled and iteration < self.settings.iterations:
             iteration += 1
             mechanical = self._reachable(place)
@@ -96,19 +97,22 @@ class PlaceTracker:
                 place, q = self._leap(q, state, mechanical, place, data)
                 continue
             update = self._update_place(data, forecast)
-            aim = self._bound(update.place, place)
-            moved, place = self._reachable(aim) - mechanical, aim
+            aim = self._bound(update.place, place, share)
+            # between two corners of an object the linearisation changes its mind: meet in the middle
+            share *= 0.5 if last[1:] @ (aim - place)[1:] < 0 else 1.0
+            missing = update.place - aim if share > _UNDECIDED else np.zeros(3)
+            last, moved, place = aim - place, self._reachable(aim) - mechanical, aim
             q = q + limit_step(self.contact.model, state.modes @ moved)
-            settled = self._is_settled(state, moved, update.place - aim)
+            settled = self._is_settled(state, moved, missing)
         if update is None or not state.touches:
             return self._lose()
         self._keep(q, place, update, forecast, state.modes)
         return self._report(state, place, moved, data, update, iteration, settled)
 
-    def _bound(self, asked: NDArray, place: NDArray) -> NDArray:
-        """Returns the place asked for, no farther from the present one than the linearisation holds."""
+    def _bound(self, asked: NDArray, place: NDArray, share: float) -> NDArray:
+        """Returns the place asked for, within a share of where the linearisation about the present one holds."""
         bounds, reach = self.contact.indenter.shape_range, _FARTHEST_HEIGHT * self.settings.height_stddev
-        change = np.array([_LARGEST_MOVE, bounds.largest_change, _LARGEST_SHIFT])
+        change = np.array([_LARGEST_MOVE, share * bounds.largest_change, share * _LARGEST_SHIFT])
         aim = np.clip(asked, place - change, place + change)
         aim[SHAPE] = min(max(aim[SHAPE], bounds.low), bounds.high)
         aim[HEIGHT] = min(max(aim[HEIGHT], self._prior[1] - reach), self._prior[1] + reach)
