@@ -188,18 +188,9 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
         place[0] -= pull[i] * step / information
     residual = _move_residuals(data, new_mean, place - reference, place[0] - depth)
     misfit = _compute_misfit(data, new_mean, new_count)
-    return PlaceUpdate(
-        place,
-        speed + gain[1] * innovation,
-        gain,
-        new_mean,
-        new_count,
-        covariance,
-        gain[0] / information,
-        kkt,
-        residual,
-        misfit,
-    )
+    speed += gain[1] * innovation
+    known = gain[0] / information
+    return PlaceUpdate(place, speed, gain, new_mean, new_count, covariance, known, kkt, residual, misfit)
 
 
 @njit(**_OPTIONS)

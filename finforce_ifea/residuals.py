@@ -11,6 +11,28 @@ _MODEL_FLOOR = 0.02e-3
 _LEAST_WEIGHT = 0.02
 
 
+class Uncertainty(NamedTuple):
+    """What is known of the errors of key points and mechanics.
+
+    Attributes:
+        noise: in-plane covariance of one point in one frame, its y known (2, 2) [m^2].
+        gain: regression of that noise on y (2,).
+        width_variance: of one point in one frame along y [m^2].
+        offset_variance: of each point's constant offset (K,) [m^2].
+        depth_variance: of the predicted depth [m^2].
+        model_error: of the mechanics, as a share of a point's way.
+        gate: residual that keeps a quarter of its weight, in standard deviations.
+    """
+
+    noise: NDArray
+    gain: NDArray
+    width_variance: float
+    offset_variance: NDArray
+    depth_variance: float
+    model_error: float
+    gate: float
+
+
 class Residuals(NamedTuple):
     """In-plane residuals about the reference place.
 
@@ -45,27 +67,11 @@ def _square_distance(r0, r1, h0, h1, noise, bias, depth_variance):
 
 
 @njit(**_OPTIONS)
-def weigh_residuals(
-    measured,
-    positions,
-    rest,
-    motions,
-    moved,
-    below,
-    noise,
-    gain,
-    width_variance,
-    offset_variance,
-    depth_variance,
-    model_error,
-    gate,
-):
+def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
     """Returns the in-plane residuals about the reference place and the weights of key points; see `Residuals`.
 
-    Weights are those of the residuals that are left at the model's own place.
-
-    The motion along y, known to be none, tells of noise that x and z share. A residual of `gate` standard deviations
-    keeps a quarter of its weight, w = 1 / (1 + d^2 / gate^2)^2 (Geman and McClure).
+    Weights are those of the residuals that are left at the model's own place: w = 1 / (1 + d^2 / gate^2)^2 (Geman and
+    McClure). The motion along y, known to be none, tells of noise that x and z share.
 
     Args:
         measured: (K, 3) [m], NaN where unused.
@@ -74,24 +80,17 @@ def weigh_residuals(
         motions: derivatives of the positions by the place (K, 3, 3).
         moved: the place at which the model stands minus the reference (3,).
         below: depth of the place below what the mechanics can reach [m].
-        noise: in-plane covariance of one point in one frame, its y known (2, 2) [m^2].
-        gain: regression of that noise on y (2,).
-        width_variance: of one point in one frame along y [m^2].
-        offset_variance: (K,) [m^2].
-        depth_variance: of the predicted depth [m^2].
-        model_error: share of a point's way.
-        gate: in standard deviations.
+        chance: see `Uncertainty`.
     """
+    noise, gain, width_variance, offset_variance, depth_variance, model_error, gate = chance
     count = len(measured)
     r, modes = np.zeros((count, 2)), np.empty((count, 2, 3))
     weights, bias = np.zeros(count), np.empty(count)
     asked, say = np.zeros(count), np.zeros(count)
     used, known = 0, 0
     for k in range(count):
-        way = 0.0
-        for a in range(3):
-            way += (positions[k, a] - rest[k, a]) ** 2
-            modes[k, 0, a], modes[k, 1, a] = motions[k, 0, a], motions[k, 2, a]
+        modes[k, 0], modes[k, 1] = motions[k, 0], motions[k, 2]
+        way = ((positions[k] - rest[k]) ** 2).sum()
         bias[k] = _MODEL_FLOOR**2 + model_error**2 * way + offset_variance[k]
         if not np.isfinite(measured[k, 0] + measured[k, 1] + measured[k, 2]):
             continue

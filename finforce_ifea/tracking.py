@@ -15,7 +15,7 @@ from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundI
 from finforce_ifea.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.place_update import PlaceUpdate, update_place
-from finforce_ifea.residuals import Residuals, weigh_residuals
+from finforce_ifea.residuals import Residuals, Uncertainty, weigh_residuals
 from finforce_ifea.rolling import PressedState, RollingContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
@@ -188,21 +188,19 @@ class PlaceTracker:
         """Returns the residuals of a state."""
         model, settings = self.contact.model, self.settings
         noise, gain = condition_on_width(tare.noise)
-        return weigh_residuals(
-            measured,
-            model.positions(self.probe, q),
-            self._rest,
-            model.project(self.probe, q, state.modes),
-            place - forecast.place,
-            place[DEPTH] - max(place[DEPTH], self._find_touch(place) + _LEAST_DEPTH),
-            noise,
-            gain,
-            tare.noise[1, 1],
-            tare.offset_variance(settings.offset_stddev),
-            min(forecast.spread[0, 0], _WIDEST_FORECAST**2),
-            settings.model_error,
-            settings.gate,
+        chance = Uncertainty(
+            noise=noise,
+            gain=gain,
+            width_variance=float(tare.noise[1, 1]),
+            offset_variance=tare.offset_variance(settings.offset_stddev),
+            depth_variance=float(min(forecast.spread[0, 0], _WIDEST_FORECAST**2)),
+            model_error=settings.model_error,
+            gate=settings.gate,
         )
+        motions = model.project(self.probe, q, state.modes)
+        below = float(place[DEPTH] - self._reachable(place)[DEPTH])
+        positions = model.positions(self.probe, q)
+        return weigh_residuals(measured, positions, self._rest, motions, place - forecast.place, below, chance)
 
     def _update_place(self, data: Residuals, forecast: "_Forecast") -> PlaceUpdate:
         """Returns the place that the residuals ask for."""
