@@ -1,0 +1,22 @@
+"""Errors of objects, poses, images and reconstructions; no contact is a result and none of these."""
+
+from finforce_camera import ImageError
+from finforce_ifea.errors import FinforceError
+
+__all__ = ["ImageError", "ObjectMeshError", "PoseError", "PoseLostError", "ReconstructionError"]
+
+
+class ObjectMeshError(FinforceError, ValueError):
+    """An object mesh cannot be read, has the wrong size, or has no surface to touch."""
+
+
+class PoseError(FinforceError, ValueError):
+    """Numbers that were given as a pose are none."""
+
+
+class PoseLostError(FinforceError, RuntimeError):
+    """The object was not found again in the image, so that its pose is not known."""
+
+
+class ReconstructionError(FinforceError, RuntimeError):
+    """No object mesh in agreement with the image was found."""

@@ -1,0 +1,150 @@
+"""Repair of object meshes: merged, closed, of one sense, turned outward; does not know what is graspable."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from finforce_contact.loops import chain_loops
+from finforce_contact.optional import import_manifold3d, import_open3d
+from finforce_contact.solids import solid_from_triangles, triangles_of_solid
+from finforce_contact.triangles import ObjectMesh, compute_volumes
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
+CRACK = 1e-5  # [m], vertices of an open mesh this close are one; below what contact can tell
+HOLE_SHARE = 0.1  # [-], radius of the holes that are filled, of the largest extent; an opening to grasp into is larger
+_GRID_BITS = 21  # three coordinates in one integer of 64 bits
+_MOST_BODIES = 1000  # beyond, the mesh is fragments and its bodies mean nothing
+
+
+def repair(mesh: ObjectMesh) -> ObjectMesh:
+    """Return the mesh with its vertices merged, closed where its holes are small, and its triangles facing outward.
+
+    `watertight` of the result is what manifold3d says; a mesh that stays open is kept and noted.
+
+    Raises:
+        MissingDependencyError: manifold3d is not installed, or the mesh is open and open3d is not.
+    """
+    mesh = merge_vertices(mesh)
+    if not mesh.edges.is_balanced:
+        mesh = close(mesh)
+    if not len(mesh.triangles):
+        return mesh
+    mesh = turn_outward(mesh)
+    solid = solid_from_triangles(mesh.vertices, mesh.triangles) if mesh.edges.is_balanced else None
+    if solid is not None:
+        return unite_bodies(replace(mesh, watertight=True), solid)
+    note = "The surface is not closed: its outline bridges the gaps, and booleans of solids are not possible."
+    return replace(mesh, watertight=False, notes=(*mesh.notes, note))
+
+
+def merge_vertices(mesh: ObjectMesh) -> ObjectMesh:
+    """Return the mesh with equal vertices as one, without the triangles that have a corner twice."""
+    low = mesh.vertices.min(axis=0)
+    # An even number of cells: the middle, where symmetric objects have their poles, is no rounding boundary.
+    cell = np.ptp(mesh.vertices, axis=0).max() / (2**_GRID_BITS - 2)
+    x, y, z = np.round((mesh.vertices - low) / cell).astype(np.int64).T
+    _, first, place = np.unique((x << 2 * _GRID_BITS) | (y << _GRID_BITS) | z, return_index=True, return_inverse=True)
+    merged = _drop_repeated_corners(place[mesh.triangles])
+    dropped = len(mesh.triangles) - len(merged)
+    note = f"{dropped} triangles without area were removed." if dropped else ""
+    return mesh.with_triangles(mesh.vertices[first], merged, note)
+
+
+def close(mesh: ObjectMesh) -> ObjectMesh:
+    """Return an open mesh with cracks merged, repeated triangles removed, in one sense, its small holes filled."""
+    open3d = import_open3d()
+    geometry = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.triangles)
+    )
+    geometry.merge_close_vertices(CRACK)
+    geometry.remove_degenerate_triangles()
+    geometry.remove_duplicated_triangles()
+    before = len(mesh.triangles)
+    triangles = np.asarray(geometry.triangles)
+    note = f"Vertices within {CRACK * 1e3:g} mm were merged; {before - len(triangles)} of {before} triangles fell away."
+    merged = mesh.with_triangles(np.asarray(geometry.vertices), triangles, note)
+    if merged.edges.is_branching:
+        note = "More than two triangles meet at an edge; their sense was left and holes were not filled."
+        return replace(merged, notes=(*merged.notes, note))
+    if not merged.edges.is_consistent:
+        if not geometry.orient_triangles():
+            return replace(merged, notes=(*merged.notes, "The surface has one side only, and so no outside."))
+        merged = merged.with_triangles(np.asarray(geometry.vertices), np.asarray(geometry.triangles))
+    return merged if merged.edges.is_balanced else fill_holes(merged)
+
+
+def fill_holes(mesh: ObjectMesh) -> ObjectMesh:
+    """Return the mesh with a fan of triangles in each hole that a small sphere about its middle covers."""
+    surplus = mesh.edges.surplus
+    ends = mesh.edges.ends[surplus != 0.0]
+    # A fan runs against its neighbour, whose sense is the sign of the surplus.
+    ends = np.where(surplus[surplus != 0.0, None] > 0.0, ends[:, ::-1], ends)
+    vertices, fans, left = [mesh.vertices], [mesh.triangles], 0
+    limit = HOLE_SHARE * np.ptp(mesh.vertices, axis=0).max()
+    for loop in chain_loops(ends[:, 0], ends[:, 1]):
+        middle = mesh.vertices[loop].mean(axis=0)
+        if np.linalg.norm(mesh.vertices[loop] - middle, axis=1).max() > limit:
+            left += 1
+            continue
+        apex = np.full(len(loop), len(mesh.vertices) + len(vertices) - 1)
+        vertices.append(middle[None])
+        fans.append(np.stack([loop, np.roll(loop, -1), apex], axis=1))
+    note = f"{len(fans) - 1} holes up to {limit * 1e3:.1f} mm in radius were filled, {left} larger ones were left."
+    return mesh.with_triangles(np.concatenate(vertices), np.concatenate(fans), note)
+
+
+def turn_outward(mesh: ObjectMesh) -> ObjectMesh:
+    """Return the mesh with inside-out bodies turned, each together with the cavities in it."""
+    body = label_bodies(mesh)
+    count = int(body.max()) + 1
+    volumes = np.bincount(body, weights=compute_volumes(mesh.vertices, mesh.triangles), minlength=count)
+    turned = (volumes[_find_containers(mesh, body, count)] < 0.0)[body]
+    if not turned.any():
+        return mesh
+    triangles = np.where(turned[:, None], mesh.triangles[:, ::-1], mesh.triangles)
+    note = f"{turned.sum()} of {len(turned)} triangles were inside-out and were turned."
+    return mesh.with_triangles(mesh.vertices, triangles, note)
+
+
+def label_bodies(mesh: ObjectMesh) -> NDArray:
+    """Return for each triangle the number (m,) of its connected body; one body for mere fragments."""
+    ends, count = mesh.edges.ends, len(mesh.vertices)
+    graph = coo_array((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    bodies, label = connected_components(graph, directed=False)
+    return label[mesh.triangles[:, 0]] if bodies <= _MOST_BODIES else np.zeros(len(mesh.triangles), dtype=int)
+
+
+def unite_bodies(mesh: ObjectMesh, solid: "Manifold") -> ObjectMesh:
+    """Return a watertight mesh, given as solid too, with overlapping bodies made one; their number is noted."""
+    bodies = solid.decompose()
+    if len(bodies) == 1:
+        return mesh
+    mesh = replace(mesh, notes=(*mesh.notes, f"The object consists of {len(bodies)} separate surfaces."))
+    if len(bodies) > _MOST_BODIES or any(body.volume() < 0.0 for body in bodies):
+        return mesh  # a union would fill the cavities
+    manifold3d = import_manifold3d()
+    union = manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add)
+    if union.volume() > (1.0 - 1e-6) * solid.volume():
+        return mesh
+    return mesh.with_triangles(*triangles_of_solid(union), "Bodies that overlap were united.")
+
+
+def _drop_repeated_corners(triangles: NDArray) -> NDArray:
+    """Return the triangles whose three corners differ."""
+    return triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+
+
+def _find_containers(mesh: ObjectMesh, body: NDArray, count: int) -> NDArray:
+    """Return for each body the one (count,) whose box is the largest around its own, or itself."""
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    corners = mesh.vertices[mesh.triangles]
+    np.minimum.at(low, body, corners.min(axis=1))
+    np.maximum.at(high, body, corners.max(axis=1))
+    contains = (low[:, None] <= low[None]).all(axis=2) & (high[:, None] >= high[None]).all(axis=2)
+    return np.argmax(contains * np.linalg.norm(high - low, axis=1)[:, None], axis=0)
