@@ -7,11 +7,12 @@ from dataclasses import asdict
 
 import numpy as np
 
+from finforce_eval.contact_setup import first_touch
 from finforce_eval.contacts import ContactChoice
 from finforce_eval.evaluate import check_keypoint_count
 from finforce_eval.scoring import match_truth
 from finforce_eval.tracks import Recording
-from finforce_ifea.estimator import Contact, Observation
+from finforce_ifea.estimator import Observation
 from finforce_ifea.identification import CalibrationFit, fit_calibration
 from finforce_ifea.jaw import Jaw
 from finforce_ifea.plateaus import CalibrationCase
@@ -26,19 +27,22 @@ UNITS = {
 }
 
 
-def calibration_case(recording: Recording, jaw: Jaw, contacts: ContactChoice, side: str) -> CalibrationCase:
+def calibration_case(
+    recording: Recording, jaw: Jaw, contacts: ContactChoice, density: str = "default"
+) -> CalibrationCase:
     """Return the observations and true forces of one jaw of a recording.
 
     Args:
         recording: a recording with ground truth.
         jaw: the jaw of that side.
-        contacts: contact heights.
-        side: "left" or "right".
+        contacts: where the contact comes from.
+        density: mesh density of the surface that the solver returns.
 
     Raises:
         RecordingError: no ground truth, or another number of key points than the jaw's.
-        OptionError: no contact height.
+        FinforceError: no contact height, no object mesh or poses.
     """
+    side = jaw.side
     track, truth = recording.jaw(side).keypoints, recording.truth(side)
     check_keypoint_count(recording, side, jaw)
     forces = match_truth(truth, track.stamps)
@@ -50,7 +54,7 @@ def calibration_case(recording: Recording, jaw: Jaw, contacts: ContactChoice, si
     return CalibrationCase(
         name=recording.name,
         observations=observations,
-        contact=Contact.fixed(jaw, contacts.height(recording)),
+        contact=first_touch(contacts, recording, jaw, density),
         stamps_true=track.stamps[known] * 1e-9,
         forces_true=forces[known],
     )
@@ -91,7 +95,8 @@ def format_fit(fit: CalibrationFit, cases: Sequence[CalibrationCase]) -> str:
         lines.append(f"{name:<24} {factor * value:9.3f} ± {factor * spread:.3f} {unit}".rstrip())
     lines.append("")
     for case, radius in zip(cases, fit.radii, strict=True):
-        lines.append(f"{case.name}: radius of the object {1e3 * radius:.1f} mm")
+        shape = "outline of its mesh" if radius is None else f"radius of the object {1e3 * radius:.1f} mm"
+        lines.append(f"{case.name}: first touch at {1e3 * case.contact.points[0, 2]:.2f} mm, {shape}")
     lines.append(
         f"{fit.plateaus} steady loads of {len(cases)} recordings; left over: force {fit.force_rms:.3f} N "
         f"({100 * fit.calibration.force_error:.1f} %), key points {1e3 * fit.shape_rms:.3f} mm."

@@ -13,9 +13,11 @@ SOLVERS = ("default", "solid", "frame", "paper")
 MESHES = ("default", "coarse", "fine")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 CONTACT_HELP = (
-    "contact: fixed:Z_MM, the height of first touch above the clamped base; fixed:case takes it from the "
-    "case.json beside each recording (the default); NAME=Z_MM gives it for one recording and may be repeated"
+    "contact: estimate, closest or paper, from the object's mesh and pose; fixed:Z_MM, the height of first touch above "
+    "the clamped base; fixed:case takes it from the case.json beside each recording; NAME=Z_MM gives it for one "
+    "recording and may be repeated. Without it estimate for a recording with mesh and poses, else fixed:case"
 )
+UNITS = ("m", "cm", "mm", "inch")
 
 
 class Parser(argparse.ArgumentParser):
@@ -37,6 +39,7 @@ def build_parser() -> Parser:
     _add_demo(commands)
     _add_bench(commands)
     _add_steel(commands)
+    _add_reconstruct(commands)
     version = commands.add_parser("version", help="print the version")
     version.set_defaults(run="finforce_eval.commands:run_version")
     return parser
@@ -48,6 +51,9 @@ def add_jaw_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--solver", default="default", choices=SOLVERS, help="model and objective")
     parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
     parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
+    mesh = "object mesh (STL, OBJ, PLY, GLB) in its own frame; without it the one that each case.json names"
+    parser.add_argument("--object", metavar="MESH", help=mesh)
+    parser.add_argument("--object-unit", default="m", choices=UNITS, help="unit of the mesh (m)")
 
 
 def _add_set(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +67,6 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("evaluate", help=text, description=text)
     parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
     add_jaw_options(parser)
-    parser.add_argument("--object", metavar="MESH", help="object mesh; used by contact estimators only")
     calibration = "calibration file, or a shipped name; without it the jaw file's own material"
     parser.add_argument("--calibration", metavar="FILE", help=calibration)
     _add_set(parser)
@@ -83,6 +88,7 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
 def _add_demo(commands: argparse._SubParsersAction) -> None:
     text = "replay the shipped recording through the real nodes and write a report"
     parser = commands.add_parser("demo", help=text, description=text)
+    parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
     parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")
     parser.set_defaults(run="finforce_eval.demo:run_demo")
 
@@ -102,6 +108,24 @@ def _add_steel(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--source", metavar="FILE", help="measurement; without it the shipped one")
     parser.add_argument("--storage", default="mcap", choices=("mcap", "sqlite3"), help="its format")
     parser.set_defaults(run="finforce_eval.steel:run_convert")
+
+
+def _add_reconstruct(commands: argparse._SubParsersAction) -> None:
+    text = "make an object's mesh in metres, and its pose, from a masked depth image"
+    parser = commands.add_parser("reconstruct", help=text, description=text)
+    parser.add_argument("--depth", required=True, metavar="FILE", help="16-bit PNG [mm], or .npy [m]")
+    parser.add_argument("--mask", required=True, metavar="FILE", help="the object's pixels: picture or .npy")
+    intrinsics = "fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a JSON or YAML file"
+    parser.add_argument("--intrinsics", required=True, nargs="+", metavar="NUMBER", help=intrinsics)
+    parser.add_argument("--color", metavar="FILE", help="colour picture, for the picture that is written")
+    parser.add_argument("--mesh", metavar="FILE", help="generated mesh (STL, OBJ, PLY, GLB), in any unit")
+    pose = "JSON of its place: rotation (w x y z), translation, scale as SAM-3D gives them, or a 4x4 matrix"
+    parser.add_argument("--pose", metavar="FILE", help=pose)
+    method = "default: robust with a generated mesh; without, a primitive where one fits, else a completion"
+    parser.add_argument("--method", choices=("robust", "paper", "primitive", "completion"), help=method)
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="mesh: .stl, .ply or .glb, in metres")
+    parser.add_argument("--picture", metavar="PNG", help="write a picture of the mesh over the depth")
+    parser.set_defaults(run="finforce_eval.reconstruct:run_reconstruct")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from finforce_eval.contact_setup import build_source
+from finforce_eval.contact_source import ContactSource
 from finforce_eval.contacts import ContactChoice, parse_contacts
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
@@ -19,7 +21,7 @@ from finforce_eval.tables import evaluation_json, format_table
 from finforce_eval.tracks import Recording
 from finforce_ifea.calibration import Calibration, load_calibration, save_calibration
 from finforce_ifea.errors import FinforceError
-from finforce_ifea.estimator import Contact, JawEstimator
+from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
 
@@ -46,9 +48,15 @@ class Setup:
         estimator.warm_up()
         return estimator
 
-    def contact(self, recording: Recording) -> Contact:
-        """Return the contact of a recording."""
-        return Contact.fixed(self.jaw, self.contacts.height(recording))
+    @property
+    def density(self) -> str:
+        """Mesh density of the surface that the solver returns."""
+        return "coarse" if self.settings.solver == "paper" else self.settings.mesh
+
+    def source(self, recording: Recording) -> ContactSource:
+        """Return a fresh contact source for this jaw of a recording."""
+        jaw = self.calibration.apply(self.jaw) if self.calibration else self.jaw
+        return build_source(self.contacts, recording, jaw, self.density)
 
 
 def run_version(options: argparse.Namespace) -> None:
@@ -98,7 +106,11 @@ def make_setup(options: argparse.Namespace) -> Setup:
     Raises:
         FinforceError: the contact, the jaw or the calibration cannot be used.
     """
-    contacts = parse_contacts(options.contact)
+    contacts = parse_contacts(
+        options.contact,
+        object_file=getattr(options, "object", None),
+        object_unit=getattr(options, "object_unit", "m"),
+    )
     jaw = load_jaw(options.jaw)
     changes = getattr(options, "set", [])
     settings = parse_settings(options.solver, options.mesh, changes)
@@ -107,7 +119,7 @@ def make_setup(options: argparse.Namespace) -> Setup:
         "jaw": jaw.name,
         "solver": options.solver,
         "mesh": options.mesh,
-        "contact": ", ".join(options.contact) or "fixed:case",
+        "contact": ", ".join(options.contact) or "estimate where mesh and poses are known, else fixed:case",
         "settings": ", ".join(changes) or "as they come",
         "calibration": options.calibration or "none",
         "version": version(),
@@ -171,7 +183,7 @@ def evaluate_all(recordings: Sequence[Recording], setup: Setup) -> Evaluation:
     for recording in recordings:
         for side in truth_sides(recording):
             check_keypoint_count(recording, side, setup.jaw)
-        setup.contact(recording)
+            setup.side(side).source(recording)
     cases = [(recording, side) for recording in recordings for side in truth_sides(recording)]
     frames = sum(len(recording.jaw(side).keypoints.stamps) for recording, side in cases)
     results = []
@@ -199,7 +211,7 @@ def _evaluate_case(recording: Recording, side: str, setup: Setup, progress: Any)
     result = evaluate_recording(
         recording,
         setup.jaw,
-        setup.contact(recording),
+        setup.source(recording),
         side=side,
         factory=setup.estimator,
         progress=progress,
@@ -217,7 +229,7 @@ def run_calibrate(options: argparse.Namespace) -> None:
     is_left = all("left" in truth_sides(recording) for recording in recordings)
     setup = setup.side("left" if is_left else "right")
     jaw, contacts = setup.jaw, setup.contacts
-    cases = [calibration_case(recording, jaw, contacts, jaw.side) for recording in recordings]
+    cases = [calibration_case(recording, jaw, contacts, setup.density) for recording in recordings]
     Path(options.output).parent.mkdir(parents=True, exist_ok=True)
     fit = calibrate(cases, jaw, setup.settings)
     print(format_fit(fit, cases))

@@ -24,7 +24,9 @@ def run_demo(options: argparse.Namespace) -> None:
     recording = read_recording(RECORDING)
     begin, end = recording.jaw("left").keypoints.stamps[[0, -1]]
     print(f"Playing {recording.name}, {(end - begin) * 1e-9:.0f} s, through the solver node ...", flush=True)
-    names = argparse.Namespace(jaw="bench", solver="default", mesh="default", contact=[], calibration=CALIBRATION)
+    names = argparse.Namespace(
+        jaw="bench", solver="default", mesh="default", contact=options.contact, calibration=CALIBRATION
+    )
     setup = make_setup(names)
     result = replay(recording, setup, calibration_file=CALIBRATION)
     print(format_replay(result))

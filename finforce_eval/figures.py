@@ -32,14 +32,14 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def _style(axes: Any) -> None:
+def style_axes(axes: Any) -> None:
     """Take away the frame and set a quiet grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
 
 
-def _spans(mask: NDArray[np.bool_]) -> list[NDArray[np.integer]]:
+def find_runs(mask: NDArray[np.bool_]) -> list[NDArray[np.integer]]:
     """Return the runs of frames in which the mask is true."""
     rows = np.flatnonzero(mask)
     if rows.size == 0:
@@ -47,11 +47,11 @@ def _spans(mask: NDArray[np.bool_]) -> list[NDArray[np.integer]]:
     return np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
 
 
-def _shade_phases(axes: Any, result: CaseResult, *, labelled: bool) -> None:
+def shade_phases(axes: Any, result: CaseResult, *, labelled: bool) -> None:
     """Shade the record phases of loading and unloading, with entries for the legend if `labelled`."""
     time = result.seconds
     for direction, colour in COLOURS.items():
-        for count, run in enumerate(_spans(result.scored & (result.direction == direction))):
+        for count, run in enumerate(find_runs(result.scored & (result.direction == direction))):
             label = f"record, {LABELS[direction]}" if labelled and count == 0 else None
             axes.axvspan(time[run[0]], time[run[-1]], color=colour, alpha=0.13, linewidth=0, label=label)
 
@@ -62,8 +62,8 @@ def draw_force(result: CaseResult) -> Figure:
     force, error = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
     time = result.seconds
     for axes in (force, error):
-        _style(axes)
-        _shade_phases(axes, result, labelled=axes is force)
+        style_axes(axes)
+        shade_phases(axes, result, labelled=axes is force)
     low, high = result.magnitude - 2 * result.stddev, result.magnitude + 2 * result.stddev
     force.fill_between(
         time, np.maximum(low, 0), high, color=GREEN, alpha=0.3, linewidth=0, label="± 2 standard deviations"
@@ -99,7 +99,7 @@ def draw_unity(results: Sequence[CaseResult]) -> Figure:
     figure = new_figure(3.4 * columns + 0.8, 3.4 * rows + 0.6)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, result in zip(panels, results, strict=False):
-        _style(axes)
+        style_axes(axes)
         counted = np.r_[result.true_magnitude[result.counted], result.magnitude[result.counted]]
         limit = 1.06 * float(counted.max(initial=0.1))
         axes.plot([0, limit], [0, limit], color=GREY, linewidth=1.0, dashes=(4, 2))
@@ -129,7 +129,7 @@ def draw_violins(results: Sequence[CaseResult]) -> Figure:
     """Draw the distribution of the error per case: loading to the left, unloading to the right."""
     figure = new_figure(max(4.2, 1.15 * len(results) + 1.4), 4.4)
     axes = figure.subplots()
-    _style(axes)
+    style_axes(axes)
     axes.axhline(0.0, color=BLACK, linewidth=0.8)
     for place, result in enumerate(results):
         for direction, colour in [*COLOURS.items(), ("", BLUE)]:

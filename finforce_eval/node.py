@@ -141,9 +141,10 @@ def play_recording(node: PlayerNode, _: Executor) -> None:
     parameters = ros.declare_record(node, PlayerParameters)
     messages = read_playback(parameters.bag)
     node.offer(messages)
-    keypoints = {message.topic for message in messages if message.topic.endswith("/keypoints")}
-    if not node.wait_for(lambda: node.has_listeners(keypoints), parameters.patience):
-        node.get_logger().warning("nobody listens to the key points; they are played all the same")
+    ends = ("/keypoints", "/jaw_pose") if parameters.awaits_poses else ("/keypoints",)
+    awaited = {message.topic for message in messages if message.topic.endswith(ends)}
+    if not node.wait_for(lambda: node.has_listeners(awaited), parameters.patience):
+        node.get_logger().warning(f"nobody listens to one of {', '.join(awaited)}; all are played all the same")
     node.play(messages, rate=parameters.rate)
     node.spin_until(monotonic() + 0.5)
 

@@ -14,10 +14,13 @@ class PlayerParameters:
         default=1.0,
         metadata={"description": "speed of playing, 1 as recorded", "unit": "", "min": 0.01, "max": 100.0},
     )
+    awaits_poses: bool = field(
+        default=False, metadata={"description": "wait for listeners to the poses of the jaws, too"}
+    )
     patience: float = field(
         default=120.0,
         metadata={
-            "description": "wait for a listener to the key points, which compiles first",
+            "description": "wait for listeners, which compile first",
             "unit": "s",
             "min": 0.0,
             "max": 3600.0,

@@ -69,7 +69,7 @@ def read_recording(path: str | Path) -> Recording:
         name=name,
         path=Path(path),
         jaws=jaws,
-        object_pose=_pose_track(poses) if poses else None,
+        object_pose=_pose_track(poses, "/object_pose", name) if poses else None,
         phases=_phases(phases, name) if phases else None,
         case=_read_case(folder / "case.json"),
         notes=tuple(notes),
@@ -169,7 +169,7 @@ def _jaw_track(samples: Mapping[str, list[Sample]], side: str, name: str) -> Jaw
     return JawTrack(
         keypoints=_keypoint_track(samples[f"/{side}/keypoints"], side, name),
         truth=_wrench_track(truth, side, name) if truth else None,
-        pose=_pose_track(pose) if pose else None,
+        pose=_pose_track(pose, f"/{side}/jaw_pose", name) if pose else None,
     )
 
 
@@ -221,14 +221,19 @@ def _wrench_track(samples: Sequence[Sample], side: str, name: str) -> WrenchTrac
     return WrenchTrack(stamps=stamps, force=force, torque=torque)
 
 
-def _pose_track(samples: Sequence[Sample]) -> PoseTrack:
-    """Stack poses; the order of their stamps is not checked, trackers publish late results."""
+def _pose_track(samples: Sequence[Sample], topic: str, name: str) -> PoseTrack:
+    """Stack poses of one frame; the order of their stamps is not checked, trackers publish late results."""
+    frames = [sample.message.header.frame_id for sample in samples]
+    odd = next((index for index, frame in enumerate(frames) if frame != frames[0]), None)
+    if odd is not None:
+        what = f"message {odd} is in the frame '{frames[odd]}', the first in '{frames[0]}'"
+        raise RecordingError(f"{name}: {topic} {what}; expected one frame")
     poses = [sample.message.pose for sample in samples]
     return PoseTrack(
         stamps=np.array([_stamp(sample) for sample in samples], dtype=np.int64),
         position=np.array([[p.position.x, p.position.y, p.position.z] for p in poses]),
         quaternion=np.array([[getattr(p.orientation, axis) for axis in "xyzw"] for p in poses]),
-        frame_id=samples[0].message.header.frame_id,
+        frame_id=frames[0],
     )
 
 

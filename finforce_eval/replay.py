@@ -10,14 +10,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic, time_ns
+from typing import Any
 
 from tqdm import tqdm
 
 from finforce_eval.cli import Parser, add_jaw_options
 from finforce_eval.commands import Setup, make_setup, truth_sides, write_json
+from finforce_eval.contacts import FIXED, ContactChoice
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluate import Evaluation, check_keypoint_count, score_results
 from finforce_eval.live import ReplayLog, live_result
+from finforce_eval.objects import require_mesh
 from finforce_eval.playback import RawMessage, read_playback
 from finforce_eval.processes import ProcessError, ProcessGroup
 from finforce_eval.recording import read_recording
@@ -29,7 +32,7 @@ from finforce_ifea.errors import MissingDependencyError
 
 PATIENCE = 180.0  # s; a first start compiles the element loops
 LINGER = 0.3  # s; the last answers may still be on their way when the last message has left
-RESULTS = ("wrench", "wrench_stddev", "surface", "markers")
+RESULTS = ("wrench", "wrench_stddev", "surface", "markers", "contact", "object_outline")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,12 +112,30 @@ def _graph_options(recording: Recording, setup: Setup, calibration_file: str, pl
         jaws="both" if len(sides) == 2 else sides[0],
         jaw_file=str(setup.jaw.path),
         calibration_file=calibration_file,
-        contact_height=setup.contacts.height(recording),
+        **_contact_options(recording, setup.contacts),
         solver=setup.settings.solver,
         mesh=setup.settings.mesh,
         parameter_file=playing.parameter_file,
         use_sim_time=playing.has_clock,
     )
+
+
+def _contact_options(recording: Recording, choice: ContactChoice) -> dict[str, Any]:
+    """Return a height for the solvers, or what the contact estimator of all jaws needs.
+
+    Raises:
+        FinforceError: height, mesh or poses are missing.
+    """
+    modes = {choice.mode_for(recording, side) for side in recording.jaws}
+    mode = modes.pop() if len(modes) == 1 else FIXED
+    if mode == FIXED:
+        return {"contact_height": choice.height(recording)}
+    for side, track in recording.jaws.items():
+        if recording.object_pose is None or track.pose is None:
+            needed = f"/object_pose and /{side}/jaw_pose"
+            raise RecordingError(f"{recording.name}: --contact {mode} needs {needed}; give --contact fixed:Z_MM")
+    mesh = require_mesh(recording, choice.object_file).resolve()
+    return {"contact": mode, "object_mesh": str(mesh), "object_mesh_unit": choice.object_unit}
 
 
 def _run(processes: Sequence[Process], messages: Sequence[RawMessage], log: ReplayLog, playing: Playing) -> None:
@@ -124,7 +145,9 @@ def _run(processes: Sequence[Process], messages: Sequence[RawMessage], log: Repl
     except ImportError as error:
         raise MissingDependencyError(f"replay needs ROS 2: pip install 'finforce[ros]' ({error})") from error
     domain = random.randint(1, 99) if playing.domain is None else playing.domain
-    keypoints = [f"/{side}/keypoints" for side in log.jaws]
+    awaited = [f"/{side}/keypoints" for side in log.jaws]
+    if any(process.executable == "contact_estimator" for process in processes):
+        awaited += ["/object_pose", *(f"/{side}/jaw_pose" for side in log.jaws)]
     with ExitStack() as stack:
         player = stack.enter_context(open_player(domain))
         nodes = stack.enter_context(ProcessGroup(processes, {"ROS_DOMAIN_ID": str(domain)}))
@@ -133,10 +156,10 @@ def _run(processes: Sequence[Process], messages: Sequence[RawMessage], log: Repl
 
         def ready() -> bool:
             nodes.check()
-            return player.has_listeners(keypoints)
+            return player.has_listeners(awaited)
 
         if not player.wait_for(ready, PATIENCE):
-            raise ProcessError(f"the solver does not listen to its key points after {PATIENCE:g} s")
+            raise ProcessError(f"nobody listens to {' or '.join(awaited)} after {PATIENCE:g} s")
         player.spin_until(monotonic() + LINGER)
         bar = stack.enter_context(tqdm(total=len(messages), unit="msg", desc="replay", disable=None))
         log.offset = 0 if playing.has_clock else time_ns() - messages[0].time
@@ -196,7 +219,6 @@ def build_parser() -> Parser:
     parser = Parser(prog="finforce replay", description=text)
     parser.add_argument("bag", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
     add_jaw_options(parser)
-    parser.add_argument("--object", metavar="MESH", help="object mesh; used by contact estimators only")
     parser.add_argument("--calibration", metavar="FILE", help="calibration file, or a shipped name")
     parser.add_argument("--rate", type=float, default=1.0, help="speed; other than 1 on /clock (1)")
     parser.add_argument("--sim-time", action="store_true", help="keep the stamps, give the time on /clock")

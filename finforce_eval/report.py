@@ -8,7 +8,7 @@ from pathlib import Path
 
 from finforce_eval.evaluate import Evaluation
 from finforce_eval.results import CaseResult
-from finforce_eval.tables import markdown_table, summary_lines
+from finforce_eval.tables import markdown_contact_table, markdown_table, summary_lines
 
 
 def write_report(
@@ -55,6 +55,7 @@ def _overview(evaluation: Evaluation) -> list[str]:
         markdown_table(evaluation),
         "",
         *summary_lines(evaluation),
+        *markdown_contact_table(evaluation),
         "",
         "Errors are norm of the estimate minus norm of the measured force, over the record phases.",
         "",
@@ -65,6 +66,7 @@ def _overview(evaluation: Evaluation) -> list[str]:
 
 def _write_case(result: CaseResult, folder: Path, keypoint_names: Sequence[str]) -> list[str]:
     """Write the pictures of one case and return its section of the page."""
+    from finforce_eval.contact_figure import draw_contact
     from finforce_eval.figures import draw_force, draw_keypoints
     from finforce_eval.jaw_figure import draw_jaw
 
@@ -77,4 +79,7 @@ def _write_case(result: CaseResult, folder: Path, keypoint_names: Sequence[str])
         title = f"{result.name}, largest force, t = {seconds:.1f} s"
         draw_jaw(result.snapshot, title).savefig(folder / f"{stem}_jaw.png")
         lines.append(f"![The jaw at the largest force]({stem}_jaw.png)")
+    if result.contact is not None:
+        draw_contact(result).savefig(folder / f"{stem}_contact.png")
+        lines.append(f"![Place of the contact over time]({stem}_contact.png)")
     return [*lines, f"![Key points used]({stem}_keypoints.png)"]

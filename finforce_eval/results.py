@@ -35,6 +35,27 @@ class Snapshot:
     force: NDArray[np.float64]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ContactSeries:
+    """Where the object was said to touch one jaw, image by image; n frames, heights on the undeformed surface.
+
+    Attributes:
+        source: what said it.
+        given: (n,) weighted mean height of the contact that the image was solved with [m], NaN = none.
+        truth: (n,) height of the pressure centre of the measured force [m], NaN where it is not known.
+        touching: (n,) whether object and jaw were said to touch once the image was solved; None when nobody says.
+        status: (n,) the contact estimator's own word, "" for a contact that was given.
+        step_ms: (n,) wall time of the contact estimator [ms]; NaN for a contact that was given.
+    """
+
+    source: str
+    given: NDArray[np.float64]
+    truth: NDArray[np.float64]
+    touching: NDArray[np.bool_] | None
+    status: NDArray[np.str_]
+    step_ms: NDArray[np.float64]
+
+
 @dataclass(frozen=True, kw_only=True)
 class CaseResult:
     """The time series of one jaw of one recording; n frames, K key points.
@@ -56,6 +77,7 @@ class CaseResult:
         scored: (n,) in a `record` phase; every frame without phases.
         snapshot: the jaw at the largest trusted force of a scored frame; None when there was none.
         message: the estimator's last words on a frame that it did not solve.
+        contact: where the object was said to touch; None when it does not travel.
     """
 
     name: str
@@ -74,6 +96,7 @@ class CaseResult:
     scored: NDArray[np.bool_]
     snapshot: Snapshot | None = None
     message: str = ""
+    contact: ContactSeries | None = None
 
     @property
     def seconds(self) -> NDArray[np.float64]:

@@ -8,6 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_eval.contact_scoring import (
+    OnsetStats,
+    PlaceStats,
+    given_distance,
+    onset_stats,
+    place_stats,
+    solved_distance,
+)
 from finforce_eval.results import CaseResult
 from finforce_eval.tracks import WrenchTrack
 
@@ -74,6 +82,10 @@ class CaseScore:
         step_ms: time per step.
         cycles: "all", "load", "unload" -> variation over the loading cycles.
         mean_rmse_N: mean of the RMSE of the cases.
+        contact_ms: time per step of the contact estimator.
+        place: distance of the contact that was given to the estimator from the true pressure centre.
+        solved_place: the same of the estimator's own contact place.
+        onset: delay of `touching`.
     """
 
     frames: int
@@ -87,6 +99,10 @@ class CaseScore:
     step_ms: StepTimes
     cycles: Mapping[str, CycleStats]
     mean_rmse_N: float | None
+    contact_ms: StepTimes
+    place: PlaceStats
+    solved_place: PlaceStats
+    onset: OnsetStats
 
 
 def force_range(truths: Iterable[NDArray[np.float64]]) -> float:
@@ -97,27 +113,43 @@ def force_range(truths: Iterable[NDArray[np.float64]]) -> float:
 
 
 def match_truth(truth: WrenchTrack, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the true force at the given stamps, (n, 3) [N].
-
-    A truth at the very stamp is taken as it is; between two samples that are no further apart than two
-    and a half periods of the truth it is interpolated; elsewhere it is NaN.
+    """Return the true force at the given stamps (n, 3) [N], matched as by `match_samples`.
 
     Args:
         truth: measured wrenches.
         stamps: (n,) image times [ns].
     """
-    matched = np.full((len(stamps), 3), np.nan)
-    after = np.clip(np.searchsorted(truth.stamps, stamps, side="left"), 0, len(truth.stamps) - 1)
-    exact = truth.stamps[after] == stamps
-    matched[exact] = truth.force[after[exact]]
+    return match_samples(truth.stamps, truth.force, stamps)
+
+
+def match_samples(
+    times: NDArray[np.int64], values: NDArray[np.float64], stamps: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return what was sampled at other times, at the given stamps.
+
+    A sample at the very stamp is taken as it is; between two that are no further apart than two and a half periods of
+    the samples it is interpolated; elsewhere it is NaN.
+
+    Args:
+        times: (m,) of the samples [ns].
+        values: (m, k) the samples.
+        stamps: (n,) [ns].
+
+    Returns:
+        (n, k).
+    """
+    matched = np.full((len(stamps), values.shape[1]), np.nan)
+    after = np.clip(np.searchsorted(times, stamps, side="left"), 0, len(times) - 1)
+    exact = times[after] == stamps
+    matched[exact] = values[after[exact]]
     before = after - 1
-    inside = ~exact & (before >= 0) & (truth.stamps[after] > stamps)
+    inside = ~exact & (before >= 0) & (times[after] > stamps)
     if inside.any():
-        gap = truth.stamps[after] - truth.stamps[before]
-        inside &= gap <= 2.5 * np.median(np.diff(truth.stamps))
+        gap = times[after] - times[before]
+        inside &= gap <= 2.5 * np.median(np.diff(times))
     rows, left, right = np.flatnonzero(inside), before[inside], after[inside]
-    share = (stamps[rows] - truth.stamps[left]) / (truth.stamps[right] - truth.stamps[left])
-    matched[rows] = truth.force[left] + share[:, None] * (truth.force[right] - truth.force[left])
+    share = (stamps[rows] - times[left]) / (times[right] - times[left])
+    matched[rows] = values[left] + share[:, None] * (values[right] - values[left])
     return matched
 
 
@@ -202,5 +234,9 @@ def score_case(results: CaseResult | Sequence[CaseResult], span: float) -> CaseS
         step_ms=_step_times(np.concatenate([case.step_ms for case in cases])),
         cycles={phase: _cycle_stats(cases, phase, span) for phase in stats},
         mean_rmse_N=_spread(each).mean,
+        contact_ms=_step_times(np.concatenate([np.zeros(0), *(c.contact.step_ms for c in cases if c.contact)])),
+        place=place_stats(np.concatenate([given_distance(case) for case in cases])),
+        solved_place=place_stats(np.concatenate([solved_distance(case) for case in cases])),
+        onset=onset_stats(cases),
         **stats,
     )

@@ -55,13 +55,63 @@ def format_table(evaluation: Evaluation) -> str:
     lines = [" " * widths[0] + "  " + "  ".join(titles), _join(head, widths)]
     rule = "-" * len(lines[1])
     lines += [rule, *(_join(row, widths) for row in rows[:-1]), rule, _join(rows[-1], widths)]
-    return "\n".join([*lines, "", *summary_lines(evaluation)])
+    contact = format_contact_table(evaluation)
+    below = ["", contact, *contact_lines()] if contact else []
+    return "\n".join([*lines, "", *summary_lines(evaluation), *below])
 
 
 def _join(cells: Sequence[str], widths: Sequence[int]) -> str:
     """Set the first cell to the left and the others to the right."""
     rest = (cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True))
     return "  ".join([cells[0].ljust(widths[0]), *rest])
+
+
+CONTACT_HEADER = (
+    "contact", "given: median/mm", "p95/mm", "max/mm", "solved: median/mm", "p95/mm", "max/mm",
+    "onset: median", "earliest", "latest", "missed", "p50/ms", "p99/ms",
+)  # fmt: skip
+
+
+def contact_rows(evaluation: Evaluation) -> list[list[str]]:
+    """Return one row per case and one for all: where the contact came from, place, onset and time; none without any."""
+    rows = []
+    for name, score in [*evaluation.scores.items(), ("all", evaluation.total)]:
+        result = evaluation.results.get(name)
+        source = "" if result is None or result.contact is None else result.contact.source
+        places = [
+            format_number(value)
+            for place in (score.place, score.solved_place)
+            for value in (place.median_mm, place.p95_mm, place.max_mm)
+        ]
+        onset = score.onset
+        frames = [format_number(v, 0) for v in (onset.median_frames, onset.earliest_frames, onset.max_frames)]
+        missed = str(onset.missed) if onset.n + onset.missed else "-"
+        times = [format_number(score.contact_ms.p50), format_number(score.contact_ms.p99)]
+        rows.append([name, source, *places, *frames, missed, *times])
+    return rows if any(result.contact is not None for result in evaluation.results.values()) else []
+
+
+def format_contact_table(evaluation: Evaluation) -> str:
+    """Return the contact's rows for a terminal, empty without any."""
+    rows = contact_rows(evaluation)
+    if not rows:
+        return ""
+    head = ["", "contact", "median", "p95", "max", "median", "p95", "max", "median", "first", "last", "missed",
+            "p50", "p99"]  # fmt: skip
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+    groups = (("", 0, 2), ("given/mm", 2, 5), ("solved/mm", 5, 8), ("onset/frames", 8, 12), ("ms", 12, 14))
+    titles = [f" {t} ".center(sum(widths[a:b]) + 2 * (b - a - 1), "-" if t else " ") for t, a, b in groups]
+    lines = ["  ".join(titles), _join(head, widths)]
+    return "\n".join([*lines, "-" * len(lines[1]), *(_join(row, widths) for row in rows)])
+
+
+def contact_lines() -> list[str]:
+    """Return what the numbers of the contact mean."""
+    return [
+        "Contact: distance along the undeformed surface between the true pressure centre and the contact that the "
+        "solver was given (given) and that it found (solved), above 0.2 N; onset: frames from 0.02 N of true force to "
+        "`touching`, one per loading cycle, negative is early; ms: a step of the contact estimator alone."
+    ]
 
 
 def summary_lines(evaluation: Evaluation) -> list[str]:
@@ -90,6 +140,16 @@ def markdown_table(evaluation: Evaluation) -> str:
     return "\n".join(lines)
 
 
+def markdown_contact_table(evaluation: Evaluation) -> list[str]:
+    """Return the contact's table in Markdown and what it means; no line without any."""
+    rows = contact_rows(evaluation)
+    if not rows:
+        return []
+    head = ["case", *CONTACT_HEADER]
+    lines = ["", "| " + " | ".join(head) + " |", "|---|---" + "|---:" * (len(head) - 2) + "|"]
+    return [*lines, *("| " + " | ".join(row) + " |" for row in rows), "", *contact_lines()]
+
+
 def evaluation_json(evaluation: Evaluation, **about: Any) -> dict[str, Any]:
     """Return the object that `evaluate --json` writes.
 
@@ -97,5 +157,11 @@ def evaluation_json(evaluation: Evaluation, **about: Any) -> dict[str, Any]:
         evaluation: the scores.
         about: what else stands at the top: jaw, solver, contact, ...
     """
-    cases = {name: asdict(score) for name, score in evaluation.scores.items()}
+    cases = {name: asdict(score) | _contact_name(evaluation, name) for name, score in evaluation.scores.items()}
     return {"cases": cases, "all": asdict(evaluation.total), "force_range_N": evaluation.span, **about}
+
+
+def _contact_name(evaluation: Evaluation, name: str) -> dict[str, str]:
+    """Return where the contact of a case came from."""
+    contact = evaluation.results[name].contact
+    return {} if contact is None else {"contact": contact.source}

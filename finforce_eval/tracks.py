@@ -94,6 +94,15 @@ class PhaseTrack:
         """Return for each stamp [ns] the row of its phase, -1 before the first."""
         return np.searchsorted(self.stamps, stamps, side="right") - 1
 
+    def displacement_at(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the displacement (n,) [mm] at stamps [ns]: linear over a ramp, held in other phases, 0 before all."""
+        held = np.r_[0.0, self.displacement_mm]
+        begins = np.where(self.stage == "ramp", held[:-1], held[1:])
+        # a ramp that nothing follows has no known end
+        ends = np.r_[held[1:-1], begins[-1]] if self.stage[-1] == "ramp" else held[1:]
+        times = np.stack([self.stamps, np.r_[self.stamps[1:], self.stamps[-1]]], axis=1).ravel()
+        return np.interp(stamps, times, np.stack([begins, ends], axis=1).ravel(), left=0.0)
+
 
 @dataclass(frozen=True, kw_only=True)
 class FramePhases:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from finforce_eval.tracks import JawTrack, KeypointTrack, PoseTrack, Recording, WrenchTrack, parse_phases
+from finforce_ifea.observation import Contact
 
 PERIOD = 33_333_333
 START = 1_000_000_000_000
@@ -67,6 +68,8 @@ class FakeJaw:
     name: str = "fake"
     keypoint_names: tuple = ("a", "b", "c", "d")
     keypoints: np.ndarray = None
+    inner_face_x: float = 0.014
+    side: str = "left"
 
 
 BOX = np.array([[x, y, z] for z in (0.0, 0.08) for y in (-0.01, 0.01) for x in (-0.014, 0.014)])
@@ -99,6 +102,7 @@ class FakeSolution:
     magnitude_stddev: float = 0.05
     residual: float = 2e-4
     contact_place: tuple = (0.014, 0.0, 0.04)
+    torque: tuple = (0.0, -0.04, 0.0)
     contact_point: tuple = (0.013, 0.0, 0.04)
 
     @property
@@ -130,3 +134,35 @@ class FakeEstimator:
 
     def surface(self):
         return BOX + np.array([1e-3 * len(self.observations), 0, 0])
+
+
+@dataclass(frozen=True)
+class FakeEstimate:
+    """What a contact estimator said."""
+
+    contact: Contact | None
+    touching: bool
+    status: str
+    message: str = ""
+
+
+class FakeContactEstimator:
+    """Puts the contact at the height of the object it knows, from its first update on; notes every call in order."""
+
+    def __init__(self, touching=lambda update: True):
+        self.calls = []
+        self._touching, self._pose, self._updates = touching, None, 0
+
+    def take_pose(self, stamp, T_jaw_object, covariance=None, *, camera=None):
+        self.calls.append(("pose", stamp, T_jaw_object))
+        self._pose = T_jaw_object
+
+    def update(self, stamp, surface=None, wrench=None):
+        self.calls.append(("update", stamp, surface, wrench))
+        self._updates += 1
+        if self._pose is None:
+            return FakeEstimate(None, False, "no_pose", "no pose yet")
+        touching = self._touching(self._updates - 1)
+        points = np.array([[0.014, 0.0, self._pose[2, 3] - 1e-3], [0.014, 0.0, self._pose[2, 3] + 3e-3]])
+        contact = Contact(points=points, weights=np.array([0.75, 0.25]), touching=touching, free=True)
+        return FakeEstimate(contact, touching, "touching" if touching else "apart")

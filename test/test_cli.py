@@ -16,6 +16,7 @@ from finforce_eval.writer import MessageFactory, write_entries, write_recording
 
 BENCH_KEYPOINTS = 15
 ROOT = Path(__file__).resolve().parents[1]
+CYLINDER = ROOT / "finforce_eval" / "data" / "objects" / "cylinder_25.stl"
 
 
 def bench_recording(name="pressed", **options):
@@ -128,9 +129,47 @@ def test_height_off_the_jaw_is_refused(capsys, bag):
     assert_refused(capsys, ["evaluate", bag, "--contact", "fixed:400"], "400")
 
 
-@pytest.mark.parametrize("contact", ["estimate", "closest", "somewhere", "fixed:x"])
+@pytest.mark.parametrize("contact", ["somewhere", "fixed:x"])
 def test_contact_that_cannot_be_used_is_refused(capsys, bag, contact):
     assert_refused(capsys, ["evaluate", bag, "--contact", contact], f"--contact {contact}")
+
+
+def test_estimate_without_mesh_or_poses_is_refused(capsys, bag, tmp_path):
+    assert_refused(capsys, ["evaluate", bag, "--contact", "estimate"], "no object mesh: no mesh in a case.json")
+    blind = write_recording(replace(bench_recording(), object_pose=None), tmp_path / "blind")
+    assert_refused(capsys, ["evaluate", blind, "--contact", "paper", "--object", CYLINDER], "no object poses")
+    track = bench_recording().jaws["left"]
+    still = replace(bench_recording(), jaws={"left": replace(track, pose=None)})
+    jawless = write_recording(still, tmp_path / "jawless")
+    assert_refused(
+        capsys, ["evaluate", jawless, "--contact", "closest", "--object", CYLINDER], "no jaw poses: /left/jaw_pose"
+    )
+    calibrate = ["calibrate", bag, "-o", tmp_path / "c.yaml", "--contact", "estimate"]
+    assert_refused(capsys, calibrate, "no object mesh")
+
+
+def test_object_that_cannot_be_used_is_refused(capsys, bag, tmp_path):
+    pytest.importorskip("trimesh")
+    assert_refused(capsys, ["evaluate", bag, "--object", tmp_path / "no.stl"], "no.stl")
+    assert_refused(capsys, ["evaluate", bag, "--object", CYLINDER, "--object-unit", "mm"], "unit")
+    assert_refused(capsys, ["evaluate", bag, "--object", CYLINDER, "--object-unit", "ell"], "--object-unit")
+    (tmp_path / "object.txt").write_text("")
+    assert_refused(capsys, ["evaluate", bag, "--object", tmp_path / "object.txt"], ".txt")
+
+
+def test_units_are_those_of_the_mesh_reader():
+    from finforce_contact.object_mesh import UNITS as READ
+    from finforce_eval.cli import UNITS
+
+    assert set(UNITS) == set(READ)
+
+
+def test_nan_pose_is_refused_with_its_message(capsys, tmp_path):
+    pytest.importorskip("trimesh")
+    recording = bench_recording()
+    recording.object_pose.position[4] = np.nan
+    bag = write_recording(recording, tmp_path / "bag")
+    assert_refused(capsys, ["evaluate", bag, "--object", CYLINDER], "/object_pose message 4")
 
 
 def test_absent_jaw_and_calibration_are_refused(capsys, bag, tmp_path):

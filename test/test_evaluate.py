@@ -4,16 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from eval_fakes import PERIOD, START, FakeEstimator, FakeJaw, make_recording
+from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, make_recording
 
+from finforce_eval.contact_source import EstimatedContact, GivenContact
 from finforce_eval.contacts import parse_contacts
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluate import evaluate_recording, score_results
-from finforce_eval.tables import evaluation_json, format_table, markdown_table
+from finforce_eval.objects import track_object
+from finforce_eval.tables import evaluation_json, format_table, markdown_contact_table, markdown_table
 from finforce_eval.tracks import JawTrack
 from finforce_ifea.errors import FinforceError, ObservationError
+from finforce_ifea.estimator import Contact
 
-CONTACT = object()
+CONTACT = Contact(points=np.array([[0.014, 0.0, 0.042]]), weights=np.ones(1), free=True)
 
 
 def truth_of(recording):
@@ -23,7 +26,7 @@ def truth_of(recording):
 def run(recording, forces, **options):
     estimator = FakeEstimator(forces)
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    result = evaluate_recording(recording, jaw, CONTACT, factory=lambda: estimator, **options)
+    result = evaluate_recording(recording, jaw, GivenContact(contact=CONTACT), factory=lambda: estimator, **options)
     return result, estimator
 
 
@@ -141,7 +144,7 @@ def test_frame_that_the_estimator_refuses_is_named():
             raise ObservationError("odd")
 
     with pytest.raises(ObservationError, match="case: frame 0: odd"):
-        evaluate_recording(make_recording(), FakeJaw(), CONTACT, factory=lambda: Refusing([]))
+        evaluate_recording(make_recording(), FakeJaw(), GivenContact(contact=CONTACT), factory=lambda: Refusing([]))
 
 
 def test_two_cases_of_one_name_are_refused():
@@ -189,6 +192,39 @@ def test_tables_have_a_row_per_case_and_one_for_all():
     assert f"{score.cycles['load'].rmse_N.mean:.2f}±{score.cycles['load'].rmse_N.std:.2f}" in rows[1]
 
 
+def estimated(recording, gain=1.0):
+    source = EstimatedContact(FakeContactEstimator(), track_object(recording, "left"), "estimate")
+    estimator = FakeEstimator(truth_of(recording) * gain)
+    jaw = FakeJaw(keypoints=np.zeros((4, 3)))
+    return evaluate_recording(recording, jaw, source, factory=lambda: estimator)
+
+
+def test_json_says_how_well_the_contact_was_known():
+    recording = make_recording("pressed")
+    content = evaluation_json(score_results([estimated(recording)], [recording]))
+    case = content["cases"]["pressed"]
+    assert case["contact"] == "estimate"
+    # the object's origin is the jaw's: rows at -1 and 3 mm weigh 3 to 1, the truth is at 40 mm
+    assert case["place"] == pytest.approx({"n": case["place"]["n"], "median_mm": 40.0, "p95_mm": 40.0, "max_mm": 40.0})
+    assert case["solved_place"]["max_mm"] == pytest.approx(0.0, abs=1e-6)
+    assert case["onset"].keys() == {"n", "missed", "median_frames", "earliest_frames", "max_frames"}
+    assert case["contact_ms"]["p50"] > 0.0
+    assert content["all"]["place"] == case["place"]
+
+
+def test_contact_table_has_a_row_per_case_and_one_for_all():
+    first, second = make_recording("first"), make_recording("second")
+    evaluation = score_results([estimated(first), run(second, truth_of(second))[0]], [first, second])
+    lines = format_table(evaluation).splitlines()
+    begin = next(index for index, line in enumerate(lines) if "given/mm" in line)
+    assert [line.split()[0] for line in lines[begin + 3 : begin + 6]] == ["first", "second", "all"]
+    assert lines[begin + 3].split()[1:4] == ["estimate", "40.00", "40.00"]
+    assert lines[begin + 4].split()[1:3] == ["given", "2.00"]
+    assert lines[begin + 4].split()[-6:] == ["-"] * 6
+    table = [line for line in markdown_contact_table(evaluation) if line.startswith("|")]
+    assert len({line.count("|") for line in table}) == 1
+
+
 def test_table_of_a_case_without_counted_frames_has_dashes():
     recording = make_recording()
     result, _ = run(recording, truth_of(recording))
@@ -216,9 +252,14 @@ def test_case_without_height_is_refused(case):
 
 
 @pytest.mark.parametrize("text", ["estimate", "closest", "paper"])
-def test_contacts_that_need_the_contact_estimator_say_so(text):
-    with pytest.raises(OptionError, match="needs the contact estimator, which this version does not have"):
-        parse_contacts([text])
+def test_estimators_have_no_fixed_height_but_a_name_may_have_one(text):
+    recording = make_recording("pressed")
+    choice = parse_contacts([text, "pressed=20"])
+    assert choice.mode_for(recording, "left") == "fixed"
+    assert choice.height(recording) == pytest.approx(0.020)
+    assert choice.mode_for(make_recording("other"), "left") == text
+    with pytest.raises(OptionError, match=f"--contact {text} has no fixed height"):
+        choice.height(make_recording("other"))
 
 
 @pytest.mark.parametrize("text", ["fixed:", "fixed:high", "fixed:nan", "40", "pressed=x", "somewhere"])

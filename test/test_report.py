@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from eval_fakes import BOX, BOX_TRIANGLES, FakeEstimator, FakeJaw, make_recording
 
+from finforce_eval.contact_source import GivenContact
 from finforce_eval.evaluate import evaluate_recording, score_results
 from finforce_eval.report import write_report
 
@@ -20,7 +21,9 @@ def evaluate(name, *, gain=1.1, phases=True, lost=()):
     for index in lost:
         forces[index] = None
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    return evaluate_recording(recording, jaw, None, factory=lambda: FakeEstimator(forces)), recording
+    return evaluate_recording(
+        recording, jaw, GivenContact(contact=None), factory=lambda: FakeEstimator(forces)
+    ), recording
 
 
 @pytest.mark.parametrize("phases", [False, True])
@@ -31,7 +34,7 @@ def test_report_shows_every_picture_it_names_and_names_every_picture(tmp_path, p
     page = write_report(evaluation, tmp_path / "new" / "report", keypoint_names="abcd", about={"solver": "fake"})
     named = re.findall(r"!\[.*?\]\((.*?)\)", page.read_text())
     assert sorted(named) == sorted(path.name for path in page.parent.glob("*.png"))
-    assert len(named) == 2 + 2 * 3
+    assert len(named) == 2 + 2 * 4
     for name in named:
         assert (page.parent / name).stat().st_size > 5000
     assert "- solver: fake" in page.read_text()

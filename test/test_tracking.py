@@ -8,8 +8,8 @@ from estimator_fakes import PERIOD, errors, make_estimator, ramp, record, run
 from mechanics_fakes import BENCH, bench_mechanics, bench_press
 
 from finforce_ifea.forward import Cylinder, press_jaw
-from finforce_ifea.observation import Contact
 from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE
+from finforce_ifea.observation import Contact
 from finforce_ifea.rolling import limit_step
 
 MODELS = [("coarse", "solid"), ("default", "frame")]
