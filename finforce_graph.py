@@ -49,10 +49,15 @@ class Process:
         if self.parameter_file:
             words += ["--params-file", self.parameter_file]
         for name, value in self.parameters.items():
-            words += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, with the type beyond doubt
+            words += ["-p", f"{name}:={_yaml(value)}"]
         for name, other in self.remappings.items():
             words += ["-r", f"{name}:={other}"]
         return words
+
+
+def _yaml(value: Any) -> str:
+    """Return a value as YAML with its type beyond doubt, which JSON is, but for NaN."""
+    return ".nan" if value != value else json.dumps(value)
 
 
 def _option(default: Any, description: str, **metadata: Any) -> Any:
@@ -67,8 +72,13 @@ class SolverOptions:
     jaw_file: str = _option("", "jaw file, or the name of a shipped jaw")
     calibration_file: str = _option("", "calibration file, or a shipped name")
     contact_height: float = _option(
-        math.nan, "height of first touch above the clamped base [m]; nan: contacts come by topic"
+        math.nan,
+        "height of first touch above the clamped base [m]; nan: contacts come by topic, as with an object mesh",
     )
+    object_mesh: str = _option("", "mesh file of the object, whose contacts are then estimated; empty: none is known")
+    object_mesh_unit: str = _option("", "unit of the mesh file: m, cm, mm or inch")
+    contact: str = _option("", "how the contact is estimated: estimate, paper or closest")
+    pose_source: str = _option("", "object poses: topic, detections or tracker")
     solver: str = _option("", "model and objective: default, solid, frame or paper")
     mesh: str = _option("", "mesh density: default, coarse or fine")
     parameter_file: str = _option("", "YAML file with ROS parameters of the nodes")
@@ -95,25 +105,55 @@ class ReplayOptions(SolverOptions):
 
 def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Process:
     """Return the solver of one jaw; `parameters` are added to those that the options name."""
+    height = None if math.isnan(options.contact_height) else options.contact_height
     asked = {
         "jaw_file": options.jaw_file,
         "calibration_file": options.calibration_file,
-        "contact_height": None if math.isnan(options.contact_height) else options.contact_height,
+        # NaN overrules a height in the parameter file
+        "contact_height": math.nan if options.object_mesh else height,
         "estimator.solver": options.solver,
         "estimator.mesh": options.mesh,
     }
-    given = {name: value for name, value in asked.items() if value not in ("", None)}
     return Process(
         executable="ifea_solver",
         name=f"{side}_ifea_solver",
-        parameters={"jaw_name": side, **given, **parameters, "use_sim_time": options.use_sim_time},
+        parameters={"jaw_name": side, **_given(asked), **parameters, "use_sim_time": options.use_sim_time},
         parameter_file=options.parameter_file,
     )
 
 
+def contact_processes(jaws: str, options: SolverOptions) -> list[Process]:
+    """Return the contact estimator of "left", "right" or "both" jaws, if an object mesh is named."""
+    if not options.object_mesh:
+        return []
+    asked = {
+        "jaw_file": options.jaw_file,
+        "calibration_file": options.calibration_file,
+        "object_mesh": options.object_mesh,
+        "object_mesh_unit": options.object_mesh_unit,
+        "pose_source": options.pose_source,
+        "contact.mode": options.contact,
+        "contact.mesh": "coarse" if options.solver == "paper" else options.mesh,
+    }
+    return [
+        Process(
+            executable="contact_estimator",
+            name="contact_estimator",
+            parameters={"jaws": jaws, **_given(asked), "use_sim_time": options.use_sim_time},
+            parameter_file=options.parameter_file,
+        )
+    ]
+
+
+def _given(asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what was asked for; the rest is the node's own."""
+    return {name: value for name, value in asked.items() if value not in ("", None)}
+
+
 def bench_processes(options: BenchOptions, share: Path) -> list[Process]:
     """Return the processes of one jaw on a bench; its force is the grasp force."""
-    return [solver_process(options.jaw, options, completes_grasp=True), *_viewer(options, share)]
+    solver = solver_process(options.jaw, options, completes_grasp=True)
+    return [solver, *contact_processes(options.jaw, options), *_viewer(options, share)]
 
 
 def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
@@ -125,13 +165,15 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
         solvers = [solver_process("left", options, peer="right"), solver_process("right", options)]
     else:
         solvers = [solver_process(options.jaws, options, completes_grasp=True)]
+    awaited = {"awaits_poses": True} if options.object_mesh else {}
     player = Process(
         executable="recording_player",
         name="recording_player",
-        parameters={"bag": options.bag, "rate": options.rate},
+        parameters={"bag": options.bag, "rate": options.rate, **awaited},
         ends_all=True,
     )
-    return [*solvers, *([player] if options.bag else []), *_viewer(options, share)]
+    played = [player] if options.bag else []
+    return [*solvers, *contact_processes(options.jaws, options), *played, *_viewer(options, share)]
 
 
 def _viewer(options: SolverOptions, share: Path) -> list[Process]:

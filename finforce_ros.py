@@ -8,15 +8,17 @@ import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields
-from typing import Any, TypeVar
+from threading import Thread
+from typing import Any
 
 import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, Vector3, Wrench, WrenchStamped
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3, Wrench, WrenchStamped
 from numpy.typing import ArrayLike, NDArray
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
@@ -24,7 +26,8 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import PointCloud2, PointField
+from rclpy.task import Future
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField  # noqa: F401 - for those who subscribe
 from std_msgs.msg import ColorRGBA, Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: F401 - for those who publish
@@ -32,16 +35,12 @@ from visualization_msgs.msg import Marker, MarkerArray  # noqa: F401 - for those
 from finforce_health import NANOSECONDS, Level, Outcome, Report
 from finforce_ifea.errors import FinforceError, ObservationError
 from finforce_ifea.pointcloud import encode_cloud
+from finforce_records import ParameterError, RecordT, bounds_of, check_value, constraints, describe
 
 MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
-RecordT = TypeVar("RecordT")
-
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-
-
-class ParameterError(FinforceError, ValueError):
-    """A ROS parameter has a value or a type that its record does not allow."""
 
 
 def nanoseconds(stamp: Any) -> int:
@@ -91,6 +90,13 @@ def _vector(xyz: Sequence[float]) -> Vector3:
     return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
 
 
+def pose_message(header: Header, numbers: Sequence[float]) -> PoseStamped:
+    """Return a pose from x, y, z [m], qx, qy, qz, qw."""
+    x, y, z, *turn = map(float, numbers)
+    orientation = Quaternion(**dict(zip("xyzw", turn, strict=True)))
+    return PoseStamped(header=header, pose=Pose(position=Point(x=x, y=y, z=z), orientation=orientation))
+
+
 def points_marker(
     header: Header,
     name: str,
@@ -126,9 +132,9 @@ def points_marker(
 
 
 def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> RecordT:
-    """Declare a read-only ROS parameter for every field of a frozen dataclass and return the record.
+    """Declare a ROS parameter for every field of a frozen dataclass and return the record.
 
-    Field metadata: `description`, `unit`, `min`, `max`, `choices`; no range forbids a default of NaN.
+    Field metadata: `description`, `unit`, `min`, `max`, `choices`, `settable` (not read-only); NaN may be a default.
 
     Args:
         node: the node that gets the parameters.
@@ -145,7 +151,7 @@ def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> Recor
             value = node.declare_parameter(name, entry.default, describe_field(entry)).value
         except ParameterException as error:
             raise ParameterError(f"parameter {name}: {error}") from error
-        _check_value(name, value, entry)
+        check_value(name, value, entry)
         values[entry.name] = value
     return record(**values)
 
@@ -157,34 +163,15 @@ def name_unknown_parameters(node: Node) -> None:
             node.get_logger().warning(f"there is no parameter '{name}'; it is ignored")
 
 
-def _check_value(name: str, value: Any, entry: Field) -> None:
-    """Refuse what a ROS range cannot: other choices, and numbers out of bounds where NaN is allowed."""
-    choices, low, high = (entry.metadata.get(key) for key in ("choices", "min", "max"))
-    if choices and value not in choices:
-        raise ParameterError(f"parameter {name} is {value!r}; expected one of {choices}")
-    if (low is not None and value < low) or (high is not None and value > high):
-        raise ParameterError(f"parameter {name} is {value!r}; expected {low} to {high}")
-
-
 def describe_field(entry: Field) -> ParameterDescriptor:
     """Return the description, unit, range and choices of a field as ROS tools show them."""
-    data, default = entry.metadata, entry.default
-    unit = f" [{data['unit']}]" if data.get("unit") else ""
-    descriptor = ParameterDescriptor(description=f"{data.get('description', '')}{unit}", read_only=True)
-    if choices := data.get("choices"):
-        descriptor.additional_constraints = f"one of {', '.join(map(repr, choices))}"
-    low, high = data.get("min"), data.get("max")
-    if low is None and high is None:
-        return descriptor
-    if default != default:  # NaN, which a range would refuse
-        descriptor.additional_constraints = f"from {low} to {high}, or NaN"
-    elif isinstance(default, float):
-        low, high = -sys.float_info.max if low is None else low, sys.float_info.max if high is None else high
-        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
-    else:
-        low, high = -(2**63) if low is None else low, 2**63 - 1 if high is None else high
-        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
-    return descriptor
+    fixed, bounds = not entry.metadata.get("settable", False), bounds_of(entry)
+    text = ParameterDescriptor(description=describe(entry), read_only=fixed, additional_constraints=constraints(entry))
+    if bounds and isinstance(entry.default, float):
+        text.floating_point_range = [FloatingPointRange(from_value=float(bounds[0]), to_value=float(bounds[1]))]
+    elif bounds:
+        text.integer_range = [IntegerRange(from_value=bounds[0], to_value=bounds[1])]
+    return text
 
 
 class QosWatch:
@@ -199,10 +186,10 @@ class QosWatch:
         events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
         return self._node.create_publisher(kind, topic, qos, event_callbacks=events)
 
-    def subscription(self, kind: type, topic: str, callback: Callable, qos: QoSProfile) -> Subscription:
+    def subscription(self, kind: type, topic: str, callback: Callable, qos: QoSProfile, **options: Any) -> Subscription:
         """Create a watched subscription."""
         events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
-        return self._node.create_subscription(kind, topic, callback, qos, event_callbacks=events)
+        return self._node.create_subscription(kind, topic, callback, qos, event_callbacks=events, **options)
 
     def _suspect(self, topic: str, writes: bool, qos: QoSProfile) -> None:
         self._suspects[self._node.resolve_topic_name(topic)] = (writes, qos)
@@ -248,17 +235,32 @@ def publish_diagnostics(
     node.create_timer(period, publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def serve_trigger(node: Node, name: str, action: Callable[[], str]) -> None:
-    """Offer an action as a std_srvs/Trigger service; what it refuses comes back as the message."""
+def serve_trigger(node: Node, name: str, action: Callable[[], str], *, aside: bool = False) -> None:
+    """Offer an action as a Trigger service, run `aside` if it takes long; what it refuses comes back as the message."""
 
-    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            response.success, response.message = True, action()
+            response.success, response.message = True, await run_aside(node, action) if aside else action()
         except FinforceError as error:
             response.success, response.message = False, str(error)
         return response
 
-    node.create_service(Trigger, name, answer)
+    node.create_service(Trigger, name, answer, callback_group=MutuallyExclusiveCallbackGroup() if aside else None)
+
+
+async def run_aside(node: Node, action: Callable[[], Any]) -> Any:
+    """Run an action in a thread of its own; only the callback that awaits it, and its group, wait."""
+    done, executor = Future(), node.executor
+
+    def run() -> None:
+        try:
+            done.set_result(action())
+        except Exception as error:
+            done.set_exception(error)
+        executor.wake()  # else it would look again with the next message only
+
+    Thread(target=run, daemon=True).start()
+    return await done
 
 
 def take_newest(subscription: Subscription, message: Any) -> tuple[Any, int]:

@@ -7,13 +7,22 @@ import signal
 import sys
 from importlib import import_module
 
-NODES = {"ifea_solver": "finforce_ifea.node", "recording_player": "finforce_eval.node"}
+NODES = {
+    "ifea_solver": "finforce_ifea.node",
+    "contact_estimator": "finforce_contact.node",
+    "recording_player": "finforce_eval.node",
+}
 STOPS = (signal.SIGINT, signal.SIGTERM)
 
 
 def ifea_solver() -> int:
     """Run the solver of one jaw."""
     return start("ifea_solver")
+
+
+def contact_estimator() -> int:
+    """Run the contact estimator of one jaw or both."""
+    return start("contact_estimator")
 
 
 def recording_player() -> int:

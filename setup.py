@@ -12,8 +12,15 @@ setup(
     description="Grasp force from the key points of fin-ray jaws, by a mechanical model of the jaw.",
     license="Apache-2.0",
     python_requires=">=3.10",
-    packages=["finforce_ifea", "finforce_eval"],
-    py_modules=["finforce_graph", "finforce_health", "finforce_ros", "finforce_start"],
+    packages=["finforce_contact", "finforce_eval", "finforce_ifea", "finforce_twin"],
+    py_modules=[
+        "finforce_camera",
+        "finforce_graph",
+        "finforce_health",
+        "finforce_records",
+        "finforce_ros",
+        "finforce_start",
+    ],
     package_data={
         "finforce_ifea": ["jaws/*", "calibrations/*"],
         "finforce_eval": ["data/*", "data/*/*", "data/*/*/*"],
@@ -34,6 +41,11 @@ setup(
         "pyyaml",  # jaw files, calibrations
         "meshio",  # volume mesh files of jaws
         "rosbags",  # recordings, without ROS
+        "manifold3d",  # Boolean intersections and outlines of object meshes
+        "trimesh",  # object mesh files
+        # ray casting, registration with scale, Poisson surfaces; the build without CUDA is a quarter of the size
+        "open3d-cpu; platform_machine == 'x86_64' and sys_platform == 'linux'",
+        "open3d; platform_machine != 'x86_64' or sys_platform != 'linux'",
         "matplotlib",  # pictures of the reports
         "tqdm",  # progress bars
     ],
@@ -51,6 +63,7 @@ setup(
     entry_points={
         "console_scripts": [
             "finforce = finforce_eval.cli:main",
+            "contact_estimator = finforce_start:contact_estimator",
             "ifea_solver = finforce_start:ifea_solver",
             "recording_player = finforce_start:recording_player",
         ],

@@ -180,6 +180,8 @@ class JawEstimator:
         if self._taring.is_at_rest(points):
             self._taring.note(quiet=True, loaded=False)
             self._relax(np.zeros(3))
+            if self._tracker.q.any():  # the shape of a load that has gone
+                self._tracker.reset()
             rest = blank_solution(self._stamp, "unloaded", "no object, the jaw is at rest", used)
             return replace(rest, converged=True)
         return self._fail("no_contact", "the jaw is bent but no contact is known", used)

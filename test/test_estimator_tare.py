@@ -125,6 +125,16 @@ def test_released_jaw_returns_to_no_force():
     assert np.nanmax(magnitudes(solved())[-20:]) < 0.15
 
 
+def test_surface_returns_to_rest_when_the_object_was_lost_under_load():
+    recording, estimator = pressed(), make_estimator(solver="frame")
+    for i, observation in enumerate(recording.observations):
+        solution = estimator.update(observation, recording.contact if i < 190 else None)
+        if i == 189:
+            assert np.abs(estimator.surface() - estimator.mechanics.mesh.nodes).max() > 3e-3
+    assert solution.status == "unloaded"
+    np.testing.assert_array_equal(estimator.surface(), estimator.mechanics.mesh.nodes)
+
+
 def test_jaw_at_rest_without_object_is_unloaded_exactly():
     recording, estimator = record(np.zeros(100)), make_estimator(solver="frame")
     solutions = [estimator.update(observation, None) for observation in recording.observations]

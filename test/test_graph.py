@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from finforce_contact.parameters import ContactParameters
+from finforce_contact.settings import ContactSettings
 from finforce_eval.parameters import PlayerParameters
 from finforce_graph import (
     BenchOptions,
@@ -24,6 +26,8 @@ from finforce_ifea.settings import EstimatorSettings
 ROOT = Path(__file__).resolve().parents[1]
 SOLVER_PARAMETERS = {entry.name for entry in fields(NodeParameters)}
 SOLVER_PARAMETERS |= {f"estimator.{entry.name}" for entry in fields(EstimatorSettings)} | {"use_sim_time"}
+CONTACT_PARAMETERS = {entry.name for entry in fields(ContactParameters)} | {"use_sim_time"}
+CONTACT_PARAMETERS |= {f"contact.{entry.name}" for entry in fields(ContactSettings)}
 PLAYER_PARAMETERS = {entry.name for entry in fields(PlayerParameters)}
 
 
@@ -50,6 +54,8 @@ def test_the_player_runs_only_with_a_bag_and_its_end_ends_all():
     assert len(replay_processes(ReplayOptions(), ROOT)) == 1
     player = by_name(replay_processes(ReplayOptions(bag="x", rate=2.0), ROOT))["recording_player"]
     assert player.parameters == {"bag": "x", "rate": 2.0} and player.ends_all
+    waiting = by_name(replay_processes(ReplayOptions(bag="x", object_mesh="can.stl"), ROOT))["recording_player"]
+    assert waiting.parameters["awaits_poses"] is True
 
 
 def test_what_was_not_asked_for_stays_the_nodes_own():
@@ -64,11 +70,44 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
         "contact_height": 0.1,
         "solver": "frame",
         "mesh": "fine",
+        "object_mesh": "c",
+        "object_mesh_unit": "mm",
+        "contact": "paper",
+        "pose_source": "tracker",
     }
-    options = ReplayOptions(jaws="both", bag="x", **given)
-    for process in replay_processes(options, ROOT):
-        known = SOLVER_PARAMETERS if process.executable == "ifea_solver" else PLAYER_PARAMETERS
-        assert set(process.parameters) <= known
+    known = {
+        "ifea_solver": SOLVER_PARAMETERS,
+        "contact_estimator": CONTACT_PARAMETERS,
+        "recording_player": PLAYER_PARAMETERS,
+    }
+    processes = replay_processes(ReplayOptions(jaws="both", bag="x", **given), ROOT)
+    assert {process.executable for process in processes} == set(known)
+    for process in processes:
+        assert set(process.parameters) <= known[process.executable]
+
+
+def test_an_object_mesh_brings_one_contact_estimator_and_its_contacts_go_to_the_solvers():
+    options = ReplayOptions(jaws="both", object_mesh="can.stl", contact="closest", contact_height=0.04)
+    processes = by_name(replay_processes(options, ROOT))
+    estimator = processes["contact_estimator"]
+    assert estimator.executable == "contact_estimator" and estimator.parameters["jaws"] == "both"
+    assert estimator.parameters["object_mesh"] == "can.stl" and estimator.parameters["contact.mode"] == "closest"
+    assert "recording_player" not in processes
+    # NaN overrules the height of a parameter file, too
+    assert all(math.isnan(processes[f"{side}_ifea_solver"].parameters["contact_height"]) for side in ("left", "right"))
+
+
+def test_without_an_object_mesh_no_contact_is_estimated():
+    processes = bench_processes(BenchOptions(contact_height=0.04, contact="paper"), ROOT)
+    assert [process.executable for process in processes] == ["ifea_solver"]
+
+
+@pytest.mark.parametrize(("solver", "mesh", "seen"), [("", "fine", "fine"), ("paper", "", "coarse"), ("", "", None)])
+def test_solver_and_contact_estimator_have_the_same_mesh_of_the_jaw(solver, mesh, seen):
+    options = BenchOptions(object_mesh="can.stl", solver=solver, mesh=mesh, jaw_file="j", calibration_file="k")
+    _, estimator = bench_processes(options, ROOT)
+    assert estimator.parameters.get("contact.mesh") == seen
+    assert (estimator.parameters["jaw_file"], estimator.parameters["calibration_file"]) == ("j", "k")
 
 
 def test_rviz_is_started_with_a_configuration_that_is_there():
@@ -77,12 +116,17 @@ def test_rviz_is_started_with_a_configuration_that_is_there():
 
 
 def test_a_command_line_carries_values_with_their_types():
-    parameters = {"jaw_file": "1e3", "max_age": 0.5, "completes_grasp": True, "peer": ""}
+    parameters = {"jaw_file": "1e3", "max_age": 0.5, "completes_grasp": True, "peer": "", "places": [1.0, 2.0]}
     words = Process(executable="e", name="n", parameters=parameters, remappings={"left/keypoints": "k"}).command()
     given = dict(word.split(":=") for word in words if ":=" in word)
     assert {name: yaml.safe_load(given[name]) for name in parameters} == parameters
     assert given["__node"] == "n" and given["left/keypoints"] == "k"
     assert words[1:4] == ["-m", "finforce_start", "e"]
+
+
+def test_a_command_line_says_nan_as_yaml_does():
+    words = Process(executable="e", name="n", parameters={"contact_height": math.nan}).command()
+    assert math.isnan(yaml.safe_load(words[-1].split(":=")[1]))
 
 
 def test_launch_arguments_become_options():
@@ -122,6 +166,8 @@ def test_every_key_of_a_configuration_is_a_parameter_and_differs_from_its_defaul
     [
         (NodeParameters, "finforce_ifea"),
         (PlayerParameters, "finforce_eval"),
+        (ContactParameters, "finforce_contact"),
+        (ContactSettings, "finforce_contact"),
         (ReplayOptions, "."),
         (BenchOptions, "."),
     ],
@@ -137,11 +183,11 @@ def test_every_field_is_read(record, folder):
 def test_the_foxglove_layout_shows_our_topics():
     layout = json.loads((ROOT / "rviz" / "foxglove_layout.json").read_text(encoding="utf-8"))
     topics = layout["configById"]["3D!jaw"]["topics"]
-    assert {"/left/markers", "/left/keypoints"} <= set(topics)
+    assert {"/left/markers", "/left/keypoints", "/left/object_outline"} <= set(topics)
 
 
 def test_the_rviz_configuration_shows_our_topics_in_the_jaws_frame():
     manager = yaml.safe_load((ROOT / "rviz" / "finforce.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
     topics = {display["Topic"]["Value"] for display in manager["Displays"] if "Topic" in display}
-    assert {"/left/markers", "/left/keypoints", "/right/markers"} <= topics
+    assert {"/left/markers", "/left/keypoints", "/left/object_outline", "/right/markers"} <= topics
     assert manager["Global Options"]["Fixed Frame"] == "left_jaw"

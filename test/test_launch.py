@@ -54,6 +54,13 @@ def test_an_argument_reaches_the_node_with_its_type(recorded_launch):
     assert solver["name"] == "right_ifea_solver"
 
 
+def test_an_object_mesh_starts_the_contact_estimator(recorded_launch):
+    nodes = start(ROOT / "launch" / "bench.launch.py", object_mesh="can.stl", contact="paper", jaw="right")
+    estimator = nodes["contact_estimator"]
+    assert (estimator["package"], estimator["executable"]) == ("finforce", "contact_estimator")
+    assert estimator["parameters"][1]["object_mesh"] == "can.stl" and estimator["parameters"][1]["jaws"] == "right"
+
+
 def test_the_end_of_the_player_ends_the_launch(recorded_launch):
     nodes = start(ROOT / "launch" / "replay.launch.py", bag="somewhere", jaws="both")
     assert set(nodes) == {"left_ifea_solver", "right_ifea_solver", "recording_player"}

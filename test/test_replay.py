@@ -6,12 +6,14 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic, sleep
 
 import numpy as np
 import pytest
 
+from finforce_contact.poses import pose_from_quaternion, quaternion_from_pose
 from finforce_eval import replay as replaying
 from finforce_eval.bench_live import with_both_jaws
 from finforce_eval.commands import make_setup
@@ -20,6 +22,7 @@ from finforce_eval.recording import read_recording
 from finforce_eval.writer import write_recording
 
 SHIPPED = Path(replaying.__file__).parent / "data" / "bench_cyl25_middle"
+MESH = SHIPPED.parent / "objects" / "cylinder_25.stl"
 SECOND = 1_000_000_000
 
 
@@ -98,6 +101,20 @@ def test_what_cannot_be_played_ends_with_two_and_one_line(words, reason):
     assert reason in done.stderr and len(done.stderr.strip().splitlines()) == 1
 
 
+def test_contacts_are_estimated_on_the_way_from_mesh_and_poses(short, tmp_path):
+    out = tmp_path / "scores.json"
+    done = run(short, "--contact", "estimate", "--object", MESH, "--json", out)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(out.read_text())["cases"]["short"]["solved"] > 60
+    (said,) = [line for line in done.stdout.splitlines() if "left contact" in line]
+    assert "apart" in said or "touching" in said
+
+
+def test_estimated_contacts_without_a_mesh_are_refused(short):
+    done = run(short, "--contact", "estimate")
+    assert done.returncode == 2 and "no object mesh" in done.stderr
+
+
 class FakeEstimator:
     """A jaw of four vertices."""
 
@@ -156,3 +173,36 @@ def test_two_solvers_answer_alike_and_complete_the_grasp(two_jaws, tmp_path):
     weaker = np.minimum(left.magnitude, right.magnitude)
     for stamp, magnitude in zip(left.stamps[held], weaker[held], strict=True):
         assert result.grasp[int(stamp)] == pytest.approx(magnitude, abs=1e-6)
+
+
+def with_opposite_jaw(recording):
+    """Give the right jaw the pose from which it sees the object as the left one does, turned by 180 degrees about z."""
+    left, right, poses = recording.jaws["left"], recording.jaws["right"], recording.object_pose
+    position, quaternion = [], []
+    for T_object, T_left in zip(matrices(poses), matrices(left.pose), strict=True):
+        T_left_right = np.diag([-1.0, -1.0, 1.0, 1.0])
+        T_left_right[0, 3] = 2.0 * (np.linalg.inv(T_left) @ T_object)[0, 3]
+        T = T_left @ T_left_right
+        position.append(T[:3, 3])
+        quaternion.append(quaternion_from_pose(T))
+    pose = replace(left.pose, position=np.array(position), quaternion=np.array(quaternion))
+    return replace(recording, jaws={"left": left, "right": replace(right, pose=pose)})
+
+
+def matrices(track):
+    return [pose_from_quaternion(*pair) for pair in zip(track.position, track.quaternion, strict=True)]
+
+
+def test_one_contact_estimator_serves_both_jaws(tmp_path):
+    recording = with_opposite_jaw(with_both_jaws(read_recording(SHIPPED), 6.0))
+    recording = read_recording(write_recording(recording, tmp_path / "both"))
+    names = argparse.Namespace(
+        jaw="bench", solver="default", mesh="default", contact=["estimate"], calibration=None, object=str(MESH)
+    )
+    result = replaying.replay(recording, make_setup(names))
+    left, right = (result.evaluation.results[f"both/{side}"] for side in ("left", "right"))
+    held = left.solved & right.solved
+    assert held.sum() > 0.5 * len(held)
+    # the same object, the same noise; each solver gets its contact a little earlier or later than the other
+    np.testing.assert_allclose(right.magnitude[held], left.magnitude[held], atol=0.1)
+    assert result.health["finforce: right contact"]["status"] == result.health["finforce: left contact"]["status"]

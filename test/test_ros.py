@@ -16,13 +16,24 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 import finforce_ros as ros
+from finforce_contact.parameters import ContactParameters
+from finforce_contact.pose_settings import TrackerSettings
+from finforce_contact.settings import ContactSettings
 from finforce_eval.parameters import PlayerParameters
 from finforce_ifea.errors import FinforceError, ObservationError
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.pointcloud import decode_keypoints
 from finforce_ifea.settings import EstimatorSettings
+from finforce_records import refresh_record
 
-RECORDS = (NodeParameters, EstimatorSettings, PlayerParameters)
+RECORDS = (
+    NodeParameters,
+    EstimatorSettings,
+    PlayerParameters,
+    ContactParameters,
+    ContactSettings,
+    TrackerSettings,
+)
 
 
 @given(st.integers(0, 2**31 * ros.NANOSECONDS - 1))
@@ -68,6 +79,9 @@ class Example:
     count: int = field(default=3, metadata={"description": "a count", "min": 1})
     mode: str = field(default="a", metadata={"description": "a mode", "choices": ("a", "b")})
     flag: bool = field(default=False, metadata={"description": "a flag"})
+    scale: float = field(
+        default=1.0, metadata={"description": "a scale", "unit": "m", "min": 0.0, "max": 2.0, "settable": True}
+    )
 
 
 @pytest.fixture
@@ -95,6 +109,7 @@ def test_descriptors_carry_description_unit_range_and_choices(declare):
     assert (limit.floating_point_range[0].from_value, limit.floating_point_range[0].to_value) == (0.0, 1.0)
     assert node.describe_parameter("group.count").integer_range[0].from_value == 1
     assert "'a', 'b'" in node.describe_parameter("group.mode").additional_constraints
+    assert not node.describe_parameter("group.scale").read_only
     # a range would refuse NaN, which says here that there is none
     assert not node.describe_parameter("group.height").floating_point_range
 
@@ -106,6 +121,17 @@ def test_descriptors_carry_description_unit_range_and_choices(declare):
 def test_a_value_that_does_not_fit_is_refused_by_name(declare, name, value):
     with pytest.raises(ros.ParameterError, match=f"group.{name}"):
         declare(**{name: value})
+
+
+def test_a_settable_field_has_its_present_value_and_the_others_theirs():
+    asked = []
+    refreshed = refresh_record(Example(limit=0.25), lambda name: asked.append(name) or 1.5)
+    assert refreshed == Example(limit=0.25, scale=1.5) and asked == ["scale"]
+
+
+def test_a_present_value_out_of_bounds_is_refused():
+    with pytest.raises(ros.ParameterError, match="scale"):
+        refresh_record(Example(), lambda name: 2.5)
 
 
 @pytest.mark.parametrize("record", RECORDS)

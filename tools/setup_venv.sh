@@ -62,7 +62,7 @@ make_venv() {
 # What open3d loads when it is imported; machines without a display often lack them.
 check_system_libraries() {
   local pair missing=()
-  for pair in libgl1=libGL.so.1 libgomp1=libgomp.so.1 libx11-6=libX11.so.6; do
+  for pair in libgl1=libGL.so.1 libgomp1=libgomp.so.1 libusb-1.0-0=libusb-1.0.so.0 libx11-6=libX11.so.6; do
     PATH=$PATH:/sbin:/usr/sbin ldconfig -p | grep -qF "${pair#*=} " || missing+=("${pair%%=*}")
   done
   if [ ${#missing[@]} -gt 0 ] && ! install_packages "${missing[@]}"; then

@@ -1,0 +1,146 @@
+"""One jaw's contact estimator with what it is fed: poses in pairs, a surface and a wrench while they are fresh."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import suppress
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_contact.estimator import ContactEstimate, ContactEstimator
+from finforce_contact.object_mesh import ObjectMesh
+from finforce_contact.pairing import PosePairing, Step
+from finforce_ifea.errors import FinforceError
+
+SECOND = 1e-9  # s/ns
+ValueT = TypeVar("ValueT")
+
+
+class TimedEstimate(NamedTuple):
+    """An estimate and the stamp of its image [ns]."""
+
+    stamp: int
+    estimate: ContactEstimate
+
+
+class JawContact:
+    """Turns the poses of images into contacts on one jaw, one per image.
+
+    A jaw pose makes the contact of its image due. Images without one, where poses are rarer than key points, are due
+    with the surface that the solver found in them.
+
+    Args:
+        estimator: of this jaw.
+        tolerance: greatest distance between the stamps of jaw pose and object pose [ns].
+        max_age: greatest distance between the stamps of an image and of the surface and wrench used for it [ns].
+    """
+
+    def __init__(self, estimator: ContactEstimator, *, tolerance: int, max_age: int) -> None:
+        self.estimator = estimator
+        self.last: TimedEstimate | None = None
+        self._pairing = PosePairing(tolerance)
+        self._max_age = max_age
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything but the object's mesh."""
+        self.estimator.reset()
+        self._pairing.reset()
+        self.last = None
+        self._surface: tuple[int, NDArray] | None = None
+        self._wrench: tuple[int, tuple[NDArray, NDArray]] | None = None
+        self._posed: int | None = None
+
+    def set_object(self, mesh: ObjectMesh | None) -> None:
+        """Take another object; its pose is not known yet.
+
+        Raises:
+            FinforceError: the mode of the estimator cannot do with this object.
+        """
+        self.estimator.set_object(mesh)
+        if mesh is not None:
+            self._warm_up()
+        self._pairing.reset()
+        self._posed = None
+
+    def _warm_up(self) -> None:
+        """Let what is compiled on first use be compiled before the first image waits for it."""
+        T = np.eye(4)
+        for stamp, place in enumerate(self.estimator.jaw.candidates[[0, -1]]):
+            T[:3, 3] = place
+            with suppress(FinforceError):
+                self.estimator.take_pose(float(stamp), T, camera=-place)
+                self.estimator.update(float(stamp))
+        self.estimator.reset()
+
+    def take_surface(self, stamp: int, surface: NDArray) -> list[TimedEstimate]:
+        """Take the deformed vertices (n, 3) [m] of an image [ns]; return the contacts that are known now.
+
+        Raises:
+            MeshError: the surface is not that of the jaw's mesh.
+        """
+        self._surface = stamp, surface
+        known = self._posed is not None and not self._pairing.is_waiting(stamp)
+        return self._update(stamp) if known else []
+
+    def take_wrench(self, stamp: int, wrench: tuple[NDArray, NDArray]) -> None:
+        """Keep force (3,) [N] and torque (3,) [N m] of an image [ns]."""
+        self._wrench = stamp, wrench
+
+    def take_jaw_pose(self, stamp: int, T_camera_jaw: NDArray) -> list[TimedEstimate]:
+        """Take the jaw's pose (4, 4) in an image [ns]; return the contacts that are known now.
+
+        Raises:
+            PoseError: a pose of the object in the jaw frame makes no sense.
+            MeshError: the surface is not that of the jaw's mesh.
+        """
+        return self._follow(self._pairing.add_jaw(stamp, T_camera_jaw))
+
+    def take_object_pose(
+        self, stamp: int, T_camera_object: NDArray, covariance: NDArray | None = None
+    ) -> list[TimedEstimate]:
+        """Take the object's pose (4, 4) in an image [ns], with its covariance (6, 6); as `take_jaw_pose`."""
+        return self._follow(self._pairing.add_object(stamp, T_camera_object, covariance))
+
+    def _follow(self, steps: Iterable[Step]) -> list[TimedEstimate]:
+        """Hand poses on and update for the images that are due."""
+        estimates = []
+        for step in steps:
+            if step.T_jaw_object is not None and (self._posed is None or step.stamp > self._posed):
+                covariance = turn_covariance(step.covariance, step.T_jaw_camera)
+                camera = step.T_jaw_camera[:3, 3]
+                self.estimator.take_pose(SECOND * step.stamp, step.T_jaw_object, covariance, camera=camera)
+                self._posed = step.stamp
+            if step.is_due:
+                estimates += self._update(step.stamp)
+        return estimates
+
+    def _update(self, stamp: int) -> list[TimedEstimate]:
+        if self.last is not None and stamp <= self.last.stamp:
+            return []
+        surface, wrench = self._fresh(self._surface, stamp), self._fresh(self._wrench, stamp)
+        self.last = TimedEstimate(stamp, self.estimator.update(SECOND * stamp, surface, wrench))
+        return [self.last]
+
+    def _fresh(self, kept: tuple[int, ValueT] | None, stamp: int) -> ValueT | None:
+        return kept[1] if kept and abs(stamp - kept[0]) <= self._max_age else None
+
+    def has_surface(self) -> bool:
+        """Say whether the last contact was found on the deformed jaw; else the undeformed one stood for it."""
+        return self.last is not None and self._fresh(self._surface, self.last.stamp) is not None
+
+    def pose_age(self) -> float:
+        """Return the time from the object's last pose to the last contact [s], NaN before the first."""
+        if self.last is None or self._posed is None:
+            return float("nan")
+        return SECOND * (self.last.stamp - self._posed)
+
+
+def turn_covariance(covariance: NDArray | None, T_jaw_camera: NDArray) -> NDArray | None:
+    """Return a pose's covariance (6, 6) [m, rad], given along the camera's axes, along those of the jaw."""
+    if covariance is None:
+        return None
+    turn = np.kron(np.eye(2), T_jaw_camera[:3, :3])
+    return turn @ covariance @ turn.T

@@ -1,0 +1,150 @@
+"""The contact estimator node: poses, surfaces and images in, contacts out; it converts, calls and publishes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from time import perf_counter
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
+
+import finforce_ros as ros
+from finforce_contact.camera_feed import StampedPose
+from finforce_contact.inputs import subscribe
+from finforce_contact.jaw_contact import TimedEstimate
+from finforce_contact.outputs import ContactOutputs
+from finforce_contact.parameters import ContactParameters
+from finforce_contact.pose_settings import TrackerSettings
+from finforce_contact.report import describe, object_alarms, outcome_of_estimate
+from finforce_contact.session import ContactSession
+from finforce_contact.settings import ContactSettings
+from finforce_health import Health, Outcome, Report, StampGate
+from finforce_ifea.errors import FinforceError
+from finforce_records import refresh_record
+
+
+class ContactEstimatorNode(Node):
+    """Says where the object touches the jaws, image by image; lives on without an object.
+
+    Args:
+        options: of `rclpy.node.Node`.
+
+    Raises:
+        FinforceError: a parameter or the jaw cannot be used.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("contact_estimator", **options)
+        self.parameters = parameters = ros.declare_record(self, ContactParameters)
+        contact = ros.declare_record(self, ContactSettings, "contact")
+        tracker = ros.declare_record(self, TrackerSettings, "tracker")
+        ros.name_unknown_parameters(self)
+        sides, age = parameters.sides, parameters.max_age
+        self.session = ContactSession(parameters, contact, tracker)
+        self.gates = {side: StampGate(max_age=age, restart_gap=parameters.restart_gap) for side in sides}
+        self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in sides}
+        self.qos = ros.QosWatch(self)
+        self.out = ContactOutputs(self.qos, parameters)
+        with self._refusals(sides):
+            self.get_logger().info(self.session.load_mesh(parameters))
+        self._serve()
+        self.camera_group = MutuallyExclusiveCallbackGroup()
+        subscribe(self.qos, parameters, self.session, self)
+        self.get_logger().info(f"jaws: {parameters.jaws}, ready, object poses by {parameters.pose_source}")
+
+    def _serve(self) -> None:
+        """Offer services, whose long work holds up nothing else, and diagnostics."""
+        session, period = self.session, self.parameters.diagnostics_period
+        ros.serve_trigger(self, "~/load_mesh", lambda: session.load_mesh(self._refreshed()), aside=True)
+        ros.serve_trigger(self, "~/reconstruct", lambda: session.reconstruct(self._refreshed()), aside=True)
+        ros.serve_trigger(self, "~/reset", session.reset)
+        for side in self.parameters.sides:
+            report = partial(self._report, side)
+            ros.publish_diagnostics(self, self.qos, f"finforce: {side} contact", period, report)
+
+    def _refreshed(self) -> ContactParameters:
+        """Return the parameters with the present values of those that may be set at run time."""
+        return refresh_record(self.parameters, lambda name: self.get_parameter(name).value)
+
+    def on_jaw_pose(self, side: str, message: PoseStamped) -> None:
+        """Find the contact of an image."""
+        began = perf_counter()
+        self.health[side].arrive()
+        with self._refusals((side,)):
+            if self.gates[side].enter(ros.nanoseconds(message.header.stamp), self._now()):
+                self.session.restart(side)
+                self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
+            self._send(side, began, self.session.take_jaw_pose(side, message))
+
+    def on_jaw(self, side: str, take: Callable[[str, Any], list[TimedEstimate]], message: Any) -> None:
+        """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own."""
+        began = perf_counter()
+        with self._refusals((side,)):
+            self._send(side, began, take(side, message))
+
+    def on_object(self, message: Any) -> None:
+        """Use the object's pose that another node has found."""
+        with self._refusals(self.parameters.sides):
+            self._hand_on(self.session.read_pose(message))
+
+    async def on_image(self, take: Callable[[Any], StampedPose | None], image: Any) -> None:
+        """Use the object's pose, if one is found with an image, while other callbacks go on."""
+        with self._refusals(self.parameters.sides):
+            self._hand_on(await ros.run_aside(self, partial(take, image)))
+
+    def _hand_on(self, found: StampedPose | None) -> None:
+        """Give the jaws a pose of the object, if it was found."""
+        began, everybody = perf_counter(), self.parameters.sides
+        if found is None:
+            return
+        self.gates[everybody[0]].check_age(found.stamp, self._now())
+        self.out.send_pose(found)
+        for side in everybody:
+            with self._refusals((side,)):
+                self._send(side, began, self.session.take_object_pose(side, found))
+
+    def _send(self, side: str, began: float, estimates: Iterable[TimedEstimate]) -> None:
+        """Publish contacts that are still fresh; an object whose place is not known gives none."""
+        for timed in estimates:
+            self.gates[side].check_age(timed.stamp, self._now())
+            outcome = outcome_of_estimate(timed.estimate)
+            if timed.estimate.status == "no_pose":
+                self._refuse(outcome, (side,))
+                continue
+            self.out.send_contact(side, timed)
+            age = (self._now() - timed.stamp) / ros.NANOSECONDS
+            self.health[side].publish(outcome, latency=perf_counter() - began, age=age)
+
+    @contextmanager
+    def _refusals(self, sides: Iterable[str]) -> Iterator[None]:
+        """Survive what is wrong with a message, and say it."""
+        try:
+            yield
+        except FinforceError as error:
+            self._refuse(Outcome.of_error(error), sides)
+
+    def _refuse(self, outcome: Outcome, sides: Iterable[str]) -> None:
+        self.get_logger().warning(f"no contact: {outcome.text}", throttle_duration_sec=2.0)
+        for side in sides:
+            self.health[side].refuse(outcome)
+
+    def _report(self, side: str, alarms: list[Outcome]) -> Report:
+        """Return how one jaw's contact is doing."""
+        return self.health[side].report([*alarms, *object_alarms(self.session)], describe(self.session, side))
+
+    def _now(self) -> int:
+        return self.get_clock().now().nanoseconds
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node until Ctrl-C."""
+    return ros.run_node("contact_estimator", ContactEstimatorNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""The topics that a contact estimator writes, and what stands in each of them; decides no trust."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import finforce_ros as ros
+from finforce_contact.messages import contact_columns
+from finforce_contact.poses import quaternion_from_pose
+from finforce_ifea.outline_cloud import columns_from_outline
+
+if TYPE_CHECKING:
+    from finforce_contact.camera_feed import StampedPose
+    from finforce_contact.jaw_contact import TimedEstimate
+    from finforce_contact.parameters import ContactParameters
+
+
+class ContactOutputs:
+    """The publishers of a contact estimator node.
+
+    Args:
+        qos: makes publishers and watches them.
+        parameters: which jaws, and whether the object's poses are found here.
+    """
+
+    def __init__(self, qos: ros.QosWatch, parameters: ContactParameters) -> None:
+        cloud, sides = ros.PointCloud2, parameters.sides
+        self._frame = parameters.camera_frame
+        self.contact = {side: qos.publisher(cloud, f"{side}/contact", ros.RESULT) for side in sides}
+        self.outline = {side: qos.publisher(cloud, f"{side}/object_outline", ros.RESULT) for side in sides}
+        self.pose = qos.publisher(ros.PoseStamped, "object_pose", ros.RESULT) if parameters.tracks else None
+
+    def send_contact(self, side: str, timed: TimedEstimate) -> None:
+        """Send outline and contact of an image; no rows say that there is none."""
+        header = ros.Header(stamp=ros.stamp_message(timed.stamp), frame_id=f"{side}_jaw")
+        # the outline goes first: the solver looks for it when the contact comes
+        self.outline[side].publish(ros.cloud_message(header, columns_from_outline(timed.estimate.outline)))
+        self.contact[side].publish(ros.cloud_message(header, contact_columns(timed.estimate)))
+
+    def send_pose(self, found: StampedPose) -> None:
+        """Send the object's pose, unless it came by topic."""
+        if self.pose is not None:
+            header = ros.Header(stamp=ros.stamp_message(found.stamp), frame_id=self._frame)
+            T = found.pose.T_camera_object
+            self.pose.publish(ros.pose_message(header, [*T[:3, 3], *quaternion_from_pose(T)]))

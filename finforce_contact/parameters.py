@@ -1,0 +1,110 @@
+"""The parameters of a contact estimator node, and what they ask for; knows no ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from finforce_contact.reconstructed import GeneratedMesh
+    from finforce_ifea.jaw import Jaw
+
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def _parameter(default: Any, description: str, **metadata: Any) -> Any:
+    """Return a dataclass field that says what it is; `metadata` are unit, min, max, choices and settable."""
+    return field(default=default, metadata={"description": description, **metadata})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactParameters:
+    """What a contact estimator node is told beside the settings of its parts; units stand in the metadata."""
+
+    jaws: str = _parameter("left", "the jaws whose contacts are estimated", choices=("left", "right", "both"))
+    jaw_file: str = _parameter("bench", "jaw file, or the name of a shipped jaw")
+    calibration_file: str = _parameter(
+        "", "calibration file, or a shipped name, as the solvers have it: it shapes the mesh of the jaw; empty: none"
+    )
+    camera_frame: str = _parameter("camera_color_optical_frame", "frame of the poses and images")
+    object_mesh: str = _parameter(
+        "", "mesh file of the object; empty: the object is unknown; read again by load_mesh", settable=True
+    )
+    object_mesh_unit: str = _parameter(
+        "m", "unit of the object's mesh file", choices=("m", "cm", "mm", "inch"), settable=True
+    )
+    pose_source: str = _parameter(
+        "topic",
+        "object poses: PoseStamped on object_pose, Detection3DArray on object_detections, or the built-in tracker",
+        choices=("topic", "detections", "tracker"),
+    )
+    pose_tolerance: float = _parameter(
+        0.017, "greatest distance between the stamps of a jaw pose and its object pose", unit="s", min=0.0, max=1.0
+    )
+    depth_scale: float = _parameter(0.001, "one step of a 16-bit depth image", unit="m", min=1e-6, max=0.01)
+    reconstruct_method: str = _parameter(
+        "",
+        "how reconstruct finds the object; empty: robust with a generated mesh, else primitive",
+        choices=("", "robust", "paper", "primitive", "completion"),
+        settable=True,
+    )
+    generated_mesh: str = _parameter(
+        "", "mesh file for reconstruct, made by a generator; empty: there is none", settable=True
+    )
+    generated_pose: tuple[float, ...] = _parameter(
+        IDENTITY, "x, y, z [m], qx, qy, qz, qw of the generated mesh in the camera frame", settable=True
+    )
+    generated_scale: float = _parameter(
+        1.0, "metres per unit of the generated mesh, as far as it is known", unit="m", min=1e-6, max=1e6, settable=True
+    )
+    max_age: float = _parameter(0.2, "greatest age of data at the time of publishing", unit="s", min=0.001, max=60.0)
+    restart_gap: float = _parameter(
+        1.0, "stamps that go back by more than this begin a new recording", unit="s", min=0.001, max=3600.0
+    )
+    diagnostics_period: float = _parameter(1.0, "time between diagnostics", unit="s", min=0.05, max=60.0)
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """The jaws by name."""
+        return ("left", "right") if self.jaws == "both" else (self.jaws,)
+
+    @property
+    def tracks(self) -> bool:
+        """Whether the object's pose is found here, from depth images."""
+        return self.pose_source == "tracker"
+
+
+def load_jaws(parameters: ContactParameters) -> dict[str, Jaw]:
+    """Load the jaws that the parameters name, calibrated as the solvers' are, by side.
+
+    Raises:
+        JawFileError: the file cannot be a jaw.
+        CalibrationError: the file is no calibration, or belongs to another jaw.
+    """
+    from finforce_ifea.calibration import load_calibration
+    from finforce_ifea.jaw import load_jaw
+
+    file = parameters.calibration_file
+    apply = load_calibration(file).apply if file else lambda jaw: jaw
+    return {side: apply(load_jaw(parameters.jaw_file, side)) for side in parameters.sides}
+
+
+def load_generated(parameters: ContactParameters) -> GeneratedMesh | None:
+    """Load the generated mesh that the parameters name, with its pose and scale; None without a name.
+
+    Raises:
+        ObjectMeshError: the file is no mesh.
+        PoseError: the pose is not seven finite numbers with a unit quaternion.
+    """
+    from finforce_contact.object_mesh import read_triangles
+    from finforce_contact.poses import pose_from_quaternion
+    from finforce_contact.reconstructed import GeneratedMesh
+
+    if not parameters.generated_mesh:
+        return None
+    vertices, triangles = read_triangles(parameters.generated_mesh)
+    affine = pose_from_quaternion(parameters.generated_pose[:3], parameters.generated_pose[3:])
+    affine[:3, :3] *= parameters.generated_scale
+    name = Path(parameters.generated_mesh).name
+    return GeneratedMesh(vertices=vertices, triangles=triangles, affine=affine, name=name)

@@ -1,0 +1,180 @@
+"""The object, where its poses come from, and the jaws that it touches, for several threads; knows no ROS."""
+
+from __future__ import annotations
+
+from threading import RLock
+from typing import Any
+
+from numpy.typing import NDArray
+
+from finforce_camera import ImageError
+from finforce_contact.camera_feed import CameraFeed, StampedPose
+from finforce_contact.estimator import ContactEstimator
+from finforce_contact.jaw_contact import SECOND, JawContact, TimedEstimate
+from finforce_contact.messages import pose_from_message, stamp_of, surface_from_cloud, wrench_from_message
+from finforce_contact.object_mesh import ObjectMesh, load_object_mesh
+from finforce_contact.parameters import ContactParameters, load_generated, load_jaws
+from finforce_contact.pose_settings import TrackerSettings
+from finforce_contact.pose_source import ExternalPoseSource, ObjectPose
+from finforce_contact.report import describe_mesh
+from finforce_contact.settings import ContactSettings
+from finforce_ifea.errors import FinforceError
+
+
+class ContactSession:
+    """Everything between messages and contacts.
+
+    Attributes:
+        mesh: of the object, None while it is unknown.
+        trouble: why there is no mesh, empty when there is nothing wrong with it.
+        jaws: by side.
+
+    Args:
+        parameters: of the node.
+        contact: settings of the contact estimators.
+        tracker: settings of the pose tracker.
+
+    Raises:
+        FinforceError: the jaw cannot be used.
+    """
+
+    def __init__(self, parameters: ContactParameters, contact: ContactSettings, tracker: TrackerSettings) -> None:
+        tolerance, max_age = round(parameters.pose_tolerance / SECOND), round(parameters.max_age / SECOND)
+        self.jaws = {
+            side: JawContact(ContactEstimator(jaw, settings=contact), tolerance=tolerance, max_age=max_age)
+            for side, jaw in load_jaws(parameters).items()
+        }
+        self.mesh: ObjectMesh | None = None
+        self.trouble = ""
+        self._frame = parameters.camera_frame
+        self._source = ExternalPoseSource(self._frame)
+        self._camera = CameraFeed(parameters, tracker) if parameters.tracks else None
+        self._camera_lock, self._lock = RLock(), RLock()
+
+    def load_mesh(self, parameters: ContactParameters) -> str:
+        """Load the mesh file that the parameters name and return what it is; without a name the object is unknown.
+
+        Raises:
+            FinforceError: the file is no object; it is unknown from now on.
+        """
+        self._set_object(None)
+        if not parameters.object_mesh:
+            return "no object mesh is named: the object is unknown"
+        try:
+            self._set_object(load_object_mesh(parameters.object_mesh, unit=parameters.object_mesh_unit))
+        except FinforceError as error:
+            self._set_object(None)
+            self.trouble = f"the object is unknown: {error}"
+            raise
+        return describe_mesh(self.mesh)
+
+    def reconstruct(self, parameters: ContactParameters) -> str:
+        """Find the object's mesh in the newest depth image with a mask, and return what it is.
+
+        Raises:
+            ImageError: there are no images, or they cannot be used.
+            FinforceError: no mesh explains the image; the object stays what it was.
+        """
+        from finforce_contact.image_evidence import collect_evidence
+        from finforce_contact.reconstruction import reconstruct
+
+        if self._camera is None:
+            raise ImageError("reconstruct needs images: set pose_source to tracker, or use finforce reconstruct")
+        with self._camera_lock:
+            view = self._camera.view()
+        evidence = collect_evidence(view.depth, view.mask, view.camera)
+        found = reconstruct(evidence, load_generated(parameters), parameters.reconstruct_method)
+        self._set_object(found.mesh, (found.T_camera_object,))
+        return f"{describe_mesh(found.mesh)} Found by the method {found.method}."
+
+    def _set_object(self, mesh: ObjectMesh | None, guesses: tuple[NDArray, ...] = ()) -> None:
+        """Work with another object from now on, to be looked for near the guessed poses (4, 4)."""
+        with self._camera_lock, self._lock:
+            self.mesh, self.trouble = mesh, ""
+            self._source = ExternalPoseSource(self._frame, mesh=mesh)
+            for jaw in self.jaws.values():
+                jaw.set_object(mesh)
+            if self._camera:
+                self._camera.set_object(mesh, guesses)
+
+    def reset(self) -> str:
+        """Forget poses, contacts and images; the object stays."""
+        with self._camera_lock, self._lock:
+            self._source.reset()
+            for jaw in self.jaws.values():
+                jaw.reset()
+            if self._camera:
+                self._camera.reset()
+        return "contacts and poses are forgotten; the object stays"
+
+    def restart(self, side: str) -> None:
+        """Forget a jaw's contact and the object's pose: their stamps belong to an earlier recording."""
+        with self._lock:
+            self.jaws[side].reset()
+            self._source.reset()
+
+    @property
+    def pose(self) -> ObjectPose | None:
+        """The newest pose of the object that was taken or found."""
+        return self._camera.latest if self._camera else self._source.latest
+
+    def take_jaw_pose(self, side: str, message: Any) -> list[TimedEstimate]:
+        """Take a jaw's PoseStamped; return its contacts that are known now.
+
+        Raises:
+            FinforceError: frame or numbers are wrong, or no contact can be found with what is known.
+        """
+        T_camera_jaw = pose_from_message(message, self._frame, f"the pose of the {side} jaw")
+        with self._lock:
+            return self.jaws[side].take_jaw_pose(stamp_of(message), T_camera_jaw)
+
+    def take_object_pose(self, side: str, found: StampedPose) -> list[TimedEstimate]:
+        """Take the object's pose; return the contacts on a jaw that are known now; see `take_jaw_pose`."""
+        with self._lock:
+            # what an external pose is worth is not said with it; the estimator finds out
+            covariance = found.pose.covariance if self._camera else None
+            return self.jaws[side].take_object_pose(found.stamp, found.pose.T_camera_object, covariance)
+
+    def take_surface(self, side: str, cloud: Any) -> list[TimedEstimate]:
+        """Take a jaw's deformed surface; return its contacts that are known now.
+
+        Raises:
+            FinforceError: frame, fields, number or place of the vertices are wrong.
+        """
+        surface = surface_from_cloud(cloud, f"{side}_jaw")
+        with self._lock:
+            return self.jaws[side].take_surface(stamp_of(cloud), surface)
+
+    def take_wrench(self, side: str, message: Any) -> list[TimedEstimate]:
+        """Take the wrench on a jaw, with which no contact is due; raises ObservationError for frame or numbers."""
+        wrench = wrench_from_message(message, f"{side}_jaw")
+        with self._lock:
+            self.jaws[side].take_wrench(stamp_of(message), wrench)
+        return []
+
+    def read_pose(self, message: Any) -> StampedPose | None:
+        """Return the object's pose of a PoseStamped or a Detection3DArray, None when nothing was detected.
+
+        Raises:
+            PoseError: frame, stamp or numbers are wrong.
+        """
+        with self._lock:
+            take = self._source.take_detections if hasattr(message, "detections") else self._source.take_pose
+            pose = take(message)
+        return pose and StampedPose(stamp_of(message), pose)
+
+    def take_camera(self, info: Any) -> None:
+        """Take a camera's intrinsics; see `CameraFeed`."""
+        with self._camera_lock:
+            self._camera.take_camera(info)
+
+    def take_depth(self, image: Any) -> StampedPose | None:
+        """Return the object's pose in a depth image, None while every grasp rests; see `CameraFeed`."""
+        rests = all(jaw.estimator.resting for jaw in self.jaws.values())
+        with self._camera_lock:
+            return self._camera.take_depth(image, rests=rests)
+
+    def take_mask(self, image: Any) -> StampedPose | None:
+        """Return the object's pose in the image that a mask belongs to, if it is looked for; see `CameraFeed`."""
+        with self._camera_lock:
+            return self._camera.take_mask(image)

@@ -1,0 +1,62 @@
+"""Claims about the contact estimator as a process: it starts, says what is wrong, and ends cleanly."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+from contact_node_fakes import MESH
+
+COMMAND = [sys.executable, "-m", "finforce_start", "contact_estimator", "--ros-args"]
+PATIENCE = 240.0  # s; a first start compiles
+
+
+def environment():
+    own = {"ROS_DOMAIN_ID": str(random.randint(1, 99)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return {**os.environ, **own}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_node_cleanly(number):
+    words = [*COMMAND, "-p", f"object_mesh:={MESH}", "-p", "object_mash:=x"]
+    node = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, env=environment())
+    guard = threading.Timer(PATIENCE, node.kill)
+    guard.start()
+    said = []
+    for line in node.stderr:
+        said.append(line)
+        if " ready" in line:
+            node.send_signal(number)
+    guard.cancel()
+    text = "".join(said)
+    assert node.wait(10) == 0, text
+    assert "Traceback" not in text
+    assert "there is no parameter 'object_mash'" in text
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ("jaws:=middle", "jaws is 'middle'"),
+        ("jaw_file:=no_such_jaw", "no_such_jaw"),
+        ("calibration_file:=no_such_file", "no_such_file"),
+        ("contact.mode:=guess", "contact.mode is 'guess'"),
+        ("tracker.least_fitness:=2.0", "tracker.least_fitness"),
+        ("pose_source:=detections", "ros-jazzy-vision-msgs"),
+    ],
+)
+def test_what_cannot_be_set_up_ends_with_two_and_one_reason(given, reason):
+    done = subprocess.run([*COMMAND, "-p", given], capture_output=True, text=True, timeout=PATIENCE, env=environment())
+    assert done.returncode == 2
+    assert reason in done.stderr.strip().splitlines()[-1] and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["ifea_solver", "contact_estimator"])
+def test_heavy_libraries_wait_until_they_are_needed(name):
+    heavy = "{'open3d', 'trimesh', 'manifold3d', 'small_gicp', 'coal'}"
+    check = f"import finforce_start, sys; __import__(finforce_start.NODES['{name}']); print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, timeout=PATIENCE, check=True)
+    assert done.stdout.strip() == "set()"
