@@ -40,6 +40,7 @@ setup(
         "numba",  # compiles the element loops: a step in milliseconds
         "pyyaml",  # jaw files, calibrations
         "meshio",  # volume mesh files of jaws
+        "pillow",  # picture files
         "rosbags",  # recordings, without ROS
         "manifold3d",  # Boolean intersections and outlines of object meshes
         "trimesh",  # object mesh files

@@ -255,3 +255,13 @@ def test_case_beside_a_single_file_is_read(tmp_path):
 def test_existing_folder_is_never_overwritten(tmp_path):
     with pytest.raises(RecordingError, match="exists already"):
         write_recording(make_recording(), tmp_path)
+
+
+@pytest.mark.parametrize("topic", ["/object_pose", "/left/jaw_pose"])
+def test_poses_of_one_topic_in_two_frames_are_refused(tmp_path, factory, entries, topic):
+    def rename(message):
+        message.header.frame_id = "other"
+
+    bag = write_entries(spoil(entries, topic, 2, rename), tmp_path / "bag", factory)
+    with pytest.raises(RecordingError, match=f"bag: {topic} message 2 is in the frame 'other', the first in 'camera_"):
+        read_recording(bag)
