@@ -1,0 +1,299 @@
+"""Object poses and the deformed jaw in, contact rows out, image after image; knows no solver and no ROS."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_contact.closest import ClosestLocalizer
+from finforce_contact.enclosure import surrounds
+from finforce_contact.errors import PoseError
+from finforce_contact.estimate import ContactEstimate, blank_estimate
+from finforce_contact.gaps import count_inside
+from finforce_contact.inner_face import build_inner_face
+from finforce_contact.intersection import IntersectionLocalizer
+from finforce_contact.localization import Localizer, OutlineLocalizer, Place, Scene
+from finforce_contact.object_mesh import ObjectMesh
+from finforce_contact.pose_filter import FilteredPose, PoseFilter
+from finforce_contact.poses import check_pose, invert_pose
+from finforce_contact.rest import RestWatch
+from finforce_contact.section import Section, SectionKeeper
+from finforce_contact.settings import ContactSettings
+from finforce_contact.touch import TouchBelief
+from finforce_ifea.errors import ContactError
+from finforce_ifea.jaw import Jaw
+from finforce_ifea.outline import ObjectOutline
+
+__all__ = ["ContactEstimate", "ContactEstimator"]
+
+# A rotation's entries times this are about the way that the object's surface moves [m].
+_LEVER = 0.03
+# Far from contact the place may be off by this [m] before it is looked for anew.
+_FAR_STILL = 0.3e-3
+# A surface that gave way by more [m] is surely bent.
+_BENT = 1e-3
+# A surface that moved by less since its rest [m] is that of a solver that has not begun.
+_AT_REST = 1e-7
+_JAW_SAMPLES = 100
+_SURROUNDED = 0.5
+_STILL_FORCE = 0.01
+_REASONS = ("solved", "apart", "still", "no_object", "no_pose", "surrounded", "beside", "late pose", "odd pose")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _RowPoints:
+    """Rows as points (n, 3) [m] with candidates (n,) and weights (n,)."""
+
+    points: NDArray
+    candidates: NDArray
+    weights: NDArray
+
+
+class ContactEstimator:
+    """Estimates where an object touches one jaw; deterministic, one thread.
+
+    Attributes:
+        jaw: with the calibration applied that the solver has.
+        settings: of this estimator.
+        face: the inner surface of the jaw's mesh.
+        counts: images and poses by what was done with them, or why nothing was.
+    """
+
+    def __init__(self, jaw: Jaw, *, mesh: ObjectMesh | None = None, settings: ContactSettings | None = None) -> None:
+        """Prepares the jaw's inner face.
+
+        Raises:
+            FinforceError: The jaw has no mesh of that density, or the object does not do for the mode.
+        """
+        self.jaw, self.settings = jaw, settings or ContactSettings()
+        self.face = build_inner_face(jaw, self.settings.mesh)
+        self._rest_line = self.face.deform(self.face.mesh.nodes)
+        self._samples = np.unique(np.linspace(0, len(self.face.mesh.nodes) - 1, _JAW_SAMPLES).astype(int))
+        self._poses = PoseFilter(self.settings)
+        self._belief = TouchBelief(self.settings)
+        self._rest = RestWatch(self.settings)
+        self._counts: Counter[str] = Counter(dict.fromkeys(_REASONS, 0))
+        self.set_object(mesh)
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Images and poses by what was done with them."""
+        return self._counts
+
+    @property
+    def resting(self) -> bool:
+        """Whether the grasp holds still, so that no new pose is needed."""
+        return self._rest.resting
+
+    def set_object(self, mesh: ObjectMesh | None) -> None:
+        """Takes another object, or none; its pose is not known yet.
+
+        Raises:
+            ObjectMeshError: The mode needs a watertight mesh, and this one is not.
+            MissingDependencyError: The mode needs a library that is not installed.
+        """
+        self._mesh: ObjectMesh | None = None
+        self._localizer = self._build_localizer(mesh) if mesh is not None else None
+        if mesh is not None:
+            low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+            self._centre, self._half = 0.5 * (low + high), 0.5 * (high - low)
+            self._sections = SectionKeeper(mesh, self.face.half_width, self.settings)
+        self._mesh = mesh
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets poses, contact and counts; jaw and object stay."""
+        self._poses.reset()
+        self._belief.reset()
+        self._rest.reset()
+        if self._localizer is not None:
+            self._localizer.reset()
+        self._counts.update({reason: -count for reason, count in self._counts.items()})
+        self._solved: Scene | None = None
+        self._place: Place | None = None
+
+    def _build_localizer(self, mesh: ObjectMesh) -> Localizer:
+        if self.settings.mode == "paper":
+            return IntersectionLocalizer(self.jaw, self.face, mesh, self.settings)
+        if self.settings.mode == "closest":
+            return ClosestLocalizer(self.jaw, self.face)
+        return OutlineLocalizer(self.face, self.settings)
+
+    def take_pose(
+        self,
+        stamp: float,
+        T_jaw_object: NDArray,
+        covariance: NDArray | None = None,
+        *,
+        camera: NDArray | None = None,
+    ) -> None:
+        """Takes a pose of the object.
+
+        Args:
+            stamp: image capture time [s].
+            T_jaw_object: (4, 4).
+            covariance: (6, 6) of x, y, z [m] and the rotations about the jaw's axes [rad]; None: learnt from the poses.
+            camera: (3,) [m], the camera's place in the jaw frame; given, a pose that puts the object around it is none.
+
+        Raises:
+            PoseError: The pose or its covariance is none, or the object would surround the camera.
+        """
+        T = check_pose(T_jaw_object, "T_jaw_object")
+        watched = camera is not None and self._mesh is not None
+        if watched and surrounds(self._mesh, (invert_pose(T) @ np.append(camera, 1.0))[:3]):
+            raise PoseError("this pose puts the object around the camera: check its pose, mesh and unit")
+        verdict = self._poses.update(stamp, T, covariance)
+        self._counts["late pose"] += verdict == "late"
+        self._counts["odd pose"] += verdict == "aside"
+
+    def update(
+        self, stamp: float, surface: NDArray | None = None, wrench: tuple[NDArray, NDArray] | None = None
+    ) -> ContactEstimate:
+        """Returns where the object touches in the image of a stamp [s].
+
+        Args:
+            stamp: image capture time [s].
+            surface: (n, 3) [m] deformed vertices in mesh order; None: the jaw is taken as undeformed.
+            wrench: force (3,) [N] and torque (3,) [N m] about the jaw's origin of the last trusted image.
+
+        Raises:
+            MeshError: The surface is not that of the jaw's mesh.
+            ContactError: The wrench is not finite.
+        """
+        surface = self.face.mesh.nodes if surface is None else self.face.check_surface(surface)
+        wrench = None if wrench is None else _check_wrench(*wrench)
+        if self._mesh is None:
+            return self._give_up(stamp, "no_object", "no object mesh: load one, or give the contact's height")
+        if self._poses.stamp is None:
+            return self._give_up(stamp, "no_pose", f"no pose of {self._mesh.name} has come yet")
+        age = min(stamp - self._poses.believed, stamp - self._rest.ended)
+        if not self._rest.resting and age > self.settings.pose_timeout:
+            message = f"the last pose of {self._mesh.name} is {age:.1f} s old, expected one every second"
+            return self._give_up(stamp, "no_pose", message)
+        pose = self._poses.at(self._poses.stamp if self._rest.resting else stamp)
+        section = self._sections.at(pose.T)
+        scene = Scene(T=pose.T, section=section, surface=surface, line=self.face.deform(surface), wrench=wrench)
+        return self._follow(stamp, pose, scene)
+
+    def _follow(self, stamp: float, pose: FilteredPose, scene: Scene) -> ContactEstimate:
+        """Finds the place in a scene, or keeps the last one, and says whether the object touches."""
+        skipped = self._find_reason_to_skip(scene)
+        if not skipped:
+            if self._surrounds_jaw(scene):
+                message = f"this pose puts {self._mesh.name} around the jaw: check its pose, mesh and unit"
+                return self._give_up(stamp, "no_pose", message, "surrounded")
+            self._solved, self._place = scene, self._localizer.locate(scene)
+            if self._place is None:
+                message = f"{self._mesh.name} does not stand before the inner surface"
+                return self._give_up(stamp, "apart", message, "beside")
+            self._rows = _points_of(self._place, self.jaw)
+        self._counts[skipped or "solved"] += 1
+        message = "" if skipped == "apart" else self._judge_touch(pose, scene)
+        if skipped == "apart":
+            self._belief.set(False)
+        self._rest.update(stamp, scene.line if self._belief.touching and self._is_live(scene) else None)
+        return self._report(stamp, pose, scene, skipped, message)
+
+    def _find_reason_to_skip(self, scene: Scene) -> str:
+        """Returns why the last place still holds, empty when it does not."""
+        before = self._solved
+        if before is None or self._place is None:
+            return ""
+        moved = np.abs(scene.T - before.T)
+        moved[:3, :3] *= _LEVER
+        if self._is_far(scene):
+            moved[0, 3] = 0.0
+            return "apart" if self._place.touching is not True and moved.max() < _FAR_STILL else ""
+        still = self.settings.still
+        if moved.max() > still or np.abs(scene.line - before.line).max() > still:
+            return ""
+        same = (scene.wrench is None) == (before.wrench is None)
+        if same and scene.wrench is not None:
+            same = np.abs(scene.wrench[0] - before.wrench[0]).max() < _STILL_FORCE
+        return "still" if same else ""
+
+    def _is_far(self, scene: Scene) -> bool:
+        """Whether the boxes around object and jaw are apart along x by more than the margin."""
+        front = scene.T[0, :3] @ self._centre + scene.T[0, 3] - np.abs(scene.T[0, :3]) @ self._half
+        return front - self.settings.margin > max(scene.line[:, 0].max(), self.face.x)
+
+    def _is_live(self, scene: Scene) -> bool:
+        """Whether the surface is that of a solver at work."""
+        return bool(np.abs(scene.line - self._rest_line).max() > _AT_REST)
+
+    def _surrounds_jaw(self, scene: Scene) -> bool:
+        """Whether most of the jaw lies within the object."""
+        jaw = scene.surface[self._samples]
+        inside = np.abs((jaw - scene.T[:3, 3]) @ scene.T[:3, :3] - self._centre) < self._half
+        if inside.all(axis=1).mean() < _SURROUNDED:
+            return False
+        return count_inside(np.ascontiguousarray(jaw[:, ::2]), scene.section.edges) > _SURROUNDED * len(jaw)
+
+    def _judge_touch(self, pose: FilteredPose, scene: Scene) -> str:
+        """Decides whether the object touches, and returns what is odd about that."""
+        place, settings = self._place, self.settings
+        if place.touching is not None:
+            self._belief.set(place.touching)
+            return ""
+        stddev = float(np.hypot(pose.stddev[0], settings.pose_bias))
+        if place.gap <= settings.reach + 3.0 * stddev:
+            self._belief.update(place.bend - place.gap, stddev, place.bend if self._is_live(scene) else None)
+            return ""
+        self._belief.set(False)
+        if place.bend < _BENT:
+            return ""
+        return f"the jaw is bent, but {self._mesh.name} is {1e3 * place.gap:.1f} mm away: is its pose right?"
+
+    def _report(self, stamp: float, pose: FilteredPose, scene: Scene, skipped: str, message: str) -> ContactEstimate:
+        """Returns the estimate of an image."""
+        touching = self._belief.touching
+        return ContactEstimate(
+            stamp=stamp,
+            status="touching" if touching else "apart",
+            message=message,
+            points=self._rows.points,
+            candidates=self._rows.candidates,
+            weights=self._rows.weights,
+            touching=touching,
+            skipped=skipped,
+            outline=self._outline(pose, scene.section),
+            T_jaw_object=pose.T,
+            probability=self._belief.probability,
+        )
+
+    def _outline(self, pose: FilteredPose, section: Section) -> ObjectOutline | None:
+        """Returns the outline for the solver, with the errors of the pose that no average removes."""
+        if self.settings.mode != "estimate":
+            return None
+        bias = np.array([self.settings.pose_bias, self.settings.pose_bias, self.settings.rotation_bias])
+        stddev = np.hypot(pose.stddev[[0, 2, 4]], bias)
+        return ObjectOutline(polygons=section.polygons, origin=section.origin, tilt=section.tilt, stddev=stddev)
+
+    def _give_up(self, stamp: float, status: str, message: str, reason: str = "") -> ContactEstimate:
+        """Returns an estimate without rows; nothing of the last contact is kept."""
+        self._counts[reason or status] += 1
+        self._belief.reset()
+        self._rest.update(stamp, None)
+        if self._localizer is not None:
+            self._localizer.reset()
+        self._solved = self._place = None
+        return blank_estimate(stamp, status, message)
+
+
+def _points_of(place: Place, jaw: Jaw) -> "_RowPoints":
+    """Returns the rows of a place as points on the undeformed inner surface."""
+    heights = place.rows.heights
+    points = np.zeros((len(heights), 3))
+    points[:, 0], points[:, 2] = jaw.inner_face_x, heights
+    candidates = np.abs(jaw.candidates[:, 2] - heights[:, None]).argmin(axis=1)
+    return _RowPoints(points=points, candidates=candidates, weights=place.rows.weights)
+
+
+def _check_wrench(force: NDArray, torque: NDArray) -> tuple[NDArray, NDArray]:
+    """Returns a wrench as floats after having refused what is none."""
+    force, torque = np.asarray(force, float), np.asarray(torque, float)
+    if force.shape != (3,) or torque.shape != (3,) or not np.isfinite(force + torque).all():
+        raise ContactError(f"wrench of force {force} and torque {torque}, expected three finite numbers each")
+    return force, torque
