@@ -12,6 +12,8 @@ from finforce_eval.results import CaseResult
 
 # Below it the pressure centre hardly matters; from it on the object is in contact [N].
 LEAST_FORCE, ONSET_FORCE = 0.2, 0.02
+# A touch that is not there to stay within so many frames after the true begin is missed.
+WATCHED = 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,14 +28,15 @@ class PlaceStats:
 
 @dataclass(frozen=True, kw_only=True)
 class OnsetStats:
-    """Frames from the true begin of contact to the first `touching`, over loading cycles; negative is early.
+    """Frames from the true begin of contact to the `touching` that stays, over loading cycles; negative is early.
 
     Attributes:
         n: loading cycles in which both are known.
-        missed: those in which `touching` never came.
+        missed: those in which `touching` did not come within a second.
         median_frames: their median.
         earliest_frames: the least of them.
         max_frames: the largest of them.
+        false_pct: share of the frames without true force that were said to touch.
     """
 
     n: int
@@ -41,6 +44,7 @@ class OnsetStats:
     median_frames: float | None
     earliest_frames: int | None
     max_frames: int | None
+    false_pct: float | None
 
 
 def place_stats(distances: NDArray[np.float64]) -> PlaceStats:
@@ -70,14 +74,13 @@ def _loaded_distance(result: CaseResult, heights: NDArray[np.float64] | None) ->
 
 
 def onset_delays(result: CaseResult) -> list[int | None]:
-    """Return for each loading cycle the frames from first true force to first `touching`; None where it never came.
+    """Return for each loading cycle the frames from first true force to the `touching` that stays; None if missed.
 
-    The first `touching` is looked for from where the contact of the cycle before was let go; if it was never let go,
-    it counts as touching all the time since the true force ended.
+    A `touching` that was never let go since the cycle before is early by the whole pause.
     """
     if result.contact is None or result.contact.touching is None:
         return []
-    loaded = np.nan_to_num(result.true_magnitude) > ONSET_FORCE
+    loaded = _loaded(result)
     delays = []
     for cycle in np.unique(result.cycle):
         rows = np.flatnonzero(result.cycle == cycle)
@@ -87,16 +90,29 @@ def onset_delays(result: CaseResult) -> list[int | None]:
     return delays
 
 
+def _loaded(result: CaseResult) -> NDArray[np.bool_]:
+    """Return on which frames (n,) something truly presses."""
+    return np.nan_to_num(result.true_magnitude) > ONSET_FORCE
+
+
 def _delay(touching: NDArray[np.bool_], loaded: NDArray[np.bool_], onset: int, last: int) -> int | None:
-    """Return the frames from `onset` to the first touching frame up to `last`."""
+    """Return the frames from `onset` to the begin of the touch that holds a second later, or at the cycle's end."""
     before = np.flatnonzero(loaded[:onset])
     released = int(before[-1]) + 1 if before.size else 0
-    apart = np.flatnonzero(~touching[released:onset])
-    if not apart.size and onset > released:
-        return released - onset
-    begin = released + int(apart[0]) if apart.size else onset
-    first = np.flatnonzero(touching[begin : last + 1])
-    return begin + int(first[0]) - onset if first.size else None
+    pressed = np.flatnonzero(~loaded[onset : last + 1])
+    end = min(onset + WATCHED, last, onset + int(pressed[0]) - 1 if pressed.size else last)
+    apart = np.flatnonzero(~touching[released : end + 1])
+    begin = released + int(apart[-1]) + 1 if apart.size else released
+    return begin - onset if begin <= end else None
+
+
+def _false_share(results: Sequence[CaseResult]) -> float | None:
+    """Return the share [%] of frames without true force that were said to touch."""
+    said = [
+        r.contact.touching[~_loaded(r)] for r in results if r.contact is not None and r.contact.touching is not None
+    ]
+    frames = np.concatenate(said) if said else np.zeros(0)
+    return 100.0 * float(frames.mean()) if frames.size else None
 
 
 def onset_stats(results: Sequence[CaseResult]) -> OnsetStats:
@@ -109,4 +125,5 @@ def onset_stats(results: Sequence[CaseResult]) -> OnsetStats:
         median_frames=float(np.median(known)) if known else None,
         earliest_frames=min(known, default=None),
         max_frames=max(known, default=None),
+        false_pct=_false_share(results),
     )

@@ -68,7 +68,7 @@ def _join(cells: Sequence[str], widths: Sequence[int]) -> str:
 
 CONTACT_HEADER = (
     "contact", "given: median/mm", "p95/mm", "max/mm", "solved: median/mm", "p95/mm", "max/mm",
-    "onset: median", "earliest", "latest", "missed", "p50/ms", "p99/ms",
+    "onset: median", "earliest", "latest", "missed", "false touches/%", "p50/ms", "p99/ms",
 )  # fmt: skip
 
 
@@ -86,8 +86,9 @@ def contact_rows(evaluation: Evaluation) -> list[list[str]]:
         onset = score.onset
         frames = [format_number(v, 0) for v in (onset.median_frames, onset.earliest_frames, onset.max_frames)]
         missed = str(onset.missed) if onset.n + onset.missed else "-"
+        false = format_number(onset.false_pct, 1)
         times = [format_number(score.contact_ms.p50), format_number(score.contact_ms.p99)]
-        rows.append([name, source, *places, *frames, missed, *times])
+        rows.append([name, source, *places, *frames, missed, false, *times])
     return rows if any(result.contact is not None for result in evaluation.results.values()) else []
 
 
@@ -97,9 +98,9 @@ def format_contact_table(evaluation: Evaluation) -> str:
     if not rows:
         return ""
     head = ["", "contact", "median", "p95", "max", "median", "p95", "max", "median", "first", "last", "missed",
-            "p50", "p99"]  # fmt: skip
+            "false/%", "p50", "p99"]  # fmt: skip
     widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    groups = (("", 0, 2), ("given/mm", 2, 5), ("solved/mm", 5, 8), ("onset/frames", 8, 12), ("ms", 12, 14))
+    groups = (("", 0, 2), ("given/mm", 2, 5), ("solved/mm", 5, 8), ("onset/frames", 8, 13), ("ms", 13, 15))
     titles = [f" {t} ".center(sum(widths[a:b]) + 2 * (b - a - 1), "-" if t else " ") for t, a, b in groups]
     lines = ["  ".join(titles), _join(head, widths)]
     return "\n".join([*lines, "-" * len(lines[1]), *(_join(row, widths) for row in rows)])
@@ -110,7 +111,8 @@ def contact_lines() -> list[str]:
     return [
         "Contact: distance along the undeformed surface between the true pressure centre and the contact that the "
         "solver was given (given) and that it found (solved), above 0.2 N; onset: frames from 0.02 N of true force to "
-        "`touching`, one per loading cycle, negative is early; ms: a step of the contact estimator alone."
+        "the `touching` that stays, one per loading cycle, negative is early; false: share of the frames without true "
+        "force that were said to touch; ms: a step of the contact estimator alone."
     ]
 
 

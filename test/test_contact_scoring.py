@@ -54,13 +54,15 @@ FORCE = [0, 0, 0, 0.01, 0.03, 1, 1, 0, 0]
         ([0, 0, 0, 0, 1, 1, 1, 0, 0], 0),
         ([0, 0, 0, 0, 0, 0, 1, 1, 0], 2),
         ([0, 0, 0, 1, 1, 1, 1, 0, 0], -1),
-        ([0, 1, 0, 0, 0, 1, 1, 0, 0], -3),
+        ([0, 1, 0, 0, 0, 1, 1, 0, 0], 1),
+        ([0, 0, 0, 0, 1, 0, 1, 0, 0], 2),
         ([1, 1, 1, 1, 1, 1, 1, 1, 1], -4),
         ([0, 0, 0, 0, 0, 0, 0, 0, 0], None),
+        ([1, 1, 1, 1, 0, 0, 0, 1, 1], None),
     ],
-    ids=["at once", "late", "early", "false alarm", "always", "never"],
+    ids=["at once", "late", "early", "false alarm before", "flicker after", "always", "never", "beside it"],
 )
-def test_delay_is_from_the_first_true_force_to_the_first_touch(touching, delay):
+def test_delay_is_from_the_first_true_force_to_the_touch_that_stays(touching, delay):
     assert onset_delays(contact_result(FORCE, touching=touching)) == [delay]
 
 
@@ -71,6 +73,11 @@ def test_cycles_are_counted_apart_and_what_lingers_from_the_last_one_is_no_touch
     stats = onset_stats([result, contact_result(FORCE, touching=[0] * 9)])
     assert (stats.n, stats.missed) == (2, 1)
     assert (stats.median_frames, stats.earliest_frames, stats.max_frames) == (1.5, 1, 2)
+
+
+def test_touches_without_true_force_are_false():
+    result = contact_result(FORCE, touching=[1, 0, 0, 0, 0, 1, 1, 1, 0])
+    assert onset_stats([result]).false_pct == pytest.approx(100 * 2 / 6)
 
 
 def test_touch_that_is_never_let_go_is_early_by_the_whole_pause():

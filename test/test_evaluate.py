@@ -207,7 +207,7 @@ def test_json_says_how_well_the_contact_was_known():
     # the object's origin is the jaw's: rows at -1 and 3 mm weigh 3 to 1, the truth is at 40 mm
     assert case["place"] == pytest.approx({"n": case["place"]["n"], "median_mm": 40.0, "p95_mm": 40.0, "max_mm": 40.0})
     assert case["solved_place"]["max_mm"] == pytest.approx(0.0, abs=1e-6)
-    assert case["onset"].keys() == {"n", "missed", "median_frames", "earliest_frames", "max_frames"}
+    assert case["onset"].keys() == {"n", "missed", "median_frames", "earliest_frames", "max_frames", "false_pct"}
     assert case["contact_ms"]["p50"] > 0.0
     assert content["all"]["place"] == case["place"]
 
