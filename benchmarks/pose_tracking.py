@@ -1,0 +1,238 @@
+"""Follows rendered objects through 30 images a second and compares with their true poses; prints tables, writes JSON.
+
+    python benchmarks/pose_tracking.py [--json report/pose_tracking.json] [--frames 90] [--seeds 2]
+
+Depths are those of a D405 in noise, edges, holes and rounding; the tracker gets no mask after the first image, the two
+libraries that it is compared with get the true one. Times are those of one thread's processor.
+"""
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pose_tracking_methods import ROUND, IcpTracker, compute_deviation
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from finforce_camera import CameraIntrinsics
+from finforce_contact.errors import PoseLostError
+from finforce_contact.pose_source import ObjectPose
+from finforce_contact.pose_tracking import PoseTracker
+from finforce_contact.poses import move_pose
+from finforce_contact.triangles import ObjectMesh
+from finforce_twin.depth_camera import build_d405
+from finforce_twin.objects import OBJECT_NAMES, build_object
+from finforce_twin.pose_sequences import Frame, Motion, render_sequence
+
+STEPS = {"848x480": 1, "424x240": 2}
+HIDDEN = (0.0, 0.3, 0.5)
+SURE = np.array([0.002] * 3 + [np.deg2rad(4.0)] * 3)  # standard deviations below which a pose is called sure
+FOUND = (0.003, np.deg2rad(4.0))  # a first pose no farther off is the right one
+LIBRARIES = ("small_gicp", "open3d")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """Which sequence, followed how."""
+
+    name: str
+    resolution: str
+    hidden: float
+    seed: int
+    speed: float = 0.1
+    method: str = "tracker"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """One image: errors [mm, deg], turn about the axis since the first image [deg], sure or not, time [ms]."""
+
+    translation: float
+    rotation: float
+    spin: float
+    sure: bool
+    milliseconds: float
+
+
+class MaskFree:
+    """`PoseTracker` behind the methods of `IcpTracker`."""
+
+    def __init__(self, mesh: ObjectMesh, camera: CameraIntrinsics) -> None:
+        """Prepares the mesh."""
+        self.tracker = PoseTracker(mesh, camera)
+
+    def locate(self, frame: Frame, guess: NDArray) -> ObjectPose:
+        """Starts with a mask and a guess (4, 4)."""
+        return self.tracker.locate(frame.stamp, frame.depth, frame.mask, [guess])
+
+    def track(self, frame: Frame) -> ObjectPose:
+        """Follows without a mask."""
+        return self.tracker.track(frame.stamp, frame.depth)
+
+
+def follow(case: Case, frames: int) -> dict:
+    """Returns the figures of one sequence: its samples, and how often the object was lost and found again."""
+    mesh, camera = build_object(case.name), build_d405(step=STEPS[case.resolution])
+    motion = Motion(
+        speed=case.speed, turn_rate=np.deg2rad(300.0 * case.speed), hidden=case.hidden, frames=frames
+    )  # at 0.1 m/s, 30 deg/s
+    method = (
+        MaskFree(mesh, camera) if case.method == "tracker" else IcpTracker(mesh, camera, import_module(case.method))
+    )
+    samples, lost, turn, before = [], 0, 0.0, None
+    for frame in render_sequence(mesh, camera, motion, case.seed):
+        began = time.thread_time()
+        try:
+            pose = method.track(frame) if before is not None else method.locate(frame, _disturb(frame, case.seed))
+        except PoseLostError:
+            lost += 1
+            continue
+        spent = time.thread_time() - began
+        T = pose.T_camera_object
+        turn += 0.0 if before is None else Rotation.from_matrix(before[:3, :3].T @ T[:3, :3]).as_rotvec()[2]
+        off = compute_deviation(case.name, frame, T, camera)
+        sure = _is_sure(case.name, pose)
+        if before is not None:
+            samples.append(
+                Sample(
+                    translation=1e3 * off.translation,
+                    rotation=float(np.rad2deg(off.rotation)),
+                    spin=float(np.rad2deg(turn)),
+                    sure=sure,
+                    milliseconds=1e3 * spent,
+                )
+            )
+        before = T
+    recovered = method.tracker.counts.get("recovered", 0) if case.method == "tracker" else 0
+    return {"samples": samples, "lost": lost, "recovered": recovered}
+
+
+def summarize(followed: Sequence[dict]) -> dict:
+    """Returns the figures of several sequences together."""
+    samples = [sample for one in followed for sample in one["samples"]]
+    sure = [sample for sample in samples if sample.sure]
+    return {
+        "n": len(samples),
+        "translation_mm": _quantiles([sample.translation for sample in samples]),
+        "rotation_deg": _quantiles([sample.rotation for sample in samples]),
+        "sure_share": len(sure) / max(len(samples), 1),
+        "sure_translation_mm": _quantiles([sample.translation for sample in sure]),
+        "sure_rotation_deg": _quantiles([sample.rotation for sample in sure]),
+        "spin_deg": max((abs(sample.spin) for sample in samples), default=0.0),
+        "cpu_ms": _quantiles([sample.milliseconds for sample in samples]),
+        "lost": sum(one["lost"] for one in followed),
+        "recovered": sum(one["recovered"] for one in followed),
+    }
+
+
+def locate_all(count: int) -> dict:
+    """Returns, for each object, how often the first pose without any guess is the right one, and its time [s]."""
+    figures, camera = {}, build_d405(step=2)
+    for name in tqdm(OBJECT_NAMES, desc="first poses", leave=False):
+        mesh, right, seconds = build_object(name), 0, []
+        for seed in range(count):
+            *_, frame = render_sequence(mesh, camera, Motion(hidden=0.3 * (seed % 2), frames=16), 100 + seed)
+            tracker, began = PoseTracker(mesh, camera), time.thread_time()
+            try:
+                off = compute_deviation(
+                    name, frame, tracker.locate(frame.stamp, frame.depth, frame.mask).T_camera_object, camera
+                )
+                right += off.translation < FOUND[0] and off.rotation < FOUND[1]
+            except PoseLostError:
+                pass
+            seconds.append(time.thread_time() - began)
+        figures[name] = {"n": count, "right": int(right), "cpu_s": _quantiles(seconds)}
+    return figures
+
+
+def run(frames: int, seeds: int) -> dict:
+    """Returns the figures of every case."""
+    plan: dict[str, list[Case]] = {}
+    for resolution in STEPS:
+        for hidden in HIDDEN:
+            for name in OBJECT_NAMES:
+                plan[f"{name} {resolution} hidden {hidden:.0%}"] = [
+                    Case(name=name, resolution=resolution, hidden=hidden, seed=seed) for seed in range(seeds)
+                ]
+    for name in OBJECT_NAMES:
+        plan[f"{name} 424x240 0.3 m/s 90 deg/s"] = [
+            Case(name=name, resolution="424x240", hidden=0.0, seed=seed, speed=0.3) for seed in range(seeds)
+        ]
+    for library in LIBRARIES:
+        for hidden in (0.0, 0.5):
+            plan[f"{library}, true mask, 424x240 hidden {hidden:.0%}"] = [
+                Case(name=name, resolution="424x240", hidden=hidden, seed=0, method=library) for name in OBJECT_NAMES
+            ]
+    figures, every = {}, {resolution: [] for resolution in STEPS}
+    for title, cases in tqdm(plan.items(), desc="sequences", leave=False):
+        followed = [follow(case, frames) for case in cases]
+        figures[title] = summarize(followed) | {"cases": [asdict(case) for case in cases]}
+        if cases[0].method == "tracker" and cases[0].speed == Case.speed:
+            every[cases[0].resolution] += followed
+    return figures | {f"all {resolution}": summarize(followed) for resolution, followed in every.items()}
+
+
+def _is_sure(name: str, pose: ObjectPose) -> bool:
+    covariance = pose.covariance.copy()
+    if name in ROUND:  # what the axis turns by itself counts for nothing
+        axis = pose.T_camera_object[:3, 2]
+        across = np.eye(3) - np.outer(axis, axis)
+        covariance[3:, 3:] = across @ covariance[3:, 3:] @ across
+    return bool((np.sqrt(np.diag(covariance)) < SURE).all())
+
+
+def _disturb(frame: Frame, seed: int) -> NDArray:
+    rng = np.random.default_rng(seed)
+    return move_pose(frame.T_camera_object, np.concatenate([rng.normal(0.0, 2e-3, 3), rng.normal(0.0, 0.03, 3)]))
+
+
+def _quantiles(values: Sequence[float]) -> dict[str, float]:
+    if not len(values):
+        return dict.fromkeys(("median", "p95", "p99", "max"), float("nan"))
+    p50, p95, p99 = np.quantile(values, (0.5, 0.95, 0.99))
+    return {"median": float(p50), "p95": float(p95), "p99": float(p99), "max": float(np.max(values))}
+
+
+def format_table(figures: dict) -> str:
+    """Returns a row for each case; translations in mm, rotations in degrees, processor time in ms."""
+    head = f"{'':44s}   n   t p50   p95   r p50   p95 | sure  t p95  r p95 | spin lost rec. | ms p50  p95   Hz"
+    rows = [head]
+    for title, one in figures.items():
+        t, r, ms = one["translation_mm"], one["rotation_deg"], one["cpu_ms"]
+        st, sr = one["sure_translation_mm"], one["sure_rotation_deg"]
+        spin = f"{one['spin_deg']:5.1f}" if title.split()[0] in ROUND else "     "
+        rows.append(
+            f"{title:44s}{one['n']:5d}  {t['median']:5.2f} {t['p95']:6.2f}  {r['median']:5.2f} {r['p95']:6.2f} | "
+            f"{one['sure_share']:4.0%}  {st['p95']:5.2f}  {sr['p95']:5.2f} |{spin} {one['lost']:4d} "
+            f"{one['recovered']:4d} | {ms['median']:5.1f} {ms['p95']:5.1f} {1e3 / ms['median']:4.0f}"
+        )
+    return "\n".join(rows)
+
+
+def main() -> None:
+    """Runs the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="file to write the figures to")
+    parser.add_argument("--frames", type=int, default=90, help="images of each sequence")
+    parser.add_argument("--seeds", type=int, default=2, help="sequences of each case")
+    parser.add_argument("--starts", type=int, default=10, help="first poses of each object")
+    options = parser.parse_args()
+    figures, starts = run(options.frames, options.seeds), locate_all(options.starts)
+    print(format_table(figures))
+    for name, one in starts.items():
+        print(f"first pose of {name}: {one['right']} of {one['n']} right, {one['cpu_s']['median']:.2f} s")
+    if options.json:
+        machine = {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+        options.json.write_text(json.dumps(machine | {"tracking": figures, "first_poses": starts}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

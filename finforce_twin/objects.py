@@ -1,0 +1,99 @@
+"""Objects of the size of a hand, made from a few numbers; watertight, in metres, z upwards, origin half way up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_contact.errors import ObjectMeshError
+from finforce_contact.object_mesh import ObjectMesh
+from finforce_contact.optional import import_manifold3d
+
+SEGMENTS = 96  # around a full turn: the chords stay within 0.02 mm of a circle of 40 mm radius
+MILLIMETRE = 1e-3
+
+
+def build_object(name: str) -> ObjectMesh:
+    """Return an object by its name, one of `OBJECT_NAMES`.
+
+    Raises:
+        ObjectMeshError: there is none of this name.
+        MissingDependencyError: manifold3d is not installed.
+    """
+    if name not in BUILDERS:
+        raise ObjectMeshError(f"object '{name}': expected one of {', '.join(OBJECT_NAMES)}")
+    shape = BUILDERS[name](import_manifold3d()).to_mesh()
+    vertices = np.array(shape.vert_properties[:, :3], dtype=float) * MILLIMETRE
+    triangles = np.array(shape.tri_verts, dtype=np.int32)
+    return ObjectMesh(vertices=vertices, triangles=triangles, watertight=True, name=name)
+
+
+def _build_cylinder(kernel):
+    """A cylinder of 50 mm diameter, 100 mm high."""
+    return kernel.Manifold.cylinder(100.0, 25.0, circular_segments=SEGMENTS, center=True)
+
+
+def _build_cube(kernel):
+    """A cube of 60 mm."""
+    return kernel.Manifold.cube((60.0, 60.0, 60.0), center=True)
+
+
+def _build_asymmetric(kernel):
+    """A leaning block with a shoulder on one side and a round boss on top; no turn maps it onto itself."""
+    corners = np.array([[-30, -20], [25, -20], [25, 8], [5, 22], [-30, 22]], dtype=float)
+    block = kernel.Manifold.extrude(_section(kernel, corners), 62.0, scale_top=(0.72, 0.85))
+    boss = kernel.Manifold.cylinder(30.0, 15.0, 12.0, circular_segments=SEGMENTS).translate((-6.0, 2.0, 60.0))
+    shoulder = kernel.Manifold.cube((22.0, 26.0, 24.0)).translate((16.0, -18.0, 0.0))
+    return (block + boss + shoulder).translate((0.0, 0.0, -45.0))
+
+
+def _build_bottle(kernel):
+    """A bottle of 60 mm diameter, 120 mm high, with a round shoulder and a neck with a cap; solid."""
+    angles = np.linspace(0.0, 0.5 * np.pi, 16)
+    foot = np.column_stack((26.0 + 4.0 * np.sin(angles), 4.0 - 4.0 * np.cos(angles)))
+    shoulder = np.column_stack((14.0 + 16.0 * np.cos(angles), 70.0 + 24.0 * np.sin(angles)))
+    neck = np.array([[12.0, 95.0], [12.0, 104.0], [14.0, 104.0], [14.0, 119.0], [13.0, 120.0], [0.0, 120.0]])
+    profile = np.vstack(([[0.0, 0.0]], foot, shoulder, neck))
+    return _revolve(kernel, profile).translate((0.0, 0.0, -60.0))
+
+
+def _build_mug(kernel):
+    """A mug of 76 mm diameter, 85 mm high, with walls of 4 mm and a handle at +x."""
+    angles = np.linspace(0.0, 0.5 * np.pi, 12)
+    foot = np.column_stack((33.0 + 5.0 * np.sin(angles), 5.0 - 5.0 * np.cos(angles)))
+    inside = np.column_stack((29.0 + 5.0 * np.sin(angles), 11.0 - 5.0 * np.cos(angles)))[::-1]
+    rim = np.array([[38.0, 84.0], [37.0, 85.0], [35.0, 85.0], [34.0, 84.0]])
+    outer = np.vstack(([[0.0, 0.0]], foot, rim, inside, [[0.0, 6.0]]))
+    solid = np.vstack(([[0.0, 0.0]], foot, rim[:2], [[0.0, 85.0]]))
+    handle = _build_ring(kernel, radius=21.0, thickness=5.0).translate((38.0, 0.0, 44.0))
+    body = _revolve(kernel, outer) + (handle - _revolve(kernel, solid))
+    return body.translate((0.0, 0.0, -42.5))
+
+
+def _build_ring(kernel, *, radius: float, thickness: float):
+    """A torus in the x-z plane, one and a half times as broad as thick."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
+    section = np.column_stack((radius + thickness * np.cos(angles), 1.5 * thickness * np.sin(angles)))
+    return _revolve(kernel, section).rotate((90.0, 0.0, 0.0))
+
+
+def _section(kernel, outline: NDArray):
+    """Return the area inside a closed outline (n, 2), whichever way round it runs."""
+    return kernel.CrossSection([outline], kernel.FillRule.EvenOdd)
+
+
+def _revolve(kernel, profile: NDArray):
+    """Turn a closed profile (n, 2), radius and height, about the z axis."""
+    return kernel.Manifold.revolve(_section(kernel, profile), SEGMENTS)
+
+
+BUILDERS: dict[str, Callable] = {
+    "cylinder": _build_cylinder,
+    "cube": _build_cube,
+    "asymmetric": _build_asymmetric,
+    "mug": _build_mug,
+    "bottle": _build_bottle,
+}
+OBJECT_NAMES = tuple(BUILDERS)
