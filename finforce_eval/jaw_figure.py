@@ -35,8 +35,8 @@ def outline_edges(vertices: NDArray[np.float64], triangles: NDArray[np.integer])
 def draw_jaw(snapshot: Snapshot, title: str) -> Any:
     """Draw the jaw from the side, in millimetres.
 
-    Undeformed in grey, deformed in blue; key points used are filled, the others hollow; the arrow is the
-    force that the object applies to the jaw.
+    Undeformed in grey, deformed in blue, the object in sand; key points used are filled, the others hollow; the arrow
+    is the force that the object applies to the jaw.
 
     Args:
         snapshot: the jaw at one instant.
@@ -46,6 +46,7 @@ def draw_jaw(snapshot: Snapshot, title: str) -> Any:
     width, height = 6.0 * (size + 30) / (size + 30).max()
     figure = new_figure(max(width, 3.0) + 2.6, height + 1.0)
     axes = figure.subplots()
+    _draw_object(axes, snapshot)
     _draw_body(axes, snapshot.surface0, snapshot.triangles, fill="#f1f1f1", line="#bbbbbb")
     _draw_body(axes, snapshot.surface, snapshot.triangles, fill="#cfe3f1", line=BLACK)
     _draw_keypoints(axes, snapshot)
@@ -56,6 +57,13 @@ def draw_jaw(snapshot: Snapshot, title: str) -> Any:
     axes.set_title(title, loc="left", fontsize=10)
     figure.legend(loc="outside right center", frameon=False, fontsize=9)
     return figure
+
+
+def _draw_object(axes: Any, snapshot: Snapshot) -> None:
+    """Fill the object's outline, as far as it is known."""
+    for number, polygon in enumerate(snapshot.outline):
+        label = "" if number else "object"
+        axes.fill(*(1e3 * polygon).T, facecolor="#efe6d5", edgecolor="#b5a27c", linewidth=0.9, label=label)
 
 
 def _draw_body(axes: Any, vertices: NDArray, triangles: NDArray, *, fill: str, line: str) -> None:

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.results import CaseResult, Snapshot
+from finforce_eval.places import InnerSurface, true_lines
+from finforce_eval.results import CaseResult, ContactSeries, Snapshot
 from finforce_eval.scoring import match_truth
 from finforce_eval.tracks import NANOSECONDS, Recording
+from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_ifea.pointcloud import decode_keypoints
 
 
@@ -25,8 +27,11 @@ class JawLog:
         force: (3,) [N], jaw frame.
         torque: (3,) [N m], about the origin of the jaw frame.
         stddev: (3,) [N].
-        surface: (n, 3) [m] at `surface_stamp`, the image with the largest force.
-        surface_stamp: see there; -1 before the first.
+        surface: (n, 3) [m] deformed vertices.
+        place: weighted mean height of the contact rows [m].
+        touching: whether a row said that object and jaw touch.
+        outline: the object's polygons (n, 2) [m], jaw frame, before or at the image with the largest force.
+        largest: stamp of that image; -1 before the first.
     """
 
     sent: dict[int, float] = field(default_factory=dict)
@@ -34,12 +39,15 @@ class JawLog:
     force: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     torque: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     stddev: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    surface: NDArray[np.float64] | None = None
-    surface_stamp: int = -1
+    surface: dict[int, NDArray[np.float32]] = field(default_factory=dict)
+    place: dict[int, float] = field(default_factory=dict)
+    touching: dict[int, bool] = field(default_factory=dict)
+    outline: tuple[NDArray[np.float64], ...] = ()
+    largest: int = -1
 
     def is_largest(self, stamp: int) -> bool:
-        """Say whether the force at a stamp exceeds that of the surface kept so far by two per cent."""
-        kept = self.force.get(self.surface_stamp)
+        """Say whether the force at a stamp exceeds that of the largest so far by two per cent."""
+        kept = self.force.get(self.largest)
         largest = 0.0 if kept is None else float(np.linalg.norm(kept))
         return stamp in self.force and float(np.linalg.norm(self.force[stamp])) > 1.02 * largest
 
@@ -53,6 +61,7 @@ class ReplayLog:
 
     def __init__(self, sides: tuple[str, ...]) -> None:
         self.jaws = {side: JawLog() for side in sides}
+        self._outlines: dict[str, tuple[NDArray[np.float64], ...]] = {}
         self.grasp: dict[int, float] = {}
         self.health: dict[str, Mapping[str, str]] = {}
         self.offset = 0
@@ -81,10 +90,24 @@ class ReplayLog:
         self.jaws[side].stddev[self._stamp(message)] = _vector(message.wrench.force)
 
     def take_surface(self, side: str, message: Any) -> None:
-        """Keep the surface under the largest force."""
+        """Keep a surface, and the object's outline with that under the largest force."""
         stamp, log = self._stamp(message), self.jaws[side]
+        log.surface[stamp] = decode_keypoints(message).points.astype(np.float32)
         if log.is_largest(stamp):
-            log.surface, log.surface_stamp = decode_keypoints(message).points, stamp
+            log.largest, log.outline = stamp, self._outlines.get(side, ())
+
+    def take_contact(self, side: str, message: Any) -> None:
+        """Keep where the object was said to touch."""
+        stamp, log = self._stamp(message), self.jaws[side]
+        contact = contact_from_cloud(message, f"{side}_jaw", free=False)
+        if len(contact.points):
+            log.place[stamp] = float(np.average(contact.points[:, 2], weights=contact.weights))
+        log.touching[stamp] = bool(contact.touching)
+
+    def take_outline(self, side: str, message: Any) -> None:
+        """Keep the newest outline of the object."""
+        outline = outline_from_cloud(message, f"{side}_jaw", None)
+        self._outlines[side] = () if outline is None else outline.placed()
 
     def take_grasp(self, message: Any) -> None:
         """Keep a grasp force."""
@@ -102,8 +125,8 @@ def live_result(
 ) -> CaseResult:
     """Return the answers of one solver as the time series of an offline run.
 
-    The contact place, the residual and the key points used do not travel; the place and the residual stay
-    open, and the key points that passed the threshold stand for those used.
+    The solver's own place, its residual and the key points used do not travel; the first two stay open, and the key
+    points that passed the threshold stand for those used.
 
     Args:
         recording: that was played.
@@ -135,26 +158,47 @@ def live_result(
         direction=phases.direction,
         scored=phases.scored,
         snapshot=_snapshot(recording, side, log, seen, estimator),
+        contact=_contact_series(recording, side, log, estimator) if log.touching else None,
+    )
+
+
+def _contact_series(recording: Recording, side: str, log: JawLog, estimator: Any) -> ContactSeries:
+    """Return where the contact was said to be, and where it was."""
+    stamps = recording.jaw(side).keypoints.stamps
+    surface = InnerSurface(np.array(estimator.surface()), estimator.jaw.inner_face_x)
+    lines = true_lines(recording, side, stamps, surface.face_x)
+    truth = [
+        surface.cut(log.surface[int(stamp)], point, direction) if int(stamp) in log.surface else np.nan
+        for stamp, point, direction in zip(stamps, lines.points, lines.directions, strict=True)
+    ]
+    return ContactSeries(
+        source="live",
+        given=np.array([log.place.get(int(stamp), np.nan) for stamp in stamps]),
+        truth=np.array(truth),
+        touching=np.array([log.touching.get(int(stamp), False) for stamp in stamps]),
+        status=np.where([int(stamp) in log.touching for stamp in stamps], "live", ""),
+        step_ms=np.full(len(stamps), np.nan),
     )
 
 
 def _snapshot(recording: Recording, side: str, log: JawLog, seen: NDArray[np.bool_], estimator: Any) -> Snapshot | None:
     """Return the jaw under the largest force, None if no surface came."""
-    if log.surface is None:
+    if log.largest < 0:
         return None
     track = recording.jaw(side).keypoints
-    row = int(np.searchsorted(track.stamps, log.surface_stamp))
-    force = log.force[log.surface_stamp]
+    row = int(np.searchsorted(track.stamps, log.largest))
+    force, surface = log.force[log.largest], log.surface[log.largest].astype(np.float64)
     return Snapshot(
-        stamp=log.surface_stamp,
+        stamp=log.largest,
         surface0=np.array(estimator.surface()),
-        surface=log.surface,
+        surface=surface,
         triangles=np.asarray(estimator.surface_triangles),
         keypoints0=np.asarray(estimator.jaw.keypoints),
         keypoints=track.points[row],
         used=seen[row],
-        contact_point=point_of_application(force, log.torque[log.surface_stamp], log.surface),
+        contact_point=point_of_application(force, log.torque[log.largest], surface),
         force=force,
+        outline=log.outline,
     )
 
 

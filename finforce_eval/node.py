@@ -115,6 +115,8 @@ class PlayerNode(Node):
             subscribe(WrenchStamped, f"{side}/wrench", lambda m, s=side: log.take_wrench(s, m, monotonic()))
             subscribe(WrenchStamped, f"{side}/wrench_stddev", lambda m, s=side: log.take_stddev(s, m))
             subscribe(PointCloud2, f"{side}/surface", lambda m, s=side: log.take_surface(s, m))
+            subscribe(PointCloud2, f"{side}/contact", lambda m, s=side: log.take_contact(s, m))
+            subscribe(PointCloud2, f"{side}/object_outline", lambda m, s=side: log.take_outline(s, m))
         subscribe(WrenchStamped, "grasp_wrench", log.take_grasp)
         subscribe(DiagnosticArray, "/diagnostics", log.take_diagnostics)
 

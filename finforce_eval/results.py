@@ -22,6 +22,7 @@ class Snapshot:
         used: (K,) key points that the estimator used.
         contact_point: (3,) on the deformed surface.
         force: (3,) [N] on the jaw.
+        outline: of the object, polygons (n, 2) of x and z; none where it is not known.
     """
 
     stamp: int
@@ -33,6 +34,7 @@ class Snapshot:
     used: NDArray[np.bool_]
     contact_point: NDArray[np.float64]
     force: NDArray[np.float64]
+    outline: tuple[NDArray[np.float64], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,7 +43,8 @@ class ContactSeries:
 
     Attributes:
         source: what said it.
-        given: (n,) weighted mean height of the contact that the image was solved with [m], NaN = none.
+        given: (n,) weighted mean height of the contact that the image was solved with, live of the one that was
+            published for it [m], NaN = none.
         truth: (n,) height of the pressure centre of the measured force [m], NaN where it is not known.
         touching: (n,) whether object and jaw were said to touch once the image was solved; None when nobody says.
         status: (n,) the contact estimator's own word, "" for a contact that was given.

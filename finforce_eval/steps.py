@@ -73,11 +73,11 @@ class StepLog:
         self.residual[index] = solution.residual
         self.contacts.after(index, self.estimator.surface(), solution)
         if solution.trusted:
-            self._keep(index, solution)
+            self._keep(index, solution, contact)
         else:
             self.message = solution.message
 
-    def _keep(self, index: int, solution: Any) -> None:
+    def _keep(self, index: int, solution: Any, contact: Contact | None) -> None:
         """Keep a trusted estimate."""
         self.force[index] = solution.force
         self.place[index] = solution.contact_place
@@ -86,10 +86,11 @@ class StepLog:
         # two per cent: the surface is copied now and then, not on every frame of a rising force
         if self.phases.scored[index] and magnitude > 1.02 * self.largest:
             self.largest = magnitude
-            self.snapshot = self._picture(index, solution)
+            self.snapshot = self._picture(index, solution, contact)
 
-    def _picture(self, index: int, solution: Any) -> Snapshot:
-        """Keep the jaw as it is now."""
+    def _picture(self, index: int, solution: Any, contact: Contact | None) -> Snapshot:
+        """Keep the jaw and the object as they are now."""
+        known = contact is not None and contact.outline is not None
         return Snapshot(
             stamp=int(self.track.stamps[index]),
             surface0=self.surface0,
@@ -100,6 +101,7 @@ class StepLog:
             used=np.array(solution.keypoints_used),
             contact_point=np.array(solution.contact_point),
             force=np.array(solution.force),
+            outline=contact.outline.placed() if known else (),
         )
 
     def result(self, truth: NDArray[np.float64]) -> CaseResult:
