@@ -42,7 +42,8 @@ def draw_jaw(snapshot: Snapshot, title: str) -> Any:
         snapshot: the jaw at one instant.
         title: what is shown.
     """
-    size = 1e3 * np.ptp(np.r_[snapshot.surface0, snapshot.surface], axis=0)[list(SIDE)]
+    bodies = [snapshot.surface0[:, SIDE], snapshot.surface[:, SIDE], *snapshot.outline]
+    size = 1e3 * np.ptp(np.concatenate(bodies), axis=0)
     width, height = 6.0 * (size + 30) / (size + 30).max()
     figure = new_figure(max(width, 3.0) + 2.6, height + 1.0)
     axes = figure.subplots()
