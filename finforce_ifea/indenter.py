@@ -30,9 +30,10 @@ class ShapeRange:
 
 
 class Indenter(Protocol):
-    """A rigid object, endless along y."""
+    """A rigid object, endless along y; one with corners may rock between them."""
 
     shape_range: ShapeRange
+    has_corners: bool
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, place: NDArray) -> PenaltyContact:
         """Returns the contact with points (p, 3) [m] at a place (3,); `by_shape` is the derivative by place[SHAPE]."""
@@ -54,6 +55,7 @@ class RoundIndenter:
     shape_range: ShapeRange = ShapeRange(
         low=float(np.log(3e-3)), high=float(np.log(0.2)), largest_change=0.15, settled_change=5e-2
     )
+    has_corners: bool = False
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, place: NDArray) -> PenaltyContact:
         """See `Indenter`; a larger radius moves the axis away, so that the depth stays."""
@@ -77,6 +79,7 @@ class OutlineIndenter:
     """A known outline: place (depth [m], tilt [rad], height of its origin [m]); depth 0 touches without tilt."""
 
     shape_range = ShapeRange(low=-1.0, high=1.0, largest_change=0.03, settled_change=5e-3)
+    has_corners = True
 
     def __init__(self, polygons: tuple[NDArray, ...]) -> None:
         """Builds the distance field of the polygons (n, 2) [m]; raises ContactError for one that is too small."""

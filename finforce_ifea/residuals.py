@@ -98,9 +98,7 @@ def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
         r[k, 0] = measured[k, 0] - positions[k, 0] - gain[0] * off - modes[k, 0, 0] * below
         r[k, 1] = measured[k, 2] - positions[k, 2] - gain[1] * off - modes[k, 1, 0] * below
         r0, r1 = r[k, 0], r[k, 1]
-        for a in range(3):
-            r[k, 0] += modes[k, 0, a] * moved[a]
-            r[k, 1] += modes[k, 1, a] * moved[a]
+        r[k] += (modes[k] * moved).sum(axis=1)
         h0, h1 = modes[k, 0, 0], modes[k, 1, 0]
         square = off * off / (width_variance + bias[k])
         square += _square_distance(r0, r1, h0, h1, noise, bias[k], depth_variance)

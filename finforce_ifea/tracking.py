@@ -99,7 +99,8 @@ class PlaceTracker:
             update = self._update_place(data, forecast)
             aim = self._bound(update.place, place, share)
             # between two corners of an object the linearisation changes its mind: meet in the middle
-            share *= 0.5 if last[1:] @ (aim - place)[1:] < 0 else 1.0
+            rocks = self.contact.indenter.has_corners and last[1:] @ (aim - place)[1:] < 0
+            share *= 0.5 if rocks else 1.0
             missing = update.place - aim if share > _UNDECIDED else np.zeros(3)
             last, moved, place = aim - place, self._reachable(aim) - mechanical, aim
             q = q + limit_step(self.contact.model, state.modes @ moved)
