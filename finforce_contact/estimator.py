@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_contact.checks import check_stamp, check_wrench
 from finforce_contact.closest import ClosestLocalizer
 from finforce_contact.enclosure import surrounds
 from finforce_contact.errors import PoseError
@@ -21,8 +22,8 @@ from finforce_contact.poses import check_pose, invert_pose
 from finforce_contact.rest import RestWatch
 from finforce_contact.section import Section, SectionKeeper
 from finforce_contact.settings import ContactSettings
-from finforce_contact.touch import TouchBelief
-from finforce_ifea.errors import ContactError
+from finforce_contact.touch import SURELY_BENT, TouchBelief, describe_conflict
+from finforce_ifea.errors import ObservationError
 from finforce_ifea.jaw import Jaw
 from finforce_ifea.outline import ObjectOutline
 
@@ -32,13 +33,13 @@ __all__ = ["ContactEstimate", "ContactEstimator"]
 _LEVER = 0.03
 # Far from contact the place may be off by this [m] before it is looked for anew.
 _FAR_STILL = 0.3e-3
-# A surface that gave way by more [m] is surely bent.
-_BENT = 1e-3
 # A surface that moved by less since its rest [m] is that of a solver that has not begun.
 _AT_REST = 1e-7
 _JAW_SAMPLES = 100
 _SURROUNDED = 0.5
 _STILL_FORCE = 0.01
+# An object with its origin farther off [m] is in nobody's reach.
+_NOWHERE = 1.0
 _REASONS = ("solved", "apart", "still", "no_object", "no_pose", "surrounded", "beside", "late pose", "odd pose")
 
 
@@ -138,7 +139,7 @@ class ContactEstimator:
             camera: (3,) [m], the camera's place in the jaw frame; given, a pose that puts the object around it is none.
 
         Raises:
-            PoseError: The pose or its covariance is none, or the object would surround the camera.
+            PoseError: The stamp, the pose or its covariance is none, or the object would surround the camera.
         """
         T = check_pose(T_jaw_object, "T_jaw_object")
         watched = camera is not None and self._mesh is not None
@@ -161,9 +162,11 @@ class ContactEstimator:
         Raises:
             MeshError: The surface is not that of the jaw's mesh.
             ContactError: The wrench is not finite.
+            ObservationError: The stamp is not finite.
         """
         surface = self.face.mesh.nodes if surface is None else self.face.check_surface(surface)
-        wrench = None if wrench is None else _check_wrench(*wrench)
+        wrench = None if wrench is None else check_wrench(wrench)
+        check_stamp(stamp, "image", ObservationError)
         if self._mesh is None:
             return self._give_up(stamp, "no_object", "no object mesh: load one, or give the contact's height")
         if self._poses.stamp is None:
@@ -171,6 +174,9 @@ class ContactEstimator:
         age = min(stamp - self._poses.believed, stamp - self._rest.ended)
         if not self._rest.resting and age > self.settings.pose_timeout:
             message = f"the last pose of {self._mesh.name} is {age:.1f} s old, expected one every second"
+            return self._give_up(stamp, "no_pose", message)
+        if age < -self.settings.pose_timeout:
+            message = f"the last pose of {self._mesh.name} lies {-age:.1f} s ahead; reset after time has jumped back"
             return self._give_up(stamp, "no_pose", message)
         pose = self._poses.at(self._poses.stamp if self._rest.resting else stamp)
         section = self._sections.at(pose.T)
@@ -185,7 +191,7 @@ class ContactEstimator:
                 message = f"this pose puts {self._mesh.name} around the jaw: check its pose, mesh and unit"
                 return self._give_up(stamp, "no_pose", message, "surrounded")
             self._solved, self._place = scene, self._localizer.locate(scene)
-            if self._place is None:
+            if self._place is None or np.abs(scene.section.origin).max() > _NOWHERE:
                 message = f"{self._mesh.name} does not stand before the inner surface"
                 return self._give_up(stamp, "apart", message, "beside")
             self._rows = _points_of(self._place, self.jaw)
@@ -199,7 +205,7 @@ class ContactEstimator:
     def _find_reason_to_skip(self, scene: Scene) -> str:
         """Returns why the last place still holds, empty when it does not."""
         before = self._solved
-        if before is None or self._place is None:
+        if before is None or self._place is None or not scene.section.polygons:
             return ""
         moved = np.abs(scene.T - before.T)
         moved[:3, :3] *= _LEVER
@@ -238,13 +244,12 @@ class ContactEstimator:
             self._belief.set(place.touching)
             return ""
         stddev = float(np.hypot(pose.stddev[0], settings.pose_bias))
-        if place.gap <= settings.reach + 3.0 * stddev:
-            self._belief.update(place.bend - place.gap, stddev, place.bend if self._is_live(scene) else None)
-            return ""
-        self._belief.set(False)
-        if place.bend < _BENT:
-            return ""
-        return f"the jaw is bent, but {self._mesh.name} is {1e3 * place.gap:.1f} mm away: is its pose right?"
+        slack, live = settings.reach + 3.0 * stddev, self._is_live(scene)
+        if place.gap > slack or (live and place.gap < -slack and place.bend < SURELY_BENT):
+            self._belief.set(False)
+            return describe_conflict(self._mesh.name, place.gap, place.bend)
+        self._belief.update(place.bend - place.gap, stddev, place.bend if live else None)
+        return ""
 
     def _report(self, stamp: float, pose: FilteredPose, scene: Scene, skipped: str, message: str) -> ContactEstimate:
         """Returns the estimate of an image."""
@@ -289,11 +294,3 @@ def _points_of(place: Place, jaw: Jaw) -> "_RowPoints":
     points[:, 0], points[:, 2] = jaw.inner_face_x, heights
     candidates = np.abs(jaw.candidates[:, 2] - heights[:, None]).argmin(axis=1)
     return _RowPoints(points=points, candidates=candidates, weights=place.rows.weights)
-
-
-def _check_wrench(force: NDArray, torque: NDArray) -> tuple[NDArray, NDArray]:
-    """Returns a wrench as floats after having refused what is none."""
-    force, torque = np.asarray(force, float), np.asarray(torque, float)
-    if force.shape != (3,) or torque.shape != (3,) or not np.isfinite(force + torque).all():
-        raise ContactError(f"wrench of force {force} and torque {torque}, expected three finite numbers each")
-    return force, torque

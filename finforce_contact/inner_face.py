@@ -6,12 +6,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from finforce_contact.checks import to_floats
 from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw import Jaw
 from finforce_ifea.mesh import VolumeMesh
 
 _SPACING = 0.5e-3
 _ON_FACE = 1e-4
+# No jaw bends by more than this share of its length.
+_MOST_BENT = 0.6
 # Where across the width the line is averaged, as shares of the half width.
 _ACROSS = np.array([-0.8, 0.0, 0.8])
 
@@ -40,9 +43,10 @@ class InnerFace:
         """Returns a deformed surface (n, 3) [m] as floats after having refused what does not belong to the mesh.
 
         Raises:
-            MeshError: Another number of vertices than the mesh has, or coordinates that are not finite.
+            MeshError: Another number of vertices than the mesh has, coordinates that are not finite, or vertices
+                farther from their places at rest than a jaw can bend.
         """
-        surface = np.ascontiguousarray(surface, dtype=float)
+        surface = np.ascontiguousarray(to_floats(surface, "a deformed surface", MeshError))
         if surface.shape != self.mesh.nodes.shape:
             raise MeshError(
                 f"a deformed surface of shape {surface.shape}, expected {self.mesh.nodes.shape}, the jaw's mesh; "
@@ -50,6 +54,12 @@ class InnerFace:
             )
         if not np.isfinite(surface).all():
             raise MeshError("a deformed surface with vertices that are not finite; drop it at its source")
+        moved, most = np.abs(surface - self.mesh.nodes).max(), _MOST_BENT * np.ptp(self.mesh.nodes, axis=0).max()
+        if moved > most:
+            raise MeshError(
+                f"a deformed surface with a vertex {1e3 * moved:.3g} mm from its place at rest, expected {1e3 * most:.0f} "
+                "mm at most; is it in metres, in the frame of the jaw and in the order of the mesh?"
+            )
         return surface
 
     def deform(self, surface: NDArray) -> NDArray:

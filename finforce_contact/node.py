@@ -85,17 +85,25 @@ class ContactEstimatorNode(Node):
         """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own."""
         began = perf_counter()
         with self._refusals((side,)):
+            self._check_ahead(message)
             self._send(side, began, take(side, message))
 
     def on_object(self, message: Any) -> None:
         """Use the object's pose that another node has found."""
         with self._refusals(self.parameters.sides):
+            self._check_ahead(message)
             self._hand_on(self.session.read_pose(message))
 
     async def on_image(self, take: Callable[[Any], StampedPose | None], image: Any) -> None:
         """Use the object's pose, if one is found with an image, while other callbacks go on."""
         with self._refusals(self.parameters.sides):
+            self._check_ahead(image)
             self._hand_on(await ros.run_aside(self, partial(take, image)))
+
+    def _check_ahead(self, message: Any) -> None:
+        """Refuse a stamp ahead of the clock before anything is kept that all later stamps would be behind."""
+        now = self._now()
+        self.gates[self.parameters.sides[0]].check_age(max(ros.nanoseconds(message.header.stamp), now), now)
 
     def _hand_on(self, found: StampedPose | None) -> None:
         """Give the jaws a pose of the object, if it was found."""

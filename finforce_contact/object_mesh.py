@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from finforce_contact.checks import to_floats
 from finforce_contact.decimation import decimate
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.mesh_repair import repair
@@ -18,6 +19,7 @@ UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
 FORMATS = (".stl", ".obj", ".ply", ".glb")
 SMALLEST, LARGEST = 0.005, 0.6  # [m], largest extent of what a gripper of 50 mm stroke holds by some part
 THINNEST = 1e-4  # [m], a mesh that is thinner is a sheet, and has no inside
+FARTHEST = 1.0  # [m], of a vertex from the origin of its frame; poses are of that origin, and turn about it
 TRIANGLE_BOUND = 2_000_000  # a closed mesh of so many takes some ten seconds, an open one a minute
 FILE_BOUND = 1 << 30  # [byte], more than any format needs for as many triangles
 _CROSSING_LIMIT = 30_000  # triangles; open3d compares all pairs, in a second for so many
@@ -36,7 +38,8 @@ def load_object_mesh(path: Path | str, *, unit: str = "m", triangle_limit: int =
         The mesh in metres, in the frame of the file.
 
     Raises:
-        ObjectMeshError: The file cannot be read, its size fits no graspable object, or it has no usable surface.
+        ObjectMeshError: The file cannot be read, its size fits no graspable object, it lies far from its origin, or it
+            has no usable surface.
         MissingDependencyError: trimesh, manifold3d or open3d is not installed.
     """
     path = Path(path)
@@ -57,8 +60,8 @@ def read_triangles(path: Path | str) -> tuple[NDArray, NDArray]:
     """
     path = Path(path)
     formats = " ".join(FORMATS)
-    if not path.is_file():
-        raise ObjectMeshError(f"{path}: there is no such file, expected a mesh ({formats}); check the path")
+    if not _is_file(path):
+        raise ObjectMeshError(f"{str(path)[:200]}: there is no such file, expected a mesh ({formats}); check the path")
     if path.suffix.lower() not in FORMATS:
         raise ObjectMeshError(f"{path.name}: got ending {path.suffix!r}, expected one of {formats}; convert the file")
     size = path.stat().st_size
@@ -75,6 +78,14 @@ def read_triangles(path: Path | str) -> tuple[NDArray, NDArray]:
     return np.array(mesh.vertices, dtype=float).reshape(-1, 3), np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
 
 
+def _is_file(path: Path) -> bool:
+    """Say whether a file can be looked at; a name that no file can have is none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def prepare_object_mesh(
     vertices: ArrayLike, triangles: ArrayLike, *, name: str = "object", triangle_limit: int = 20000
 ) -> ObjectMesh:
@@ -87,13 +98,15 @@ def prepare_object_mesh(
         triangle_limit: the most triangles that are kept.
 
     Raises:
-        ObjectMeshError: The arrays are no mesh, its size fits no graspable object, or it has no body.
+        ObjectMeshError: The arrays are no mesh, its size fits no graspable object, it lies far from its origin, or it
+            has no body.
         MissingDependencyError: manifold3d or open3d is not installed.
     """
-    vertices, triangles = np.asarray(vertices, dtype=float), np.asarray(triangles)
+    vertices, triangles = to_floats(vertices, f"{name}: vertices", ObjectMeshError), np.asarray(triangles)
     _check_triangles(vertices, triangles, name)
     _check_size(vertices, triangles, name, "m")
-    if triangle_limit < 100:
+    _check_origin(vertices, triangles, name)
+    if not triangle_limit >= 100:
         raise ObjectMeshError(f"{name}: got triangle_limit {triangle_limit}, expected 100 at least; 20000 is usual")
     raw = ObjectMesh(vertices=vertices, triangles=triangles, watertight=False, name=name)
     mesh = repair(raw.with_triangles(vertices, triangles))
@@ -135,6 +148,16 @@ def _check_size(vertices: NDArray, triangles: NDArray, name: str, unit: str) -> 
         f"{name}: got a largest extent of {extent * UNITS[unit] * 1e3:.6g} mm in unit {unit!r}, "
         f"expected {SMALLEST * 1e3:g} to {LARGEST * 1e3:g} mm for a graspable object; {advice}"
     )
+
+
+def _check_origin(vertices: NDArray, triangles: NDArray, name: str) -> None:
+    """Refuse an object that lies far from the origin of its own frame [m]."""
+    away = float(np.linalg.norm(vertices[triangles], axis=-1).max())
+    if away > FARTHEST:
+        raise ObjectMeshError(
+            f"{name}: got vertices up to {away:.3g} m from the origin of their frame, expected {FARTHEST:g} m at most; "
+            "move the origin into the object, and give its poses for that origin"
+        )
 
 
 def _sizes_by_unit(extent: float) -> dict[str, float]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_contact.checks import check_stamp, to_floats
 from finforce_contact.errors import PoseError
 from finforce_contact.poses import check_pose, move_pose, step_between
 from finforce_contact.settings import ContactSettings
@@ -71,8 +72,9 @@ class PoseFilter:
             covariance: (6, 6) of x, y, z [m] and the rotations about the jaw's axes [rad]; None: learn it.
 
         Raises:
-            PoseError: The pose is none, or the covariance has another shape or no positive diagonal.
+            PoseError: Stamp or pose is none, or the covariance has another shape or no positive diagonal.
         """
+        check_stamp(stamp, "T_jaw_object", PoseError)
         T = check_pose(T, "T_jaw_object")
         noise = self._noise(covariance)
         if self.stamp is not None and stamp <= self.stamp:
@@ -113,7 +115,7 @@ class PoseFilter:
         """Returns the variances (6,) of a pose; stated ones are raised when the poses scatter more."""
         if covariance is None:
             return self._assumed * self._scale
-        stated = np.asarray(covariance, float)
+        stated = to_floats(covariance, "a pose covariance", PoseError)
         if stated.shape != (6, 6) or not np.isfinite(stated).all() or not (np.diag(stated) > 0).all():
             raise PoseError(
                 f"a pose covariance {stated.tolist()}, expected (6, 6) with finite numbers and variances above zero; "

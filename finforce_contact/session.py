@@ -84,7 +84,12 @@ class ContactSession:
             view = self._camera.view()
         evidence = collect_evidence(view.depth, view.mask, view.camera)
         found = reconstruct(evidence, load_generated(parameters), parameters.reconstruct_method)
-        self._set_object(found.mesh, (found.T_camera_object,))
+        before = self.mesh
+        try:
+            self._set_object(found.mesh, (found.T_camera_object,))
+        except FinforceError:
+            self._set_object(before)
+            raise
         return f"{describe_mesh(found.mesh)} Found by the method {found.method}."
 
     def _set_object(self, mesh: ObjectMesh | None, guesses: tuple[NDArray, ...] = ()) -> None:

@@ -4,6 +4,8 @@ from math import erf, exp, pi, sqrt
 
 from finforce_contact.settings import ContactSettings
 
+# A surface that gave way by more [m] is surely bent.
+SURELY_BENT = 1e-3
 _NEGLIGIBLE = 1e-300
 # Images over which the restlessness of the surface before contact is learnt, and how much of it is believed.
 _NOISE_MEMORY = 150.0
@@ -11,7 +13,7 @@ _MOST_NOISE = 3.0
 # Images over which a constant error of the pose along x is learnt: from contacts bent by this much [m], and from
 # objects that stand in a jaw which is not bent.
 _BIAS_MEMORY = 60.0
-_SURELY_BENT = 0.3e-3
+_TEACHING_BEND = 0.3e-3
 
 
 def contact_probability(depth: float, depth_stddev: float, bend: float, bend_stddev: float) -> float:
@@ -38,6 +40,21 @@ def contact_probability(depth: float, depth_stddev: float, bend: float, bend_std
     if total > _NEGLIGIBLE:
         return touches / total
     return 1.0 if bend > 0.5 * abs(depth) or depth > 0.0 else 0.0
+
+
+def describe_conflict(name: str, gap: float, bend: float) -> str:
+    """Returns how pose and bend contradict each other, empty where they do not.
+
+    Args:
+        name: of the object.
+        gap: from the deformed surface to the object along x as the pose has it, far beyond its errors [m].
+        bend: of the surface where the object is nearest [m].
+    """
+    if gap < 0.0:
+        return f"this pose puts {name} {-1e3 * gap:.1f} mm into a jaw that is bent by {1e3 * bend:.1f} mm: is it right?"
+    if bend < SURELY_BENT:
+        return ""
+    return f"the jaw is bent, but {name} is {1e3 * gap:.1f} mm away: is its pose right?"
 
 
 class TouchBelief:
@@ -89,7 +106,7 @@ class TouchBelief:
         """Learns how deep [m] the pose has an object that is as deep as the jaw is bent, and the noise of a rest."""
         error = depth - self._bias - bend
         plausible = abs(error) < 3.0 * depth_stddev
-        if plausible and (error > 0.0 or self.touching) and (not self.touching or bend > _SURELY_BENT):
+        if plausible and (error > 0.0 or self.touching) and (not self.touching or bend > _TEACHING_BEND):
             self._bias += error / _BIAS_MEMORY
         if self.touching:
             return

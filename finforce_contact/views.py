@@ -79,9 +79,9 @@ class MeshView:
         at_row, at_column = np.divmod(np.flatnonzero(hit), rays.shape[1])
         pixels = np.column_stack((columns.start + step * at_column, rows.start + step * at_row))
         points = rays.reshape(-1, 3)[hit] * distance[hit, None]
-        return View(
-            depth=depth, points=points, normals=_towards_camera(normals[hit] @ T[:3, :3].T, points), pixels=pixels
-        )
+        # normals of a stretched mesh go with the inverse
+        facing = _towards_camera(normals[hit] @ np.linalg.inv(T[:3, :3]), points)
+        return View(depth=depth, points=points, normals=facing, pixels=pixels)
 
     def render_back(self, T_camera_object: NDArray, camera: CameraIntrinsics, step: int = 1) -> NDArray:
         """Return the depths (ceil(h / step), ceil(w / step)) [m] at which the rays leave the mesh, NaN beside it."""

@@ -5,9 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from finforce_ifea.errors import ObservationError
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_ifea.observation import Contact
 from finforce_ifea.outline import ObjectOutline
+
+# Rows with which an image is still solved in time; a contact has a row every few millimetres, an outline some hundred.
+MOST_ROWS, MOST_CORNERS = 500, 5000
 
 
 class ContactFeed:
@@ -36,20 +40,22 @@ class ContactFeed:
         """Keep the contact of a sensor_msgs/PointCloud2; one that cannot be read leaves none.
 
         Raises:
-            ObservationError: the frame, the height, the fields or the buffer are wrong.
+            ObservationError: the frame, the height, the fields, the buffer or the number of rows are wrong.
             ContactError: a coordinate or a weight is not finite.
         """
         self._contact, self._stamp = None, stamp
+        _check_size(cloud, MOST_ROWS, "the contact")
         self._contact = contact_from_cloud(cloud, self._frame, free=self._free)
 
     def take_outline(self, cloud: Any, stamp: int) -> None:
         """Keep the object's outline of a sensor_msgs/PointCloud2; one that cannot be read leaves none.
 
         Raises:
-            ObservationError: the frame, the height, the fields or the buffer are wrong.
+            ObservationError: the frame, the height, the fields, the buffer or the number of rows are wrong.
             ContactError: the corners are no outline.
         """
         self._outline, self._outline_stamp = None, stamp
+        _check_size(cloud, MOST_CORNERS, "the outline")
         self._outline = outline_from_cloud(cloud, self._frame, self._cut)
         self._cut = self._outline or self._cut
 
@@ -67,3 +73,13 @@ class ContactFeed:
         if outline is not self._contact.outline:
             self._contact = replace(self._contact, outline=outline)
         return self._contact
+
+
+def _check_size(cloud: Any, most: int, what: str) -> None:
+    """Refuse a cloud of more than `most` rows, or with fields of several numbers each."""
+    rows = cloud.width * cloud.height
+    if rows > most:
+        raise ObservationError(f"{what} came with {rows} rows; expected {most} at most")
+    wide = [field.name for field in cloud.fields if field.count > 1]
+    if wide:
+        raise ObservationError(f"{what} came with several numbers in the field {', '.join(wide)}; expected one each")

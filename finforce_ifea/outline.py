@@ -38,8 +38,9 @@ class ObjectOutline:
         numbers = np.concatenate([p.ravel() for p in self.polygons] + [np.ravel(self.origin), [self.tilt]])
         if np.shape(self.origin) != (2,) or not np.isfinite(numbers).all() or np.abs(numbers[:-1]).max() > _LARGEST:
             raise ContactError("outline with coordinates that are not finite or beyond a metre, expected metres")
-        if np.shape(self.stddev) != (3,) or not (np.asarray(self.stddev) > 0).all():
-            raise ContactError(f"outline with standard deviations {self.stddev}, expected three above zero")
+        spread = np.asarray(self.stddev)
+        if spread.shape != (3,) or not (np.isfinite(spread) & (spread > 0)).all():
+            raise ContactError(f"outline with standard deviations {self.stddev}, expected three finite ones above zero")
 
     def placed(self) -> tuple[NDArray, ...]:
         """Returns the polygons (n, 2) [m] in x and z of the jaw frame."""

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -23,6 +25,12 @@ def pose_at(z, rotation=None):
 @pytest.fixture(scope="module")
 def cube():
     return MeshView(build_object("cube"))
+
+
+def turned_cube():
+    """The cube with an edge, along y, towards the camera."""
+    mesh = build_object("cube")
+    return replace(mesh, vertices=mesh.vertices @ Rotation.from_euler("y", np.pi / 4.0).as_matrix().T)
 
 
 def test_front_of_a_cube_is_at_half_its_edge_before_its_middle(cube):
@@ -58,8 +66,11 @@ def test_scale_in_the_pose_is_a_larger_mesh(cube):
     scaled = pose_at(0.3) @ np.diag([1.5, 1.5, 0.5, 1.0])
     view = cube.render(scaled, CAMERA)
     np.testing.assert_allclose(view.points[:, 2], 0.3 - 0.015, atol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(view.normals, axis=1), 1.0, atol=1e-6)
     assert np.ptp(view.points[:, 0]) > 0.085
+    # a stretched slope: (1, 1) / sqrt 2 becomes (1 / 1.5, 1 / 0.5), to unit length
+    sloped = MeshView(turned_cube()).render(scaled, CAMERA)
+    slopes = np.abs(sloped.normals[:, [0, 2]])
+    np.testing.assert_allclose(slopes, np.tile([1 / 3, 1.0] / np.hypot(1 / 3, 1.0), (len(slopes), 1)), atol=1e-5)
 
 
 def test_rays_leave_a_cube_at_its_back(cube):
@@ -80,6 +91,7 @@ def test_mesh_behind_the_camera_or_beside_the_image_is_not_seen(cube):
 def test_camera_inside_a_mesh_sees_its_inner_side(cube):
     view = cube.render(pose_at(0.0), CAMERA)
     assert np.isfinite(view.depth).all()
+    assert (np.einsum("ij,ij->i", view.normals, view.points) < 0.0).all()
 
 
 def test_closest_points_lie_on_the_surface(cube):
