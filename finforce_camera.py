@@ -12,6 +12,7 @@ from finforce_ifea.errors import FinforceError
 
 DEPTH_TYPES = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}
 MILLIMETRE = 1e-3  # the unit of 16-bit depth images (REP 118)
+FARTHEST_CENTRE = 10.0  # of a principal point outside its image, in sizes of that image; a cut-out has one
 UNDISTORTION_STEPS = 50
 UNDISTORTION_TOLERANCE = 1e-10  # of a ray with z = 1
 
@@ -38,7 +39,8 @@ class CameraIntrinsics:
         distortion: (5,) plumb-bob coefficients k1, k2, p1, p2, k3.
 
     Raises:
-        IntrinsicsError: a size or a focal length is not positive, or a number is not finite.
+        IntrinsicsError: a size or a focal length is not positive, a number is not finite, or the principal point is far
+            outside the image.
     """
 
     width: int
@@ -55,6 +57,11 @@ class CameraIntrinsics:
             raise IntrinsicsError(
                 f"intrinsics {self.width}x{self.height}, fx fy cx cy = {numbers.tolist()}: expected a positive size, "
                 "positive focal lengths and finite numbers [px]"
+            )
+        if abs(self.cx) > FARTHEST_CENTRE * self.width or abs(self.cy) > FARTHEST_CENTRE * self.height:
+            raise IntrinsicsError(
+                f"intrinsics {self.width}x{self.height}, cx cy = {numbers[2:].tolist()}: expected a principal point in "
+                "or near the image [px]"
             )
         distortion = np.asarray(self.distortion, dtype=float).ravel()
         if len(distortion) not in (0, 4, 5) or not np.isfinite(distortion).all():

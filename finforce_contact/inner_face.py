@@ -57,8 +57,8 @@ class InnerFace:
         moved, most = np.abs(surface - self.mesh.nodes).max(), _MOST_BENT * np.ptp(self.mesh.nodes, axis=0).max()
         if moved > most:
             raise MeshError(
-                f"a deformed surface with a vertex {1e3 * moved:.3g} mm from its place at rest, expected {1e3 * most:.0f} "
-                "mm at most; is it in metres, in the frame of the jaw and in the order of the mesh?"
+                f"a deformed surface with a vertex {1e3 * moved:.3g} mm from its place at rest, expected "
+                f"{1e3 * most:.0f} mm at most; is it in metres, in the frame of the jaw and in the order of the mesh?"
             )
         return surface
 

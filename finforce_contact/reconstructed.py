@@ -73,6 +73,6 @@ def check_agreement(score: ShapeScore) -> None:
     if score.overlap < LEAST_OVERLAP or not score.residual <= LARGEST_RESIDUAL:
         raise ReconstructionError(
             f"no placement of the mesh explains the image: {100.0 * score.overlap:.1f} % of its outline and the mask "
-            f"overlap, its surface is {1e3 * score.residual:.1f} mm off; expected {100.0 * LEAST_OVERLAP:.0f} % or more "
+            f"overlap, its surface {1e3 * score.residual:.1f} mm off; expected {100.0 * LEAST_OVERLAP:.0f} % or more "
             f"and {1e3 * LARGEST_RESIDUAL:.0f} mm or less. Is the mesh of this object, and the mask of it alone?"
         )

@@ -54,6 +54,8 @@ def outline_from_columns(columns: Mapping[str, NDArray], previous: ObjectOutline
     """
     if not len(columns["x"]):
         return None
+    if not all(np.isfinite(columns[name]).all() for name in COLUMNS):
+        raise ContactError("the outline has numbers that are not finite")
     now, cut = (np.stack([columns[a], columns[b]], axis=1).astype(float) for a, b in (("x", "z"), ("u", "v")))
     about_now, about_cut = now - now.mean(0), cut - cut.mean(0)
     (xx, xz), (zx, zz) = about_cut.T @ about_now
