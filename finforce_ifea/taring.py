@@ -20,6 +20,10 @@ _DELAY_FRAMES = 15
 _FEWEST_FRAMES = 5
 _LEAST_SEEN = 0.5
 _LEAST_NEAR = 0.75
+# At rest the nearer three quarters of the key points are so near to their places [m]: in one frame, and on average.
+_NEARER = 0.75
+_REST_FRAMES = 10
+_REST_REACH, _REST_REACH_MEAN = 1e-3, 0.45e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -153,8 +157,24 @@ class TareKeeper:
             raise UnderLoadError(f"cannot tare: the load is changing ({sigma:.1f} standard deviations)")
 
     def is_at_rest(self, points: NDArray) -> bool:
-        """Whether key points (K, 3) [m] of one frame are where the tared, unloaded jaw has them."""
-        tare = compute_tare([points, points], self._keypoints + self.tare.offsets)
-        return (
-            self.tared and tare is not None and self._significance(tare, self._settings.offset_stddev) < _LOADED_SIGMA
-        )
+        """Whether key points (K, 3) [m] of one frame are where the tared, unloaded jaw has them.
+
+        Neither the frame nor the average of the last ones may be bent, nor look loaded.
+        """
+        if not self.tared:
+            return False
+        rest = self._keypoints + self.tare.offsets
+        recent = np.stack(list(self._frames)[-_REST_FRAMES:] or [points]) - rest
+        seen = np.isfinite(recent[:, :, 0]).any(axis=0)
+        mean = np.nanmean(recent[:, seen], axis=0)
+        if _measure_bend(points - rest) > _REST_REACH or _measure_bend(mean) > _REST_REACH_MEAN:
+            return False
+        tare = compute_tare([points, points], rest)
+        return tare is not None and self._significance(tare, self._settings.offset_stddev) < _LOADED_SIGMA
+
+
+def _measure_bend(deviations: NDArray) -> float:
+    """Returns the root mean square [m] of the nearer deviations (K, 3) [m], infinite when there are too few."""
+    ways = np.sort(np.linalg.norm(deviations[np.isfinite(deviations[:, 0])], axis=1))
+    nearer = ways[: int(np.ceil(_NEARER * len(ways)))]
+    return float(np.sqrt(np.mean(nearer**2))) if len(nearer) >= 3 else np.inf
