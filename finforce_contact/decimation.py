@@ -4,11 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from finforce_contact.errors import ObjectMeshError
 from finforce_contact.optional import import_open3d
 from finforce_contact.solids import solid_from_triangles, to_manifold, triangles_of_solid
 from finforce_contact.triangles import ObjectMesh
 
 DEVIATION_LIMIT = 1e-4  # [m], a fifth of the error of a good pose; more is said in the note
+RUIN = 0.1  # [-], deviation of the largest extent; what deviates by more is another object
 _FIRST_TOLERANCE = 1e-5  # [m]
 _SAMPLES = 50_000  # points at which the deviation is measured
 
@@ -20,6 +22,7 @@ def decimate(mesh: ObjectMesh, triangle_limit: int) -> ObjectMesh:
     Heckbert 1997).
 
     Raises:
+        ObjectMeshError: So few triangles cannot be this object.
         MissingDependencyError: manifold3d or open3d is not installed.
     """
     solid = to_manifold(mesh)
@@ -72,7 +75,12 @@ def _simplify_within(solid, triangle_limit: int) -> tuple[NDArray, NDArray]:
 
 
 def _describe(mesh: ObjectMesh, thinned: tuple[NDArray, NDArray]) -> str:
-    deviation = measure_deviation(mesh, *thinned)
+    deviation = measure_deviation(mesh, *thinned) if len(thinned[1]) else np.inf
+    if deviation > RUIN * np.ptp(mesh.vertices, axis=0).max():
+        raise ObjectMeshError(
+            f"{mesh.name}: got {len(mesh.triangles)} triangles, of which {len(thinned[1])} are left that deviate by "
+            f"{deviation * 1e3:.1f} mm, expected one object of connected parts; remove fragments in a mesh editor"
+        )
     verdict = "" if deviation <= DEVIATION_LIMIT else ", more than contact should have: raise triangle_limit"
     return (
         f"Decimated from {len(mesh.triangles)} to {len(thinned[1])} triangles; "

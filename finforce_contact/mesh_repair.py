@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from finforce_contact.errors import ObjectMeshError
 from finforce_contact.loops import chain_loops
 from finforce_contact.optional import import_manifold3d, import_open3d
 from finforce_contact.solids import solid_from_triangles, triangles_of_solid
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 CRACK = 1e-5  # [m], vertices of an open mesh this close are one; below what contact can tell
 HOLE_SHARE = 0.1  # [-], radius of the holes that are filled, of the largest extent; an opening to grasp into is larger
+MOST_OPEN = 0.75  # [-], share of edges with one triangle only; a closed surface has none
 _GRID_BITS = 21  # three coordinates in one integer of 64 bits
 _MOST_BODIES = 1000  # beyond, the mesh is fragments and its bodies mean nothing
 
@@ -28,6 +30,7 @@ def repair(mesh: ObjectMesh) -> ObjectMesh:
     `watertight` of the result is what manifold3d says; a mesh that stays open is kept and noted.
 
     Raises:
+        ObjectMeshError: The triangles are fragments.
         MissingDependencyError: manifold3d is not installed, or the mesh is open and open3d is not.
     """
     mesh = merge_vertices(mesh)
@@ -57,7 +60,11 @@ def merge_vertices(mesh: ObjectMesh) -> ObjectMesh:
 
 
 def close(mesh: ObjectMesh) -> ObjectMesh:
-    """Return an open mesh with cracks merged, repeated triangles removed, in one sense, its small holes filled."""
+    """Return an open mesh with cracks merged, repeated triangles removed, in one sense, its small holes filled.
+
+    Raises:
+        ObjectMeshError: The triangles are fragments, of which hardly any have neighbours.
+    """
     open3d = import_open3d()
     geometry = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.triangles)
@@ -69,6 +76,12 @@ def close(mesh: ObjectMesh) -> ObjectMesh:
     triangles = np.asarray(geometry.triangles)
     note = f"Vertices within {CRACK * 1e3:g} mm were merged; {before - len(triangles)} of {before} triangles fell away."
     merged = mesh.with_triangles(np.asarray(geometry.vertices), triangles, note)
+    if len(triangles) > 1 and merged.edges.open_share > MOST_OPEN:
+        share = 100.0 * merged.edges.open_share
+        raise ObjectMeshError(
+            f"{mesh.name}: got {len(triangles)} triangles with no neighbour at {share:.0f} % of their edges, expected "
+            "a connected surface; merge its vertices in a mesh editor"
+        )
     if merged.edges.is_branching:
         note = "More than two triangles meet at an edge; their sense was left and holes were not filled."
         return replace(merged, notes=(*merged.notes, note))

@@ -32,6 +32,12 @@ class EdgeTable:
         return bool(np.bincount(self.of_triangles.ravel()).max(initial=0) > 2)
 
     @cached_property
+    def open_share(self) -> float:
+        """Share [-] of the edges that belong to one triangle only, 1 where no two triangles are neighbours."""
+        uses = np.bincount(self.of_triangles.ravel(), minlength=len(self.ends))
+        return float((uses == 1).mean()) if len(uses) else 0.0
+
+    @cached_property
     def is_consistent(self) -> bool:
         """Neighbours run along their common edge in opposite ways; holes do not matter."""
         return bool(np.abs(self.surplus).max(initial=0.0) <= 1.0)

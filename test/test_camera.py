@@ -126,7 +126,9 @@ def test_mask_is_refused_when_empty_of_another_size_or_without_depth():
     check_mask(np.ones((4, 5)), depth, least=1)
 
 
-@pytest.mark.parametrize("change", [{"fx": 0.0}, {"cy": np.nan}, {"width": 0}, {"distortion": np.zeros(8)}])
+@pytest.mark.parametrize(
+    "change", [{"fx": 0.0}, {"cy": np.nan}, {"width": 0}, {"distortion": np.zeros(8)}, {"cx": 1e9}, {"cy": -50.0}]
+)
 def test_impossible_intrinsics_are_refused(change):
     good = {"width": 4, "height": 3, "fx": 2.0, "fy": 2.0, "cx": 2.0, "cy": 1.5}
     CameraIntrinsics(**good)

@@ -123,6 +123,11 @@ def test_missing_file_and_folder_are_refused(tmp_path):
             load_object_mesh(path)
 
 
+def test_name_that_no_file_can_have_is_refused():
+    with pytest.raises(ObjectMeshError, match="no such file"):
+        load_object_mesh("x" * 5000 + ".stl")
+
+
 def test_raw_triangles_are_read_whatever_their_size(tmp_path):
     vertices, triangles = read_triangles(write(tmp_path, "raw.ply", fakes.box_triangles((3.0, 2.0, 1.0))))
     assert np.ptp(vertices, axis=0) == pytest.approx([3.0, 2.0, 1.0])
@@ -145,6 +150,9 @@ BOX = fakes.box_triangles((0.05, 0.05, 0.05))
         (BOX[0] * (1.0, 0.0, 0.0), BOX[1], "of 0 mm.2 in all, expected a surface"),
         (BOX[0] * (1.0, 1.0, 0.0), BOX[1], "sheet"),
         (BOX[0], np.array([[0, 0, 1], [2, 2, 1]]), "expected a surface"),
+        (BOX[0] + (1.2, 0.0, 0.0), BOX[1], "from the origin of their frame"),
+        ("abc", BOX[1], "expected an array of numbers"),
+        ([[0, 0, 0], [1]], BOX[1], "expected an array of numbers"),
     ],
 )
 def test_arrays_that_are_no_body_are_refused(vertices, triangles, problem):
@@ -173,7 +181,29 @@ def test_cracks_are_merged_and_wide_gaps_are_not():
     soup = vertices[triangles].reshape(-1, 3), np.arange(36).reshape(-1, 3)
     noise = np.random.default_rng(0).uniform(-1.0, 1.0, (36, 3))
     assert prepare_object_mesh(soup[0] + 2e-6 * noise, soup[1]).watertight
+    noise[6:] = 0.0
     assert not prepare_object_mesh(soup[0] + 5e-4 * noise, soup[1]).watertight
+
+
+def test_triangles_without_neighbours_are_refused():
+    vertices, triangles = fakes.sphere_triangles(0.03)
+    soup = vertices[triangles] + 3e-4 * np.random.default_rng(0).standard_normal((len(triangles), 3, 3))
+    with pytest.raises(ObjectMeshError, match="no neighbour at 100 % of their edges"):
+        prepare_object_mesh(soup.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
+    kept = np.random.default_rng(0).random(len(triangles)) < 0.7  # a scan full of holes is still an object
+    assert len(prepare_object_mesh(vertices, triangles[kept]).triangles)
+
+
+@pytest.mark.parametrize("limit", [100, 400])  # none is left of them, or hardly any
+def test_crumbs_that_decimation_swallows_are_refused(limit):
+    places = np.random.default_rng(0).uniform(-0.05, 0.05, (300, 1, 3))
+    corners, triangles = fakes.box_triangles((1e-3, 1e-3, 1e-3))
+    crumbs = (
+        (corners + places).reshape(-1, 3),
+        (triangles + len(corners) * np.arange(300)[:, None, None]).reshape(-1, 3),
+    )
+    with pytest.raises(ObjectMeshError, match="remove fragments"):
+        prepare_object_mesh(*crumbs, triangle_limit=limit)
 
 
 def test_inside_out_mesh_is_turned():

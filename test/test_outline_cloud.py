@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from finforce_ifea.contact_feed import ContactFeed
+from finforce_ifea.contact_feed import MOST_CORNERS, MOST_ROWS, ContactFeed
 from finforce_ifea.errors import ContactError, ObservationError
 from finforce_ifea.outline import ObjectOutline
 from finforce_ifea.outline_cloud import columns_from_outline, outline_from_columns
@@ -132,6 +132,46 @@ def test_an_outline_that_cannot_be_read_leaves_none(feed):
     del broken["u"]
     with pytest.raises(ObservationError, match="no field u"):
         feed.take_outline(cloud(broken), 102 * MS)
+
+
+@pytest.mark.parametrize("name", ["x", "stddev_z"])
+def test_an_outline_with_infinite_numbers_is_refused(name):
+    columns = columns_from_outline(outline())
+    columns[name] = np.full_like(columns[name], np.inf)
+    with pytest.raises(ContactError, match="not finite"):
+        outline_from_columns(columns)
+
+
+def test_a_polygon_without_a_number_is_refused():
+    columns = columns_from_outline(outline())
+    columns["polygon"] = np.full(len(columns["x"]), np.nan, np.float32)
+    with pytest.raises(ContactError, match="not finite"):
+        outline_from_columns(columns)
+
+
+def test_clouds_that_cannot_be_solved_in_time_are_refused(feed):
+    feed.take(contact_cloud(rows=MOST_ROWS), 100 * MS)
+    with pytest.raises(ObservationError, match=f"expected {MOST_ROWS} at most"):
+        feed.take(contact_cloud(rows=MOST_ROWS + 1), 101 * MS)
+    assert feed.at(101 * MS) is None
+    angle = np.linspace(0.0, 6.28, MOST_CORNERS + 1)
+    circle = 0.0125 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    with pytest.raises(ObservationError, match=f"expected {MOST_CORNERS} at most"):
+        feed.take_outline(outline_message(polygons=(circle,)), 102 * MS)
+
+
+def test_fields_of_several_numbers_are_refused(feed):
+    feed.take(contact_cloud(), 100 * MS)
+    wide = cloud(
+        {"x": np.full((1, 3), 0.014, np.float32), "y": np.zeros(1, np.float32), "z": np.full(1, 0.04, np.float32)}
+    )
+    with pytest.raises(ObservationError, match="several numbers in the field x"):
+        feed.take(wide, 101 * MS)
+    assert feed.at(101 * MS) is None
+    columns = columns_from_outline(outline())
+    columns["u"] = np.stack([columns["u"]] * 2, axis=1)
+    with pytest.raises(ObservationError, match="several numbers in the field u"):
+        feed.take_outline(cloud(columns), 102 * MS)
 
 
 def test_the_same_polygons_serve_on_after_an_interruption(feed):
