@@ -17,6 +17,7 @@ from finforce_ifea.penalty import PenaltyContact, press_cylinder, press_field
 from finforce_ifea.settings import EstimatorSettings
 
 DEPTH, SHAPE, HEIGHT = 0, 1, 2
+_OTHER_SIZE = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +94,11 @@ class OutlineIndenter:
         return len(outline.polygons) == len(self.polygons) and all(
             np.array_equal(a, b) for a, b in zip(outline.polygons, self.polygons, strict=True)
         )
+
+    def resembles(self, other: "OutlineIndenter") -> bool:
+        """Whether another outline has about the size of this one, as two cuts of one object do."""
+        sizes = [np.ptp(np.concatenate(item.polygons), axis=0) for item in (self, other)]
+        return bool((np.abs(np.log(sizes[0] / sizes[1])) < np.log(_OTHER_SIZE)).all())
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, place: NDArray) -> PenaltyContact:
         """See `Indenter`."""

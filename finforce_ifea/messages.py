@@ -67,7 +67,7 @@ def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:
     weights = columns.get("weight", np.ones(len(points))).astype(np.float64)
     if not (np.isfinite(points).all() and np.isfinite(weights).all()):
         raise ContactError("the contact has coordinates or weights that are not finite")
-    touching = bool(np.any(columns["touching"])) if "touching" in columns else None
+    touching = bool((columns["touching"] == 1).any()) if "touching" in columns else None
     return Contact(points=points, weights=weights, touching=touching if len(points) else False, free=free)
 
 

@@ -159,7 +159,8 @@ class PlaceTracker:
         self._prior, self._prior_variance = expected.mean, expected.variance
         self.contact.indenter = after = expected.indenter
         self._given = self._stiffness = None
-        if not isinstance(before, OutlineIndenter):
+        away = abs(self._slow[1] - expected.mean[1]) > _FARTHEST_HEIGHT * self.settings.height_stddev
+        if away or not isinstance(before, OutlineIndenter) or not after.resembles(before):
             self._begin()
         elif after is not before:
             change = after.field.front - before.field.front

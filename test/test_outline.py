@@ -1,5 +1,7 @@
 """Claims about known outlines: their distance field, their contact forces, and forces found with them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from estimator_fakes import make_estimator
@@ -233,3 +235,20 @@ def test_outline_smaller_than_the_field_resolves_is_refused():
 def test_outline_is_placed_by_its_origin_and_its_tilt_turns_x_towards_z():
     placed = outline((np.array([[0.01, 0.0], [0.0, 0.01], [-0.01, 0.0]]),), 0.04, tilt=np.pi / 2).placed()[0]
     np.testing.assert_allclose(placed, [[0.03, 0.05], [0.02, 0.04], [0.03, 0.03]], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("polygons", "height"), [(SHAPES["box"], 0.5), (box(0.2, 0.25), 0.040)], ids=["elsewhere", "too large"]
+)
+def test_wrong_first_outline_is_forgotten_when_the_right_one_comes(polygons, height):
+    estimator = make_estimator()
+    results = press_shape("box", 0.040)
+    right = contact_with(SHAPES["box"], 0.040)
+    wrong = replace(right, outline=outline(polygons, height))
+    errors = []
+    for i, (observation, force) in enumerate(observe(results)):
+        solution = estimator.update(observation, wrong if i < 80 else right)
+        if force is not None and i > 150:
+            errors.append(np.linalg.norm(solution.force) - force if solution.trusted else force)
+    assert len(errors) == 30
+    assert np.mean(np.abs(errors)) < 0.1
