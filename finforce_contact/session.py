@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from finforce_camera import ImageError
 from finforce_contact.camera_feed import CameraFeed, StampedPose
+from finforce_contact.errors import ReconstructionError
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.jaw_contact import SECOND, JawContact, TimedEstimate
 from finforce_contact.messages import pose_from_message, stamp_of, surface_from_cloud, wrench_from_message
@@ -83,7 +84,13 @@ class ContactSession:
         with self._camera_lock:
             view = self._camera.view()
         evidence = collect_evidence(view.depth, view.mask, view.camera)
-        found = reconstruct(evidence, load_generated(parameters), parameters.reconstruct_method)
+        generated = load_generated(parameters)
+        try:
+            found = reconstruct(evidence, generated, parameters.reconstruct_method)
+        except FinforceError:
+            raise
+        except (RuntimeError, ValueError, ArithmeticError) as error:  # of the libraries behind it
+            raise ReconstructionError(f"the mesh could not be reconstructed: {error}") from error
         before = self.mesh
         try:
             self._set_object(found.mesh, (found.T_camera_object,))
