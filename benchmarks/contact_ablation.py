@@ -14,9 +14,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from finforce_eval.bench import describe_machine
+from finforce_eval.bench import write_figures
 from finforce_eval.cli import add_jaw_options
-from finforce_eval.commands import Setup, make_setup, write_json
+from finforce_eval.commands import Setup, make_setup
 from finforce_eval.contacts import parse_contacts
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluate import evaluate_recording, score_results
@@ -167,7 +167,7 @@ def main() -> None:
     print(format_ablation(recordings, cells), format_price(recordings, cells), sep="\n\n")
     if options.json:
         content = [asdict(cell) | {"solved_pct": cell.solved} for cell in cells.values()]
-        write_json(options.json, {"machine": describe_machine(), **setup.about, "cells": content})
+        write_figures(options.json, {**setup.about, "cells": content})
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ from the place to where the line of action of the true force cuts the deformed s
 """
 
 import argparse
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from tqdm import tqdm
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.object_mesh import ObjectMesh, load_object_mesh
 from finforce_contact.settings import ContactSettings
-from finforce_eval.bench import describe_machine, row_from_times
+from finforce_eval.bench import row_from_times, write_figures
 from finforce_eval.demo import RECORDING
 from finforce_eval.objects import track_object
 from finforce_eval.places import InnerSurface, true_lines
@@ -70,12 +69,9 @@ def main() -> None:
     options = parser.parse_args()
     accuracies, pressed = measure_errors(options.recordings)
     times = measure_times(pressed)
-    machine = describe_machine()
     print(format_accuracies(accuracies), format_times(times), sep="\n\n")
     if options.json:
-        content = {"machine": machine, "errors_mm": [asdict(row) for row in accuracies], "times_ms": times}
-        Path(options.json).parent.mkdir(parents=True, exist_ok=True)
-        Path(options.json).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_figures(options.json, {"errors_mm": [asdict(row) for row in accuracies], "times_ms": times})
 
 
 def measure_errors(paths: list[str]) -> tuple[list[Accuracy], Frame]:

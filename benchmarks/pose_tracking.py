@@ -7,13 +7,11 @@ libraries that it is compared with get the true one. Times are those of one thre
 """
 
 import argparse
-import json
-import os
-import platform
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +26,7 @@ from finforce_contact.pose_source import ObjectPose
 from finforce_contact.pose_tracking import PoseTracker
 from finforce_contact.poses import move_pose
 from finforce_contact.triangles import ObjectMesh
+from finforce_eval.bench import write_figures
 from finforce_twin.depth_camera import build_d405
 from finforce_twin.objects import OBJECT_NAMES, build_object
 from finforce_twin.pose_sequences import Frame, Motion, render_sequence
@@ -37,6 +36,7 @@ HIDDEN = (0.0, 0.3, 0.5)
 SURE = np.array([0.002] * 3 + [np.deg2rad(4.0)] * 3)  # standard deviations below which a pose is called sure
 FOUND = (0.003, np.deg2rad(4.0))  # a first pose no farther off is the right one
 LIBRARIES = ("small_gicp", "open3d")
+IN, LENGTH = 35, 60  # the image in which the plates of a sequence of so many images are in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,12 +134,17 @@ def summarize(followed: Sequence[dict]) -> dict:
 
 
 def locate_all(count: int) -> dict:
-    """Returns, for each object, how often the first pose without any guess is the right one, and its time [s]."""
+    """Returns, for each object, how often the first pose without any guess is the right one, and its time [s].
+
+    Plates hide 30 % of the object in every second image.
+    """
     figures, camera = {}, build_d405(step=2)
     for name in tqdm(OBJECT_NAMES, desc="first poses", leave=False):
-        mesh, right, seconds = build_object(name), 0, []
+        mesh, right, seconds, hidden = build_object(name), 0, [], []
         for seed in range(count):
-            *_, frame = render_sequence(mesh, camera, Motion(hidden=0.3 * (seed % 2), frames=16), 100 + seed)
+            images = render_sequence(mesh, camera, Motion(hidden=0.3 * (seed % 2), frames=LENGTH), 100 + seed)
+            frame = next(islice(images, IN, None))
+            hidden.append(frame.hidden)
             tracker, began = PoseTracker(mesh, camera), time.thread_time()
             try:
                 off = compute_deviation(
@@ -149,7 +154,7 @@ def locate_all(count: int) -> dict:
             except PoseLostError:
                 pass
             seconds.append(time.thread_time() - began)
-        figures[name] = {"n": count, "right": int(right), "cpu_s": _quantiles(seconds)}
+        figures[name] = {"n": count, "right": int(right), "hidden": hidden, "cpu_s": _quantiles(seconds)}
     return figures
 
 
@@ -166,7 +171,7 @@ def run(frames: int, seeds: int) -> dict:
         plan[f"{name} 424x240 0.3 m/s 90 deg/s"] = [
             Case(name=name, resolution="424x240", hidden=0.0, seed=seed, speed=0.3) for seed in range(seeds)
         ]
-    for library in LIBRARIES:
+    for library in find_libraries():
         for hidden in (0.0, 0.5):
             plan[f"{library}, true mask, 424x240 hidden {hidden:.0%}"] = [
                 Case(name=name, resolution="424x240", hidden=hidden, seed=0, method=library) for name in OBJECT_NAMES
@@ -178,6 +183,19 @@ def run(frames: int, seeds: int) -> dict:
         if cases[0].method == "tracker" and cases[0].speed == Case.speed:
             every[cases[0].resolution] += followed
     return figures | {f"all {resolution}": summarize(followed) for resolution, followed in every.items()}
+
+
+def find_libraries() -> list[str]:
+    """Returns the libraries to compare with that are installed, and prints what is left out."""
+    found = []
+    for name in LIBRARIES:
+        try:
+            import_module(name)
+        except ImportError as error:
+            print(f"{name} is left out: {error}; pip install {name}")
+        else:
+            found.append(name)
+    return found
 
 
 def _is_sure(name: str, pose: ObjectPose) -> bool:
@@ -228,10 +246,10 @@ def main() -> None:
     figures, starts = run(options.frames, options.seeds), locate_all(options.starts)
     print(format_table(figures))
     for name, one in starts.items():
-        print(f"first pose of {name}: {one['right']} of {one['n']} right, {one['cpu_s']['median']:.2f} s")
+        hidden = f"hidden {min(one['hidden']):.0%} to {max(one['hidden']):.0%}"
+        print(f"first pose of {name}: {one['right']} of {one['n']} right, {hidden}, {one['cpu_s']['median']:.2f} s")
     if options.json:
-        machine = {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count()}
-        options.json.write_text(json.dumps(machine | {"tracking": figures, "first_poses": starts}, indent=1))
+        write_figures(options.json, {"tracking": figures, "first_poses": starts})
 
 
 if __name__ == "__main__":

@@ -10,11 +10,9 @@ cent off is left out: it moves the object along the optical axis by as much, and
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +27,7 @@ from finforce_contact.object_mesh import ObjectMesh
 from finforce_contact.paper_alignment import scale_coarsely
 from finforce_contact.reconstructed import GeneratedMesh
 from finforce_contact.reconstruction import METHODS, reconstruct
-from finforce_eval.bench import describe_machine
+from finforce_eval.bench import write_figures
 from finforce_twin.depth_camera import build_d405
 from finforce_twin.guesses import GuessError, draw_guess, place_mesh
 from finforce_twin.objects import OBJECT_NAMES, build_object
@@ -194,10 +192,8 @@ def main() -> None:
     print("\nPoisson surface of a perfect mesh, Chamfer distance from it [mm]:")
     print("  ".join(f"{name} {distance:.3f}" for name, distance in poisson.items()))
     if options.json:
-        content = {"machine": describe_machine(), "rows": rows, "poisson_mm": poisson}
-        content["trials"] = [{k: v if v != np.inf else None for k, v in asdict(trial).items()} for trial in trials]
-        Path(options.json).parent.mkdir(parents=True, exist_ok=True)
-        Path(options.json).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        every = [asdict(trial) for trial in trials]
+        write_figures(options.json, {"rows": rows, "poisson_mm": poisson, "trials": every})
 
 
 if __name__ == "__main__":

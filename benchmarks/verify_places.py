@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_eval.commands import Setup, make_setup, write_json
+from finforce_eval.bench import write_figures
+from finforce_eval.commands import Setup, make_setup
 from finforce_eval.evaluate import evaluate_recording
 from finforce_eval.places import InnerSurface
 from finforce_eval.recording import read_recording
@@ -72,7 +73,7 @@ def main() -> None:
         f"max {sizes.max():.3f} mm; the line meets the true surface within {max(gaps):.3f} mm of the cylinder."
     )
     if options.json:
-        write_json(options.json, {"difference_mm": differences, "gap_max_mm": max(gaps)})
+        write_figures(options.json, {**setup.about, "difference_mm": differences, "gap_max_mm": max(gaps)})
 
 
 if __name__ == "__main__":

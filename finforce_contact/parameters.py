@@ -45,7 +45,8 @@ class ContactParameters:
     depth_scale: float = _parameter(0.001, "one step of a 16-bit depth image", unit="m", min=1e-6, max=0.01)
     reconstruct_method: str = _parameter(
         "",
-        "how reconstruct finds the object; empty: robust with a generated mesh, else primitive",
+        "how reconstruct finds the object; empty: robust with a generated mesh; without, a primitive where that fits, "
+        "else completion",
         choices=("", "robust", "paper", "primitive", "completion"),
         settable=True,
     )

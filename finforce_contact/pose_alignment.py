@@ -25,6 +25,9 @@ _LONGEST_STEP = 0.02
 _SHORTEST_STEP = 2e-5  # [m], after which there is no other
 _FEWEST = 20  # fewer points of a kind tell less than all of them would
 _EDGE_REACH = 0.004  # [m], the least way to look for the end of the object
+# To be sure, a direction must be told so much more than errors of the mesh would feign. Three points of an outline tell
+# 6.7 by default, and a few flying pixels at the edge of what hides the object look like its own end.
+_SURE = 7.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,7 +38,7 @@ class Alignment:
         T_camera_object: pose (4, 4).
         information: (6, 6) inverse covariance of x, y, z [m] and rotation [rad], camera axes, about the origin;
             of the determined directions alone.
-        determined: how many of the six directions the image tells.
+        determined: how many of the six directions the image tells by more than a few stray points.
         fitness: points where they should be, as a share of those that nothing hides, 0 to 1.
         visible: points where they should be, as a share of those in view, 0 to 1.
         seen: points where they should be.
@@ -74,12 +77,14 @@ class Effort:
 class _Normal:
     """Normal equations about the object's middle: information (6, 6) and gradient (6,), lengths at the rim.
 
-    `told` (6, 6) is what each kind of evidence tells, over what errors of the mesh would make it seem to tell.
+    `told` (6, 6) is what each kind of evidence tells, over what errors of the mesh would make it seem to tell. In
+    `counted` (6, 6), points of the outline count the same however many others there are.
     """
 
     information: NDArray
     gradient: NDArray
     told: NDArray
+    counted: NDArray
     stddev: float
     sights: NDArray
     outlined: float = 0.0
@@ -92,12 +97,19 @@ class _Normal:
             information=self.information + other.information,
             gradient=self.gradient + other.gradient,
             told=self.told + other.told,
+            counted=self.told + other.counted,
         )
 
     def directions(self) -> NDArray:
         """Returns an orthonormal basis (6, k) of the directions that the image tells."""
         values, vectors = np.linalg.eigh(self.told)
         return vectors[:, values > 1.0]
+
+    def sure_directions(self) -> NDArray:
+        """Returns an orthonormal basis (6, k) of those of them that more than a few points tell."""
+        basis = self.directions()
+        values, vectors = np.linalg.eigh(basis.T @ self.counted @ basis)
+        return basis @ vectors[:, values > _SURE]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -206,7 +218,7 @@ class MeshAligner:
         expected = self._expect(T, effort)
         normal = self._build(T, expected, image, effort.gates[-1])
         counts = np.bincount(normal.sights, minlength=len(Sight))
-        basis = normal.directions()
+        basis = normal.sure_directions()
         # neighbouring depths err alike: so many pixels count as one
         alike = max(1.0, self.settings.noise_width / expected.step) ** 2
         known = basis.T @ self._to_middle(T)
@@ -252,6 +264,7 @@ def _normal_equations(samples: Samples, seen: Comparison, about: _About, error: 
         information=information,
         gradient=weighted.T @ residuals,
         told=information / (error**2 * max(float(weights.sum()), fewest)),
+        counted=information / (error**2 * fewest),
         stddev=about.stddev,
         sights=seen.sights,
     )

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from finforce_contact.enclosure import surrounds
 from finforce_contact.errors import PoseError
 from finforce_contact.object_mesh import ObjectMesh
 from finforce_contact.poses import check_pose, invert_pose, pose_from_quaternion
@@ -131,12 +132,11 @@ def check_camera_outside(T_camera_object: ArrayLike, mesh: ObjectMesh) -> NDArra
     """Returns a checked pose (4, 4) after having refused one that puts the object around the camera.
 
     Raises:
-        PoseError: The pose is not rigid, or the camera's origin is inside the bounding box of the mesh.
+        PoseError: The pose is not rigid, or the mesh surrounds the camera's origin.
     """
     T_camera_object = check_pose(T_camera_object, "object pose")
     camera = invert_pose(T_camera_object)[:3, 3]
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    if (low < camera).all() and (camera < high).all():
+    if surrounds(mesh, camera):
         raise PoseError(
             f"object pose: got one that puts the camera inside the object '{mesh.name}', at {camera.round(4)} m of its "
             "frame; expected the object in front of the camera (z forward), with T_camera_object and not its inverse"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,8 +53,9 @@ def fit_primitive(evidence: ImageEvidence, report: Report | None = None) -> Reco
     fits = compare_primitives(evidence, report)
     name = min(fits, key=lambda key: HANDICAP[key] * fits[key].score.misfit)
     fit = fits[name]
+    mesh = scale_mesh(build_primitive(name).mesh, fit.placement.log_scale)
     return Reconstruction(
-        mesh=scale_mesh(build_primitive(name).mesh, fit.placement.log_scale),
+        mesh=replace(mesh, notes=(*mesh.notes, f"The back was not seen; it is guessed to be that of a {name}.")),
         T_camera_object=fit.placement.pose,
         scale=np.ones(3),
         score=fit.score,

@@ -7,8 +7,10 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -36,6 +38,7 @@ SOLVERS = (
     ("paper's setting", "paper", "default"),
 )
 FACTORISATIONS = 50
+LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh", "small_gicp", "coal")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,19 +135,36 @@ def measure_memory(solver: str, mesh: str) -> float:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return processor, cores, versions and commit."""
-    import numba
-    import scipy
-
-    versions = {"numpy": np.__version__, "scipy": scipy.__version__, "numba": numba.__version__}
+    """Return processor, cores, versions of what is installed, and commit."""
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
         "system": platform.platform(),
         "python": platform.python_version(),
-        **versions,
+        **dict(_find_versions()),
         "commit": _commit(),
     }
+
+
+def write_figures(path: Path | str, figures: Mapping[str, Any]) -> None:
+    """Write figures as JSON with the machine, versions and commit that they are of; what is not finite becomes null."""
+    write_json(path, {"machine": describe_machine(), **_without_nan(figures)})
+
+
+def _without_nan(content: Any) -> Any:
+    """Return nested mappings and sequences with None for numbers that are not finite."""
+    if isinstance(content, Mapping):
+        return {name: _without_nan(value) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_without_nan(value) for value in content]
+    return None if isinstance(content, float) and not np.isfinite(content) else content
+
+
+def _find_versions() -> Iterator[tuple[str, str]]:
+    """Yield the installed libraries with their versions."""
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):
+            yield name, version(name)
 
 
 def _processor() -> str:
@@ -214,4 +234,4 @@ def run_bench(options: argparse.Namespace) -> None:
     print(f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
     if options.json:
         rows = [asdict(row) for row in figures.rows]
-        write_json(options.json, {"machine": machine, "times_ms": rows, "memory_MB": figures.memory})
+        write_figures(options.json, {"times_ms": rows, "memory_MB": figures.memory})

@@ -19,7 +19,7 @@ from finforce_ifea.errors import MissingDependencyError
 FARTHEST = 10.0  # [m] of the median depth; more means that the numbers are no metres
 POSE_FORMS = (
     '{"rotation": [w, x, y, z], "translation": [x, y, z], "scale": s, "axes": "glb" or "canonical"}, '
-    '{"matrix": 4x4} or a bare 4x4 list'
+    '{"matrix": 4x4}, {"T_camera_object": 4x4} as reconstruct writes it, or a bare 4x4 list'
 )
 INTRINSICS_FORMS = "fx fy cx cy, or a JSON or YAML file with these names, or one of a ROS camera (K and D)"
 
@@ -162,8 +162,9 @@ def read_generated_pose(path: Path | str) -> NDArray:
         content = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(content, list):
             content = {"matrix": content}
-        if "matrix" in content:
-            return _check_matrix(np.array(content["matrix"], dtype=float), path.name)
+        for key in ("matrix", "T_camera_object"):
+            if key in content:
+                return _check_matrix(np.array(content[key], dtype=float), path.name)
         parts = [content[name] for name in ("rotation", "translation", "scale")]
         return affine_from_generator(*parts, mesh_axes=content.get("axes", "glb"))
     except PoseError:

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from finforce_eval.bench import RECORDING, format_rows, measure_steps, row_from_times
+from finforce_eval.bench import RECORDING, format_rows, measure_steps, row_from_times, write_figures
 from finforce_eval.bench_live import MIRROR_MOMENT, LiveFigures, with_both_jaws
 from finforce_eval.cli import main
 from finforce_eval.memory import child_processes, resident_bytes
@@ -93,6 +93,14 @@ def test_bench_prints_a_table_and_writes_json(tmp_path, monkeypatch, capsys):
     assert names[-1] == "key points to wrench, both jaws live"
     assert content["memory_MB"]["solver node"] == 150.0
     assert "123 MB" in capsys.readouterr().out
+
+
+def test_figures_are_written_with_where_they_are_from_and_null_for_what_is_not_finite(tmp_path):
+    write_figures(tmp_path / "new" / "figures.json", {"rows": [{"p95": float("nan"), "n": 3}]})
+    content = json.loads((tmp_path / "new" / "figures.json").read_text())
+    assert content["rows"] == [{"p95": None, "n": 3}]
+    assert content["machine"]["numpy"] == np.__version__
+    assert {"processor", "cores", "python", "commit"} <= set(content["machine"])
 
 
 def test_bench_without_ros_says_what_it_left_out(monkeypatch, capsys):

@@ -8,11 +8,13 @@ import pytest
 from finforce_contact.errors import PoseError
 from finforce_contact.pose_source import ExternalPoseSource, check_camera_outside
 from finforce_contact.triangles import ObjectMesh
+from finforce_twin.objects import build_object
 
 FRAME = "camera_color_optical_frame"
 CORNERS = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (-0.03, 0.03)])
-TRIANGLES = np.array([[0, 1, 2], [4, 6, 5]])
-BOX = ObjectMesh(vertices=CORNERS, triangles=TRIANGLES, watertight=False, name="box")
+SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+TRIANGLES = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
+BOX = ObjectMesh(vertices=CORNERS, triangles=TRIANGLES, watertight=True, name="box")
 UNSET = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -118,6 +120,14 @@ def test_only_a_pose_around_the_camera_is_refused():
     T[2, 3] = 0.0299
     with pytest.raises(PoseError, match="inside the object 'box'"):
         check_camera_outside(T, BOX)
+
+
+def test_a_camera_that_looks_into_a_mug_is_outside_of_it():
+    mug, T = build_object("mug"), np.eye(4)
+    assert np.allclose(check_camera_outside(T, mug), T)
+    T[:3, 3] = -mug.vertices[mug.vertices[:, 2].argmin()] * (0.5, 0.5, 0.97)  # within the bottom
+    with pytest.raises(PoseError, match="inside the object 'mug'"):
+        check_camera_outside(T, mug)
 
 
 @pytest.mark.parametrize("stddev", [[0.001] * 5, [0.0] + [0.001] * 5, [np.nan] * 6])

@@ -131,6 +131,19 @@ def test_errors_are_as_large_as_the_covariance_says(tracker, frames):
     assert 0.1 < np.mean(ratios) < 4.0  # one, were the errors of neighbouring pixels as modelled
 
 
+def test_a_face_that_slides_between_plates_is_known_to_slide():
+    frames = sequence("cube", seed=3, hidden=0.5, frames=90)[::2]
+    tracker, off = started(build_object("cube"), frames[0]), []
+    for frame in frames[1:27]:
+        pose = tracker.track(frame.stamp, frame.depth)
+        error = pose.T_camera_object[:3, 3] - frame.T_camera_object[:3, 3]
+        way = error / np.linalg.norm(error)
+        off.append(np.linalg.norm(error))
+        # half a millimetre of bias is no slide
+        assert off[-1] < 5e-4 + 3.0 * np.sqrt(way @ pose.covariance[:3, :3] @ way)
+    assert max(off) > 5e-3
+
+
 def test_a_hidden_object_is_lost_and_found_again(tracker, frames):
     kept = tracker.latest
     with pytest.raises(PoseLostError, match="'asymmetric' is not found"):

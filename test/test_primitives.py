@@ -34,6 +34,7 @@ def test_true_shape_is_chosen_with_its_size(name, shape):
     case = make_case(name)
     result, _ = fit_once(name)
     assert result.method == f"primitive: {shape}" and result.mesh.watertight
+    assert result.mesh.notes == (f"The back was not seen; it is guessed to be that of a {shape}.",)
     assert distance_mm(case, result.mesh, result.T_camera_object) < 0.5
     sides = np.sort(np.ptp(result.mesh.vertices, axis=0))
     np.testing.assert_allclose(sides, np.sort(np.ptp(case.scene.mesh.vertices, axis=0)), atol=1e-3)

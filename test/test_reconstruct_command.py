@@ -164,7 +164,7 @@ def test_pose_of_the_generator_is_read_in_each_form(tmp_path):
     path.write_text(json.dumps({"rotation": [[1, 0, 0, 0]], "translation": [[0.1, 0.2, 0.3]], "scale": [[2, 2, 2]]}))
     expected = [[-2, 0, 0, -0.1], [0, 0, 2, -0.2], [0, 2, 0, 0.3], [0, 0, 0, 1]]
     np.testing.assert_allclose(read_generated_pose(path), expected, atol=1e-12)
-    for content in (expected, {"matrix": expected}):
+    for content in (expected, {"matrix": expected}, {"T_camera_object": expected, "method": "robust"}):
         path.write_text(json.dumps(content))
         np.testing.assert_allclose(read_generated_pose(path), expected)
     for content in ("{", "3", "[[1, 2], [3]]", '{"rotation": [1, 0, 0, 0]}'):
