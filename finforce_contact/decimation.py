@@ -81,7 +81,7 @@ def _describe(mesh: ObjectMesh, thinned: tuple[NDArray, NDArray]) -> str:
             f"{mesh.name}: got {len(mesh.triangles)} triangles, of which {len(thinned[1])} are left that deviate by "
             f"{deviation * 1e3:.1f} mm, expected one object of connected parts; remove fragments in a mesh editor"
         )
-    verdict = "" if deviation <= DEVIATION_LIMIT else ", more than contact should have: raise triangle_limit"
+    verdict = "" if deviation <= DEVIATION_LIMIT else ", more than contact should have: is this one object?"
     return (
         f"Decimated from {len(mesh.triangles)} to {len(thinned[1])} triangles; "
         f"the surface deviates by {deviation * 1e3:.3f} mm at most{verdict}."

@@ -23,9 +23,7 @@ def run_demo(options: argparse.Namespace) -> None:
     """
     recording = read_recording(RECORDING)
     begin, end = recording.jaw("left").keypoints.stamps[[0, -1]]
-    print(
-        f"Playing {recording.name}, {(end - begin) * 1e-9:.0f} s, through contact node and solver ...", flush=True
-    )
+    print(f"Playing {recording.name}, {(end - begin) * 1e-9:.0f} s, through contact node and solver ...", flush=True)
     names = argparse.Namespace(
         jaw="bench", solver="default", mesh="default", contact=options.contact, calibration=CALIBRATION
     )
