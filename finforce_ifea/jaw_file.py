@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from finforce_ifea.errors import JawFileError
 
+_LARGEST_COUNT = 10_000
+
 
 class _Loader(yaml.SafeLoader):
     """The safe loader, which also refuses a key that stands twice."""
@@ -145,14 +147,16 @@ class Table:
         return value
 
     def count(self, key: str) -> int:
-        """Return the whole number from 1 on under a key.
+        """Return the whole number from 1 to 10000 under a key.
 
         Raises:
             JawFileError: Something else stands there.
         """
         value = self.values[key]
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise JawFileError(f"{self.name(key)}: got {_describe(value)}, expected a whole number >= 1")
+        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _LARGEST_COUNT:
+            raise JawFileError(
+                f"{self.name(key)}: got {_describe(value)}, expected a whole number >= 1 and <= {_LARGEST_COUNT}"
+            )
         return value
 
     def number(self, key: str, default: float | None = None) -> float:

@@ -49,6 +49,7 @@ BAD_VALUES = [
     ("model", "shell", "model: got the text 'shell', expected solid or frame"),
     ("candidates.count", 2.5, "candidates.count: got the float 2.5"),
     ("candidates.count", 0, "candidates.count: got the int 0"),
+    ("candidates.count", 10**12, "candidates.count: got the int 1000000000000, expected .*<= 10000"),
     ("candidates", [], "candidates: got none"),
     ("candidates", 4, "candidates: got the int 4"),
     ("keypoints", {}, "keypoints: got none"),
