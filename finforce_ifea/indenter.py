@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.distance_field import CELL, DistanceField, build_distance_field, find_leading, read_depth
 from finforce_ifea.observation import Contact
-from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.outline import ObjectOutline, are_same_polygons
 from finforce_ifea.penalty import PenaltyContact, press_cylinder, press_field
 from finforce_ifea.settings import EstimatorSettings
 
@@ -89,11 +89,7 @@ class OutlineIndenter:
 
     def describes(self, outline: ObjectOutline) -> bool:
         """Whether an outline has this object's polygons."""
-        if outline.polygons is self.polygons:
-            return True
-        return len(outline.polygons) == len(self.polygons) and all(
-            np.array_equal(a, b) for a, b in zip(outline.polygons, self.polygons, strict=True)
-        )
+        return are_same_polygons(outline.polygons, self.polygons)
 
     def resembles(self, other: "OutlineIndenter") -> bool:
         """Whether another outline has about the size of this one, as two cuts of one object do."""

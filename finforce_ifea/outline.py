@@ -47,3 +47,8 @@ class ObjectOutline:
         c, s = np.cos(self.tilt), np.sin(self.tilt)
         turn = np.array([[c, s], [-s, c]])
         return tuple(p @ turn + self.origin for p in self.polygons)
+
+
+def are_same_polygons(first: tuple[NDArray, ...], second: tuple[NDArray, ...]) -> bool:
+    """Returns whether two sets of polygons (n, 2) are equal, so that what was computed from one holds for the other."""
+    return first is second or (len(first) == len(second) and all(map(np.array_equal, first, second)))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import ContactError
-from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.outline import ObjectOutline, are_same_polygons
 
 STDDEVS = ("stddev_x", "stddev_z", "stddev_tilt")
 COLUMNS = ("x", "z", "u", "v", "polygon", *STDDEVS)
@@ -75,5 +75,4 @@ def outline_from_columns(columns: Mapping[str, NDArray], previous: ObjectOutline
 def _known_polygons(polygons: tuple[NDArray, ...], previous: ObjectOutline | None) -> tuple[NDArray, ...]:
     """Return the previous polygons when they are equal: what was computed from them still holds."""
     known = previous.polygons if previous else ()
-    same = len(known) == len(polygons) and all(map(np.array_equal, known, polygons))
-    return known if same else polygons
+    return known if are_same_polygons(known, polygons) else polygons

@@ -1,38 +1,18 @@
 """Claims about the contact estimator as a process: it starts, says what is wrong, and ends cleanly."""
 
-import os
-import random
 import signal
 import subprocess
 import sys
-import threading
 
 import pytest
 from contact_node_fakes import MESH
-
-COMMAND = [sys.executable, "-m", "finforce_start", "contact_estimator", "--ros-args"]
-PATIENCE = 240.0  # s; a first start compiles
-
-
-def environment():
-    own = {"ROS_DOMAIN_ID": str(random.randint(1, 99)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    return {**os.environ, **own}
+from node_process_fakes import PATIENCE, command_of, run_node, stop_when_ready
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_node_cleanly(number):
-    words = [*COMMAND, "-p", f"object_mesh:={MESH}", "-p", "object_mash:=x"]
-    node = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, env=environment())
-    guard = threading.Timer(PATIENCE, node.kill)
-    guard.start()
-    said = []
-    for line in node.stderr:
-        said.append(line)
-        if " ready" in line:
-            node.send_signal(number)
-    guard.cancel()
-    text = "".join(said)
-    assert node.wait(10) == 0, text
+    status, text = stop_when_ready(command_of("contact_estimator", f"object_mesh:={MESH}", "object_mash:=x"), number)
+    assert status == 0, text
     assert "Traceback" not in text
     assert "there is no parameter 'object_mash'" in text
 
@@ -49,7 +29,7 @@ def test_a_signal_ends_the_node_cleanly(number):
     ],
 )
 def test_what_cannot_be_set_up_ends_with_two_and_one_reason(given, reason):
-    done = subprocess.run([*COMMAND, "-p", given], capture_output=True, text=True, timeout=PATIENCE, env=environment())
+    done = run_node(command_of("contact_estimator", given))
     assert done.returncode == 2
     assert reason in done.stderr.strip().splitlines()[-1] and "Traceback" not in done.stderr
 

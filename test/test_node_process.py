@@ -1,37 +1,17 @@
 """Claims about the solver as a process: it starts, says what is wrong, and ends cleanly."""
 
-import os
-import random
 import signal
 import subprocess
 import sys
-import threading
 
 import pytest
-
-COMMAND = [sys.executable, "-m", "finforce_start", "ifea_solver", "--ros-args"]
-PATIENCE = 240.0  # s; a first start compiles
-
-
-def environment():
-    own = {"ROS_DOMAIN_ID": str(random.randint(1, 99)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    return {**os.environ, **own}
+from node_process_fakes import PATIENCE, command_of, run_node, stop_when_ready
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_node_cleanly(number):
-    words = [*COMMAND, "-p", "contact_height:=0.04", "-p", "contact_heigth:=0.05"]
-    node = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, env=environment())
-    guard = threading.Timer(PATIENCE, node.kill)
-    guard.start()
-    said = []
-    for line in node.stderr:
-        said.append(line)
-        if " ready" in line:
-            node.send_signal(number)
-    guard.cancel()
-    text = "".join(said)
-    assert node.wait(10) == 0, text
+    status, text = stop_when_ready(command_of("ifea_solver", "contact_height:=0.04", "contact_heigth:=0.05"), number)
+    assert status == 0, text
     assert "Traceback" not in text
     # a misspelt parameter is named
     assert "there is no parameter 'contact_heigth'" in text
@@ -50,7 +30,7 @@ def test_a_signal_ends_the_node_cleanly(number):
     ],
 )
 def test_what_cannot_be_set_up_ends_with_two_and_one_line(given, reason):
-    done = subprocess.run([*COMMAND, "-p", given], capture_output=True, text=True, timeout=PATIENCE, env=environment())
+    done = run_node(command_of("ifea_solver", given))
     assert done.returncode == 2
     assert reason in done.stderr and len(done.stderr.strip().splitlines()) == 1
 
