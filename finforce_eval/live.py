@@ -65,6 +65,7 @@ class ReplayLog:
         self.grasp: dict[int, float] = {}
         self.health: dict[str, Mapping[str, str]] = {}
         self.offset = 0
+        self.ended = False
 
     def _stamp(self, message: Any) -> int:
         """Return a stamp as it was recorded [ns]."""
@@ -114,8 +115,10 @@ class ReplayLog:
         self.grasp[self._stamp(message)] = message.wrench.force.x
 
     def take_diagnostics(self, message: Any) -> None:
-        """Keep the last state of every node."""
+        """Keep the last state of every node; that nothing arrives any more after the end is no news."""
         for status in message.status:
+            if self.ended and status.name in self.health:
+                continue
             values = {entry.key: entry.value for entry in status.values}
             self.health[status.name] = {"message": status.message, **values}
 

@@ -171,6 +171,7 @@ def _run(processes: Sequence[Process], messages: Sequence[RawMessage], log: Repl
 
         offset = None if playing.has_clock else log.offset
         player.play(messages, rate=playing.rate, offset=offset, sent=sent)
+        log.ended = True
         player.spin_until(monotonic() + LINGER)
         nodes.check()
 

@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic, sleep
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from finforce_contact.poses import pose_from_quaternion, quaternion_from_pose
 from finforce_eval import replay as replaying
 from finforce_eval.bench_live import with_both_jaws
 from finforce_eval.commands import make_setup
-from finforce_eval.live import JawLog, live_result, point_of_application
+from finforce_eval.live import JawLog, ReplayLog, live_result, point_of_application
 from finforce_eval.recording import read_recording
 from finforce_eval.writer import write_recording
 
@@ -206,3 +207,19 @@ def test_one_contact_estimator_serves_both_jaws(tmp_path):
     # the same object, the same noise; each solver gets its contact a little earlier or later than the other
     np.testing.assert_allclose(right.magnitude[held], left.magnitude[held], atol=0.1)
     assert result.health["finforce: right contact"]["status"] == result.health["finforce: left contact"]["status"]
+
+
+def test_silence_after_the_end_of_a_recording_is_no_state_of_a_node():
+    def report(name, text):
+        return SimpleNamespace(status=[SimpleNamespace(name=name, message=text, values=[])])
+
+    log = ReplayLog(("left",))
+    log.take_diagnostics(report("jaw", "loaded"))
+    log.take_diagnostics(report("jaw", "touching"))
+    log.ended = True
+    log.take_diagnostics(report("jaw", "nothing has arrived"))
+    log.take_diagnostics(report("late", "never heard before"))
+    assert {name: state["message"] for name, state in log.health.items()} == {
+        "jaw": "touching",
+        "late": "never heard before",
+    }
