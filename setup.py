@@ -12,7 +12,7 @@ setup(
     description="Grasp force from the key points of fin-ray jaws, by a mechanical model of the jaw.",
     license="Apache-2.0",
     python_requires=">=3.10",
-    packages=["finforce_contact", "finforce_eval", "finforce_ifea", "finforce_twin"],
+    packages=["finforce_contact", "finforce_eval", "finforce_ifea", "finforce_keypoints", "finforce_twin"],
     py_modules=[
         "finforce_camera",
         "finforce_graph",
@@ -24,6 +24,7 @@ setup(
     package_data={
         "finforce_ifea": ["jaws/*", "calibrations/*"],
         "finforce_eval": ["data/*", "data/*/*", "data/*/*/*"],
+        "finforce_keypoints": ["models/*/*"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
@@ -47,6 +48,8 @@ setup(
         # ray casting, registration with scale, Poisson surfaces; the build without CUDA is a quarter of the size
         "open3d-cpu; platform_machine == 'x86_64' and sys_platform == 'linux'",
         "open3d; platform_machine != 'x86_64' or sys_platform != 'linux'",
+        "onnxruntime",  # runs key point networks, without their makers' frameworks
+        "opencv-contrib-python-headless",  # warps, resizes and decodes images; finds dots
         "matplotlib",  # pictures of the reports
         "tqdm",  # progress bars
     ],
@@ -58,7 +61,9 @@ setup(
             "ros-jazzy-common-interfaces",
             "ros-jazzy-ament-index-python",
         ],
-        "test": ["pytest", "hypothesis"],
+        # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
+        "train": ["torch", "onnx"],
+        "test": ["pytest", "hypothesis", "onnx"],
         "lint": ["ruff"],
     },
     entry_points={
@@ -66,7 +71,9 @@ setup(
             "finforce = finforce_eval.cli:main",
             "contact_estimator = finforce_start:contact_estimator",
             "ifea_solver = finforce_start:ifea_solver",
+            "keypoint_detector = finforce_start:keypoint_detector",
             "recording_player = finforce_start:recording_player",
+            "twin_camera = finforce_start:twin_camera",
         ],
     },
 )

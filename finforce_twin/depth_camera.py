@@ -16,6 +16,12 @@ from finforce_camera import CameraIntrinsics
 D405_DISTORTION = (-0.0545, 0.0568, 0.0010, 0.00034, -0.0185)
 
 
+def build_d405_vga() -> CameraIntrinsics:
+    """Return the colour camera of a D405 at 640 x 480, with its distortion."""
+    distortion = np.array(D405_DISTORTION)
+    return CameraIntrinsics(width=640, height=480, fx=431.2, fy=430.0, cx=319.6, cy=241.3, distortion=distortion)
+
+
 def build_d405(*, distorted: bool = False, step: int = 1) -> CameraIntrinsics:
     """Return the colour camera of a D405 at 848 x 480, to which its depth is aligned.
 
@@ -48,6 +54,7 @@ class DepthNoise:
         hole_fraction: of the pixels without depth, in patches.
         scale_stddev: of the relative error that all pixels of an image share; 1 to 2 % in a real unit.
         nearest: depth below which nothing is measured [m].
+        fattening: by how much near things look wider than they are, on every side [px].
     """
 
     disparity_stddev: float = 0.08
@@ -59,6 +66,7 @@ class DepthNoise:
     hole_fraction: float = 0.02
     scale_stddev: float = 0.0
     nearest: float = 0.07
+    fattening: int = 0
 
 
 EDGE_STEP = 4e-3  # [m] in depth between neighbours, above which matching mixes the two sides
@@ -107,6 +115,9 @@ def _mix_edges(depth: NDArray, camera: CameraIntrinsics, noise: DepthNoise, rng:
     flies &= np.isfinite(depth)
     between = near[flies] + (far - near)[flies] * rng.random(int(flies.sum()))
     mixed = depth.copy()
+    if noise.fattening:
+        nearest = minimum_filter(np.where(np.isnan(depth), np.inf, depth), 2 * noise.fattening + 1)
+        mixed = np.where(depth - nearest > EDGE_STEP, nearest, depth)
     mixed[flies] = between
     return mixed
 

@@ -1,8 +1,12 @@
-"""Objects of the size of a hand, made from a few numbers; watertight, in metres, z upwards, origin half way up."""
+"""Objects made from a few numbers, watertight, in metres: of the size of a hand, and small enough for two fin-ray jaws.
+
+Those of a hand's size stand with z upwards, the origin half way up; the small ones lie along y, their origin inside.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +20,16 @@ MILLIMETRE = 1e-3
 
 
 def build_object(name: str) -> ObjectMesh:
-    """Return an object by its name, one of `OBJECT_NAMES`.
+    """Return an object by its name, one of `OBJECT_NAMES` or `SMALL_OBJECT_NAMES`.
 
     Raises:
         ObjectMeshError: there is none of this name.
         MissingDependencyError: manifold3d is not installed.
     """
-    if name not in BUILDERS:
-        raise ObjectMeshError(f"object '{name}': expected one of {', '.join(OBJECT_NAMES)}")
-    shape = BUILDERS[name](import_manifold3d()).to_mesh()
+    builders = BUILDERS | SMALL_BUILDERS
+    if name not in builders:
+        raise ObjectMeshError(f"object '{name}': expected one of {', '.join(builders)}")
+    shape = builders[name](import_manifold3d()).to_mesh()
     vertices = np.array(shape.vert_properties[:, :3], dtype=float) * MILLIMETRE
     triangles = np.array(shape.tri_verts, dtype=np.int32)
     return ObjectMesh(vertices=vertices, triangles=triangles, watertight=True, name=name)
@@ -72,6 +77,27 @@ def _build_mug(kernel):
     return body.translate((0.0, 0.0, -42.5))
 
 
+def _build_rod(kernel, diameter: float):
+    """A cylinder 60 mm long, as those of the bench."""
+    rod = kernel.Manifold.cylinder(60.0, 0.5 * diameter, circular_segments=SEGMENTS, center=True)
+    return rod.rotate((90.0, 0.0, 0.0))
+
+
+def _build_block(kernel):
+    """A block 24 mm wide, 60 mm long and 30 mm high, its edges rounded by 2 mm."""
+    core = kernel.CrossSection.square((20.0, 26.0), center=True)
+    section = core.offset(2.0, kernel.JoinType.Round, 2.0, SEGMENTS)
+    return kernel.Manifold.extrude(section, 60.0).translate((0.0, 0.0, -30.0)).rotate((90.0, 0.0, 0.0))
+
+
+def _build_wedge(kernel):
+    """A leaning block up to 28 mm wide with a shoulder at +x and a boss at one end; no turn maps it onto itself."""
+    corners = np.array([[-13, -16], [9, -16], [15, -6], [11, 12], [4, 17], [-11, 17]], dtype=float)
+    block = kernel.Manifold.extrude(_section(kernel, corners), 44.0, scale_top=(0.9, 0.85))
+    boss = kernel.Manifold.cylinder(14.0, 8.0, 6.0, circular_segments=SEGMENTS).translate((-2.0, 3.0, 43.0))
+    return (block + boss).translate((0.0, 0.0, -26.0)).rotate((90.0, 0.0, 0.0))
+
+
 def _build_ring(kernel, *, radius: float, thickness: float):
     """A torus in the x-z plane, one and a half times as broad as thick."""
     angles = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
@@ -96,4 +122,12 @@ BUILDERS: dict[str, Callable] = {
     "mug": _build_mug,
     "bottle": _build_bottle,
 }
+SMALL_BUILDERS: dict[str, Callable] = {
+    "rod15": partial(_build_rod, diameter=15.0),
+    "rod25": partial(_build_rod, diameter=25.0),
+    "rod35": partial(_build_rod, diameter=35.0),
+    "block": _build_block,
+    "wedge": _build_wedge,
+}
 OBJECT_NAMES = tuple(BUILDERS)
+SMALL_OBJECT_NAMES = tuple(SMALL_BUILDERS)

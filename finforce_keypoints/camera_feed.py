@@ -1,0 +1,147 @@
+"""Colour and depth images and intrinsics in, whole RGB-D images out; knows no jaw and finds nothing in them."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_camera import CameraIntrinsics, ImageError, ImageLayout
+from finforce_contact.messages import camera_from_info, depth_from_image, same_camera, stamp_of
+from finforce_ifea.messages import check_frame
+from finforce_keypoints.errors import SyncError
+from finforce_keypoints.images import ImageWatch, RgbdImage, check_image, decode_color
+from finforce_keypoints.parameters import DetectorParameters
+
+SECOND = 1e-9  # s/ns
+WAITING = 3  # colour images that may wait for their depth: a tenth of a second at 30 Hz
+
+
+class StampedImage(NamedTuple):
+    """A whole image and its exact stamp [ns]."""
+
+    stamp: int
+    image: RgbdImage
+
+
+class CameraFeed:
+    """Brings the images of a camera together by their stamps, the newest first, and refuses what no camera sees.
+
+    A colour image waits for its depth image; one that a newer whole image overtook is passed over.
+
+    Attributes:
+        camera: intrinsics of both images, None until they came.
+        passed: colour images that were overtaken while they waited.
+
+    Args:
+        parameters: frame, topics, unit of depth and greatest distance of stamps.
+    """
+
+    def __init__(self, parameters: DetectorParameters) -> None:
+        self._parameters = parameters
+        self._tolerance = round(parameters.sync_tolerance / SECOND)
+        self.camera: CameraIntrinsics | None = None
+        self.passed = 0
+        self._topic: str | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images; the intrinsics stay."""
+        self._colors: deque[Any] = deque()
+        self._depths: deque[Any] = deque(maxlen=WAITING + 1)
+        self._watch = ImageWatch(self._parameters.frozen_after)
+
+    def take_info(self, info: Any) -> None:
+        """Take a sensor_msgs/CameraInfo.
+
+        Raises:
+            ObservationError: the frame is another one.
+            IntrinsicsError: the numbers are no camera's.
+        """
+        camera = camera_from_info(info, self._parameters.camera_frame)
+        if not same_camera(self.camera, camera):
+            self.camera = camera
+
+    def take_color(self, topic: str, message: Any) -> StampedImage | None:
+        """Take a colour image and return it with its depth; None while that has not come.
+
+        Only the first topic that brings an image is listened to.
+
+        Raises:
+            SyncError: no depth image came for an earlier image.
+            ObservationError: the frame is another one.
+            ImageError: the images cannot be used, or the intrinsics are not known yet.
+        """
+        self._topic = self._topic or topic
+        if topic != self._topic:
+            return None
+        self._colors.append(message)
+        found = self._match()
+        if found is None and len(self._colors) > WAITING:
+            raise self._missing_depth(stamp_of(self._colors.popleft()))
+        return found
+
+    def take_depth(self, message: Any) -> StampedImage | None:
+        """Take a depth image and return it with its colour; None while that has not come; raises as `take_color`."""
+        self._depths.append(message)
+        return self._match()
+
+    def _match(self) -> StampedImage | None:
+        """Return the newest colour image that has its depth, and pass the older ones over."""
+        for place in reversed(range(len(self._colors))):
+            color = self._colors[place]
+            depth = min(self._depths, key=lambda image: _distance(image, stamp_of(color)), default=None)
+            if depth is not None and _distance(depth, stamp_of(color)) <= self._tolerance:
+                self.passed += place
+                for _ in range(place + 1):
+                    self._colors.popleft()
+                return StampedImage(stamp_of(color), self._decode(color, depth))
+        return None
+
+    def _decode(self, color: Any, depth: Any) -> RgbdImage:
+        """Return the whole image after having refused what cannot be one."""
+        if self.camera is None:
+            raise ImageError(f"images came, but no camera_info on {self._parameters.info_topic} yet")
+        check_frame(color, self._parameters.camera_frame, "the colour image")
+        image = RgbdImage(
+            stamp=SECOND * stamp_of(color),
+            color=color_from_image(color),
+            depth=depth_from_image(depth, self._parameters.camera_frame, self._parameters.depth_scale),
+            camera=self.camera,
+        )
+        check_image(image)
+        self._watch.check(image)
+        return image
+
+    def _missing_depth(self, stamp: int) -> SyncError:
+        """Return the error of a colour image [ns] that has waited long enough."""
+        nearest = min((_distance(image, stamp) for image in self._depths), default=None)
+        limit = f"{1e3 * self._parameters.sync_tolerance:g} ms"
+        if nearest is None:
+            return SyncError(
+                f"colour images come, but no depth image on {self._parameters.depth_topic}; "
+                "start the camera with align_depth.enable:=true"
+            )
+        return SyncError(
+            f"no depth image within {limit} of the colour image at {SECOND * stamp:.3f} s, the nearest lies "
+            f"{1e3 * SECOND * nearest:.1f} ms away; start the camera with enable_sync:=true or raise sync_tolerance"
+        )
+
+
+def color_from_image(message: Any) -> NDArray[np.uint8]:
+    """Return the colours (h, w, 3), red green blue, of a sensor_msgs/Image, without a copy where its bytes lie so.
+
+    Raises:
+        ImageError: the encoding is not known, or the data do not fill the image.
+    """
+    layout = ImageLayout(
+        height=message.height, width=message.width, step=message.step, is_bigendian=bool(message.is_bigendian)
+    )
+    return decode_color(np.frombuffer(message.data, dtype=np.uint8), message.encoding, layout)
+
+
+def _distance(message: Any, stamp: int) -> int:
+    """Return how far a message's stamp is from another [ns]."""
+    return abs(stamp_of(message) - stamp)

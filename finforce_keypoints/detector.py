@@ -1,0 +1,131 @@
+"""RGB-D images to key points in the jaw frames, image after image; knows neither ROS nor what finds the pixels."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_contact.poses import check_pose
+from finforce_ifea.jaw import Jaw
+from finforce_keypoints.errors import DetectionError, GeometryError, ImageOrderError
+from finforce_keypoints.finder import PixelFinder, PixelFinding
+from finforce_keypoints.images import RgbdImage, check_image
+from finforce_keypoints.jaw_localizer import JawKeypoints, JawLocalizer
+from finforce_keypoints.localization import DepthScale
+from finforce_keypoints.settings import DetectorSettings
+
+__all__ = ["JawKeypoints", "KeypointDetector"]
+
+_LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is better than this
+
+
+class KeypointDetector:
+    """Finds the key points of one jaw or two in the images of one camera.
+
+    A finder gives their pixels; the jaws' places, depths, and what is believed, are found here.
+
+    Raises:
+        GeometryError: there is no jaw, or a jaw is not the one of its side.
+        PoseError: the camera's pose is none.
+        MeshError: a jaw's mesh is bad.
+    """
+
+    def __init__(
+        self,
+        finder: PixelFinder,
+        jaws: Mapping[str, Jaw],
+        T_gripper_camera: NDArray,
+        settings: DetectorSettings | None = None,
+    ) -> None:
+        """Prepare to look at jaws, side -> jaw, with a camera at T_gripper_camera (4, 4)."""
+        self.settings = settings or DetectorSettings()
+        wrong = [side for side, jaw in jaws.items() if jaw.side != side]
+        if wrong or not jaws:
+            raise GeometryError(f"jaws {sorted(jaws)}, wrong side: {wrong}; expected left, right or both")
+        T_gripper_camera = check_pose(T_gripper_camera, "T_gripper_camera")
+        self._finder = finder
+        self._counts_of = {side: len(jaw.keypoints) + 1 for side, jaw in jaws.items()}
+        self._jaws = {side: JawLocalizer(jaw, T_gripper_camera, self.settings) for side, jaw in jaws.items()}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget where the jaws were, the depth scale and the counts; for a new recording or another camera."""
+        for jaw in self._jaws.values():
+            jaw.reset()
+        self._stamp: float | None = None
+        self._scale = DepthScale(error=0.0, stddev=self.settings.scale_stddev)
+        self.counts: Counter[str] = Counter()
+
+    @property
+    def lost_sides(self) -> tuple[str, ...]:
+        """The jaws that have to be looked for everywhere."""
+        return tuple(side for side, jaw in self._jaws.items() if jaw.is_lost)
+
+    @property
+    def depth_scale(self) -> DepthScale:
+        """The relative error of the depth image's scale, as the rigid reference points show it."""
+        return self._scale
+
+    def detect(self, image: RgbdImage) -> Mapping[str, JawKeypoints]:
+        """Return the key points of the jaws in an image; a jaw that is not found is absent.
+
+        Counts go to `counts`: "images", "<side>" found, "<side>/<reason>" refused key points.
+
+        Raises:
+            ImageError: the image's parts do not fit each other.
+            ImageOrderError: it is not younger than the one before.
+            DetectionError: the finder returned a finding of the wrong shape.
+            KeypointError: the finder cannot use it.
+        """
+        check_image(image)
+        if self._stamp is not None and image.stamp <= self._stamp:
+            raise ImageOrderError(
+                f"image of {image.stamp:.6f} s after one of {self._stamp:.6f} s; expected rising stamps; "
+                "reset for a new recording"
+            )
+        self._drift(image.stamp)
+        findings = self._finder.find(image, {side: jaw.expect(image.stamp) for side, jaw in self._jaws.items()})
+        self.counts["images"] += 1
+        return self._locate(image, findings)
+
+    def _locate(self, image: RgbdImage, findings: Mapping[str, PixelFinding]) -> dict[str, JawKeypoints]:
+        """Return the key points of the jaws that are found."""
+        keypoints = {}
+        for side, jaw in self._jaws.items():
+            finding = self._check(side, findings.get(side))
+            located = jaw.locate(image, finding, self._scale)
+            if located is not None:
+                stddev = max(located.scale.stddev, _LEAST_SCALE_STDDEV)
+                self._scale = replace(located.scale, stddev=min(stddev, self.settings.scale_stddev))
+                keypoints[side] = located.keypoints
+                self._count(side, located.keypoints)
+        return keypoints
+
+    def _drift(self, stamp: float) -> None:
+        """Let the depth scale, once known, become less certain with time."""
+        if self._stamp is not None:
+            spread = np.hypot(self._scale.stddev, self.settings.scale_drift * np.sqrt(stamp - self._stamp))
+            self._scale = replace(self._scale, stddev=float(min(spread, self.settings.scale_stddev)))
+        self._stamp = stamp
+
+    def _check(self, side: str, finding: PixelFinding | None) -> PixelFinding | None:
+        """Refuse a finding with another number of points than the jaw has."""
+        count = self._counts_of[side]
+        if finding is not None and (
+            finding.pixels.shape != (count, 2) or not finding.likelihood.shape == finding.stddev.shape == (count,)
+        ):
+            raise DetectionError(
+                f"{side} jaw: pixels {finding.pixels.shape}, likelihood {finding.likelihood.shape}, stddev "
+                f"{finding.stddev.shape}; expected {count} rows: the jaw's key points, then its reference point"
+            )
+        return finding
+
+    def _count(self, side: str, keypoints: JawKeypoints) -> None:
+        """Count a found jaw and its refused key points."""
+        self.counts[side] += 1
+        for reason in keypoints.reasons[~keypoints.valid]:
+            self.counts[f"{side}/{reason}"] += 1

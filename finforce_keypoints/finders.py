@@ -1,0 +1,115 @@
+"""The detector that parameters ask for, from the network's files to the geometry; knows no ROS and no image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from finforce_ifea.jaw import Jaw
+    from finforce_keypoints.detector import KeypointDetector
+    from finforce_keypoints.dot_image import DotSettings
+    from finforce_keypoints.finder import PixelFinder
+    from finforce_keypoints.model import KeypointModel
+    from finforce_keypoints.parameters import DetectorParameters
+    from finforce_keypoints.settings import DetectorSettings
+
+SHIPPED = Path(__file__).parent / "models" / "plane"
+ANSWERS = {"auto": None, "yes": True, "no": False}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinderCard:
+    """What finds the key points, by name; the checksum of its network, empty without one."""
+
+    name: str
+    sha256: str = ""
+
+
+class BuiltDetector(NamedTuple):
+    """A detector, and what finds the key points for it."""
+
+    detector: KeypointDetector
+    card: FinderCard
+
+
+class BuiltFinder(NamedTuple):
+    """What finds the pixels of key points, and its card."""
+
+    finder: PixelFinder
+    card: FinderCard
+
+
+def build_detector(
+    jaws: Mapping[str, Jaw],
+    parameters: DetectorParameters,
+    settings: DetectorSettings | None = None,
+    dots: DotSettings | None = None,
+) -> BuiltDetector:
+    """Return the detector of the jaws (by side) that the parameters ask for.
+
+    Raises:
+        PoseError: the camera's pose is none.
+        KeypointError: the network, its names or a setting cannot be used.
+        MissingDependencyError: a library that the finder needs is not installed.
+    """
+    from finforce_keypoints.detector import KeypointDetector
+    from finforce_keypoints.settings import DetectorSettings
+
+    T_gripper_camera = parameters.camera_pose
+    settings = settings or DetectorSettings()
+    finder, card = build_finder(jaws, parameters, settings, dots)
+    return BuiltDetector(KeypointDetector(finder, jaws, T_gripper_camera, settings), card)
+
+
+def build_finder(
+    jaws: Mapping[str, Jaw], parameters: DetectorParameters, settings: DetectorSettings, dots: DotSettings | None = None
+) -> BuiltFinder:
+    """Return what finds the pixels of key points; see `build_detector`."""
+    from finforce_keypoints.plane_finder import OpeningRange, PlaneFinder
+
+    opening = OpeningRange(nearest=settings.opening_min, farthest=settings.opening_max)
+    if parameters.finder == "dots":
+        from finforce_keypoints.dots import DotFinder
+
+        return BuiltFinder(DotFinder(jaws, dots, parameters.camera_pose, opening), FinderCard(name="dots"))
+    model = load_model(parameters)
+    if parameters.finder == "network":
+        finder = PlaneFinder(model, jaws, parameters.camera_pose, opening)
+    else:
+        finder = _build_frame_finder(model, jaws, parameters)
+    return BuiltFinder(finder, FinderCard(name=f"{parameters.finder} {model.path.stem}", sha256=model.sha256))
+
+
+def load_model(parameters: DetectorParameters) -> KeypointModel:
+    """Load the network that the parameters name, the shipped one without a name.
+
+    Raises:
+        ModelError: its files are missing, or do not agree with the metadata and the parameters.
+        MissingDependencyError: onnxruntime is not installed.
+    """
+    from finforce_keypoints.errors import ModelError
+    from finforce_keypoints.model import KeypointModel, ModelOverrides
+
+    size = tuple(parameters.input_size)
+    if len(size) != 2:
+        raise ModelError(f"input_size: got {size}, expected height and width [px], or two zeros")
+    overrides = ModelOverrides(
+        stride=parameters.stride or None,
+        locref_std=parameters.locref_std or None,
+        apply_sigmoid=ANSWERS[parameters.apply_sigmoid],
+        normalize=ANSWERS[parameters.normalize],
+        input_size=size if any(size) else None,
+    )
+    return KeypointModel(parameters.model or SHIPPED, overrides, threads=parameters.threads)
+
+
+def _build_frame_finder(model: KeypointModel, jaws: Mapping[str, Jaw], parameters: DetectorParameters) -> PixelFinder:
+    """Return the finder of a network that sees the image, under the names that the parameters give."""
+    from finforce_keypoints.frame_finder import FrameFinder
+    from finforce_keypoints.naming import build_name_map, parse_mapping
+
+    mapping = parse_mapping(entry for entry in parameters.names if entry)
+    return FrameFinder(model, build_name_map(model.names, jaws, mapping), jaws, allow_resize=parameters.allow_resize)

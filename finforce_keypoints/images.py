@@ -1,0 +1,141 @@
+"""Colour images with aligned depth: decoded, checked and watched for a camera that fails; knows no jaw and no ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_camera import CameraIntrinsics, ImageError, ImageLayout
+from finforce_keypoints.errors import BlackImageError, FrozenImageError
+
+COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
+_PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
+_WATCHED_STEP = 8  # every so many rows and columns are looked at
+_DARKEST = 10  # of 255: a picture whose brightest hundredth is below this shows nothing
+_BRIGHTEST_PERCENT = 99.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RgbdImage:
+    """A colour image and the depth aligned to it.
+
+    Attributes:
+        stamp: image capture time [s].
+        color: (h, w, 3) uint8 RGB, as the lens made it.
+        depth: (h, w) float32 distance along the optical axis [m], NaN invalid; None when there is none.
+        camera: intrinsics of both.
+    """
+
+    stamp: float
+    color: NDArray
+    depth: NDArray | None
+    camera: CameraIntrinsics
+
+
+def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | None = None) -> NDArray:
+    """Return a colour image as RGB.
+
+    Args:
+        data: the image (h, w, channels), or (h, w) when mono8, or its bytes together with their layout.
+        encoding: rgb8, bgr8, rgba8, bgra8 or mono8, as in sensor_msgs/Image.
+        layout: how the bytes lie.
+
+    Returns:
+        (h, w, 3) uint8, contiguous; a view of the data where nothing has to move.
+
+    Raises:
+        ImageError: the encoding is another one, or the data do not fill the layout.
+    """
+    if encoding not in COLOR_CHANNELS:
+        raise ImageError(f"colour image: encoding {encoding!r}; expected one of {', '.join(COLOR_CHANNELS)}")
+    depth = _PIXEL_BYTES[encoding]
+    image = np.asarray(data) if layout is None else _unpack_rows(data, depth, layout)
+    if image.ndim == 2 and depth == 1:
+        image = image[:, :, None]
+    if image.ndim != 3 or image.shape[2] != depth or image.dtype != np.uint8:
+        raise ImageError(
+            f"colour image: {image.dtype} of shape {image.shape}; expected uint8 (h, w, {depth}) for {encoding}"
+        )
+    if encoding != "rgb8":
+        image = image[:, :, COLOR_CHANNELS[encoding]]
+    return np.ascontiguousarray(image)
+
+
+def _unpack_rows(data: NDArray | bytes, depth: int, layout: ImageLayout) -> NDArray:
+    """Return the image (h, w, depth) of bytes that may have padding at the end of their rows."""
+    raw = np.frombuffer(data, dtype=np.uint8)
+    used = layout.width * depth
+    step = layout.step or used
+    if min(layout.width, layout.height) < 1 or step < used or len(raw) != step * layout.height:
+        raise ImageError(
+            f"colour image: {len(raw)} bytes with {step} a row; expected {layout.height} rows of at least {used} bytes"
+        )
+    return raw.reshape(layout.height, step)[:, :used].reshape(layout.height, layout.width, depth)
+
+
+def check_image(image: RgbdImage) -> None:
+    """Refuse an image whose parts do not fit each other.
+
+    Raises:
+        ImageError: colour or depth has another size than the camera, another type, or the stamp is no time.
+    """
+    size = (image.camera.height, image.camera.width)
+    if not np.isfinite(image.stamp):
+        raise ImageError(f"image: stamp {image.stamp}; expected seconds")
+    if np.shape(image.color) != (*size, 3) or image.color.dtype != np.uint8:
+        raise ImageError(
+            f"colour image: {getattr(image.color, 'dtype', type(image.color).__name__)} of shape "
+            f"{np.shape(image.color)}; expected uint8 {(*size, 3)}, the size in the camera_info"
+        )
+    if image.depth is not None and (np.shape(image.depth) != size or image.depth.dtype.kind != "f"):
+        raise ImageError(
+            f"depth image: {image.depth.dtype} of shape {np.shape(image.depth)}; expected metres of shape {size}, "
+            "that of the colour image; use the depth that is aligned to colour"
+        )
+
+
+def lie_inside(image: RgbdImage, pixels: NDArray) -> NDArray:
+    """Return which pixels (n, 2), column and row, lie in the image, (n,) bool; those that are NaN do not."""
+    with np.errstate(invalid="ignore"):
+        size = (image.camera.width - 0.5, image.camera.height - 0.5)
+        return (pixels >= -0.5).all(axis=1) & (pixels <= size).all(axis=1)
+
+
+class ImageWatch:
+    """Notices a camera that gives black pictures, or the same one again and again."""
+
+    def __init__(self, frozen_after: int = 5) -> None:
+        """Keeps after how many identical pictures in a row the camera counts as frozen."""
+        self._frozen_after = frozen_after
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last picture."""
+        self._last: NDArray | None = None
+        self._same = 0
+
+    def check(self, image: RgbdImage) -> None:
+        """Refuse a picture that shows nothing, or nothing new.
+
+        A real sensor has noise: two pictures are never alike, not even of a scene at rest.
+
+        Raises:
+            BlackImageError: nearly all of the picture is black.
+            FrozenImageError: it is the same as the ones before.
+        """
+        seen = image.color[::_WATCHED_STEP, ::_WATCHED_STEP].copy()
+        is_same = self._last is not None and np.array_equal(seen, self._last)
+        self._same = self._same + 1 if is_same else 0
+        self._last = seen
+        brightest = float(np.percentile(seen.max(axis=2), _BRIGHTEST_PERCENT))
+        if brightest < _DARKEST:
+            raise BlackImageError(
+                f"black image: its brightest pixels are {brightest:.0f} of 255; expected at least {_DARKEST}; "
+                "is the lens covered, or the exposure far too short?"
+            )
+        if self._same >= self._frozen_after:
+            raise FrozenImageError(
+                f"frozen camera: {self._same + 1} identical pictures; expected noise between them; restart the camera"
+            )

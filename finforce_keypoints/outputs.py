@@ -1,0 +1,72 @@
+"""The topics that a key point detector writes, and what stands in each of them; decides no trust."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+import finforce_ros as ros
+from finforce_keypoints.overlay import draw_keypoints
+from finforce_keypoints.parameters import DetectorParameters, pose_numbers
+from finforce_keypoints.report import build_skeleton, describe_names
+
+if TYPE_CHECKING:
+    from finforce_keypoints.camera_feed import StampedImage
+    from finforce_keypoints.detector import JawKeypoints
+    from finforce_keypoints.finders import FinderCard
+
+
+class DetectorOutputs:
+    """The publishers of a key point detector node.
+
+    Args:
+        qos: makes publishers and watches them.
+        parameters: which jaws, and the camera's frame.
+        names: of the rows of the clouds; sent once, and kept for whoever comes later.
+        card: of the finder.
+    """
+
+    def __init__(
+        self, qos: ros.QosWatch, parameters: DetectorParameters, names: Sequence[str], card: FinderCard
+    ) -> None:
+        sides = parameters.sides
+        self._frame, self._skeleton = parameters.camera_frame, build_skeleton(names)
+        self.keypoints = {side: qos.publisher(ros.PointCloud2, f"{side}/keypoints", ros.RESULT) for side in sides}
+        self.pose = {side: qos.publisher(ros.PoseStamped, f"{side}/jaw_pose", ros.RESULT) for side in sides}
+        self.annotated = qos.publisher(ros.Image, "~/annotated", ros.RESULT)
+        self.names = qos.publisher(ros.String, "~/keypoint_names", ros.LATCHED)
+        self.names.publish(ros.String(data=describe_names(names, card)))
+
+    def send_jaw(self, side: str, stamp: int, found: JawKeypoints) -> None:
+        """Send the key points of a jaw and its pose, of the image at `stamp` [ns]."""
+        time = ros.stamp_message(stamp)
+        # the pose goes first: the contact estimator and the solver work at the same time then
+        pose = ros.pose_message(ros.Header(stamp=time, frame_id=self._frame), pose_numbers(found.T_camera_jaw))
+        self.pose[side].publish(pose)
+        header = ros.Header(stamp=time, frame_id=f"{side}_jaw")
+        self.keypoints[side].publish(ros.cloud_message(header, keypoint_columns(found)))
+
+    def send_annotated(self, taken: StampedImage, found: Mapping[str, JawKeypoints]) -> None:
+        """Send the image with what was found in it, while someone subscribes."""
+        if self.annotated.get_subscription_count():
+            header = ros.Header(stamp=ros.stamp_message(taken.stamp), frame_id=self._frame)
+            self.annotated.publish(
+                ros.image_message(header, draw_keypoints(taken.image.color, found.values(), self._skeleton))
+            )
+
+
+def keypoint_columns(found: JawKeypoints) -> dict[str, NDArray]:
+    """Return the columns of a cloud of key points, one row (K,) per key point of the jaw file."""
+    u, v = np.asarray(found.pixels, dtype=np.float32).T
+    stddev = np.asarray(found.stddev, dtype=np.float32).T
+    return {
+        **ros.xyz_columns(found.points),
+        "likelihood": np.asarray(found.likelihood, dtype=np.float32),
+        "u": u,
+        "v": v,
+        "valid": np.asarray(found.valid, dtype=np.uint8),
+        **dict(zip(("stddev_x", "stddev_y", "stddev_z"), stddev, strict=True)),
+    }

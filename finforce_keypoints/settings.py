@@ -1,0 +1,65 @@
+"""What can be set on a key point detector: defaults, units, bounds and meanings; knows no ROS and no file."""
+
+from dataclasses import dataclass
+
+from finforce_ifea.bounded import check_bounds, setting
+from finforce_keypoints.errors import DetectorSettingsError
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectorSettings:
+    """Settings of `KeypointDetector`; each field's metadata says unit, bounds and meaning."""
+
+    likelihood: float = setting(0.6, "1", 0.0, 1.0, "a key point less likely than this is not there")
+    plane_depth: bool = setting(
+        False, "", None, None, "believe key points without depth, too, on the plane that the jaw's side is known to be"
+    )
+    window: float = setting(3e-3, "m", 5e-4, 0.02, "around a key point, depth is taken from the finger's side this far")
+    edge: float = setting(0.4e-3, "m", 0.0, 5e-3, "and no nearer than this to an edge, where depths are mixed")
+    wide_gate: float = setting(5e-3, "m", 1e-3, 0.05, "depth farther off the known side plane is not the finger's")
+    gate: float = setting(2e-3, "m", 5e-4, 0.02, "the same, once the plane is found in the image")
+    least_depths: int = setting(6, "1", 1, 1000, "samples of the finger's side with depth that a key point needs")
+    least_share: float = setting(0.4, "1", 0.0, 1.0, "share of a key point's depths that must be the finger's")
+    quantum: float = setting(1e-3, "m", 0.0, 0.01, "step of the depth image")
+    depth_noise: float = setting(0.06e-3, "m", 0.0, 0.01, "error of the depth that the samples of one point share")
+    scale_stddev: float = setting(0.015, "1", 0.0, 0.1, "relative error that all depths of a camera share")
+    scale_drift: float = setting(1e-3, "1/s^0.5", 0.0, 0.1, "random walk of this error")
+    offset_stddev: float = setting(0.2e-3, "m", 0.0, 0.01, "of the jaw's side from where it should be, at its base")
+    tilt_stddev: float = setting(0.02, "1", 0.0, 0.5, "of the slopes of the jaw's side, bent or ill calibrated")
+    bow_stddev: float = setting(0.2, "1/m", 0.0, 10.0, "of the side's curvature, bent sideways: y = bow z^2")
+    relief_stddev: float = setting(0.06e-3, "m", 0.0, 0.01, "of single key points off the plane of the jaw's side")
+    misfit: float = setting(5.0, "sigma", 1.0, 100.0, "a key point whose depth is farther off than this is not there")
+    workspace_closing: float = setting(0.025, "m", 1e-3, 0.5, "how far a key point may leave its place along x")
+    workspace_width: float = setting(4e-3, "m", 1e-4, 0.5, "the same along y")
+    workspace_length: float = setting(0.012, "m", 1e-3, 0.5, "the same along z")
+    opening_min: float = setting(0.010, "m", 0.0, 0.5, "least distance of a jaw's origin from the middle of the grasp")
+    opening_max: float = setting(0.080, "m", 1e-3, 0.5, "largest distance of a jaw's origin from there")
+    acceleration: float = setting(
+        2e-3, "m/s^1.5", 1e-6, 10.0, "random walk of the closing speed; what is more is noticed and followed"
+    )
+    origin_gate: float = setting(3.0, "sigma", 1.0, 100.0, "an origin farther off means that the speed changed")
+    largest_speed: float = setting(0.3, "m/s", 1e-3, 10.0, "a jaw never moves faster")
+    reference_tolerance: float = setting(
+        5e-3, "m", 1e-4, 0.1, "a reference point farther off its line of motion is another thing"
+    )
+    rigid_stddev: float = setting(
+        0.3e-3, "m", 1e-5, 0.01, "bending of the jaw 10 mm above its base, more with the square of the height"
+    )
+    origin_stddev: float = setting(0.6e-3, "m", 1e-5, 0.02, "a jaw whose place is less well known is not found")
+    lost_images: int = setting(5, "images", 1, 1000, "after so many images without it a jaw is looked for everywhere")
+
+    def __post_init__(self) -> None:
+        """Refuse values out of bounds.
+
+        Raises:
+            DetectorSettingsError: a setting is outside its bounds, or a lower bound is above its upper one.
+        """
+        check_bounds(self, DetectorSettingsError)
+        if self.wide_gate < self.gate:
+            raise DetectorSettingsError(
+                f"wide_gate: got {self.wide_gate:g} m, expected no less than gate, {self.gate:g} m"
+            )
+        if self.opening_max <= self.opening_min:
+            raise DetectorSettingsError(
+                f"opening_max: got {self.opening_max:g} m, expected more than opening_min, {self.opening_min:g} m"
+            )

@@ -1,0 +1,39 @@
+"""The parameters of a twin camera node, and the scene that they name; knows no ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from finforce_twin.scenarios import Scenario
+
+
+def _parameter(default: Any, description: str, **metadata: Any) -> Any:
+    """Return a dataclass field that says what it is; `metadata` are unit, min, max and choices."""
+    return field(default=default, metadata={"description": description, **metadata})
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinParameters:
+    """What a twin camera node is told; units stand in the metadata."""
+
+    scene: str = _parameter("grasp_cylinder", "a name that `finforce twin list` prints")
+    seed: int = _parameter(0, "of material, textures, light and noise", unit="", min=0, max=2**31 - 1)
+    light: str = _parameter("", "bright or dim; empty: that of the scene")
+    object: str = _parameter("", "a shape by name, or a mesh file; empty: that of the scene")
+    size: str = _parameter("640x480", "of the images, WIDTHxHEIGHT [px]")
+    loop: bool = _parameter(True, "begin again at the end; else the node ends with the scene")
+    camera_frame: str = _parameter("camera_color_optical_frame", "frame of the images")
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scene with what is changed in it.
+
+        Raises:
+            ScenarioError: there is no such scene, light or object.
+        """
+        from finforce_twin.scenarios import build_scenario
+
+        changes = {"light": self.light, "object": self.object}
+        return build_scenario(self.scene, **{name: value for name, value in changes.items() if value})

@@ -1,0 +1,1 @@
+"""Training of the shipped key point network; the product never imports it."""
