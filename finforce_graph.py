@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
-
-OptionsT = TypeVar("OptionsT")
+from typing import Any
 
 # small matrices: more threads per process cost time and make it vary
 SINGLE_THREAD = {
@@ -79,6 +77,10 @@ class SolverOptions:
     object_mesh_unit: str = _option("", "unit of the mesh file: m, cm, mm or inch")
     contact: str = _option("", "how the contact is estimated: estimate, paper or closest")
     pose_source: str = _option("", "object poses: topic, detections or tracker")
+    images: bool = _option(False, "find the key points in images of a camera; else they come by topic")
+    finder: str = _option("", "what finds key points in images: network, frame (any DeepLabCut network) or dots")
+    model: str = _option("", "folder of a network and its pytorch_config.yaml; empty: the shipped network")
+    T_gripper_camera: str = _option("", "camera in the gripper's frame: x y z [m] qx qy qz qw")
     solver: str = _option("", "model and objective: default, solid, frame or paper")
     mesh: str = _option("", "mesh density: default, coarse or fine")
     parameter_file: str = _option("", "YAML file with ROS parameters of the nodes")
@@ -145,19 +147,62 @@ def contact_processes(jaws: str, options: SolverOptions) -> list[Process]:
     ]
 
 
+def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
+    """Return the key point detector of "left", "right" or "both" jaws, if images are to be used.
+
+    Raises:
+        ValueError: the camera's pose is not seven numbers.
+    """
+    if not options.images:
+        return []
+    asked = {
+        "jaw_file": options.jaw_file,
+        "finder": options.finder,
+        "model": options.model,
+        "T_gripper_camera": _numbers("T_gripper_camera", options.T_gripper_camera, 7),
+    }
+    return [
+        Process(
+            executable="keypoint_detector",
+            name="keypoint_detector",
+            parameters={"jaws": jaws, **_given(asked), "use_sim_time": options.use_sim_time},
+            parameter_file=options.parameter_file,
+        )
+    ]
+
+
+def _numbers(name: str, text: str, count: int) -> list[float] | None:
+    """Return the numbers of an option, None for an empty text."""
+    words = text.replace(",", " ").split()
+    if not words:
+        return None
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count:
+        raise ValueError(f"{name}:={text}: expected {count} numbers")
+    return numbers
+
+
 def _given(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return what was asked for; the rest is the node's own."""
     return {name: value for name, value in asked.items() if value not in ("", None)}
 
 
 def bench_processes(options: BenchOptions, share: Path) -> list[Process]:
-    """Return the processes of one jaw on a bench; its force is the grasp force."""
+    """Return the processes of one jaw on a bench; its force is the grasp force; `images` start the detector."""
     solver = solver_process(options.jaw, options, completes_grasp=True)
-    return [solver, *contact_processes(options.jaw, options), *_viewer(options, share)]
+    return [
+        solver,
+        *contact_processes(options.jaw, options),
+        *detector_processes(options.jaw, options),
+        *_viewer(options, share),
+    ]
 
 
 def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
-    """Return the solvers of the jaws in a recording, and the player where a recording is named.
+    """Return the solvers of the jaws in a recording, what feeds them, and the player where a recording is named.
 
     With two jaws the left one completes the forces on the gripper, with one jaw that one.
     """
@@ -173,7 +218,8 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
         ends_all=True,
     )
     played = [player] if options.bag else []
-    return [*solvers, *contact_processes(options.jaws, options), *played, *_viewer(options, share)]
+    estimators = [*contact_processes(options.jaws, options), *detector_processes(options.jaws, options)]
+    return [*solvers, *estimators, *played, *_viewer(options, share)]
 
 
 def _viewer(options: SolverOptions, share: Path) -> list[Process]:
@@ -190,75 +236,3 @@ def _viewer(options: SolverOptions, share: Path) -> list[Process]:
             arguments=("-d", config),
         )
     ]
-
-
-def options_from_texts(record: type[OptionsT], texts: Mapping[str, str]) -> OptionsT:
-    """Return an options record from launch arguments, each turned into the type of its default.
-
-    Raises:
-        ValueError: a text is no such value.
-    """
-    values = {entry.name: _value(entry.name, texts[entry.name], entry.default) for entry in fields(record)}
-    return record(**values)
-
-
-def _value(name: str, text: str, default: Any) -> Any:
-    """Turn one text into the type of a default."""
-    if isinstance(default, bool):
-        if text.lower() not in ("true", "false"):
-            raise ValueError(f"{name}:={text}: expected true or false")
-        return text.lower() == "true"
-    try:
-        return type(default)(text)
-    except ValueError:
-        raise ValueError(f"{name}:={text}: expected a {type(default).__name__}") from None
-
-
-def describe_launch(
-    record: type[OptionsT], build: Callable[[OptionsT, Path], Sequence[Process]], share: Path, **defaults: str
-) -> Any:
-    """Return a launch description: one argument per field of the record, one action per process.
-
-    Args:
-        record: the options dataclass.
-        build: options and share folder to processes.
-        share: folder that holds `config` and `rviz`.
-        defaults: of arguments, in place of the record's.
-    """
-    from launch import LaunchDescription
-    from launch.actions import DeclareLaunchArgument, OpaqueFunction
-
-    arguments = [
-        DeclareLaunchArgument(
-            entry.name,
-            default_value=defaults.get(entry.name, str(entry.default)),
-            description=entry.metadata["description"],
-        )
-        for entry in fields(record)
-        if entry.default is not MISSING
-    ]
-
-    def start(context: Any) -> list[Any]:
-        options = options_from_texts(record, context.launch_configurations)
-        return [_launch_action(process) for process in build(options, share)]
-
-    return LaunchDescription([*arguments, OpaqueFunction(function=start)])
-
-
-def _launch_action(process: Process) -> Any:
-    """Return the launch_ros action of a process."""
-    from launch.actions import Shutdown
-    from launch_ros.actions import Node
-
-    files = [process.parameter_file] if process.parameter_file else []
-    return Node(
-        package=process.package,
-        executable=process.executable,
-        name=process.name,
-        output="screen",
-        parameters=[*files, dict(process.parameters)],
-        remappings=list(process.remappings.items()),
-        arguments=list(process.arguments),
-        additional_env=SINGLE_THREAD,
-        on_exit=Shutdown(reason=f"{process.name} has ended") if process.ends_all else None,
-    )

@@ -1,22 +1,20 @@
-"""What every node shares: messages, parameters, quality of service, start and stop; knows no jaw."""
+"""What every node shares: parameters, quality of service, diagnostics, start and stop, and messages; knows no jaw."""
 
 from __future__ import annotations
 
-import array
-import math
+import os
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import Field, fields
+from functools import partial
+from pathlib import Path
 from threading import Thread
 from typing import Any
 
-import numpy as np
 import rclpy
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3, Wrench, WrenchStamped
-from numpy.typing import ArrayLike, NDArray
+from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: F401 - for those who publish
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -24,111 +22,45 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.subscription import Subscription
 from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField  # noqa: F401 - for those who subscribe
-from std_msgs.msg import ColorRGBA, Header
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: F401 - for those who subscribe
+from std_msgs.msg import Header, String  # noqa: F401 - for those who publish
 from std_srvs.srv import Trigger
-from visualization_msgs.msg import Marker, MarkerArray  # noqa: F401 - for those who publish
+from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who publish
 
-from finforce_health import NANOSECONDS, Level, Outcome, Report
-from finforce_ifea.errors import FinforceError, ObservationError
-from finforce_ifea.pointcloud import encode_cloud
+from finforce_health import NANOSECONDS, Level, Outcome, Report  # noqa: F401 - for those with stamps
+from finforce_ifea.errors import FinforceError
+from finforce_messages import (  # noqa: F401 - for those who publish
+    cloud_message,
+    image_message,
+    nanoseconds,
+    points_marker,
+    pose_message,
+    stamp_message,
+    wrench_message,
+    xyz_columns,
+)
 from finforce_records import ParameterError, RecordT, bounds_of, check_value, constraints, describe
 
-MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+STEADY = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+TRANSPORT = Path(__file__).parent / "finforce_keypoints" / "transport" / "fastdds.xml"
+PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+CHOICES = (PROFILES, "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
 
 
-def nanoseconds(stamp: Any) -> int:
-    """Return a builtin_interfaces/Time as exact integer nanoseconds."""
-    return stamp.sec * NANOSECONDS + stamp.nanosec
+def provide_transport() -> None:
+    """Have Fast DDS carry images, which its default loses, unless somebody has chosen how it works already."""
+    if TRANSPORT.is_file() and not any(os.environ.get(name) for name in CHOICES):
+        os.environ[PROFILES] = str(TRANSPORT)
 
 
-def stamp_message(stamp: int) -> Time:
-    """Return integer nanoseconds as a builtin_interfaces/Time."""
-    seconds, rest = divmod(stamp, NANOSECONDS)
-    return Time(sec=seconds, nanosec=rest)
-
-
-def cloud_message(header: Header, columns: Mapping[str, ArrayLike]) -> PointCloud2:
-    """Return a cloud of height 1 with one field per column (n,), in their order and type."""
-    encoded = encode_cloud(columns)
-    return PointCloud2(
-        header=header,
-        height=1,
-        width=len(encoded.data) // encoded.point_step,
-        fields=[PointField(**vars(entry)) for entry in encoded.fields],
-        point_step=encoded.point_step,
-        row_step=len(encoded.data),
-        data=array.array("B", encoded.data),  # an ndarray would be checked byte by byte
-        is_dense=all(bool(np.isfinite(values).all()) for values in columns.values()),
-    )
-
-
-def xyz_columns(points: ArrayLike) -> dict[str, NDArray[np.float32]]:
-    """Return points (n, 3) as the float32 columns x, y, z."""
-    return dict(zip("xyz", np.asarray(points, dtype=np.float32).reshape(-1, 3).T, strict=True))
-
-
-def wrench_message(header: Header, force: ArrayLike, torque: ArrayLike = (0.0, 0.0, 0.0)) -> WrenchStamped:
-    """Return a wrench from force (3,) [N] and torque (3,) [N m].
-
-    Raises:
-        ObservationError: a component is not finite; such a wrench must not leave.
-    """
-    numbers = [*map(float, force), *map(float, torque)]
-    if not all(map(math.isfinite, numbers)):
-        raise ObservationError(f"the wrench is not finite: {numbers}")
-    return WrenchStamped(header=header, wrench=Wrench(force=_vector(numbers[:3]), torque=_vector(numbers[3:])))
-
-
-def _vector(xyz: Sequence[float]) -> Vector3:
-    return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
-
-
-def pose_message(header: Header, numbers: Sequence[float]) -> PoseStamped:
-    """Return a pose from x, y, z [m], qx, qy, qz, qw."""
-    x, y, z, *turn = map(float, numbers)
-    orientation = Quaternion(**dict(zip("xyzw", turn, strict=True)))
-    return PoseStamped(header=header, pose=Pose(position=Point(x=x, y=y, z=z), orientation=orientation))
-
-
-def points_marker(
-    header: Header,
-    name: str,
-    kind: str,
-    points: ArrayLike,
-    *,
-    color: Sequence[float],
-    scale: Sequence[float],
-    colors: Sequence[Sequence[float]] = (),
-) -> Marker:
-    """Return a marker of points (n, 3) [m]: triangles, spheres or an arrow from the first to the second.
-
-    Args:
-        header: stamp and frame.
-        name: the marker's namespace; each holds one marker.
-        kind: "triangles", "spheres" or "arrow".
-        points: in the frame of the header; none of them deletes the marker.
-        color: red, green, blue, opacity.
-        scale: what the kind makes of it [m].
-        colors: one per point, in place of `color`.
-    """
-    known = [Point(x=x, y=y, z=z) for x, y, z in np.asarray(points, dtype=np.float64).reshape(-1, 3).tolist()]
-    return Marker(
-        header=header,
-        ns=name,
-        type=MARKERS[kind],
-        action=Marker.ADD if known else Marker.DELETE,
-        points=known,
-        color=ColorRGBA(**dict(zip("rgba", color, strict=True))),
-        colors=[ColorRGBA(**dict(zip("rgba", entry, strict=True))) for entry in colors],
-        scale=_vector(scale),
-    )
+provide_transport()  # read when the first context is made, whoever makes it
 
 
 def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> RecordT:
@@ -175,25 +107,29 @@ def describe_field(entry: Field) -> ParameterDescriptor:
 
 
 class QosWatch:
-    """Says which connections do not come about because the two ends ask for different service."""
+    """Says which connections do not come about because the two ends ask for different service.
+
+    Attributes:
+        node: whose connections these are.
+    """
 
     def __init__(self, node: Node) -> None:
-        self._node = node
+        self.node = node
         self._suspects: dict[str, tuple[bool, QoSProfile]] = {}
 
     def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
         """Create a watched publisher."""
         events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
-        return self._node.create_publisher(kind, topic, qos, event_callbacks=events)
+        return self.node.create_publisher(kind, topic, qos, event_callbacks=events)
 
     def subscription(self, kind: type, topic: str, callback: Callable, qos: QoSProfile, **options: Any) -> Subscription:
         """Create a watched subscription."""
         events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
-        return self._node.create_subscription(kind, topic, callback, qos, event_callbacks=events, **options)
+        return self.node.create_subscription(kind, topic, callback, qos, event_callbacks=events, **options)
 
     def _suspect(self, topic: str, writes: bool, qos: QoSProfile) -> None:
-        self._suspects[self._node.resolve_topic_name(topic)] = (writes, qos)
-        self._node.get_logger().error("; ".join(self.faults()))
+        self._suspects[self.node.resolve_topic_name(topic)] = (writes, qos)
+        self.node.get_logger().error("; ".join(self.faults()))
 
     def faults(self) -> list[str]:
         """Return one sentence per mismatch that still stands."""
@@ -202,7 +138,7 @@ class QosWatch:
 
     def _mismatches(self, topic: str, writes: bool, qos: QoSProfile) -> list[str]:
         """Compare our end of a topic with every other end that stands against it."""
-        node, sentences = self._node, []
+        node, sentences = self.node, []
         look_up = node.get_subscriptions_info_by_topic if writes else node.get_publishers_info_by_topic
         for end in look_up(topic):
             pair = (qos, end.qos_profile) if writes else (end.qos_profile, qos)
@@ -210,6 +146,35 @@ class QosWatch:
             if verdict == QoSCompatibility.ERROR:
                 sentences.append(f"quality of service of {topic} does not match {end.node_name}: {why}")
         return sentences
+
+
+class LargeSubscription:
+    """A subscription to messages of a megabyte, whose lost pieces come again, unless their publisher keeps nothing.
+
+    Best effort alone loses most of such messages where Fast DDS has its default of 512 kB of shared memory.
+
+    Attributes:
+        current: the subscription.
+
+    Args:
+        qos: makes subscriptions and watches them.
+        kind: of the messages.
+        topic: of the messages.
+        callback: takes them.
+    """
+
+    def __init__(self, qos: QosWatch, kind: type, topic: str, callback: Callable) -> None:
+        self._relax = partial(qos.subscription, kind, topic, callback, SENSOR)
+        self._node, self._topic = qos.node, topic
+        events = SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch)
+        self.current = qos.node.create_subscription(kind, topic, callback, STEADY, event_callbacks=events)
+
+    def _on_mismatch(self, _: Any) -> None:
+        """Take the messages as they come from a publisher that offers no more."""
+        if self._relax is not None:
+            self._node.get_logger().warning(f"{self._topic} comes with best effort: large messages may be lost")
+            self._node.destroy_subscription(self.current)
+            self.current, self._relax = self._relax(), None
 
 
 def publish_diagnostics(

@@ -10,7 +10,9 @@ from importlib import import_module
 NODES = {
     "ifea_solver": "finforce_ifea.node",
     "contact_estimator": "finforce_contact.node",
+    "keypoint_detector": "finforce_keypoints.node",
     "recording_player": "finforce_eval.node",
+    "twin_camera": "finforce_twin.node",
 }
 STOPS = (signal.SIGINT, signal.SIGTERM)
 
@@ -25,9 +27,19 @@ def contact_estimator() -> int:
     return start("contact_estimator")
 
 
+def keypoint_detector() -> int:
+    """Run the key point detector of one jaw or both."""
+    return start("keypoint_detector")
+
+
 def recording_player() -> int:
     """Run the player of recordings."""
     return start("recording_player")
+
+
+def twin_camera() -> int:
+    """Run the camera of the synthetic twin."""
+    return start("twin_camera")
 
 
 def start(name: str) -> int:

@@ -17,6 +17,8 @@ setup(
         "finforce_camera",
         "finforce_graph",
         "finforce_health",
+        "finforce_launch",
+        "finforce_messages",
         "finforce_records",
         "finforce_ros",
         "finforce_start",
@@ -24,7 +26,7 @@ setup(
     package_data={
         "finforce_ifea": ["jaws/*", "calibrations/*"],
         "finforce_eval": ["data/*", "data/*/*", "data/*/*/*"],
-        "finforce_keypoints": ["models/*/*"],
+        "finforce_keypoints": ["models/*/*", "transport/*"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

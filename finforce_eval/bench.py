@@ -25,7 +25,7 @@ from finforce_eval.errors import OptionError
 from finforce_eval.recording import read_recording
 from finforce_eval.tracks import Recording
 from finforce_ifea.errors import MissingDependencyError
-from finforce_ifea.estimator import Contact, JawEstimator, Observation
+from finforce_ifea.estimator import Contact, JawEstimator
 from finforce_ifea.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.solid import SolidModel
@@ -81,10 +81,7 @@ def measure_steps(recording: Recording, jaw: Jaw, solver: str, mesh: str, frames
     contact = Contact.fixed(jaw, ContactChoice().height(recording))
     settings = EstimatorSettings(solver=solver, mesh=mesh)
     track = recording.jaw(jaw.side).keypoints
-    seen = [
-        Observation(stamp=stamp * 1e-9, points=points, likelihood=likelihood)
-        for stamp, points, likelihood in zip(track.stamps, track.points, track.likelihood, strict=True)
-    ]
+    seen = [track.observation(index) for index in range(len(track.stamps))]
     warm_up = JawEstimator(jaw, settings=settings)
     for observation in seen[:200]:
         warm_up.update(observation, contact)

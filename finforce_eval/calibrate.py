@@ -12,7 +12,6 @@ from finforce_eval.contacts import ContactChoice
 from finforce_eval.evaluate import check_keypoint_count
 from finforce_eval.scoring import match_truth
 from finforce_eval.tracks import Recording
-from finforce_ifea.estimator import Observation
 from finforce_ifea.identification import CalibrationFit, fit_calibration
 from finforce_ifea.jaw import Jaw
 from finforce_ifea.plateaus import CalibrationCase
@@ -47,10 +46,7 @@ def calibration_case(
     check_keypoint_count(recording, side, jaw)
     forces = match_truth(truth, track.stamps)
     known = np.isfinite(forces).all(axis=1)
-    observations = [
-        Observation(stamp=stamp * 1e-9, points=points, likelihood=likelihood)
-        for stamp, points, likelihood in zip(track.stamps, track.points, track.likelihood, strict=True)
-    ]
+    observations = [track.observation(index) for index in range(len(track.stamps))]
     return CalibrationCase(
         name=recording.name,
         observations=observations,

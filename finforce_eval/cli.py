@@ -17,6 +17,7 @@ CONTACT_HELP = (
     "the clamped base; fixed:case takes it from the case.json beside each recording; NAME=Z_MM gives it for one "
     "recording and may be repeated. Without it estimate for a recording with mesh and poses, else fixed:case"
 )
+SOURCES = ("images", "keypoints", "truth")
 UNITS = ("m", "cm", "mm", "inch")
 
 
@@ -36,6 +37,7 @@ def build_parser() -> Parser:
     _add_calibrate(commands)
     replay = "play a recording through the real nodes in real time and score it"
     commands.add_parser("replay", help=replay, add_help=False)
+    _add_twin(commands)
     _add_demo(commands)
     _add_bench(commands)
     _add_steel(commands)
@@ -56,6 +58,17 @@ def add_jaw_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--object-unit", default="m", choices=UNITS, help="unit of the mesh (m)")
 
 
+def add_source_options(parser: argparse.ArgumentParser) -> None:
+    """Add what names the key points and their detector."""
+    text = "key points: images, by the detector; keypoints, as recorded; truth, of a synthetic recording. Without it "
+    text += "keypoints where they were recorded, else images"
+    parser.add_argument("--from", dest="source", choices=SOURCES, help=text)
+    text = "change a parameter of the key point detector, as model=FOLDER or detector.gate=0.004; repeatable"
+    parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
+    text = "the camera in the gripper: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
+    parser.add_argument("--extrinsics", metavar="POSE", help=text)
+
+
 def _add_set(parser: argparse.ArgumentParser) -> None:
     """Add changes of single settings."""
     text = "change a setting of the estimator, may be repeated; an unknown NAME lists them"
@@ -67,6 +80,7 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("evaluate", help=text, description=text)
     parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
     add_jaw_options(parser)
+    add_source_options(parser)
     calibration = "calibration file, or a shipped name; without it the jaw file's own material"
     parser.add_argument("--calibration", metavar="FILE", help=calibration)
     _add_set(parser)
@@ -80,14 +94,43 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("calibrate", help=text, description=text)
     parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
     add_jaw_options(parser)
+    add_source_options(parser)
     _add_set(parser)
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration to be written")
     parser.set_defaults(run="finforce_eval.commands:run_calibrate")
 
 
+def _add_twin(commands: argparse._SubParsersAction) -> None:
+    text = "make RGB-D recordings of a synthetic gripper, with the truth about everything in them"
+    parser = commands.add_parser("twin", help=text, description=text)
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=Parser)
+    listing = actions.add_parser("list", help="name the scenes")
+    listing.set_defaults(run="finforce_eval.twin_commands:run_list")
+    record = actions.add_parser("record", help="render a scene and write it", description="render a scene and write it")
+    record.add_argument("scene", metavar="SCENE", help="a name that `finforce twin list` prints")
+    record.add_argument("-o", "--output", required=True, metavar="BAG", help="recording to be written, a new folder")
+    record.add_argument("--seed", type=int, default=0, help="of material, textures, light and noise (0)")
+    record.add_argument("--light", metavar="WORD", help="bright or dim; without it that of the scene")
+    record.add_argument("--object", metavar="NAME", help="shape by name, or mesh file; without it that of the scene")
+    record.add_argument("--camera", choices=("robot", "bench"), help="two jaws on the wrist, or one on the bench")
+    record.add_argument("--size", default="640x480", metavar="WxH", help="of the images (640x480)")
+    text = "change a number of the scene, may be repeated; an unknown NAME lists them"
+    record.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
+    kind = record.add_mutually_exclusive_group()
+    kind.add_argument("--compressed", action="store_true", help="jpeg colour and png depth (as it is without --raw)")
+    kind.add_argument("--raw", action="store_true", help="plain images, 46 MB a second")
+    record.add_argument("--quality", type=int, default=90, metavar="N", help="of the jpegs, 1 to 95 (90)")
+    text = "leave depth beyond so many metres away, which makes a recording smaller"
+    record.add_argument("--farthest", type=float, default=float("inf"), metavar="M", help=text)
+    record.add_argument("--storage", default="mcap", choices=("mcap", "sqlite3"), help="format of the recording")
+    record.set_defaults(run="finforce_eval.twin_commands:run_record")
+
+
 def _add_demo(commands: argparse._SubParsersAction) -> None:
-    text = "replay the shipped recording through the real nodes and write a report"
+    text = "play a recording through the real nodes, from images to force, and write a report"
     parser = commands.add_parser("demo", help=text, description=text)
+    text = "begin with images of a synthetic gripper, rendered at first use, or with the key points of a bench (images)"
+    parser.add_argument("--from", dest="source", default="images", choices=("images", "keypoints"), help=text)
     parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
     parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")
     parser.set_defaults(run="finforce_eval.demo:run_demo")
@@ -142,7 +185,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     try:
         if arguments[:1] == ["replay"]:
-            return import_module("finforce_eval.replay").main(arguments[1:]) or 0
+            return import_module("finforce_eval.replay_command").main(arguments[1:]) or 0
         options = build_parser().parse_args(arguments)
         module, function = options.run.split(":")
         return getattr(import_module(module), function)(options) or 0

@@ -15,6 +15,7 @@ from finforce_eval.contact_source import ContactSource
 from finforce_eval.contacts import ContactChoice, parse_contacts
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
+from finforce_eval.keypoint_source import parse_source
 from finforce_eval.recording import read_recording
 from finforce_eval.results import CaseResult
 from finforce_eval.tables import evaluation_json, format_table
@@ -95,6 +96,22 @@ def read_recordings(paths: Sequence[str]) -> list[Recording]:
     ]
 
 
+def read_keypoints(options: argparse.Namespace) -> list[Recording]:
+    """Read the recordings with the key points that were asked for.
+
+    Raises:
+        FinforceError: one of them cannot be read, or has no such key points.
+    """
+    source = parse_source(options)
+    recordings = []
+    for read in read_recordings(options.bags):
+        recording = source.apply(read)
+        for note in recording.notes[len(read.notes) :]:
+            print(f"note: {recording.name}: {note}", file=sys.stderr)
+        recordings.append(recording)
+    return recordings
+
+
 def _long_name(recording: Recording) -> str:
     """Return the name with the folders above it."""
     return "/".join(recording.path.resolve().with_suffix("").parts[-3:])
@@ -119,6 +136,7 @@ def make_setup(options: argparse.Namespace) -> Setup:
         "jaw": jaw.name,
         "solver": options.solver,
         "mesh": options.mesh,
+        "keypoints": getattr(options, "source", None) or "keypoints where they were recorded, else images",
         "contact": ", ".join(options.contact) or "estimate where mesh and poses are known, else fixed:case",
         "settings": ", ".join(changes) or "as they come",
         "calibration": options.calibration or "none",
@@ -153,7 +171,7 @@ def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorS
 def run_evaluate(options: argparse.Namespace) -> None:
     """Evaluate recordings: print the table, write JSON and report."""
     setup = make_setup(options)
-    recordings = read_recordings(options.bags)
+    recordings = read_keypoints(options)
     evaluation = evaluate_all(recordings, setup)
     print(format_table(evaluation))
     if options.json:
@@ -225,7 +243,7 @@ def run_calibrate(options: argparse.Namespace) -> None:
 
     options.calibration = None
     setup = make_setup(options)
-    recordings = read_recordings(options.bags)
+    recordings = read_keypoints(options)
     is_left = all("left" in truth_sides(recording) for recording in recordings)
     setup = setup.side("left" if is_left else "right")
     jaw, contacts = setup.jaw, setup.contacts

@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_eval.images import COLOR, DEPTH
+from finforce_eval.live_detection import DetectionLog
 from finforce_eval.places import InnerSurface, true_lines
 from finforce_eval.results import CaseResult, ContactSeries, Snapshot
 from finforce_eval.scoring import match_truth
+from finforce_eval.sight_scoring import compare_sight
 from finforce_eval.tracks import NANOSECONDS, Recording
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_ifea.pointcloud import decode_keypoints
@@ -63,6 +66,8 @@ class ReplayLog:
         self.jaws = {side: JawLog() for side in sides}
         self._outlines: dict[str, tuple[NDArray[np.float64], ...]] = {}
         self.grasp: dict[int, float] = {}
+        self.grasp_latency: dict[int, float] = {}
+        self.detections = {side: DetectionLog() for side in sides}
         self.health: dict[str, Mapping[str, str]] = {}
         self.offset = 0
         self.ended = False
@@ -73,7 +78,12 @@ class ReplayLog:
         return stamp.sec * NANOSECONDS + stamp.nanosec - self.offset
 
     def take_sent(self, topic: str, stamp: int, time: float) -> None:
-        """Note when a message left; only those of key points count."""
+        """Note when a message left [s, monotonic]; those count that a run begins with: key points, or an image."""
+        if topic in (COLOR, DEPTH):
+            # an image is whole with the later of its two messages
+            for log in self.jaws.values():
+                log.sent[stamp] = time
+            return
         side = topic.removeprefix("/").removesuffix("/keypoints")
         if side in self.jaws:
             self.jaws[side].sent[stamp] = time
@@ -110,9 +120,28 @@ class ReplayLog:
         outline = outline_from_cloud(message, f"{side}_jaw", None)
         self._outlines[side] = () if outline is None else outline.placed()
 
-    def take_grasp(self, message: Any) -> None:
-        """Keep a grasp force."""
-        self.grasp[self._stamp(message)] = message.wrench.force.x
+    def take_pose(self, side: str, message: Any) -> None:
+        """Keep the pose of a jaw that the detector found."""
+        self.detections[side].take_pose(self._stamp(message), message)
+
+    def take_keypoints(self, side: str, message: Any, time: float) -> None:
+        """Keep key points that the detector found and that arrived at `time` [s, monotonic]."""
+        stamp = self._stamp(message)
+        sent = self.jaws[side].sent.get(stamp)
+        self.detections[side].take_cloud(stamp, message, None if sent is None else time - sent)
+
+    def take_grasp(self, message: Any, time: float) -> None:
+        """Keep a grasp force that arrived at `time` [s, monotonic]."""
+        stamp = self._stamp(message)
+        self.grasp[stamp] = message.wrench.force.x
+        sent = [log.sent[stamp] for log in self.jaws.values() if stamp in log.sent]
+        if sent:
+            self.grasp_latency[stamp] = time - min(sent)
+
+    @property
+    def grasp_series(self) -> tuple[Mapping[int, float], Mapping[int, float]]:
+        """Grasp force [N] and the time from the image to it [s], by recorded stamp [ns]."""
+        return self.grasp, self.grasp_latency
 
     def take_diagnostics(self, message: Any) -> None:
         """Keep the last state of every node; that nothing arrives any more after the end is no news."""
@@ -138,7 +167,8 @@ def live_result(
         likelihood_threshold: of the solver.
         estimator: a fresh one of the same jaw, for the undeformed surface and its triangles.
     """
-    track = recording.jaw(side).keypoints
+    jaw_track = recording.jaw(side)
+    track, detection = jaw_track.keypoints, jaw_track.detection
     stamps, frames = track.stamps, len(track.stamps)
     force = _rows(log.force, stamps)
     norm = np.linalg.norm(force, axis=1, keepdims=True)
@@ -162,6 +192,8 @@ def live_result(
         scored=phases.scored,
         snapshot=_snapshot(recording, side, log, seen, estimator),
         contact=_contact_series(recording, side, log, estimator) if log.touching else None,
+        sight=compare_sight(detection, jaw_track.sight) if detection and jaw_track.sight else None,
+        detector_ms=None if detection is None else detection.step_ms,
     )
 
 

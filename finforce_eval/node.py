@@ -6,12 +6,14 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from itertools import groupby
+from operator import attrgetter
 from time import monotonic
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
@@ -20,7 +22,7 @@ from sensor_msgs.msg import PointCloud2
 import finforce_ros as ros
 from finforce_eval.live import ReplayLog
 from finforce_eval.parameters import PlayerParameters
-from finforce_eval.playback import RawMessage, read_playback
+from finforce_eval.playback import Playback, RawMessage, read_playback
 
 
 class PlayerNode(Node):
@@ -33,9 +35,9 @@ class PlayerNode(Node):
         self._outputs: dict[str, Any] = {}
         self._clock_out: Any = None
 
-    def offer(self, messages: Iterable[RawMessage]) -> None:
+    def offer(self, messages: Playback) -> None:
         """Create a publisher for every topic; a type that is not installed is named and left out."""
-        for topic, msgtype in {message.topic: message.msgtype for message in messages}.items():
+        for topic, msgtype in messages.types.items():
             package, _, name = msgtype.split("/")
             try:
                 kind = getattr(import_module(f"{package}.msg"), name)
@@ -45,8 +47,11 @@ class PlayerNode(Node):
             self._outputs[topic] = self.create_publisher(kind, topic, ros.RESULT)
 
     def has_listeners(self, topics: Iterable[str]) -> bool:
-        """Say whether somebody listens to each of the topics."""
-        return all(self._outputs[topic].get_subscription_count() for topic in topics)
+        """Say whether somebody listens to each of the topics, whether they are played from here or not."""
+        return all(
+            self._outputs[topic].get_subscription_count() if topic in self._outputs else self.count_subscribers(topic)
+            for topic in topics
+        )
 
     def wait_for(self, condition: Callable[[], bool], patience: float) -> bool:
         """Spin until a condition holds, for at most `patience` [s]; return whether it does."""
@@ -71,7 +76,7 @@ class PlayerNode(Node):
 
     def play(
         self,
-        messages: Sequence[RawMessage],
+        messages: Playback,
         *,
         rate: float = 1.0,
         offset: int | None = None,
@@ -85,18 +90,24 @@ class PlayerNode(Node):
             offset: added to every stamp [ns]; None keeps the stamps and publishes them on /clock.
             sent: called just before each message leaves.
         """
-        first = messages[0].time
+        first = messages.begin
         if offset is None:
             self._start_clock(first)
         began = monotonic()
-        for message in messages:
-            self.spin_until(began + (message.time - first) / (rate * ros.NANOSECONDS))
+        for time, together in groupby(messages, key=attrgetter("time")):
+            due = list(together)  # read and decompressed ahead: what belongs to one image leaves at once
+            self.spin_until(began + (time - first) / (rate * ros.NANOSECONDS))
             if offset is None:
-                self._clock_out.publish(Clock(clock=ros.stamp_message(message.time)))
-            if message.topic in self._outputs:
-                sent(message)
-                data = message.data if offset is None else message.restamped(message.stamp + offset)
-                self._outputs[message.topic].publish(data)
+                self._clock_out.publish(Clock(clock=ros.stamp_message(time)))
+            for message in due:
+                self._publish(message, offset, sent)
+
+    def _publish(self, message: RawMessage, offset: int | None, sent: Callable[[RawMessage], Any]) -> None:
+        """Publish one message with its stamp moved by `offset` [ns]."""
+        if message.topic in self._outputs:
+            sent(message)
+            data = message.data if offset is None else message.restamped(message.stamp + offset)
+            self._outputs[message.topic].publish(data)
 
     def _start_clock(self, time: int) -> None:
         """Give the time [ns] to whoever waits for /clock, before the first message needs it."""
@@ -105,8 +116,8 @@ class PlayerNode(Node):
         self._clock_out.publish(Clock(clock=ros.stamp_message(time)))
         self.spin_until(monotonic() + 0.2)
 
-    def listen(self, sides: Iterable[str], log: ReplayLog) -> None:
-        """Hand results to a log, with the time of their arrival."""
+    def listen(self, sides: Iterable[str], log: ReplayLog, *, detector: bool = False) -> None:
+        """Hand results to a log, with the time of their arrival; with those of the key point detector, if it runs."""
 
         def subscribe(kind: type, topic: str, take: Callable[[Any], Any]) -> None:
             self.create_subscription(kind, topic, take, ros.RESULT)
@@ -117,7 +128,10 @@ class PlayerNode(Node):
             subscribe(PointCloud2, f"{side}/surface", lambda m, s=side: log.take_surface(s, m))
             subscribe(PointCloud2, f"{side}/contact", lambda m, s=side: log.take_contact(s, m))
             subscribe(PointCloud2, f"{side}/object_outline", lambda m, s=side: log.take_outline(s, m))
-        subscribe(WrenchStamped, "grasp_wrench", log.take_grasp)
+            if detector:
+                subscribe(PoseStamped, f"{side}/jaw_pose", lambda m, s=side: log.take_pose(s, m))
+                subscribe(PointCloud2, f"{side}/keypoints", lambda m, s=side: log.take_keypoints(s, m, monotonic()))
+        subscribe(WrenchStamped, "grasp_wrench", lambda m: log.take_grasp(m, monotonic()))
         subscribe(DiagnosticArray, "/diagnostics", log.take_diagnostics)
 
 
@@ -144,7 +158,7 @@ def play_recording(node: PlayerNode, _: Executor) -> None:
     messages = read_playback(parameters.bag)
     node.offer(messages)
     ends = ("/keypoints", "/jaw_pose") if parameters.awaits_poses else ("/keypoints",)
-    awaited = {message.topic for message in messages if message.topic.endswith(ends)}
+    awaited = {topic for topic in messages.types if topic.endswith(ends)}
     if not node.wait_for(lambda: node.has_listeners(awaited), parameters.patience):
         node.get_logger().warning(f"nobody listens to one of {', '.join(awaited)}; all are played all the same")
     node.play(messages, rate=parameters.rate)

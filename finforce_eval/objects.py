@@ -39,7 +39,7 @@ def find_mesh(recording: Recording, object_file: str | None = None) -> Path | No
     """Return the mesh file that was given, or the one that the `case.json` names; None without either.
 
     The path in a `case.json` is relative to the folder that holds the recordings: the one above the recording's own
-    folder, or the one with the bag file itself.
+    folder, or the one with the bag file itself. A mesh in the recording's own folder is found when that was renamed.
     """
     if object_file is not None:
         return Path(object_file)
@@ -48,7 +48,8 @@ def find_mesh(recording: Recording, object_file: str | None = None) -> Path | No
         return None
     path = recording.path.resolve()
     folder = path if path.is_dir() else path.parent
-    return next((place / name for place in (folder.parent, folder) if (place / name).is_file()), None)
+    places = (folder.parent / name, folder / name, folder / Path(name).name)
+    return next((place for place in places if place.is_file()), None)
 
 
 def require_mesh(recording: Recording, object_file: str | None = None) -> Path:
@@ -66,9 +67,9 @@ def require_mesh(recording: Recording, object_file: str | None = None) -> Path:
 
 
 def has_object(recording: Recording, side: str) -> bool:
-    """Say whether a recording tells where the object is in the frame of the jaw `side`."""
-    poses = recording.object_pose
-    return poses is not None and (_is_in_jaw(poses, side) or recording.jaw(side).pose is not None)
+    """Say whether a recording tells where the object is in the frame of the jaw `side`, or images will."""
+    poses, track = recording.object_pose, recording.jaw(side)
+    return poses is not None and (_is_in_jaw(poses, side) or track.pose is not None or track.is_awaited)
 
 
 def track_object(recording: Recording, side: str) -> ObjectTrack:

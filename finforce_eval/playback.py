@@ -1,17 +1,19 @@
-"""Recorded messages as they lie in a bag, undecoded, ready to be published again; knows no ROS node."""
+"""Recorded messages as they lie in a bag, ready to be published again, read one by one; knows no ROS node."""
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from finforce_eval.bags import BagReader, RawSample, bag_source, open_bag, read_stamp, restamp
 from finforce_eval.errors import RecordingError
-from finforce_eval.recording import bag_source, damage_reported
-from finforce_eval.tracks import NANOSECONDS
+from finforce_eval.image_messages import COMPRESSED, IMAGE, color_from_message, depth_millimetres
+from finforce_eval.images import COLOR, COLOR_ENDS, DEPTH, DEPTH_ENDS, INFO, INFO_ENDS
 
 HEADER = "std_msgs/msg/Header"
+# where the nodes listen -> the ends of the topics that are played there
+PLAYED = {COLOR: COLOR_ENDS, DEPTH: DEPTH_ENDS, INFO: INFO_ENDS}
 
 
 class RawMessage(NamedTuple):
@@ -34,26 +36,51 @@ class RawMessage(NamedTuple):
     @property
     def stamp(self) -> int:
         """The header's stamp [ns]; the time of receipt without a header."""
-        if not self.has_header:
-            return self.time
-        seconds, nanoseconds = struct.unpack_from(self._layout, self.data, 4)
-        return seconds * NANOSECONDS + nanoseconds
+        return read_stamp(self.data) if self.has_header else self.time
 
     def restamped(self, stamp: int) -> bytes:
         """Return the bytes with another stamp [ns]; unchanged without a header."""
-        if not self.has_header:
-            return self.data
-        data = bytearray(self.data)
-        struct.pack_into(self._layout, data, 4, *divmod(stamp, NANOSECONDS))
-        return bytes(data)
-
-    @property
-    def _layout(self) -> str:
-        """Return int32 sec, uint32 nanosec in the byte order that the encapsulation names."""
-        return "<iI" if self.data[1] & 1 else ">iI"
+        return restamp(self.data, stamp) if self.has_header else self.data
 
 
-def read_playback(path: str | Path, without: Collection[str] = ()) -> list[RawMessage]:
+class Playback:
+    """The messages of a bag in the order of their receipt; every iteration reads them anew.
+
+    Camera topics come out where the nodes listen, and compressed images as plain ones.
+
+    Args:
+        source: the bag.
+        without: topics to be left out.
+
+    Raises:
+        RecordingError: the bag cannot be read, or holds nothing to be played.
+    """
+
+    def __init__(self, source: Path, without: Collection[str]) -> None:
+        self._source = source
+        with open_bag(source, source.name) as bag:
+            chosen = [entry for entry in bag.connections if entry.topic not in without and bag.knows(entry.msgtype)]
+            self._topics = {entry.topic: _played_topic(entry.topic) for entry in chosen}
+            self._count = sum({id(entry): entry.msgcount for entry in chosen}.values())
+            first = next(bag.raw(self._topics), None)
+            self._headed = {entry.topic: _begins_with_header(bag.definition(entry.msgtype)) for entry in chosen}
+        if first is None:
+            raise RecordingError(f"{source.name}: nothing to be played in it")
+        self.begin = first.time
+        self.types = {self._topics[entry.topic]: _played_type(entry.msgtype) for entry in chosen}
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[RawMessage]:
+        with open_bag(self._source, self._source.name) as bag:
+            for raw in bag.raw(self._topics):
+                topic, kind = self._topics[raw.topic], bag.types[raw.topic]
+                data = _decompress(bag, raw, topic) if kind == COMPRESSED else bytes(raw.data)
+                yield RawMessage(raw.time, topic, _played_type(kind), data, self._headed[raw.topic])
+
+
+def read_playback(path: str | Path, without: Collection[str] = ()) -> Playback:
     """Return the messages of a bag in the order of their receipt.
 
     Args:
@@ -63,21 +90,32 @@ def read_playback(path: str | Path, without: Collection[str] = ()) -> list[RawMe
     Raises:
         RecordingError: the bag cannot be read, or holds nothing to be played.
     """
-    from rosbags.rosbag2 import Reader
-    from rosbags.typesys import Stores, get_typestore
+    return Playback(bag_source(Path(path)), without)
 
-    types = get_typestore(Stores.ROS2_JAZZY).fielddefs
-    source = bag_source(Path(path))
-    with damage_reported(source.name), Reader(source) as reader:
-        chosen = [entry for entry in reader.connections if entry.topic not in without and entry.msgtype in types]
-        headed = {entry.msgtype: _begins_with_header(types[entry.msgtype]) for entry in chosen}
-        messages = [
-            RawMessage(time, entry.topic, entry.msgtype, bytes(data), headed[entry.msgtype])
-            for entry, time, data in (reader.messages(connections=chosen) if chosen else ())
-        ]
-    if not messages:
-        raise RecordingError(f"{source.name}: nothing to be played in it")
-    return messages
+
+def _played_topic(topic: str) -> str:
+    """Return where a topic is played: those of any camera under the names that the nodes listen to."""
+    return next((ours for ours, ends in PLAYED.items() if topic.endswith(tuple(f"/{end}" for end in ends))), topic)
+
+
+def _played_type(msgtype: str) -> str:
+    return IMAGE if msgtype == COMPRESSED else msgtype
+
+
+def _decompress(bag: BagReader, raw: RawSample, topic: str) -> bytes:
+    """Return the CDR bytes of a sensor_msgs/Image with the pixels of a compressed one."""
+    message: Any = bag.decode(raw)
+    pixels = depth_millimetres(message) if topic == DEPTH else color_from_message(message)
+    fields = {
+        "header": message.header,
+        "height": pixels.shape[0],
+        "width": pixels.shape[1],
+        "encoding": "16UC1" if topic == DEPTH else "rgb8",
+        "is_bigendian": 0,
+        "step": pixels.strides[0],
+        "data": pixels.reshape(-1).view("u1"),
+    }
+    return bag.encode(IMAGE, fields)
 
 
 def _begins_with_header(definition: tuple) -> bool:

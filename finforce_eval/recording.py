@@ -1,16 +1,18 @@
-"""rosbag2 files (mcap, sqlite3) into recordings; the only place that reads bags."""
+"""Bags into recordings: topics to tracks, checked; knows neither files of bags nor pixels."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from finforce_eval.bags import Sample, bag_source, check_types, open_bag
 from finforce_eval.errors import RecordingError
+from finforce_eval.images import ImageTrack, find_images
+from finforce_eval.sight import SightTrack
 from finforce_eval.tracks import (
     JAWS,
     NANOSECONDS,
@@ -21,48 +23,55 @@ from finforce_eval.tracks import (
     WrenchTrack,
     parse_phases,
 )
-from finforce_ifea.errors import MissingDependencyError, ObservationError
-from finforce_ifea.pointcloud import Keypoints, decode_keypoints
+from finforce_ifea.errors import ObservationError
+from finforce_ifea.pointcloud import Keypoints, decode_columns, decode_keypoints
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 STRING = "std_msgs/msg/String"
+SIGHT_COLUMNS = ("x", "y", "z", "u", "v", "visible")
+TRUE_KEYPOINTS, TRUE_POSE = "ground_truth_keypoints", "ground_truth_jaw_pose"
 TOPICS = {"/object_pose": POSE, "/bench/phase": STRING}
 for _side in JAWS:
     TOPICS |= {
         f"/{_side}/keypoints": CLOUD,
         f"/{_side}/ground_truth_wrench": WRENCH,
         f"/{_side}/jaw_pose": POSE,
+        f"/{_side}/{TRUE_KEYPOINTS}": CLOUD,
+        f"/{_side}/{TRUE_POSE}": POSE,
     }
 
 
-class Sample(NamedTuple):
-    """A message and the time [ns] at which the bag received it."""
+class _Content(NamedTuple):
+    """What lies in a bag: messages by topic, images, and notes on what was left aside."""
 
-    time: int
-    message: Any
+    samples: Mapping[str, list[Sample]]
+    images: ImageTrack | None
+    notes: list[str]
 
 
 def read_recording(path: str | Path) -> Recording:
     """Read a rosbag2 folder or a single .mcap / .db3 file, with the `case.json` beside it.
 
-    Topics that are not ours are not decoded; those of unknown type are named in `notes`.
+    Topics that are not ours are not decoded; those of unknown type are named in `notes`. Images are not read yet; a
+    recording with images may do without key points, its tracks of them are empty then.
 
     Args:
         path: the folder or the file.
 
     Raises:
-        RecordingError: nothing there, damaged, empty, without key points, or with malformed content.
+        RecordingError: nothing there, damaged, empty, without key points and images, or with malformed content.
         MissingDependencyError: rosbags is not installed.
     """
     source = bag_source(Path(path))
     folder = source if source.is_dir() else source.parent
     name = source.name if source.is_dir() else source.stem
-    samples, notes = _read_samples(source, name)
-    jaws = {side: _jaw_track(samples, side, name) for side in JAWS if samples.get(f"/{side}/keypoints")}
+    samples, images, notes = _read_samples(source, name)
+    jaws = {side: _jaw_track(samples, side, name) for side in JAWS if _has_jaw(samples, side, images is not None)}
     if not jaws:
-        raise RecordingError(f"{name}: no key points: /left/keypoints and /right/keypoints have no messages")
+        what = "no images either" if images is None else "there are images, but no topic names a jaw"
+        raise RecordingError(f"{name}: no key points: /left/keypoints and /right/keypoints have no messages; {what}")
     phases = samples.get("/bench/phase")
     poses = samples.get("/object_pose")
     return Recording(
@@ -73,74 +82,31 @@ def read_recording(path: str | Path) -> Recording:
         phases=_phases(phases, name) if phases else None,
         case=_read_case(folder / "case.json"),
         notes=tuple(notes),
+        images=images,
     )
 
 
-def bag_source(path: Path) -> Path:
-    """Return what rosbags can open: a folder with metadata.yaml, or the one bag file in a folder without."""
-    if not path.exists():
-        raise RecordingError(f"{path}: no such recording")
-    path = path.resolve()
-    if path.is_file() and path.suffix not in (".mcap", ".db3"):
-        raise RecordingError(f"{path.name}: not a recording; expected a rosbag2 folder, .mcap or .db3")
-    if path.is_file() or (path / "metadata.yaml").exists():
-        return path
-    files = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
-    if len(files) != 1:
-        found = f"no metadata.yaml and {len(files)} bag files" if files else "no metadata.yaml, .mcap or .db3"
-        raise RecordingError(f"{path.name}: the folder is no recording: {found} in it")
-    return files[0]
+def _has_jaw(samples: Mapping[str, list[Sample]], side: str, has_images: bool) -> bool:
+    """Say whether a recording tells of a jaw: by its key points, or with images by anything that is the jaw's own."""
+    topics = [topic for topic in samples if topic.startswith(f"/{side}/")]
+    return f"/{side}/keypoints" in topics or (has_images and bool(topics))
 
 
-@contextmanager
-def damage_reported(name: str) -> Iterator[None]:
-    """Turn whatever a bag reader raises on damaged bytes into one RecordingError."""
-    try:
-        yield
-    except (RecordingError, MissingDependencyError):
-        raise
-    except Exception as error:  # struct, sqlite3, zstd, lz4, yaml, ... each has its own classes
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise RecordingError(f"{name}: truncated or damaged: {reason}") from error
-
-
-def _read_samples(source: Path, name: str) -> tuple[dict[str, list[Sample]], list[str]]:
-    """Decode the messages of our topics, by topic, and note the topics of unknown type."""
-    try:
-        from rosbags.rosbag2 import Reader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise MissingDependencyError("reading a recording needs rosbags: pip install rosbags") from error
-    # not AnyReader: it registers every definition in the bag and ends at a foreign one it cannot parse
-    types = get_typestore(Stores.ROS2_JAZZY)
+def _read_samples(source: Path, name: str) -> _Content:
+    """Decode the messages of our topics, by topic, and find the images."""
     samples: dict[str, list[Sample]] = {}
-    with damage_reported(name), Reader(source) as reader:
-        if reader.message_count == 0:
-            raise RecordingError(f"{name}: the recording is empty: it holds no messages")
-        ours = [connection for connection in reader.connections if connection.topic in TOPICS]
-        _check_types(ours, name)
-        notes = _foreign_notes(reader.connections, types.fielddefs)
-        for connection, time, data in reader.messages(connections=ours) if ours else ():
-            message = types.deserialize_cdr(data, connection.msgtype)
-            samples.setdefault(connection.topic, []).append(Sample(time, message))
-    return samples, notes
-
-
-def _check_types(connections: Iterable[Any], name: str) -> None:
-    """Refuse one of our topics with another type."""
-    for connection in connections:
-        expected = TOPICS[connection.topic]
-        if connection.msgtype != expected:
-            raise RecordingError(f"{name}: {connection.topic} is {connection.msgtype}; expected {expected}")
-
-
-def _foreign_notes(connections: Iterable[Any], known: Mapping[str, Any]) -> list[str]:
-    """Name the topics whose type is unknown."""
-    return [
-        f"{connection.topic} skipped: unknown type {connection.msgtype}"
-        for connection in connections
-        if connection.msgtype not in known
-    ]
+    with open_bag(source, name) as bag:
+        check_types(bag.connections, {topic: (kind,) for topic, kind in TOPICS.items()}, name)
+        for raw in bag.raw(TOPICS):
+            samples.setdefault(raw.topic, []).append(Sample(raw.time, bag.decode(raw)))
+        notes = bag.foreign_notes()
+        try:
+            images = find_images(bag, source)
+        except RecordingError as error:
+            if not any(topic.endswith("/keypoints") for topic in samples):
+                raise
+            images, notes = None, [*notes, str(error)]
+        return _Content(samples, images, notes)
 
 
 def _stamp(sample: Sample) -> int:
@@ -166,10 +132,14 @@ def _jaw_track(samples: Mapping[str, list[Sample]], side: str, name: str) -> Jaw
     """Gather what was recorded of one jaw."""
     truth = samples.get(f"/{side}/ground_truth_wrench")
     pose = samples.get(f"/{side}/jaw_pose")
+    true_pose = samples.get(f"/{side}/{TRUE_POSE}")
+    keypoints, sight = samples.get(f"/{side}/keypoints"), samples.get(f"/{side}/{TRUE_KEYPOINTS}")
     return JawTrack(
-        keypoints=_keypoint_track(samples[f"/{side}/keypoints"], side, name),
+        keypoints=_keypoint_track(keypoints, side, name) if keypoints else KeypointTrack.empty(),
         truth=_wrench_track(truth, side, name) if truth else None,
         pose=_pose_track(pose, f"/{side}/jaw_pose", name) if pose else None,
+        sight=_sight_track(sight, side, name) if sight else None,
+        true_pose=_pose_track(true_pose, f"/{side}/{TRUE_POSE}", name) if true_pose else None,
     )
 
 
@@ -197,7 +167,27 @@ def _keypoint_track(samples: Sequence[Sample], side: str, name: str) -> Keypoint
     if infinite.any():
         first = int(np.argmax(infinite))
         raise RecordingError(f"{name}: {topic} message {first} has infinite coordinates; NaN says 'no point'")
-    return KeypointTrack(stamps=stamps, points=points, likelihood=np.stack([c.likelihood for c in clouds]))
+    likelihood, stated = np.stack([c.likelihood for c in clouds]), [c.stddev is not None for c in clouds]
+    if any(stated) and not all(stated):
+        first = stated.index(not stated[0])
+        raise RecordingError(f"{name}: {topic} message {first} differs from the first in whether it states stddev_x")
+    stddev = np.stack([c.stddev for c in clouds]) if stated[0] else None
+    return KeypointTrack(stamps=stamps, points=points, likelihood=likelihood, stddev=stddev)
+
+
+def _sight_track(samples: Sequence[Sample], side: str, name: str) -> SightTrack:
+    """Stack the true key points of one jaw."""
+    topic = f"/{side}/{TRUE_KEYPOINTS}"
+    _check_frame(samples, topic, side, name)
+    stamps = _stamps(samples, topic, name, strict=True)
+    try:
+        clouds = [decode_columns(sample.message, SIGHT_COLUMNS) for sample in samples]
+        columns = ([cloud[name] for cloud in clouds] for name in SIGHT_COLUMNS)
+        x, y, z, u, v, visible = (np.array(column, dtype=np.float64) for column in columns)
+    except (ObservationError, ValueError) as error:
+        raise RecordingError(f"{name}: {topic}: {error}") from error
+    points, pixels = np.stack([x, y, z], axis=-1), np.stack([u, v], axis=-1)
+    return SightTrack(stamps=stamps, points=points, pixels=pixels, visible=visible > 0)
 
 
 def _cloud(sample: Sample, index: int, topic: str, name: str) -> Keypoints:

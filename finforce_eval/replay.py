@@ -1,32 +1,35 @@
-"""`finforce replay`: a recording through the real nodes, in real time, scored against the measured force."""
+"""A recording through the real nodes, in real time, scored against the measured force; prints nothing."""
 
 from __future__ import annotations
 
-import argparse
-import math
 import random
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import monotonic, time_ns
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
-from finforce_eval.cli import Parser, add_jaw_options
-from finforce_eval.commands import Setup, make_setup, truth_sides, write_json
+from finforce_eval.commands import Setup, truth_sides
 from finforce_eval.contacts import FIXED, ContactChoice
+from finforce_eval.delay_scoring import DelayStats, delay_stats, onset_delays
+from finforce_eval.detection import awaiting_keypoints, with_detections
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluate import Evaluation, check_keypoint_count, score_results
+from finforce_eval.images import COLOR, DEPTH, INFO
+from finforce_eval.keypoint_source import IMAGES, TRUTH, KeypointSource
 from finforce_eval.live import ReplayLog, live_result
-from finforce_eval.objects import require_mesh
-from finforce_eval.playback import RawMessage, read_playback
+from finforce_eval.objects import find_mesh, require_mesh
+from finforce_eval.playback import Playback, RawMessage, read_playback
 from finforce_eval.processes import ProcessError, ProcessGroup
-from finforce_eval.recording import read_recording
 from finforce_eval.results import CaseResult
-from finforce_eval.tables import evaluation_json, format_table
+from finforce_eval.scoring import match_truth
 from finforce_eval.tracks import Recording
+from finforce_eval.writer import write_recording
 from finforce_graph import Process, ReplayOptions, replay_processes
 from finforce_ifea.errors import MissingDependencyError
 
@@ -65,38 +68,97 @@ class Replay:
         evaluation: scores and time series; their step times are from key points out to wrench in.
         grasp: stamp [ns] -> grasp force [N].
         health: node -> its last diagnostics.
+        delay: of the grasp force after its true onset.
     """
 
     evaluation: Evaluation
     grasp: Mapping[int, float]
     health: Mapping[str, Mapping[str, str]]
+    delay: DelayStats
 
 
-def replay(recording: Recording, setup: Setup, *, calibration_file: str = "", playing: Playing | None = None) -> Replay:
+def replay(
+    recording: Recording,
+    setup: Setup,
+    *,
+    calibration_file: str = "",
+    playing: Playing | None = None,
+    keypoints: KeypointSource | None = None,
+) -> Replay:
     """Play a recording through solver nodes, one process per jaw, and score what they answer.
 
-    Nothing outlives the call.
+    From images it goes through the key point detector's node, too. Nothing outlives the call.
 
     Args:
         recording: what is played.
         setup: jaw, settings and contact.
         calibration_file: as the nodes load it; empty for none.
         playing: how it is played.
+        keypoints: where the key points come from; where they were recorded, else from images, without it.
 
     Raises:
         RecordingError: no ground truth, another number of key points than the jaw's, or no wrench came.
         ProcessError: a node cannot be started, or ended early.
         MissingDependencyError: ROS 2 is not installed.
     """
-    playing = playing or Playing()
-    for side in truth_sides(recording):
-        check_keypoint_count(recording, side, setup.jaw)
-    sides = tuple(recording.jaws)
-    messages = read_playback(recording.path, without=_results_of(sides))
-    processes = replay_processes(_graph_options(recording, setup, calibration_file, playing), Path())
-    log = ReplayLog(sides)
-    _run(processes, messages, log, playing)
-    return Replay(evaluation=_score(recording, setup, log), grasp=log.grasp, health=log.health)
+    playing, keypoints = playing or Playing(), keypoints or KeypointSource(jaw_file=str(setup.jaw.path))
+    source, sides = keypoints.source_of(recording), tuple(recording.jaws)
+    with ExitStack() as stack:
+        if source == IMAGES:
+            recording = awaiting_keypoints(recording)
+        elif source == TRUTH:
+            recording = _write_truth(keypoints.apply(recording), stack)
+        for side in truth_sides(recording):
+            if source != IMAGES:
+                check_keypoint_count(recording, side, setup.jaw)
+        without = _results_of(sides) | _unplayed(sides, source == IMAGES)
+        messages = read_playback(recording.path, without=without)
+        options = _graph_options(recording, setup, calibration_file, playing)
+        processes = replay_processes(replace(options, images=source == IMAGES), Path())
+        log = ReplayLog(sides)
+        _run(_with_detector(processes, recording, keypoints), messages, log, playing)
+    if source == IMAGES:
+        recording = with_detections(recording, {side: found.side_log() for side, found in log.detections.items()})
+    evaluation = _score(recording, setup, log)
+    return Replay(evaluation=evaluation, grasp=log.grasp, health=log.health, delay=_grasp_delay(recording, log))
+
+
+def _write_truth(recording: Recording, stack: ExitStack) -> Recording:
+    """Return a recording that has been written to a folder of its own, for as long as the stack lasts."""
+    folder = Path(stack.enter_context(TemporaryDirectory())) / recording.name.replace("/", "_")
+    plain = replace(recording, images=None)
+    mesh = find_mesh(recording)
+    if mesh is not None:
+        plain = replace(plain, case={**recording.case, "mesh": str(mesh.resolve())})
+    return replace(plain, path=write_recording(plain, folder))
+
+
+def _unplayed(sides: Sequence[str], from_images: bool) -> set[str]:
+    """Return the topics that are found anew, or those of the camera where nobody looks at its images."""
+    if from_images:
+        return {f"/{side}/{name}" for side in sides for name in ("keypoints", "jaw_pose")}
+    return {COLOR, DEPTH, INFO}
+
+
+def _with_detector(processes: Sequence[Process], recording: Recording, keypoints: KeypointSource) -> list[Process]:
+    """Return the processes, that of the key point detector with the parameters of the recording's camera."""
+    return [
+        replace(process, parameters={**process.parameters, **keypoints.node_parameters(recording)})
+        if process.executable == "keypoint_detector"
+        else process
+        for process in processes
+    ]
+
+
+def _grasp_delay(recording: Recording, log: ReplayLog) -> DelayStats:
+    """Return what /grasp_wrench took to show after each true onset of the grasp force, the smaller of the jaws'."""
+    sides = truth_sides(recording)
+    if len(sides) < len(recording.jaws):
+        return delay_stats([])
+    stamps = recording.jaw(sides[0]).keypoints.stamps
+    forces = [np.linalg.norm(match_truth(recording.truth(side), stamps), axis=1) for side in sides]
+    said, lag = (np.array([values.get(int(stamp), np.nan) for stamp in stamps]) for values in log.grasp_series)
+    return delay_stats(onset_delays(stamps * 1e-9, np.min(forces, axis=0), said, lag))
 
 
 def _results_of(sides: Sequence[str]) -> set[str]:
@@ -131,14 +193,14 @@ def _contact_options(recording: Recording, choice: ContactChoice) -> dict[str, A
     if mode == FIXED:
         return {"contact_height": choice.height(recording)}
     for side, track in recording.jaws.items():
-        if recording.object_pose is None or track.pose is None:
+        if recording.object_pose is None or not (track.pose or track.is_awaited):
             needed = f"/object_pose and /{side}/jaw_pose"
             raise RecordingError(f"{recording.name}: --contact {mode} needs {needed}; give --contact fixed:Z_MM")
     mesh = require_mesh(recording, choice.object_file).resolve()
     return {"contact": mode, "object_mesh": str(mesh), "object_mesh_unit": choice.object_unit}
 
 
-def _run(processes: Sequence[Process], messages: Sequence[RawMessage], log: ReplayLog, playing: Playing) -> None:
+def _run(processes: Sequence[Process], messages: Playback, log: ReplayLog, playing: Playing) -> None:
     """Start the nodes, wait until they listen, play, and end them."""
     try:
         from finforce_eval.node import open_player
@@ -146,13 +208,16 @@ def _run(processes: Sequence[Process], messages: Sequence[RawMessage], log: Repl
         raise MissingDependencyError(f"replay needs ROS 2: pip install 'finforce[ros]' ({error})") from error
     domain = random.randint(1, 99) if playing.domain is None else playing.domain
     awaited = [f"/{side}/keypoints" for side in log.jaws]
+    detects = any(process.executable == "keypoint_detector" for process in processes)
+    if detects:
+        awaited += [COLOR, DEPTH, INFO]
     if any(process.executable == "contact_estimator" for process in processes):
         awaited += ["/object_pose", *(f"/{side}/jaw_pose" for side in log.jaws)]
     with ExitStack() as stack:
         player = stack.enter_context(open_player(domain))
         nodes = stack.enter_context(ProcessGroup(processes, {"ROS_DOMAIN_ID": str(domain)}))
         player.offer(messages)
-        player.listen(log.jaws, log)
+        player.listen(log.jaws, log, detector=detects)
 
         def ready() -> bool:
             nodes.check()
@@ -162,7 +227,7 @@ def _run(processes: Sequence[Process], messages: Sequence[RawMessage], log: Repl
             raise ProcessError(f"nobody listens to {' or '.join(awaited)} after {PATIENCE:g} s")
         player.spin_until(monotonic() + LINGER)
         bar = stack.enter_context(tqdm(total=len(messages), unit="msg", desc="replay", disable=None))
-        log.offset = 0 if playing.has_clock else time_ns() - messages[0].time
+        log.offset = 0 if playing.has_clock else time_ns() - messages.begin
 
         def sent(message: RawMessage) -> None:
             nodes.check()
@@ -195,73 +260,11 @@ def _score(recording: Recording, setup: Setup, log: ReplayLog) -> Evaluation:
 
 
 def _words(log: ReplayLog, side: str) -> str:
-    """Return what the diagnostics of a jaw said last."""
-    return log.health.get(f"finforce: {side} jaw", {}).get("message", "no diagnostics either")
+    """Return what the diagnostics of a jaw said last, those of the key point detector first, where it runs."""
+    said = [log.health[name]["message"] for name in _sources(side) if name in log.health]
+    return "; ".join(said) or "no diagnostics either"
 
 
-def format_replay(result: Replay) -> str:
-    """Return the table of the score, with the state of the nodes below."""
-    lines = [format_table(result.evaluation), ""]
-    lines.append("Step times are from key points out to wrench in, over the middleware and back.")
-    lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {_largest(result.grasp):.2f} N.")
-    for name, state in result.health.items():
-        own = " / ".join(state.get(f"callback to published {part} [ms]", "-") for part in ("p50", "p95"))
-        lines.append(f"{name}: {state['message']}; refused: {state.get('refused', '-')}; in the node {own} ms")
-    return "\n".join(lines)
-
-
-def _largest(values: Mapping[int, float]) -> float:
-    return max(values.values(), default=math.nan)
-
-
-def build_parser() -> Parser:
-    """Return the parser of `finforce replay`."""
-    text = "play a recording through the real nodes in real time and score it"
-    parser = Parser(prog="finforce replay", description=text)
-    parser.add_argument("bag", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
-    add_jaw_options(parser)
-    parser.add_argument("--calibration", metavar="FILE", help="calibration file, or a shipped name")
-    parser.add_argument("--rate", type=float, default=1.0, help="speed; other than 1 on /clock (1)")
-    parser.add_argument("--sim-time", action="store_true", help="keep the stamps, give the time on /clock")
-    parser.add_argument(
-        "--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID, to look on with RViz; else one by chance"
-    )
-    parser.add_argument("--params", default="", metavar="FILE", help="further ROS parameters of the solvers")
-    parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
-    parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
-    return parser
-
-
-def main(argv: Sequence[str]) -> int:
-    """Run `finforce replay`.
-
-    Raises:
-        FinforceError: an option, the recording or a node fails.
-    """
-    parser = build_parser()
-    options = parser.parse_args(argv)
-    if not 0.01 <= options.rate <= 100.0:
-        parser.error(f"--rate {options.rate:g}: expected 0.01 to 100")
-    if options.domain is not None and not 0 <= options.domain <= 232:
-        parser.error(f"--domain {options.domain}: expected 0 to 232")
-    setup = make_setup(options)
-    playing = Playing(
-        rate=options.rate, sim_time=options.sim_time, domain=options.domain, parameter_file=options.params
-    )
-    recording = read_recording(options.bag)
-    result = replay(recording, setup, calibration_file=options.calibration or "", playing=playing)
-    print(format_replay(result))
-    _write(result, setup, options)
-    return 0
-
-
-def _write(result: Replay, setup: Setup, options: argparse.Namespace) -> None:
-    """Write what was asked for."""
-    if options.json:
-        write_json(options.json, evaluation_json(result.evaluation, **setup.about))
-    if options.report:
-        from finforce_eval.report import write_report
-
-        names = setup.jaw.keypoint_names
-        page = write_report(result.evaluation, options.report, keypoint_names=names, about=setup.about)
-        print(f"Report: {page}")
+def _sources(side: str) -> tuple[str, str]:
+    """Return under which names the nodes report on a jaw."""
+    return f"finforce: {side} key points", f"finforce: {side} jaw"

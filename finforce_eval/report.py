@@ -8,6 +8,7 @@ from pathlib import Path
 
 from finforce_eval.evaluate import Evaluation
 from finforce_eval.results import CaseResult
+from finforce_eval.sight_table import markdown_sight
 from finforce_eval.tables import markdown_contact_table, markdown_table, summary_lines
 
 
@@ -56,6 +57,7 @@ def _overview(evaluation: Evaluation) -> list[str]:
         "",
         *summary_lines(evaluation),
         *markdown_contact_table(evaluation),
+        *markdown_sight(evaluation),
         "",
         "Errors are norm of the estimate minus norm of the measured force, over the record phases.",
         "",

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_eval.delay_scoring import Delay, onset_delays
+from finforce_eval.sight_scoring import SightSeries
+
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
@@ -81,6 +84,9 @@ class CaseResult:
         snapshot: the jaw at the largest trusted force of a scored frame; None when there was none.
         message: the estimator's last words on a frame that it did not solve.
         contact: where the object was said to touch; None when it does not travel.
+        sight: the key points that were found against the true ones; None where nothing says where they truly were.
+        detector_ms: (n,) wall time from image to key points [ms], NaN where it was not timed; None without a detector.
+        latency_ms: (n,) from what the call began with, images or key points, to the force [ms]; None for `step_ms`.
     """
 
     name: str
@@ -100,6 +106,9 @@ class CaseResult:
     snapshot: Snapshot | None = None
     message: str = ""
     contact: ContactSeries | None = None
+    sight: SightSeries | None = None
+    detector_ms: NDArray[np.float64] | None = None
+    latency_ms: NDArray[np.float64] | None = None
 
     @property
     def seconds(self) -> NDArray[np.float64]:
@@ -125,6 +134,12 @@ class CaseResult:
     def error(self) -> NDArray[np.float64]:
         """Norm of the estimate minus norm of the truth (n,) [N]; NaN where either is missing."""
         return self.magnitude - self.true_magnitude
+
+    @property
+    def delays(self) -> list[Delay]:
+        """What the estimate took to show after each onset of the true force."""
+        lag = 1e-3 * (self.step_ms if self.latency_ms is None else self.latency_ms)
+        return onset_delays(self.stamps * 1e-9, self.true_magnitude, self.magnitude, lag)
 
     @property
     def counted(self) -> NDArray[np.bool_]:

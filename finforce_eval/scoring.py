@@ -16,7 +16,9 @@ from finforce_eval.contact_scoring import (
     place_stats,
     solved_distance,
 )
+from finforce_eval.delay_scoring import DelayStats, delay_stats
 from finforce_eval.results import CaseResult
+from finforce_eval.sight_scoring import SightStats, sight_stats
 from finforce_eval.tracks import WrenchTrack
 
 
@@ -86,6 +88,9 @@ class CaseScore:
         place: distance of the contact that was given to the estimator from the true pressure centre.
         solved_place: the same of the estimator's own contact place.
         onset: delay of `touching`.
+        delay: of the force after its true onset.
+        sight: how well the key points were seen.
+        detector_ms: time per image of the key point detector.
     """
 
     frames: int
@@ -103,6 +108,9 @@ class CaseScore:
     place: PlaceStats
     solved_place: PlaceStats
     onset: OnsetStats
+    delay: DelayStats
+    sight: SightStats
+    detector_ms: StepTimes
 
 
 def force_range(truths: Iterable[NDArray[np.float64]]) -> float:
@@ -204,6 +212,12 @@ def _cycle_stats(results: Sequence[CaseResult], phase: str, span: float) -> Cycl
     )
 
 
+def _detector_times(cases: Sequence[CaseResult]) -> list[NDArray[np.float64]]:
+    """Return the times of the detector, once for each recording: it sees both jaws in one pass."""
+    times = {case.detector_ms.tobytes(): case.detector_ms for case in cases if case.detector_ms is not None}
+    return list(times.values())
+
+
 def _step_times(steps: NDArray[np.float64]) -> StepTimes:
     """Return the percentiles of times (n,) [ms]; NaN is a step that was not timed."""
     timed = steps[np.isfinite(steps)]
@@ -238,5 +252,8 @@ def score_case(results: CaseResult | Sequence[CaseResult], span: float) -> CaseS
         place=place_stats(np.concatenate([given_distance(case) for case in cases])),
         solved_place=place_stats(np.concatenate([solved_distance(case) for case in cases])),
         onset=onset_stats(cases),
+        delay=delay_stats([delay for case in cases for delay in case.delays]),
+        sight=sight_stats([case.sight for case in cases if case.sight is not None]),
+        detector_ms=_step_times(np.concatenate([np.zeros(0), *_detector_times(cases)])),
         **stats,
     )

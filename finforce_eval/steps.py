@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from finforce_eval.contact_source import ContactSource
 from finforce_eval.places import InnerSurface, true_lines
 from finforce_eval.results import CaseResult, ContactSeries, Snapshot
+from finforce_eval.sight_scoring import compare_sight
 from finforce_eval.tracks import Recording
 from finforce_ifea.estimator import Contact, Observation
 
@@ -41,7 +42,8 @@ class StepLog:
     def __init__(self, recording: Recording, side: str, jaw: Any, estimator: Estimator, source: ContactSource) -> None:
         """Make room for every image."""
         self.name, self.side, self.jaw, self.estimator = recording.name, side, jaw, estimator
-        self.track = track = recording.jaw(side).keypoints
+        self._jaw_track = recording.jaw(side)
+        self.track = track = self._jaw_track.keypoints
         self.phases = recording.phases_at(track.stamps)
         frames = len(track.stamps)
         self.force = np.full((frames, 3), np.nan)
@@ -60,11 +62,7 @@ class StepLog:
     def step(self, index: int) -> None:
         """Give image `index` to estimator and contact source."""
         contact = self.contacts.before(index)
-        observation = Observation(
-            stamp=self.track.stamps[index] * 1e-9,
-            points=self.track.points[index],
-            likelihood=self.track.likelihood[index],
-        )
+        observation = self.track.observation(index)
         begin = perf_counter()
         solution = self.estimator.update(observation, contact)
         self.step_ms[index] = 1e3 * (perf_counter() - begin)
@@ -124,7 +122,19 @@ class StepLog:
             snapshot=self.snapshot,
             message=self.message,
             contact=self.contacts.series(),
+            **self._seen(),
         )
+
+    def _seen(self) -> dict[str, Any]:
+        """Return how the key points were seen, where this call has found them in images."""
+        detection, sight = self._jaw_track.detection, self._jaw_track.sight
+        if detection is None:
+            return {}
+        return {
+            "sight": None if sight is None else compare_sight(detection, sight),
+            "detector_ms": detection.step_ms,
+            "latency_ms": self.step_ms + detection.step_ms,
+        }
 
 
 class ContactLog:

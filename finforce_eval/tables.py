@@ -8,6 +8,7 @@ from typing import Any
 
 from finforce_eval.evaluate import Evaluation
 from finforce_eval.scoring import CaseScore, Spread, Stats
+from finforce_eval.sight_table import format_sight
 
 PHASES = ("all", "load", "unload")
 HEADER = ("RMSE/N", "NRMSD/%", "max/N")
@@ -57,6 +58,7 @@ def format_table(evaluation: Evaluation) -> str:
     lines += [rule, *(_join(row, widths) for row in rows[:-1]), rule, _join(rows[-1], widths)]
     contact = format_contact_table(evaluation)
     below = ["", contact, *contact_lines()] if contact else []
+    below += format_sight(evaluation)
     return "\n".join([*lines, "", *summary_lines(evaluation), *below])
 
 

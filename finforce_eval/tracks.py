@@ -5,19 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce_eval.errors import RecordingError
+from finforce_eval.sight import DetectionTrack, SightTrack
+from finforce_ifea.observation import Observation
+
+if TYPE_CHECKING:
+    from finforce_eval.images import ImageTrack
 
 JAWS = ("left", "right")
 DIRECTIONS = ("load", "unload")
 STAGES = ("ramp", "settle", "record")
 NANOSECONDS = 1_000_000_000
 
-TrackT = TypeVar("TrackT", "KeypointTrack", "WrenchTrack", "PoseTrack", "PhaseTrack")
+TrackT = TypeVar("TrackT", "KeypointTrack", "WrenchTrack", "PoseTrack", "PhaseTrack", "SightTrack", "DetectionTrack")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,16 +33,32 @@ class KeypointTrack:
         stamps: (n,) image time [ns], strictly increasing.
         points: (n, K, 3) [m], jaw frame; NaN = none.
         likelihood: (n, K) in [0, 1].
+        stddev: (n, K, 3) one standard deviation [m], jaw frame, NaN = not known; None when nothing says.
     """
 
     stamps: NDArray[np.int64]
     points: NDArray[np.float64]
     likelihood: NDArray[np.float64]
+    stddev: NDArray[np.float64] | None = None
+
+    @classmethod
+    def empty(cls, count: int = 0) -> KeypointTrack:
+        """Return a track of no image, which stands where key points are still to be found."""
+        return cls(stamps=np.zeros(0, np.int64), points=np.zeros((0, count, 3)), likelihood=np.zeros((0, count)))
 
     @property
     def count(self) -> int:
         """Key points per image, K."""
         return self.points.shape[1]
+
+    def observation(self, index: int) -> Observation:
+        """Return what an estimator is given of image `index`."""
+        return Observation(
+            stamp=self.stamps[index] * 1e-9,
+            points=self.points[index],
+            likelihood=self.likelihood[index],
+            stddev=None if self.stddev is None else self.stddev[index],
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,11 +142,27 @@ class FramePhases:
 
 @dataclass(frozen=True, kw_only=True)
 class JawTrack:
-    """What a recording holds of one jaw."""
+    """What a recording holds of one jaw.
+
+    Attributes:
+        keypoints: as they were recorded, or as they were found in images; empty before that.
+        truth: measured wrenches.
+        pose: T_camera_jaw over time, of the key point detector.
+        sight: true key points, `true_pose` the true T_camera_jaw: of a synthetic recording.
+        detection: what the detector said, where this call found the key points in images.
+    """
 
     keypoints: KeypointTrack
     truth: WrenchTrack | None = None
     pose: PoseTrack | None = None
+    sight: SightTrack | None = None
+    true_pose: PoseTrack | None = None
+    detection: DetectionTrack | None = None
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether key points and poses are still to come from images."""
+        return not len(self.keypoints.stamps)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,6 +177,7 @@ class Recording:
         phases: phases of the bench, None outside the bench.
         case: content of `case.json`, empty without it.
         notes: what was left aside on reading, one sentence each.
+        images: its RGB-D images, read one by one; None without any.
     """
 
     name: str
@@ -149,6 +187,7 @@ class Recording:
     phases: PhaseTrack | None = None
     case: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    images: ImageTrack | None = None
 
     def jaw(self, side: str) -> JawTrack:
         """Return what was recorded of the jaw `side`.
@@ -177,10 +216,8 @@ class Recording:
         """Return the phase of each stamp [ns]."""
         frames, phases = len(stamps), self.phases
         if phases is None:
-            nothing = np.full(frames, "", dtype="U6")
-            return FramePhases(
-                cycle=np.zeros(frames, dtype=np.int64), direction=nothing, scored=np.ones(frames, dtype=bool)
-            )
+            nothing, every = np.full(frames, "", dtype="U6"), np.ones(frames, dtype=bool)
+            return FramePhases(cycle=np.zeros(frames, dtype=np.int64), direction=nothing, scored=every)
         row = phases.index_at(stamps)
         return FramePhases(
             cycle=np.where(row >= 0, phases.cycle[row], 0),
@@ -195,6 +232,9 @@ class Recording:
                 keypoints=_cut(track.keypoints, start, stop),
                 truth=track.truth and _cut(track.truth, start, stop),
                 pose=track.pose and _cut(track.pose, start, stop),
+                sight=track.sight and _cut(track.sight, start, stop),
+                true_pose=track.true_pose and _cut(track.true_pose, start, stop),
+                detection=track.detection and _cut(track.detection, start, stop),
             )
             for side, track in self.jaws.items()
         }
@@ -202,7 +242,8 @@ class Recording:
         if phases is not None:
             phases = _cut(replace(phases, stamps=_clip_running(phases.stamps, start)), start, stop)
         pose = self.object_pose and _cut(self.object_pose, start, stop)
-        return replace(self, jaws=jaws, object_pose=pose, phases=phases)
+        images = self.images and self.images.between(start, stop)
+        return replace(self, jaws=jaws, object_pose=pose, phases=phases, images=images)
 
 
 def _clip_running(stamps: NDArray[np.int64], start: int) -> NDArray[np.int64]:

@@ -142,7 +142,8 @@ def write_entries(
 def recording_entries(recording: Recording, factory: MessageFactory) -> Iterator[Entry]:
     """Yield every message of a recording, track by track."""
     for side, track in recording.jaws.items():
-        yield from _keypoint_entries(track.keypoints, side, factory)
+        if not track.is_awaited:
+            yield from _keypoint_entries(track.keypoints, side, factory)
         if track.truth is not None:
             yield from _wrench_entries(track.truth, side, factory)
         if track.pose is not None:

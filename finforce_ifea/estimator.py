@@ -101,7 +101,7 @@ class JawEstimator:
         """Takes one image's key points and returns what they say.
 
         Args:
-            observation: stamp [s], points (K, 3) [m] in the jaw frame, likelihood (K,).
+            observation: stamp [s], points (K, 3) [m] in the jaw frame, likelihood (K,), stddev (K, 3) [m] if known.
             contact: where the object touches; None or no rows when there is no object.
 
         Raises:
@@ -116,7 +116,7 @@ class JawEstimator:
         self._contact = contact
         self._stamp = observation.stamp
         points = self._gate.accept(observation)
-        self._taring.add(points, apart=contact is not None and contact.touching is False)
+        self._taring.add(points, observation.stddev, apart=contact is not None and contact.touching is False)
         used = np.isfinite(points[:, 0])
         if used.sum() < self.settings.minimum_keypoints:
             seen = f"{int(used.sum())} of {len(used)} key points can be used"
@@ -127,7 +127,7 @@ class JawEstimator:
         if contact is None or not len(contact.points):
             return self._without_contact(points, used)
         try:
-            track = self._tracker.update(points, self._taring.tare, min(dt, _LONGEST_GAP))
+            track = self._tracker.update(points, self._taring.tare, min(dt, _LONGEST_GAP), observation.stddev)
         except UnobservableError as error:
             return self._fail("unobservable", str(error), used)
         return self._conclude(track, used)

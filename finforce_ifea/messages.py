@@ -11,7 +11,7 @@ from finforce_ifea.errors import ContactError, ObservationError
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.outline import ObjectOutline
 from finforce_ifea.outline_cloud import COLUMNS, outline_from_columns
-from finforce_ifea.pointcloud import decode_cloud, decode_keypoints
+from finforce_ifea.pointcloud import decode_columns, decode_keypoints
 
 
 def check_frame(message: Any, frame: str, what: str) -> None:
@@ -39,12 +39,12 @@ def observation_from_cloud(cloud: Any, frame: str) -> Observation:
     """Return the key points of a sensor_msgs/PointCloud2 in the jaw frame `frame`.
 
     Raises:
-        ObservationError: the frame, the height, the fields or the buffer are wrong.
+        ObservationError: the frame, the height, the fields, a standard deviation or the buffer are wrong.
     """
     check_cloud(cloud, frame, "the key points")
-    points, likelihood = decode_keypoints(cloud)
+    points, likelihood, stddev = decode_keypoints(cloud)
     stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
-    return Observation(stamp=stamp, points=points, likelihood=likelihood)
+    return Observation(stamp=stamp, points=points, likelihood=likelihood, stddev=stddev)
 
 
 def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:
@@ -62,7 +62,7 @@ def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:
         ContactError: a coordinate or a weight is not finite.
     """
     check_cloud(cloud, frame, "the contact")
-    columns = _columns(cloud, ("x", "y", "z"), ("weight", "touching"))
+    columns = decode_columns(cloud, ("x", "y", "z"), ("weight", "touching"))
     points = np.stack([columns[name] for name in "xyz"], axis=-1).astype(np.float64).reshape(-1, 3)
     weights = columns.get("weight", np.ones(len(points))).astype(np.float64)
     if not (np.isfinite(points).all() and np.isfinite(weights).all()):
@@ -84,22 +84,7 @@ def outline_from_cloud(cloud: Any, frame: str, previous: ObjectOutline | None) -
         ContactError: the corners are no outline.
     """
     check_cloud(cloud, frame, "the outline")
-    return outline_from_columns(_columns(cloud, COLUMNS), previous)
-
-
-def _columns(cloud: Any, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, NDArray]:
-    """Decode the named fields of a cloud."""
-    return decode_cloud(
-        cloud.fields,
-        cloud.data,
-        width=cloud.width,
-        height=cloud.height,
-        point_step=cloud.point_step,
-        row_step=cloud.row_step,
-        is_bigendian=cloud.is_bigendian,
-        names=names,
-        optional=optional,
-    )
+    return outline_from_columns(decode_columns(cloud, COLUMNS), previous)
 
 
 def force_from_wrench(message: Any, frame: str, what: str) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from finforce_ifea.errors import ContactError, ObservationError
 from finforce_ifea.jaw import Jaw
 from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.pointcloud import check_stddev
 
 TRUSTED = ("ok", "unloaded")
 
@@ -20,11 +21,14 @@ class Observation:
         stamp: image capture time [s].
         points: (K, 3) [m], jaw frame; NaN where there is no depth.
         likelihood: (K,) in [0, 1].
+        stddev: (K, 3) [m] of each point along the axes of the jaw frame, above zero where there is a point; None when
+            the detector states none.
     """
 
     stamp: float
     points: NDArray
     likelihood: NDArray
+    stddev: NDArray | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,7 +137,8 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
     """Refuses what cannot be an image's key points.
 
     Raises:
-        ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], stamps not rising.
+        ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], a standard deviation that is none,
+            stamps not rising.
     """
     points, likelihood = np.asarray(observation.points), np.asarray(observation.likelihood)
     if points.shape != (count, 3) or likelihood.shape != (count,):
@@ -147,6 +152,8 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
         )
     if not ((likelihood >= 0) & (likelihood <= 1)).all():
         raise ObservationError(f"likelihoods from {likelihood.min():g} to {likelihood.max():g}, expected 0 to 1")
+    if observation.stddev is not None:
+        check_stddev(np.asarray(observation.stddev), points)
     if not np.isfinite(observation.stamp):
         raise ObservationError(f"stamp {observation.stamp}, expected seconds")
     if last_stamp is not None and observation.stamp <= last_stamp:

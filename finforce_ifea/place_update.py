@@ -14,7 +14,27 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Depth has no prior; this share of one frame's information keeps the posterior regular while nothing was averaged.
 _DEPTH_SHARE = 1e-3
 _PRIOR_REACH = 4.0
-_MANOEUVRE_SIGMA = 3.0
+# Innovations beyond this many standard deviations are no chance: where the speed is known, and where it is not.
+_MANOEUVRE_SIGMA, _ONSET_SIGMA = 3.0, 2.5
+# Of a longer jump [m/s] the rest is taken for one of the place alone.
+_FASTEST = 0.05
+
+
+class Forecast(NamedTuple):
+    """The place that is expected in a frame.
+
+    Attributes:
+        place: depth [m], log radius, height [m].
+        speed: of the depth [m/s].
+        spread: covariance of depth and speed (2, 2).
+        unsure: time since the last frame if that did not show the speed, because nothing pressed or the depth jumped;
+            else 0 [s].
+    """
+
+    place: NDArray
+    speed: float
+    spread: NDArray
+    unsure: float
 
 
 class PlaceUpdate(NamedTuple):
@@ -23,7 +43,8 @@ class PlaceUpdate(NamedTuple):
     Attributes:
         place: depth [m], log radius, height [m].
         speed: of the depth [m/s].
-        gain: Kalman gain of depth and speed (2,).
+        spread: covariance of depth and speed (2, 2).
+        jumped: whether the depth changed beyond what was expected.
         mean: averaged residuals about the new place (K, 2) [m].
         count: frames that they stand for (K,).
         covariance: of the place (3, 3).
@@ -35,7 +56,8 @@ class PlaceUpdate(NamedTuple):
 
     place: NDArray
     speed: float
-    gain: NDArray
+    spread: NDArray
+    jumped: bool
     mean: NDArray
     count: NDArray
     covariance: NDArray
@@ -65,7 +87,8 @@ def _invert_symmetric(A):
 def _averaged_spread(data, count, k):
     """Returns the entries 00, 11 and 01 of the covariance of point k's averaged residual [m^2]."""
     share = 1.0 / max(count[k], 1.0)
-    return data.noise[0, 0] * share + data.bias[k], data.noise[1, 1] * share + data.bias[k], data.noise[0, 1] * share
+    noise = data.noise[k]
+    return noise[0, 0] * share + data.bias[k], noise[1, 1] * share + data.bias[k], noise[0, 1] * share
 
 
 @njit(**_OPTIONS)
@@ -98,18 +121,20 @@ def _weigh_depth(data, mean, count):
 
     The averaged residuals are taken off as each point's bias; what they have in common along the depth is no bias.
     """
-    det = data.noise[0, 0] * data.noise[1, 1] - data.noise[0, 1] ** 2
-    p00, p11, p01 = data.noise[1, 1] / det, data.noise[0, 0] / det, -data.noise[0, 1] / det
+    n00, n11, n01 = data.noise[:, 0, 0], data.noise[:, 1, 1], data.noise[:, 0, 1]
+    det = n00 * n11 - n01**2
+    p00, p11, p01 = n11 / det, n00 / det, -n01 / det
     along, norm = 0.0, 1e-300
     for k in range(len(count)):
         h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
-        along += count[k] * ((p00 * h0 + p01 * h1) * mean[k, 0] + (p01 * h0 + p11 * h1) * mean[k, 1])
-        norm += count[k] * (p00 * h0 * h0 + 2.0 * p01 * h0 * h1 + p11 * h1 * h1)
+        along += count[k] * ((p00[k] * h0 + p01[k] * h1) * mean[k, 0] + (p01[k] * h0 + p11[k] * h1) * mean[k, 1])
+        norm += count[k] * (p00[k] * h0 * h0 + 2.0 * p01[k] * h0 * h1 + p11[k] * h1 * h1)
     along /= norm
     information, innovation, pull = 0.0, 0.0, np.zeros(3)
     for k in range(len(count)):
         h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
-        w0, w1 = data.weights[k] * (p00 * h0 + p01 * h1), data.weights[k] * (p01 * h0 + p11 * h1)
+        w0 = data.weights[k] * (p00[k] * h0 + p01[k] * h1)
+        w1 = data.weights[k] * (p01[k] * h0 + p11[k] * h1)
         information += w0 * h0 + w1 * h1
         innovation += w0 * (data.r[k, 0] - mean[k, 0] + along * h0) + w1 * (data.r[k, 1] - mean[k, 1] + along * h1)
         for i in range(1, 3):
@@ -151,16 +176,42 @@ def _move_residuals(data, mean, moved, deeper):
 
 
 @njit(**_OPTIONS)
-def update_place(data, mean, count, reference, speed, spread, prior, prior_variance, memory, largest):
+def _allow_for_manoeuvre(forecast, innovation, noise):
+    """Returns the covariance of expected depth and speed (2, 2), widened where the innovation is beyond chance.
+
+    The depth is widened by what chance leaves of the innovation, g = innovation^2 - noise - spread. Where the last
+    frame did not show the speed, the way was made at a new one within the time dt since,
+
+        spread += g [[1, 1/dt], [1/dt, 1/dt^2]].
+
+    Args:
+        forecast: see `Forecast`.
+        innovation: of the depth [m].
+        noise: its variance by the key points of this frame [m^2].
+    """
+    spread = forecast.spread.copy()
+    limit = _ONSET_SIGMA if forecast.unsure > 0.0 else _MANOEUVRE_SIGMA
+    expected = max(spread[0, 0], 0.0) + noise
+    if innovation**2 > limit**2 * expected:
+        grown = innovation**2 - expected
+        spread[0, 0] += grown
+        if forecast.unsure > 0.0:
+            time = max(forecast.unsure, abs(innovation) / _FASTEST)
+            spread[0, 1] += grown / time
+            spread[1, 0] = spread[0, 1]
+            spread[1, 1] += grown / time**2
+    return spread
+
+
+@njit(**_OPTIONS)
+def update_place(data, mean, count, forecast, prior, prior_variance, memory, largest):
     """Returns the place after one frame; see `PlaceUpdate`.
 
     Args:
         data: residuals about the reference place.
         mean: residuals averaged so far (K, 2) [m].
         count: frames that they stand for (K,).
-        reference: predicted depth [m], last log radius and height [m].
-        speed: predicted speed of the depth [m/s].
-        spread: covariance of predicted depth and speed (2, 2).
+        forecast: predicted depth and speed, last log radius and height.
         prior: of log radius and height (2,).
         prior_variance: (2,).
         memory: longest average [frames].
@@ -168,11 +219,9 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
     """
     information, innovation, pull = _weigh_depth(data, mean, count)
     innovation /= information
-    # an innovation beyond chance is a manoeuvre: believe the frame
-    variance = max(spread[0, 0], 0.0)
-    if innovation**2 > _MANOEUVRE_SIGMA**2 * (variance + 1.0 / information):
-        variance = innovation**2
-    gain = np.array([variance, spread[1, 0]]) / (1.0 / information + variance)
+    reference, spread = forecast.place, _allow_for_manoeuvre(forecast, innovation, 1.0 / information)
+    jumped = spread[0, 0] > forecast.spread[0, 0]
+    gain = spread[0] / (1.0 / information + max(spread[0, 0], 0.0))
     depth = reference[0] + gain[0] * innovation
     new_mean, new_count = _average(data, mean, count, depth - reference[0], memory)
     hessian, gradient = _posterior(data, new_mean, new_count, reference[1:] - prior, prior_variance, information)
@@ -188,9 +237,10 @@ def update_place(data, mean, count, reference, speed, spread, prior, prior_varia
         place[0] -= pull[i] * step / information
     residual = _move_residuals(data, new_mean, place - reference, place[0] - depth)
     misfit = _compute_misfit(data, new_mean, new_count)
-    speed += gain[1] * innovation
+    speed = forecast.speed + gain[1] * innovation
     known = gain[0] / information
-    return PlaceUpdate(place, speed, gain, new_mean, new_count, covariance, known, kkt, residual, misfit)
+    spread = spread - np.outer(gain, spread[0])
+    return PlaceUpdate(place, speed, spread, jumped, new_mean, new_count, covariance, known, kkt, residual, misfit)
 
 
 @njit(**_OPTIONS)

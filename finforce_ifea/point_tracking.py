@@ -13,7 +13,7 @@ from finforce_ifea.mechanics import Mechanics
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
-from finforce_ifea.track import Track, compute_magnitude_stddev, condition_on_width, explain_offsets
+from finforce_ifea.track import Track, compute_magnitude_stddev, explain_offsets
 
 _NEIGHBOUR = 1e-3
 _QUIET_SIGMA = 3.0
@@ -104,16 +104,19 @@ class PointTracker:
             )
         return self._probe_pair
 
-    def update(self, points: NDArray, tare: Tare, dt: float) -> Track | None:
+    def update(self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None) -> Track | None:
         """Takes the key points (K, 3) [m], NaN where unused; returns None when too few are left.
+
+        `stddev` (K, 3) [m] are their stated standard deviations.
 
         Raises:
             UnobservableError: They do not tell the force.
         """
         targets = points - tare.offsets
         known = np.isfinite(targets[:, 0])
-        noise = condition_on_width(tare.noise)[0]
-        variance = np.trace(noise) / 2.0 + tare.offset_variance(self.settings.offset_stddev)
+        noise = tare.point_noise(stddev)
+        scatter = np.trace(noise.plane, axis1=1, axis2=2) / 2.0 / noise.trust
+        variance = scatter + tare.offset_variance(self.settings.offset_stddev)
         try:
             if self.paper:
                 result, weights = self._solve(targets, None), known.astype(float)

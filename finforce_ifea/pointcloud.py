@@ -14,6 +14,7 @@ from finforce_ifea.errors import ObservationError
 
 # sensor_msgs/msg/PointField: INT8 = 1 ... FLOAT64 = 8
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+STDDEV_COLUMNS = ("stddev_x", "stddev_y", "stddev_z")
 _CODES = {np.dtype(name): code for code, name in DATATYPES.items()}
 
 
@@ -45,10 +46,11 @@ class EncodedCloud(NamedTuple):
 
 
 class Keypoints(NamedTuple):
-    """Key points of one cloud: `points (K, 3)` [m], NaN = none; `likelihood (K,)` in [0, 1]."""
+    """Key points of one cloud: `points (K, 3)` [m], NaN = none; `likelihood (K,)` in [0, 1]; `stddev (K, 3)` [m]."""
 
     points: NDArray[np.float64]
     likelihood: NDArray[np.float64]
+    stddev: NDArray[np.float64] | None
 
 
 @lru_cache(maxsize=64)
@@ -175,15 +177,13 @@ def encode_cloud(columns: Mapping[str, ArrayLike]) -> EncodedCloud:
     return EncodedCloud(tuple(fields), point_step, table.tobytes())
 
 
-def decode_keypoints(cloud: Any) -> Keypoints:
-    """Return points and likelihood of a key point cloud (any object with the attributes of PointCloud2).
-
-    A cloud without the field `likelihood` gets ones. Rows whose field `valid` is zero, if there is one, become NaN.
+def decode_columns(cloud: Any, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray]:
+    """Return the named columns of any object with the attributes of PointCloud2; see `decode_cloud`.
 
     Raises:
-        ObservationError: the cloud has no x, y, z or its buffer is too short.
+        ObservationError: a field is missing or leaves the point, or the buffer is too short.
     """
-    columns = decode_cloud(
+    return decode_cloud(
         cloud.fields,
         cloud.data,
         width=cloud.width,
@@ -191,14 +191,63 @@ def decode_keypoints(cloud: Any) -> Keypoints:
         point_step=cloud.point_step,
         row_step=cloud.row_step,
         is_bigendian=cloud.is_bigendian,
-        names=("x", "y", "z"),
-        optional=("likelihood", "valid"),
+        names=names,
+        optional=optional,
     )
-    points = np.stack([columns["x"], columns["y"], columns["z"]], axis=-1).astype(np.float64)
-    if points.ndim != 2:
-        raise ObservationError("x, y, z of a key point cloud must be single numbers (count 1)")
+
+
+def decode_keypoints(cloud: Any) -> Keypoints:
+    """Return points, likelihood and standard deviations of a key point cloud (any object like a PointCloud2).
+
+    A cloud without the field `likelihood` gets ones. Rows whose field `valid` is zero, if there is one, become NaN.
+
+    Raises:
+        ObservationError: the cloud has no x, y, z, its buffer is too short, it has some of the fields `stddev_x`,
+            `stddev_y`, `stddev_z` and not all, or a point states what is no standard deviation.
+    """
+    columns = decode_columns(cloud, ("x", "y", "z"), ("likelihood", "valid", *STDDEV_COLUMNS))
+    points = _stack(columns, ("x", "y", "z"))
     valid, likelihood = columns.get("valid"), columns.get("likelihood")
     if valid is not None:
         points[valid == 0] = np.nan
     ones = np.ones(len(points))
-    return Keypoints(points, ones if likelihood is None else likelihood.astype(np.float64))
+    stddev = _stated(columns, points)
+    return Keypoints(points, ones if likelihood is None else likelihood.astype(np.float64), stddev)
+
+
+def _stated(columns: Mapping[str, NDArray], points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the standard deviations (K, 3) [m] of a cloud's points, None when it states none."""
+    have = [name for name in STDDEV_COLUMNS if name in columns]
+    if not have:
+        return None
+    if len(have) < len(STDDEV_COLUMNS):
+        raise ObservationError(f"the cloud has {', '.join(have)}; expected all of {', '.join(STDDEV_COLUMNS)}, or none")
+    stddev = _stack(columns, STDDEV_COLUMNS)
+    check_stddev(stddev, points)
+    return stddev
+
+
+def check_stddev(stddev: NDArray, points: NDArray) -> None:
+    """Refuse what cannot be the standard deviations (K, 3) [m] of key points (K, 3) [m], NaN where there is none.
+
+    Raises:
+        ObservationError: another shape, or a point with a standard deviation that is not a number above zero.
+    """
+    if stddev.shape != points.shape:
+        raise ObservationError(f"standard deviations of shape {stddev.shape}, expected {points.shape}")
+    there = np.isfinite(points).all(axis=1)[:, None]
+    odd = there & ~((stddev > 0.0) & np.isfinite(stddev))
+    if odd.any():
+        row, axis = np.argwhere(odd)[0]
+        raise ObservationError(
+            f"key point {row} states the standard deviation {stddev[row, axis]:g} m along {'xyz'[axis]}, expected a "
+            "number above zero; a point that must not be used has valid = 0 or NaN coordinates"
+        )
+
+
+def _stack(columns: Mapping[str, NDArray], names: Sequence[str]) -> NDArray[np.float64]:
+    """Return columns (K,) side by side (K, 3)."""
+    stacked = np.stack([columns.get(name, np.empty(0)) for name in names], axis=-1).astype(np.float64)
+    if stacked.ndim != 2:
+        raise ObservationError(f"{', '.join(names)} of a key point cloud must be single numbers (count 1)")
+    return stacked

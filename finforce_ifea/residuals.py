@@ -15,9 +15,10 @@ class Uncertainty(NamedTuple):
     """What is known of the errors of key points and mechanics.
 
     Attributes:
-        noise: in-plane covariance of one point in one frame, its y known (2, 2) [m^2].
-        gain: regression of that noise on y (2,).
-        width_variance: of one point in one frame along y [m^2].
+        noise: in-plane covariance of each point in a usual frame, its y known (K, 2, 2) [m^2].
+        gain: regression of each point's noise on y (K, 2).
+        width_variance: of each point in this frame along y (K,) [m^2].
+        trust: usual variance of each point over that in this frame (K,).
         offset_variance: of each point's constant offset (K,) [m^2].
         depth_variance: of the predicted depth [m^2].
         model_error: of the mechanics, as a share of a point's way.
@@ -26,7 +27,8 @@ class Uncertainty(NamedTuple):
 
     noise: NDArray
     gain: NDArray
-    width_variance: float
+    width_variance: NDArray
+    trust: NDArray
     offset_variance: NDArray
     depth_variance: float
     model_error: float
@@ -39,8 +41,8 @@ class Residuals(NamedTuple):
     Attributes:
         r: (K, 2) [m], zero where unused.
         modes: their derivatives by depth, log radius and height (K, 2, 3).
-        weights: (K,) from 0 to 1.
-        noise: of one point in one frame, in plane, (2, 2) [m^2].
+        weights: (K,) from 0 to 1, agreement times trust.
+        noise: of each point in a usual frame, in plane, (K, 2, 2) [m^2].
         bias: variance that no averaging removes (K,) [m^2].
         used: number of points with a weight.
         known: number of points that were measured.
@@ -71,7 +73,8 @@ def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
     """Returns the in-plane residuals about the reference place and the weights of key points; see `Residuals`.
 
     Weights are those of the residuals that are left at the model's own place: w = 1 / (1 + d^2 / gate^2)^2 (Geman and
-    McClure). The motion along y, known to be none, tells of noise that x and z share.
+    McClure), times the trust in a point of this frame. The motion along y, known to be none, tells of noise that x
+    and z share.
 
     Args:
         measured: (K, 3) [m], NaN where unused.
@@ -82,12 +85,13 @@ def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
         below: depth of the place below what the mechanics can reach [m].
         chance: see `Uncertainty`.
     """
-    noise, gain, width_variance, offset_variance, depth_variance, model_error, gate = chance
+    noise, gain, width_variance, trust, offset_variance, depth_variance, model_error, gate = chance
     count = len(measured)
     r, modes = np.zeros((count, 2)), np.empty((count, 2, 3))
     weights, bias = np.zeros(count), np.empty(count)
     asked, say = np.zeros(count), np.zeros(count)
     used, known = 0, 0
+    least = (noise[:, 0, 0] + noise[:, 1, 1]).min()
     for k in range(count):
         modes[k, 0], modes[k, 1] = motions[k, 0], motions[k, 2]
         way = ((positions[k] - rest[k]) ** 2).sum()
@@ -95,19 +99,20 @@ def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
         if not np.isfinite(measured[k, 0] + measured[k, 1] + measured[k, 2]):
             continue
         off = measured[k, 1] - positions[k, 1]
-        r[k, 0] = measured[k, 0] - positions[k, 0] - gain[0] * off - modes[k, 0, 0] * below
-        r[k, 1] = measured[k, 2] - positions[k, 2] - gain[1] * off - modes[k, 1, 0] * below
+        r[k, 0] = measured[k, 0] - positions[k, 0] - gain[k, 0] * off - modes[k, 0, 0] * below
+        r[k, 1] = measured[k, 2] - positions[k, 2] - gain[k, 1] * off - modes[k, 1, 0] * below
         r0, r1 = r[k, 0], r[k, 1]
         r[k] += (modes[k] * moved).sum(axis=1)
         h0, h1 = modes[k, 0, 0], modes[k, 1, 0]
-        square = off * off / (width_variance + bias[k])
-        square += _square_distance(r0, r1, h0, h1, noise, bias[k], depth_variance)
+        square = off * off / (width_variance[k] + bias[k])
+        square += _square_distance(r0, r1, h0, h1, noise[k] / trust[k], bias[k], depth_variance)
         say[k] = h0 * h0 + h1 * h1
         asked[k] = (h0 * r0 + h1 * r1) / max(say[k], 1e-12)
+        say[k] *= trust[k] * least / (noise[k, 0, 0] + noise[k, 1, 1])
         known += 1
         weight = 1.0 / (1.0 + square / gate**2) ** 2
         if weight >= _LEAST_WEIGHT:
-            weights[k] = weight
+            weights[k] = weight * trust[k]
             used += 1
         else:
             r[k, 0] = r[k, 1] = 0.0

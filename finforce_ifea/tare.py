@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.point_noise import PointNoise, StatedNoise, compute_point_noise, match_stated
+
 _FARTHEST_OFFSET = 3e-3
 _FARTHEST_FROM_MEDIAN = 1.8e-3
 _NOISE_FLOOR = 0.02e-3
@@ -19,16 +21,29 @@ class Tare:
         offsets: (K, 3) [m], measured minus drawn; zero where a key point was not seen.
         counts: (K,) frames behind each offset.
         noise: covariance of one key point in one frame (3, 3) [m^2], pooled over all of them.
+        stated: that of each key point by the standard deviations that came with it; None without such.
     """
 
     offsets: NDArray
     counts: NDArray
     noise: NDArray
+    stated: StatedNoise | None = None
 
     def offset_variance(self, unseen: float) -> NDArray:
         """Returns the variance (K,) [m^2] of each offset; `unseen` is the standard deviation without a tare [m]."""
-        seen = np.trace(self.noise) / 3.0 / np.maximum(self.counts, 1)
+        noise = self.noise if self.stated is None else self.stated.covariance
+        seen = np.trace(noise, axis1=-2, axis2=-1) / 3.0 / np.maximum(self.counts, 1)
         return np.where(self.counts > 0, seen, unseen**2)
+
+    def point_noise(self, stddev: NDArray | None) -> PointNoise:
+        """Returns the noise of the key points of an image that states `stddev` (K, 3) [m], or nothing.
+
+        A tare without stated deviations stands for key points that all state its pooled noise.
+        """
+        count = len(self.counts)
+        pooled = np.broadcast_to(np.sqrt(np.diag(self.noise)), (count, 3))
+        usual = self.stated or StatedNoise(np.broadcast_to(self.noise, (count, 3, 3)), pooled)
+        return compute_point_noise(usual, stddev)
 
 
 def blank_tare(count: int, noise: float) -> Tare:
@@ -36,7 +51,9 @@ def blank_tare(count: int, noise: float) -> Tare:
     return Tare(offsets=np.zeros((count, 3)), counts=np.zeros(count), noise=noise**2 * np.eye(3))
 
 
-def compute_tare(frames: Sequence[NDArray], keypoints: NDArray) -> Tare | None:
+def compute_tare(
+    frames: Sequence[NDArray], keypoints: NDArray, stddevs: Sequence[NDArray | None] = (None,)
+) -> Tare | None:
     """Averages unloaded frames.
 
     Points farther than 3 mm from the drawing, or 1.8 mm from their own median, are gross errors. A point seen in less
@@ -45,6 +62,7 @@ def compute_tare(frames: Sequence[NDArray], keypoints: NDArray) -> Tare | None:
     Args:
         frames: accepted key points of each frame (K, 3) [m], NaN where hidden.
         keypoints: drawn (K, 3) [m].
+        stddevs: standard deviations stated in each frame (K, 3) [m]; unused when one states none.
 
     Returns:
         The tare, or None when fewer than three points were seen.
@@ -62,6 +80,11 @@ def compute_tare(frames: Sequence[NDArray], keypoints: NDArray) -> Tare | None:
         return None
     offsets = np.zeros_like(keypoints)
     offsets[often] = np.nanmean(deviations[:, often], axis=0)
-    noise = (deviations - offsets)[:, often].reshape(-1, 3)
+    scatter = deviations - offsets
+    noise = scatter[:, often].reshape(-1, 3)
     noise = np.cov(noise[np.isfinite(noise[:, 0])].T) + _NOISE_FLOOR**2 * np.eye(3)
-    return Tare(offsets=offsets, counts=np.where(often, counts, 0), noise=noise)
+    stated = None
+    if all(stddev is not None for stddev in stddevs):
+        scatter[:, ~often] = np.nan
+        stated = match_stated(scatter, np.stack(stddevs), _NOISE_FLOOR)
+    return Tare(offsets=offsets, counts=np.where(often, counts, 0), noise=noise, stated=stated)

@@ -65,6 +65,7 @@ class TareKeeper:
         """Forgets offsets and frames."""
         self.tare = blank_tare(len(self._keypoints), self._settings.noise)
         self._frames: deque[NDArray] = deque(maxlen=self._settings.tare_memory + _DELAY_FRAMES)
+        self._stddevs: deque[NDArray | None] = deque(maxlen=self._frames.maxlen)
         self._open = self._settings.automatic_tare
         self._quiet = 0
 
@@ -79,11 +80,16 @@ class TareKeeper:
         due = self._open and not self.tared
         return max(0, self._settings.tare_frames - len(self._frames)) if due else 0
 
-    def add(self, points: NDArray, *, apart: bool) -> None:
-        """Takes the accepted key points (K, 3) [m] of a frame; `apart` when the object is known not to touch."""
+    def add(self, points: NDArray, stddev: NDArray | None = None, *, apart: bool) -> None:
+        """Takes the accepted key points (K, 3) [m] of a frame and their stated standard deviations (K, 3) [m].
+
+        `apart` when the object is known not to touch.
+        """
         self._frames.append(points)
+        self._stddevs.append(stddev)
         if apart and not self.tared and not self._open and self._settings.automatic_tare:
             self._frames.clear()
+            self._stddevs.clear()
             self._open = True
 
     def begin(self) -> None:
@@ -108,7 +114,9 @@ class TareKeeper:
             self._open = False
         elif self._quiet >= 2 * _DELAY_FRAMES and self._quiet % _DELAY_FRAMES == 0:
             # the newest half second is left out: a load may just have begun
-            self.tare = compute_tare(list(self._frames)[:-_DELAY_FRAMES], self._keypoints) or self.tare
+            older = slice(None, -_DELAY_FRAMES)
+            frames, stddevs = list(self._frames)[older], list(self._stddevs)[older]
+            self.tare = compute_tare(frames, self._keypoints, stddevs) or self.tare
 
     def take(self) -> TareReport:
         """Takes the last frames as unloaded and learns each key point's offset.
@@ -123,7 +131,7 @@ class TareKeeper:
         if count < _FEWEST_FRAMES:
             raise NotEnoughDataError(f"cannot tare: {count} unloaded frames, expected at least {_FEWEST_FRAMES}")
         frames = list(self._frames)[-count:]
-        tare = compute_tare(frames, self._keypoints)
+        tare = compute_tare(frames, self._keypoints, list(self._stddevs)[-count:])
         seen = np.isfinite(np.stack(frames)[..., 0]).mean(0) >= _LEAST_SEEN
         if seen.sum() < 3:
             raise NotEnoughDataError("cannot tare: fewer than three key points are seen in half of the frames")

@@ -77,9 +77,3 @@ def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
     target = np.append((tare.offsets[seen][:, [0, 2]] / deviation).ravel(), np.zeros(3))
     covariance = np.linalg.pinv(design.T @ design)
     return float((covariance @ design.T @ target)[0] / np.sqrt(max(covariance[0, 0], 1e-300)))
-
-
-def condition_on_width(noise: NDArray) -> tuple[NDArray, NDArray]:
-    """Returns the in-plane noise (2, 2) [m^2] that is left, and its regression (2,) on y, once y is known."""
-    gain = noise[[0, 2], 1] / noise[1, 1]
-    return noise[np.ix_([0, 2], [0, 2])] - np.outer(gain, noise[[0, 2], 1]), gain

@@ -6,20 +6,19 @@ the maximum a posteriori for the residuals averaged over the last frames, so tha
 of the mechanics are not mistaken for information.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
-from finforce_ifea.place_update import PlaceUpdate, update_place
+from finforce_ifea.place_update import Forecast, PlaceUpdate, update_place
+from finforce_ifea.point_noise import PointNoise
 from finforce_ifea.residuals import Residuals, Uncertainty, weigh_residuals
 from finforce_ifea.rolling import PressedState, RollingContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
-from finforce_ifea.track import Track, condition_on_width, explain_offsets
+from finforce_ifea.track import Track, explain_offsets
 
 # The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
 _LEAST_DEPTH = 3e-5
@@ -69,7 +68,7 @@ class PlaceTracker:
         self._motion = np.array([self._find_touch(np.r_[0.0, self._prior]), 0.0])
         self._motion_covariance = np.diag([0.1e-3, 1e-3]) ** 2
         self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
-        self._released = 0
+        self._released, self._jumped = 0, False
         self._forget_place()
 
     def _forget_place(self) -> None:
@@ -77,12 +76,16 @@ class PlaceTracker:
         self._mean = np.zeros((len(self._rest), 2))
         self._count = np.zeros(len(self._rest))
 
-    def update(self, points: NDArray, tare: Tare, dt: float) -> Track | None:
-        """Takes the key points (K, 3) [m], NaN where unused, dt [s] after the last; None when too few agree."""
-        forecast = self._predict(dt)
+    def update(self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None) -> Track | None:
+        """Takes the key points (K, 3) [m], NaN where unused, dt [s] after the last; None when too few agree.
+
+        `stddev` (K, 3) [m] are their stated standard deviations.
+        """
+        forecast, noise = self._predict(dt), tare.point_noise(stddev)
         place = forecast.place
         q = self.q + self._modes @ (self._reachable(place) - self._reached)
-        measured = points - tare.offsets
+        measured, unseen = points - tare.offsets, self.settings.offset_stddev
+        chance = self._expect_errors(noise, tare.offset_variance(unseen), forecast)
         update, settled, iteration, share, last = None, False, 0, 1.0, np.zeros(3)
         while not settled and iteration < self.settings.iterations:
             iteration += 1
@@ -92,7 +95,7 @@ class PlaceTracker:
                 q = q + self.contact.approach(q, state.correction, mechanical)
                 continue
             q = q + limit_step(self.contact.model, state.correction)
-            data = self._weigh(q, state, measured, tare, place, forecast)
+            data = self._weigh(q, state, measured, place - forecast.place, place, chance)
             if data.used < max(self.settings.minimum_keypoints, _LEAST_AGREEMENT * data.known):
                 place, q = self._leap(q, state, mechanical, place, data)
                 continue
@@ -107,7 +110,7 @@ class PlaceTracker:
             settled = self._is_settled(state, moved, missing)
         if update is None or not state.touches:
             return self._lose()
-        self._keep(q, place, update, forecast, state.modes)
+        self._keep(q, place, update, state.modes)
         return self._report(state, place, moved, data, update, iteration, settled)
 
     def _bound(self, asked: NDArray, place: NDArray, share: float) -> NDArray:
@@ -173,7 +176,7 @@ class PlaceTracker:
         state = self.contact.linearize(np.zeros(self.contact.model.size), place)
         return float(np.linalg.norm(state.force_modes[:, DEPTH]))
 
-    def _predict(self, dt: float) -> "_Forecast":
+    def _predict(self, dt: float) -> Forecast:
         """Returns the place dt [s] later: constant speed of the depth under white acceleration."""
         depth, speed = self._motion
         (a, b), (_, c) = self._motion_covariance
@@ -182,37 +185,38 @@ class PlaceTracker:
         spread += power * np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]])
         spread[0, 0] += _DEPTH_DRIFT**2
         place = np.array([depth + dt * speed, *self._slow])
-        return _Forecast(place=place, speed=float(speed), spread=spread)
+        return Forecast(place, float(speed), spread, float(dt) if self._released or self._jumped else 0.0)
+
+    def _expect_errors(self, noise: PointNoise, offset_variance: NDArray, forecast: Forecast) -> Uncertainty:
+        """Returns what is known of the errors of this frame's key points."""
+        return Uncertainty(
+            noise=noise.plane,
+            gain=noise.gain,
+            width_variance=noise.width_variance,
+            trust=noise.trust,
+            offset_variance=offset_variance,
+            depth_variance=float(min(forecast.spread[0, 0], _WIDEST_FORECAST**2)),
+            model_error=self.settings.model_error,
+            gate=self.settings.gate,
+        )
 
     def _weigh(
-        self, q: NDArray, state: PressedState, measured: NDArray, tare: Tare, place: NDArray, forecast: "_Forecast"
+        self, q: NDArray, state: PressedState, measured: NDArray, moved: NDArray, place: NDArray, chance: Uncertainty
     ) -> Residuals:
-        """Returns the residuals of a state."""
-        model, settings = self.contact.model, self.settings
-        noise, gain = condition_on_width(tare.noise)
-        chance = Uncertainty(
-            noise=noise,
-            gain=gain,
-            width_variance=float(tare.noise[1, 1]),
-            offset_variance=tare.offset_variance(settings.offset_stddev),
-            depth_variance=float(min(forecast.spread[0, 0], _WIDEST_FORECAST**2)),
-            model_error=settings.model_error,
-            gate=settings.gate,
-        )
+        """Returns the residuals of a state at a place (3,) that has moved by `moved` (3,) since the forecast."""
+        model = self.contact.model
         motions = model.project(self.probe, q, state.modes)
         below = float(place[DEPTH] - self._reachable(place)[DEPTH])
         positions = model.positions(self.probe, q)
-        return weigh_residuals(measured, positions, self._rest, motions, place - forecast.place, below, chance)
+        return weigh_residuals(measured, positions, self._rest, motions, moved, below, chance)
 
-    def _update_place(self, data: Residuals, forecast: "_Forecast") -> PlaceUpdate:
+    def _update_place(self, data: Residuals, forecast: Forecast) -> PlaceUpdate:
         """Returns the place that the residuals ask for."""
         return update_place(
             data,
             self._mean,
             self._count,
-            forecast.place,
-            forecast.speed,
-            forecast.spread,
+            forecast,
             self._prior,
             self._prior_variance,
             float(self.settings.memory),
@@ -233,12 +237,12 @@ class PlaceTracker:
         self._motion[1] = 0.0
         self._motion_covariance[0, 0] += _LOST_STDDEV**2
 
-    def _keep(self, q: NDArray, place: NDArray, update: PlaceUpdate, forecast: "_Forecast", modes: NDArray) -> None:
+    def _keep(self, q: NDArray, place: NDArray, update: PlaceUpdate, modes: NDArray) -> None:
         """Keeps what the next frame starts from; a released jaw expects any object again."""
         self.q, self._modes, self._reached = q, modes, self._reachable(place)
         self._slow = place[1:].copy()
         self._motion = np.array([place[DEPTH], update.speed])
-        self._motion_covariance = forecast.spread - np.outer(update.gain, forecast.spread[0])
+        self._motion_covariance, self._jumped = update.spread, update.jumped
         self._mean, self._count = update.mean, update.count
         pressed = place[DEPTH] - self._find_touch(place)
         self._released = self._released + 1 if pressed < _TOUCH_DEPTH else 0
@@ -285,12 +289,3 @@ class PlaceTracker:
         if self._stiffness is None or place[DEPTH] < _LOADED_DEPTH:
             return 1.0
         return float(np.linalg.norm(force) / (self._stiffness * place[DEPTH]))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Forecast:
-    """Predicted place (3,), speed of the depth [m/s], and covariance of depth and speed (2, 2)."""
-
-    place: NDArray
-    speed: float
-    spread: NDArray

@@ -131,7 +131,8 @@ def weigh_depths(excess: NDArray, centre: NDArray, gate: float, quantum: float) 
     """Return what sampled depths say, those of the finger being within `gate` [m] of the expectation.
 
     The median of these and their median absolute deviation (MAD) choose the ones to average:
-    |excess - median| <= 3 max(1.4826 MAD, quantum / 2); the error of the average counts neighbours as one.
+    |excess - median| <= 3 max(1.4826 MAD, quantum / 2). The average's error is that of one depth, at least that of
+    rounding, quantum / sqrt 12, by the root of the number of samples whose errors are not alike.
 
     Args:
         excess: (n, S) measured less expected depths [m], NaN where nothing was measured.
@@ -145,13 +146,12 @@ def weigh_depths(excess: NDArray, centre: NDArray, gate: float, quantum: float) 
     finger = known & ~is_near & ~is_far
     median = _masked_median(away, finger)
     spread = _MAD_TO_STDDEV * _masked_median(np.abs(away - median[:, None]), finger)
-    spread = np.maximum(spread, 0.5 * quantum)
     with np.errstate(invalid="ignore"):
-        finger &= np.abs(away - median[:, None]) <= _INLIER_SIGMA * spread[:, None]
+        finger &= np.abs(away - median[:, None]) <= _INLIER_SIGMA * np.maximum(spread, 0.5 * quantum)[:, None]
     count, measured = finger.sum(axis=1), np.maximum(known.sum(axis=1), 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(finger, away, 0.0).sum(axis=1) / count
-        stddev = spread / np.sqrt(np.maximum(count / _CORRELATED, 1.0))
+        stddev = np.maximum(spread, quantum / np.sqrt(12.0)) / np.sqrt(np.maximum(count / _CORRELATED, 1.0))
     return DepthEvidence(
         excess=mean + centre,
         stddev=stddev,

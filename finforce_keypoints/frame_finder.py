@@ -97,7 +97,7 @@ class FrameFinder:
         findings = {}
         for number, view in enumerate(views):
             pixels = _map_back(peaks.pixels[number], view, scale)
-            is_known = np.isfinite(pixels).all(axis=1) & _contains(view.canvas, pixels)
+            is_known = _contains(view.canvas, pixels)
             likelihood = np.where(is_known, peaks.likelihood[number], 0.0)
             stddev = np.where(is_known, peaks.stddev[number] / scale, np.inf)
             pixels = np.where(is_known[:, None], pixels, np.nan)
@@ -197,7 +197,7 @@ def _map_back(pixels: NDArray, view: _View, scale: float) -> NDArray:
 
 
 def _contains(box: Box, pixels: NDArray) -> NDArray:
-    """Tell (n,) which pixels (n, 2) lie in a box, borders included."""
+    """Tell (n,) which pixels (n, 2) lie in a box; NaN does not."""
     places = pixels - (box.x, box.y)
     return ((places >= -0.5) & (places <= (box.width - 0.5, box.height - 0.5))).all(axis=1)
 

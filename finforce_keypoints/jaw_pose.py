@@ -91,8 +91,8 @@ class OriginFinder:
 class OriginTrack:
     """Kalman filter of a jaw's place and speed that follows changes of speed at once.
 
-    Constant speed under white acceleration, p' = F p F^T + Q. An origin farther off the forecast than its gate, or
-    a trend of smaller errors, means that the speed has changed: position and speed are opened to what was seen.
+    Constant speed under white acceleration, P' = F P F^T + Q. An origin farther off the forecast than the gate means
+    that the speed has changed: position and speed are opened to what was seen.
     """
 
     def __init__(self, settings: DetectorSettings) -> None:
@@ -104,7 +104,6 @@ class OriginTrack:
         """Forget the jaw."""
         self._stamp: float | None = None
         self._state, self._P = np.zeros(2), np.zeros((2, 2))
-        self._trend = 0.0
         self._aside: list[tuple[float, float]] = []
         self._missed = 0
 
@@ -133,27 +132,18 @@ class OriginTrack:
         if abs(error) > self._settings.largest_speed * dt + self._settings.origin_gate * spread:
             return self._set_aside(stamp, origin, forecast)
         self._missed, self._aside = 0, []
-        if self._is_surprised(error / spread):
+        if abs(error) > self._settings.origin_gate * spread:
             P = P + np.diag([error**2, (error / dt) ** 2])
         gain = P[:, 0] / (P[0, 0] + origin.stddev**2)
         self._stamp, self._state = stamp, state + gain * error
         self._P = P - np.outer(gain, P[0])
         return self._estimate()
 
-    def _is_surprised(self, standard: float) -> bool:
-        """Whether an error, in standard deviations, or the run of the last ones says that the speed has changed."""
-        gate = self._settings.origin_gate
-        self._trend = 0.5 * self._trend + 0.5 * standard  # white errors leave this 0.58 standard deviations wide
-        if abs(standard) <= gate and abs(self._trend) <= 0.58 * gate:
-            return False
-        self._trend = 0.0
-        return True
-
     def _begin(self, stamp: float, origin: Origin, speed: float = 0.0) -> Origin:
         """Start the course at an origin."""
         self._stamp, self._state = stamp, np.array([origin.x, speed])
         self._P = np.diag([origin.stddev**2, 0.01**2])
-        self._trend, self._aside, self._missed = 0.0, [], 0
+        self._aside, self._missed = [], 0
         return self._estimate()
 
     def _miss(self, stamp: float, forecast: Origin | None) -> Origin | None:

@@ -70,17 +70,19 @@ class KeypointDetectorNode(Node):
 
     def _subscribe(self) -> None:
         """Create the subscriptions; images that a newer one overtook are passed over."""
-        parameters, feed, subscribe = self.parameters, self.feed, self.qos.subscription
-        subscribe(CameraInfo, parameters.info_topic, partial(self._take, feed.take_info), ros.SENSOR)
-        subscribe(Image, parameters.depth_topic, partial(self._take, feed.take_depth), ros.SENSOR)
+        parameters, feed = self.parameters, self.feed
+        self.qos.subscription(CameraInfo, parameters.info_topic, partial(self._take, feed.take_info), ros.SENSOR)
+        self.depths = ros.LargeSubscription(
+            self.qos, Image, parameters.depth_topic, partial(self._take, feed.take_depth)
+        )
         self.colors = {
-            topic: subscribe(Image, topic, partial(self._on_color, topic), ros.SENSOR)
+            topic: ros.LargeSubscription(self.qos, Image, topic, partial(self._on_color, topic))
             for topic in parameters.color_topics
         }
 
     def _on_color(self, topic: str, message: Image) -> None:
         """Take the newest colour image."""
-        message, superseded = ros.take_newest(self.colors[topic], message)
+        message, superseded = ros.take_newest(self.colors[topic].current, message)
         for health in self.health.values():
             health.arrive(superseded)
         self._take(partial(self.feed.take_color, topic), message)

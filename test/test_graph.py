@@ -6,6 +6,7 @@ import math
 from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -17,17 +18,22 @@ from finforce_graph import (
     Process,
     ReplayOptions,
     bench_processes,
-    options_from_texts,
     replay_processes,
 )
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings
+from finforce_keypoints.dot_image import DotSettings
+from finforce_keypoints.gripper_geometry import BENCH_CAMERA
+from finforce_keypoints.parameters import DetectorParameters
+from finforce_keypoints.settings import DetectorSettings
+from finforce_launch import options_from_texts
 
 ROOT = Path(__file__).resolve().parents[1]
 SOLVER_PARAMETERS = {entry.name for entry in fields(NodeParameters)}
 SOLVER_PARAMETERS |= {f"estimator.{entry.name}" for entry in fields(EstimatorSettings)} | {"use_sim_time"}
 CONTACT_PARAMETERS = {entry.name for entry in fields(ContactParameters)} | {"use_sim_time"}
 CONTACT_PARAMETERS |= {f"contact.{entry.name}" for entry in fields(ContactSettings)}
+DETECTOR_PARAMETERS = {entry.name for entry in fields(DetectorParameters)} | {"use_sim_time"}
 PLAYER_PARAMETERS = {entry.name for entry in fields(PlayerParameters)}
 
 
@@ -74,10 +80,15 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
         "object_mesh_unit": "mm",
         "contact": "paper",
         "pose_source": "tracker",
+        "images": True,
+        "finder": "frame",
+        "model": "d",
+        "T_gripper_camera": "0 0 0.1, 0 0 0 1",
     }
     known = {
         "ifea_solver": SOLVER_PARAMETERS,
         "contact_estimator": CONTACT_PARAMETERS,
+        "keypoint_detector": DETECTOR_PARAMETERS,
         "recording_player": PLAYER_PARAMETERS,
     }
     processes = replay_processes(ReplayOptions(jaws="both", bag="x", **given), ROOT)
@@ -108,6 +119,33 @@ def test_solver_and_contact_estimator_have_the_same_mesh_of_the_jaw(solver, mesh
     _, estimator = bench_processes(options, ROOT)
     assert estimator.parameters.get("contact.mesh") == seen
     assert (estimator.parameters["jaw_file"], estimator.parameters["calibration_file"]) == ("j", "k")
+
+
+def test_images_start_one_detector_for_all_jaws():
+    options = ReplayOptions(jaws="both", images=True, finder="dots", jaw_file="j", T_gripper_camera="0 0 0.1 0 0 0 1")
+    detector = by_name(replay_processes(options, ROOT))["keypoint_detector"]
+    assert detector.parameters["jaws"] == "both" and detector.parameters["use_sim_time"] is True
+    assert detector.parameters["finder"] == "dots" and detector.parameters["jaw_file"] == "j"
+    assert detector.parameters["T_gripper_camera"] == [0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0]
+    assert "keypoint_detector" in by_name(bench_processes(BenchOptions(images=True), ROOT))
+
+
+def test_without_images_key_points_come_by_topic():
+    processes = replay_processes(ReplayOptions(jaws="both", finder="dots", model="m"), ROOT)
+    assert "keypoint_detector" not in by_name(processes)
+
+
+@pytest.mark.parametrize("text", ["bench", "0 0 0", "0 0 0 0 0 0 x"])
+def test_a_camera_pose_that_is_not_seven_numbers_is_named(text):
+    with pytest.raises(ValueError, match="T_gripper_camera.*7 numbers"):
+        bench_processes(BenchOptions(images=True, T_gripper_camera=text), ROOT)
+
+
+def test_the_bench_configuration_has_the_camera_of_the_bench():
+    bench = yaml.safe_load((ROOT / "config" / "bench.yaml").read_text(encoding="utf-8"))
+    numbers = tuple(bench["keypoint_detector"]["ros__parameters"]["T_gripper_camera"])
+    # 1e-7: of the printed digits
+    np.testing.assert_allclose(DetectorParameters(T_gripper_camera=numbers).camera_pose, BENCH_CAMERA, atol=1e-7)
 
 
 def test_rviz_is_started_with_a_configuration_that_is_there():
@@ -152,10 +190,14 @@ def test_every_launch_argument_has_a_description():
 
 @pytest.mark.parametrize("path", sorted((ROOT / "config").glob("*.yaml")), ids=lambda path: path.name)
 def test_every_key_of_a_configuration_is_a_parameter_and_differs_from_its_default(path):
-    defaults = {entry.name: entry.default for entry in fields(NodeParameters)}
-    defaults |= {f"estimator.{entry.name}": entry.default for entry in fields(EstimatorSettings)}
-    for section in yaml.safe_load(path.read_text(encoding="utf-8")).values():
+    solver = {entry.name: entry.default for entry in fields(NodeParameters)}
+    solver |= {f"estimator.{entry.name}": entry.default for entry in fields(EstimatorSettings)}
+    detector = {entry.name: entry.default for entry in fields(DetectorParameters)}
+    detector |= {f"detector.{entry.name}": entry.default for entry in fields(DetectorSettings)}
+    for node, section in yaml.safe_load(path.read_text(encoding="utf-8")).items():
+        defaults = detector if node == "keypoint_detector" else solver
         for name, value in section["ros__parameters"].items():
+            value = tuple(value) if isinstance(value, list) else value
             assert name in defaults
             assert value != defaults[name]
             assert type(value) is type(defaults[name])
@@ -168,6 +210,9 @@ def test_every_key_of_a_configuration_is_a_parameter_and_differs_from_its_defaul
         (PlayerParameters, "finforce_eval"),
         (ContactParameters, "finforce_contact"),
         (ContactSettings, "finforce_contact"),
+        (DetectorParameters, "finforce_keypoints"),
+        (DetectorSettings, "finforce_keypoints"),
+        (DotSettings, "finforce_keypoints"),
         (ReplayOptions, "."),
         (BenchOptions, "."),
     ],

@@ -61,6 +61,15 @@ def test_an_object_mesh_starts_the_contact_estimator(recorded_launch):
     assert estimator["parameters"][1]["object_mesh"] == "can.stl" and estimator["parameters"][1]["jaws"] == "right"
 
 
+def test_images_start_the_detector_with_the_configuration(recorded_launch):
+    nodes = start(ROOT / "launch" / "bench.launch.py", images="true", finder="dots", jaw="right")
+    detector = nodes["keypoint_detector"]
+    configuration, parameters = detector["parameters"]
+    assert (detector["package"], detector["executable"]) == ("finforce", "keypoint_detector")
+    assert Path(configuration).name == "bench.yaml"
+    assert (parameters["jaws"], parameters["finder"]) == ("right", "dots")
+
+
 def test_the_end_of_the_player_ends_the_launch(recorded_launch):
     nodes = start(ROOT / "launch" / "replay.launch.py", bag="somewhere", jaws="both")
     assert set(nodes) == {"left_ifea_solver", "right_ifea_solver", "recording_player"}

@@ -50,7 +50,7 @@ def imported(path):
 
 
 def is_ros_file(path):
-    return path.name in ("node.py", "finforce_ros.py")
+    return path.name in ("node.py", "finforce_ros.py", "finforce_messages.py")
 
 
 def test_only_nodes_and_their_shared_module_import_ros():

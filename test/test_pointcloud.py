@@ -117,9 +117,10 @@ def test_key_points_without_likelihood_are_certain():
         row_step=24,
         is_bigendian=False,
     )
-    points, likelihood = decode_keypoints(cloud)
+    points, likelihood, stddev = decode_keypoints(cloud)
     np.testing.assert_array_equal(points, [[1, 2, 3], [np.nan, 2, 3]])
     np.testing.assert_array_equal(likelihood, [1, 1])
+    assert stddev is None
 
 
 def test_rows_that_the_detector_calls_invalid_are_not_used():
@@ -134,6 +135,49 @@ def test_rows_that_the_detector_calls_invalid_are_not_used():
         row_step=3 * encoded.point_step,
         is_bigendian=False,
     )
-    points, _ = decode_keypoints(cloud)
+    points, *_ = decode_keypoints(cloud)
     assert np.isnan(points[1]).all()
     np.testing.assert_array_equal(points[[0, 2]], [[0, 0, 0], [2, 2, 2]])
+
+
+def keypoint_cloud(**columns):
+    encoded = encode_cloud({name: np.arange(3, dtype="<f4") for name in "xyz"} | columns)
+    return SimpleNamespace(
+        fields=encoded.fields,
+        data=encoded.data,
+        width=3,
+        height=1,
+        point_step=encoded.point_step,
+        row_step=3 * encoded.point_step,
+        is_bigendian=False,
+    )
+
+
+def stated(*values):
+    return {f"stddev_{axis}": np.float32(values) for axis in "xyz"}
+
+
+def test_stated_deviations_come_with_the_points():
+    columns = {f"stddev_{axis}": np.float32([i + 1, i + 2, i + 3]) for i, axis in enumerate("xyz")}
+    found = decode_keypoints(keypoint_cloud(**columns))
+    np.testing.assert_array_equal(found.stddev, [[1, 2, 3], [2, 3, 4], [3, 4, 5]])
+
+
+def test_a_row_that_is_not_valid_need_not_state_a_deviation():
+    cloud = keypoint_cloud(**stated(1, np.nan, 1), valid=np.array([1, 0, 1], dtype="u1"))
+    found = decode_keypoints(cloud)
+    assert np.isnan(found.points[1]).all() and np.isfinite(found.points[[0, 2]]).all()
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, np.nan, np.inf])
+def test_a_valid_row_with_a_deviation_that_is_none_is_refused(value):
+    cloud = keypoint_cloud(**stated(1, value, 1), valid=np.array([1, 1, 1], dtype="u1"))
+    with pytest.raises(ObservationError, match="key point 1 states the standard deviation .* along x"):
+        decode_keypoints(cloud)
+
+
+def test_some_of_the_deviations_without_the_others_are_refused():
+    columns = stated(1, 1, 1)
+    del columns["stddev_y"]
+    with pytest.raises(ObservationError, match="stddev_x, stddev_z; expected all of stddev_x, stddev_y, stddev_z"):
+        decode_keypoints(keypoint_cloud(**columns))

@@ -265,3 +265,35 @@ def test_poses_of_one_topic_in_two_frames_are_refused(tmp_path, factory, entries
     bag = write_entries(spoil(entries, topic, 2, rename), tmp_path / "bag", factory)
     with pytest.raises(RecordingError, match=f"bag: {topic} message 2 is in the frame 'other', the first in 'camera_"):
         read_recording(bag)
+
+
+def stated(number, *, axes="xyz"):
+    """An entry with four key points that state their standard deviations, the second not valid."""
+    factory = MessageFactory()
+    columns = {axis: np.float32([0, 1, 2, 3]) for axis in "xyz"}
+    columns |= {f"stddev_{axis}": np.float32([1e-3, np.nan, 2e-3, 3e-3]) for axis in axes}
+    columns["valid"] = np.array([1, 0, 1, 1], dtype="u1")
+    stamp = START + number * PERIOD
+    return Entry(stamp, "/left/keypoints", CLOUD, factory.cloud(stamp, "left_jaw", columns))
+
+
+def test_stated_deviations_go_with_the_key_points(tmp_path):
+    write_entries([stated(0), stated(1)], tmp_path / "bag", MessageFactory())
+    track = read_recording(tmp_path / "bag").jaw("left").keypoints
+    np.testing.assert_array_equal(track.stddev[:, 2:, 1], np.float32([[2e-3, 3e-3]] * 2))
+    observation = track.observation(1)
+    np.testing.assert_array_equal(observation.stddev, track.stddev[1])
+    assert np.isnan(observation.points[1]).all() and observation.stamp == track.stamps[1] * 1e-9
+
+
+def test_recording_without_deviations_has_none(tmp_path, factory, entries):
+    write_entries(entries, tmp_path / "bag", factory)
+    track = read_recording(tmp_path / "bag").jaw("left").keypoints
+    assert track.stddev is None and track.observation(0).stddev is None
+
+
+@pytest.mark.parametrize(("axes", "reason"), [("", "message 1 differs from the first"), ("xy", "expected all of")])
+def test_deviations_in_some_messages_or_along_some_axes_are_refused(tmp_path, axes, reason):
+    write_entries([stated(0), stated(1, axes=axes)], tmp_path / "bag", MessageFactory())
+    with pytest.raises(RecordingError, match=reason):
+        read_recording(tmp_path / "bag")

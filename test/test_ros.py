@@ -1,6 +1,7 @@
 """Claims about what every node shares: messages, parameters from records, start and stop."""
 
 import math
+import os
 from dataclasses import dataclass, field, fields
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from node_fakes import ros_domain
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
@@ -24,6 +26,9 @@ from finforce_ifea.errors import FinforceError, ObservationError
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.pointcloud import decode_keypoints
 from finforce_ifea.settings import EstimatorSettings
+from finforce_keypoints.dot_image import DotSettings
+from finforce_keypoints.parameters import DetectorParameters
+from finforce_keypoints.settings import DetectorSettings
 from finforce_records import refresh_record
 
 RECORDS = (
@@ -33,6 +38,9 @@ RECORDS = (
     ContactParameters,
     ContactSettings,
     TrackerSettings,
+    DetectorParameters,
+    DetectorSettings,
+    DotSettings,
 )
 
 
@@ -159,3 +167,28 @@ def test_a_defect_is_not_swallowed():
     with pytest.raises(ZeroDivisionError):
         ros.run_node("some_node", build, [])
     assert not rclpy.ok()
+
+
+def test_images_are_carried_unless_somebody_has_chosen_how(monkeypatch):
+    for name in ros.CHOICES:
+        monkeypatch.delenv(name, raising=False)
+    ros.provide_transport()
+    assert os.environ[ros.PROFILES] == str(ros.TRANSPORT) and ros.TRANSPORT.is_file()
+    monkeypatch.setenv(ros.PROFILES, "other.xml")
+    ros.provide_transport()
+    assert os.environ[ros.PROFILES] == "other.xml"
+    monkeypatch.delenv(ros.PROFILES)
+    monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
+    ros.provide_transport()
+    assert ros.PROFILES not in os.environ
+
+
+def test_images_of_a_megabyte_arrive_with_best_effort():
+    picture = np.zeros((480, 640, 3), dtype=np.uint8)
+    with ros_domain() as probe:
+        probe.hear("picture", Image, ros.SENSOR)
+        publisher = probe.speak("picture", Image)
+        probe.connected(publisher)
+        for count in range(1, 6):
+            publisher.publish(ros.image_message(Header(), picture))
+            probe.wait_for(lambda count=count: len(probe.got["picture"]) == count)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from mechanics_fakes import BENCH
 
+from finforce_ifea.point_noise import condition_on_width
 from finforce_ifea.tare import blank_tare, compute_tare
-from finforce_ifea.track import condition_on_width, explain_offsets
+from finforce_ifea.track import explain_offsets
 
 REST = BENCH.keypoints
 NOISE = np.array([0.2e-3, 0.4e-3, 0.1e-3])

@@ -1,0 +1,110 @@
+"""The subcommands `twin list` and `twin record`: options to a scenario, footage to a recording and a picture of it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.preview import Preview
+from finforce_eval.twin_writer import RecordingForm, write_footage
+from finforce_twin.record import build_footage, parse_size
+from finforce_twin.scenarios import SCENARIOS, Scenario, build_scenario
+from finforce_twin.script import write_script
+
+PREVIEW = "preview.jpg"
+
+
+def run_list(options: argparse.Namespace) -> None:
+    """Print the scenes, with the numbers in which each differs from the default."""
+    for name, scenario in SCENARIOS.items():
+        duration = write_script(scenario).stamps[-1]
+        print(f"{name:<22} {duration:5.1f} s  {', '.join(_deviations(scenario))}")
+
+
+def _deviations(scenario: Scenario) -> list[str]:
+    """Return what makes a scene, as NAME=VALUE."""
+    plain = {entry.name: entry.default for entry in fields(Scenario)}
+    values = {name: getattr(scenario, name) for name in plain if name != "name"}
+    named = ("object", "camera", "light")
+    changed = [name for name, value in values.items() if name in named or value != plain[name]]
+    return [f"{name}={_short(values[name])}" for name in changed]
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value) or "none"
+
+
+def run_record(options: argparse.Namespace) -> None:
+    """Render a scene and write the recording, its mesh, its `case.json` and a preview.
+
+    Raises:
+        FinforceError: an option or the scene cannot be used, or the folder exists.
+    """
+    folder = Path(options.output)
+    if folder.exists():
+        raise RecordingError(f"{folder}: exists already; a recording is written to a new folder")
+    scenario = scenario_from_options(options)
+    camera = parse_size(options.size)
+    if not 1 <= options.quality <= 95:
+        raise OptionError(f"--quality {options.quality}: expected 1 to 95")
+    form = RecordingForm(
+        compressed=not options.raw, quality=options.quality, farthest=options.farthest, storage=options.storage
+    )
+    record_scene(scenario, options.seed, folder, camera=camera, form=form)
+    size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
+    print(f"Recording: {folder} ({size:.1f} MB), preview: {folder / PREVIEW}")
+    print(f"Score it with: finforce evaluate {folder} --from images")
+
+
+def record_scene(scenario: Scenario, seed: int, folder: Path, *, camera: Any, form: RecordingForm) -> None:
+    """Render a scene into a new folder, under a progress bar."""
+    from tqdm import tqdm
+
+    footage = build_footage(scenario, seed, camera)
+    preview = Preview(len(footage))
+    case = {"scene": scenario.name, "seed": seed, "light": scenario.light, "object": {"kind": scenario.object}}
+    with tqdm(total=len(footage), unit="image", desc=scenario.name, disable=None, leave=False) as bar:
+
+        def seen(frame: Any) -> None:
+            preview.take(frame)
+            bar.update()
+
+        write_footage(footage, folder, form=form, case=case, seen=seen)
+    preview.save(folder / PREVIEW)
+
+
+def scenario_from_options(options: argparse.Namespace) -> Scenario:
+    """Return the scene that options name, with what they change in it.
+
+    Raises:
+        OptionError: a change is no NAME=VALUE, or its value has another type.
+        ScenarioError: there is no such scene, or a number is out of its bounds.
+    """
+    changes = parse_changes(options.set)
+    for name in ("light", "object", "camera"):
+        if getattr(options, name) is not None:
+            changes[name] = getattr(options, name)
+    return build_scenario(options.scene, **changes)
+
+
+def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
+    """Return `NAME=VALUE` texts as values of the type of the scene's number.
+
+    Raises:
+        OptionError: a name is not known, or a value is not of its type.
+    """
+    kinds = {entry.name: type(entry.default) for entry in fields(Scenario) if entry.name != "name"}
+    changes = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if name not in kinds:
+            raise OptionError(f"--set {text}: unknown number; expected one of {', '.join(kinds)}")
+        try:
+            changes[name] = kinds[name](value)
+        except ValueError:
+            raise OptionError(f"--set {text}: '{value}' is no {kinds[name].__name__}") from None
+    return changes

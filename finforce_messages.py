@@ -1,0 +1,123 @@
+"""Messages of ROS from arrays and numbers, exact in their stamps; knows no node and no jaw."""
+
+from __future__ import annotations
+
+import array
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3, Wrench, WrenchStamped
+from numpy.typing import ArrayLike, NDArray
+from sensor_msgs.msg import Image, PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker
+
+from finforce_health import NANOSECONDS
+from finforce_ifea.errors import ObservationError
+from finforce_ifea.pointcloud import encode_cloud
+
+MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Return a builtin_interfaces/Time as exact integer nanoseconds."""
+    return stamp.sec * NANOSECONDS + stamp.nanosec
+
+
+def stamp_message(stamp: int) -> Time:
+    """Return integer nanoseconds as a builtin_interfaces/Time."""
+    seconds, rest = divmod(stamp, NANOSECONDS)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def cloud_message(header: Header, columns: Mapping[str, ArrayLike]) -> PointCloud2:
+    """Return a cloud of height 1 with one field per column (n,), in their order and type."""
+    encoded = encode_cloud(columns)
+    return PointCloud2(
+        header=header,
+        height=1,
+        width=len(encoded.data) // encoded.point_step,
+        fields=[PointField(**vars(entry)) for entry in encoded.fields],
+        point_step=encoded.point_step,
+        row_step=len(encoded.data),
+        data=array.array("B", encoded.data),  # an ndarray would be checked byte by byte
+        is_dense=all(bool(np.isfinite(values).all()) for values in columns.values()),
+    )
+
+
+def xyz_columns(points: ArrayLike) -> dict[str, NDArray[np.float32]]:
+    """Return points (n, 3) as the float32 columns x, y, z."""
+    return dict(zip("xyz", np.asarray(points, dtype=np.float32).reshape(-1, 3).T, strict=True))
+
+
+def image_message(header: Header, picture: NDArray[np.uint8]) -> Image:
+    """Return a picture (h, w, 3) of red, green and blue as an rgb8 image."""
+    height, width, _ = picture.shape
+    return Image(
+        header=header,
+        height=height,
+        width=width,
+        encoding="rgb8",
+        step=3 * width,
+        data=array.array("B", picture.tobytes()),  # an ndarray would be checked byte by byte
+    )
+
+
+def wrench_message(header: Header, force: ArrayLike, torque: ArrayLike = (0.0, 0.0, 0.0)) -> WrenchStamped:
+    """Return a wrench from force (3,) [N] and torque (3,) [N m].
+
+    Raises:
+        ObservationError: a component is not finite; such a wrench must not leave.
+    """
+    numbers = [*map(float, force), *map(float, torque)]
+    if not all(map(math.isfinite, numbers)):
+        raise ObservationError(f"the wrench is not finite: {numbers}")
+    return WrenchStamped(header=header, wrench=Wrench(force=_vector(numbers[:3]), torque=_vector(numbers[3:])))
+
+
+def _vector(xyz: Sequence[float]) -> Vector3:
+    return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
+
+
+def pose_message(header: Header, numbers: Sequence[float]) -> PoseStamped:
+    """Return a pose from x, y, z [m], qx, qy, qz, qw."""
+    x, y, z, *turn = map(float, numbers)
+    orientation = Quaternion(**dict(zip("xyzw", turn, strict=True)))
+    return PoseStamped(header=header, pose=Pose(position=Point(x=x, y=y, z=z), orientation=orientation))
+
+
+def points_marker(
+    header: Header,
+    name: str,
+    kind: str,
+    points: ArrayLike,
+    *,
+    color: Sequence[float],
+    scale: Sequence[float],
+    colors: Sequence[Sequence[float]] = (),
+) -> Marker:
+    """Return a marker of points (n, 3) [m]: triangles, spheres or an arrow from the first to the second.
+
+    Args:
+        header: stamp and frame.
+        name: the marker's namespace; each holds one marker.
+        kind: "triangles", "spheres" or "arrow".
+        points: in the frame of the header; none of them deletes the marker.
+        color: red, green, blue, opacity.
+        scale: what the kind makes of it [m].
+        colors: one per point, in place of `color`.
+    """
+    known = [Point(x=x, y=y, z=z) for x, y, z in np.asarray(points, dtype=np.float64).reshape(-1, 3).tolist()]
+    return Marker(
+        header=header,
+        ns=name,
+        type=MARKERS[kind],
+        action=Marker.ADD if known else Marker.DELETE,
+        points=known,
+        color=ColorRGBA(**dict(zip("rgba", color, strict=True))),
+        colors=[ColorRGBA(**dict(zip("rgba", entry, strict=True))) for entry in colors],
+        scale=_vector(scale),
+    )

@@ -1,0 +1,69 @@
+"""Files that hold a training at one moment, to go on from or to export; knows no pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from training.errors import CheckpointError
+from training.network import KeypointNetwork, NetworkShape
+from training.optional import import_torch
+
+torch = import_torch()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Checkpoint:
+    """A training at one moment.
+
+    Attributes:
+        shape: of the network.
+        names: (K,) of the points, the reference point last.
+        averaged: state of the averaged network, the one to use.
+        network: state of the network that is trained.
+        optimizer: its state.
+        step: batches seen.
+        elapsed: time spent on them [s].
+    """
+
+    shape: NetworkShape
+    names: tuple[str, ...]
+    averaged: Mapping[str, Any]
+    network: Mapping[str, Any]
+    optimizer: Mapping[str, Any]
+    step: int
+    elapsed: float
+
+
+def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint; the file before it stays whole until the new one is complete."""
+    content = {name: getattr(checkpoint, name) for name in checkpoint.__dataclass_fields__}
+    content["shape"] = asdict(checkpoint.shape)
+    content["names"] = list(checkpoint.names)
+    part = Path(path).with_suffix(".part")
+    torch.save(content, part)
+    part.replace(path)
+
+
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """Read a checkpoint.
+
+    Raises:
+        CheckpointError: the file is missing, or no checkpoint.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        shape = {name: tuple(v) if isinstance(v, list) else v for name, v in content["shape"].items()}
+        return Checkpoint(**content | {"shape": NetworkShape(**shape), "names": tuple(content["names"])})
+    except Exception as error:  # torch raises whatever its unpickler does
+        reason = str(error).partition("\n")[0]
+        raise CheckpointError(f"{path}: {reason}; expected a checkpoint written by training.train") from error
+
+
+def build_averaged(checkpoint: Checkpoint) -> KeypointNetwork:
+    """Return the averaged network of a checkpoint, in evaluation mode."""
+    network = KeypointNetwork(checkpoint.shape)
+    network.load_state_dict(checkpoint.averaged)
+    return network.eval()

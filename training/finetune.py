@@ -1,0 +1,149 @@
+"""Trains the shipped network further on a user's labelled images.
+
+`python -m training.finetune CollectedData_X.csv --camera camera.yaml --network FOLDER -o FOLDER`
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from finforce_ifea.errors import FinforceError
+from finforce_ifea.jaw import load_jaw
+from finforce_keypoints.gripper_geometry import SIDES
+from finforce_keypoints.naming import build_name_map, parse_mapping
+from finforce_keypoints.optional import import_cv2
+from training.dataset import TRAIN, LabelledPictures, join_pictures, load_pictures
+from training.errors import LabelFileError
+from training.evaluate import build_model, crop_all, detect_samples, format_scores
+from training.labels import Labels, read_labels
+from training.rectification import CameraView, LabelledImage, read_camera, rectify
+from training.scoring import score_detections
+
+FEWEST = 10  # labelled pictures; fewer cannot even be judged
+HELD_BACK = 6  # every sixth picture judges, the others teach
+MINUTES, RATE = 10.0, 3e-4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Project:
+    """A labelled DeepLabCut project: labels, the folder of its images, camera, and the names of its jaws' points."""
+
+    labels: Labels
+    folder: Path
+    view: CameraView
+    jaw: str
+    sides: tuple[str, ...]
+    mapping: dict[str, str]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Fine-tune a network, print its scores on pictures held back, before and after, and export it."""
+    options = build_parser().parse_args(arguments)
+    try:
+        run(options)
+    except FinforceError as error:
+        raise SystemExit(f"training: {error}") from error
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the options of the command."""
+    parser = argparse.ArgumentParser(prog="python -m training.finetune", description=__doc__)
+    parser.add_argument("labels", type=Path, help="CollectedData_SCORER.csv")
+    parser.add_argument("--project", type=Path, help="folder that holds labeled-data (two above the label file)")
+    parser.add_argument("--camera", type=Path, required=True, help="YAML of intrinsics and T_gripper_camera")
+    parser.add_argument("--network", type=Path, required=True, help="folder of the exported network to begin with")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the fine-tuned network")
+    parser.add_argument("--jaw", default="bench", help="jaw file, or the name of a shipped jaw")
+    parser.add_argument("--sides", nargs="+", choices=SIDES, default=SIDES, help="labelled jaws (both)")
+    parser.add_argument("--map", nargs="*", default=[], help="BODYPART=NAME for body parts with names of their own")
+    parser.add_argument("--dataset", type=Path, help="shards of the twin, mixed in half and half against forgetting")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help=f"time for training ({MINUTES:g})")
+    parser.add_argument("--rate", type=float, default=RATE, help=f"largest learning rate ({RATE:g})")
+    parser.add_argument("--threads", type=int, default=1, help="threads of the network's arithmetic (1)")
+    parser.add_argument("--seed", type=int, default=0, help="of order and augmentation (0)")
+    return parser
+
+
+def run(options: argparse.Namespace) -> None:
+    """Fine-tune as the options say."""
+    # PyTorch is only wanted once the labels are known to be usable
+    pictures = load_project(read_project(options))
+    from training.refinement import refine
+
+    judging = np.arange(len(pictures)) % HELD_BACK == HELD_BACK - 1
+    train, validation = pictures.take(~judging), pictures.take(judging)
+    if options.dataset:
+        train = mix(train, load_pictures(options.dataset, TRAIN, 2000))
+    before = detect_samples(build_model(options.network), crop_all(validation))
+    after = refine(options, train, validation)
+    print(format_scores({"before": score_detections(before), "after": score_detections(after)}))
+
+
+def read_project(options: argparse.Namespace) -> Project:
+    """Return the project that the options name."""
+    return Project(
+        labels=read_labels(options.labels),
+        folder=options.project or options.labels.resolve().parent.parent.parent,
+        view=read_camera(options.camera),
+        jaw=options.jaw,
+        sides=tuple(options.sides),
+        mapping=parse_mapping(options.map),
+    )
+
+
+def load_project(project: Project) -> LabelledPictures:
+    """Return every labelled jaw of a project as a rectified picture, with a progress bar.
+
+    Raises:
+        LabelFileError: an image is missing or of another size, or hardly any picture shows a labelled jaw.
+        NamingError: the body parts are not the jaws' key points.
+    """
+    left = load_jaw(project.jaw)
+    jaws = {side: left if side == "left" else left.mirrored() for side in project.sides}
+    rows = build_name_map(project.labels.names, jaws, project.mapping).rows
+    found = []
+    for number, name in enumerate(tqdm(project.labels.images, desc="images", leave=False)):
+        image = read_image(project.folder / name)
+        for side, jaw in jaws.items():
+            labelled = LabelledImage(image=image, points=project.labels.points[number, rows[side]])
+            found.append(rectify(labelled, jaw, side, project.view))
+    usable = [picture for picture in found if picture is not None]
+    if len(usable) < FEWEST:
+        raise LabelFileError(
+            f"{len(usable)} of {len(found)} pictures show a jaw with its reference point or a key point near its base; "
+            f"expected at least {FEWEST}, better 50 to 300"
+        )
+    return join_pictures(usable)
+
+
+def read_image(path: Path) -> NDArray:
+    """Return an image file as (h, w, 3) uint8 RGB.
+
+    Raises:
+        LabelFileError: the file is missing, or no image.
+    """
+    cv2 = import_cv2()
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    if image is None:
+        raise LabelFileError(f"{path}: no image there; expected it below the project's folder (--project)")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def mix(few: LabelledPictures, many: LabelledPictures) -> LabelledPictures:
+    """Return both sets, the smaller one repeated until it is about half."""
+    few = few.take(np.tile(np.arange(len(few)), max(1, round(len(many) / len(few)))))
+    named = LabelledPictures(
+        picture=many.picture, xz=many.xz, visible=many.visible, names=few.names if not many.names else many.names
+    )
+    return join_pictures([few, named])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""A user's labelled images as pictures of the jaws' side planes; knows neither label files nor networks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from finforce_camera import CameraIntrinsics
+from finforce_contact.poses import pose_from_quaternion
+from finforce_ifea.jaw import Jaw
+from finforce_keypoints.gripper_geometry import jaw_in_camera, jaw_in_gripper
+from finforce_keypoints.plane_picture import PlaneGrid, intersect_plane, map_picture, take_picture
+from training.dataset import MARGIN, LabelledPictures
+from training.errors import LabelFileError
+
+BASE_PART = 0.3  # of the jaw's length: key points nearer to the base hardly move when the jaw bends
+NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraView:
+    """A camera and its place: intrinsics and T_gripper_camera (4, 4)."""
+
+    camera: CameraIntrinsics
+    T_gripper_camera: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LabelledImage:
+    """An image (h, w, 3) uint8 RGB with the points (K, 2) [px] of one jaw, the reference point last; NaN if hidden."""
+
+    image: NDArray
+    points: NDArray
+
+
+def read_camera(path: str | Path) -> CameraView:
+    """Read a camera from YAML: width, height, fx, fy, cx, cy [px], distortion, T_gripper_camera [x y z qx qy qz qw].
+
+    Raises:
+        LabelFileError: the file cannot be read or lacks one of these.
+        IntrinsicsError: no camera has such numbers.
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        return parse_camera(content)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise LabelFileError(
+            f"{path}: {error!r}; expected {', '.join(NUMBERS)}, distortion and T_gripper_camera [x y z qx qy qz qw]"
+        ) from error
+
+
+def parse_camera(content: Mapping[str, Any]) -> CameraView:
+    """Return the camera of a file's content; see `read_camera`."""
+    numbers = {name: content[name] for name in NUMBERS}
+    pose = np.array(content["T_gripper_camera"], dtype=float)
+    if pose.shape != (7,):
+        raise LabelFileError(f"T_gripper_camera: got {pose.tolist()}, expected x y z [m] qx qy qz qw")
+    return CameraView(
+        camera=CameraIntrinsics(**numbers, distortion=np.array(content.get("distortion", ()), dtype=float)),
+        T_gripper_camera=pose_from_quaternion(pose[:3], pose[3:]),
+    )
+
+
+def find_origin(points: NDArray, jaw: Jaw, side: str, view: CameraView) -> float | None:
+    """Return where a jaw's origin is on the closing axis [m], from its labels.
+
+    The reference point tells it; where it is hidden, the mean of the key points near the base does.
+
+    Args:
+        points: (K + 1, 2) labels [px], the reference point last.
+        jaw: in its own frame, right jaws mirrored.
+        side: "left" or "right".
+        view: camera and its place.
+
+    Returns:
+        The place, None when neither the reference point nor one near the base is labelled.
+    """
+    rest = np.vstack((jaw.keypoints, jaw.reference_point))
+    chosen = np.isfinite(points).all(axis=1)
+    if chosen[-1]:
+        chosen = np.arange(len(points)) == len(points) - 1
+    else:
+        chosen &= rest[:, 2] < BASE_PART * jaw.keypoints[:, 2].max()
+    if not chosen.any():
+        return None
+    at_zero = jaw_in_camera(view.T_gripper_camera, side, 0.0)
+    places = intersect_plane(points[chosen], float(jaw.keypoints[:, 1].mean()), at_zero, view.camera)
+    along = float((places[:, 0] - rest[chosen, 0]).mean())
+    return along * float(jaw_in_gripper(side, 0.0)[0, 0])
+
+
+def rectify(labelled: LabelledImage, jaw: Jaw, side: str, view: CameraView) -> LabelledPictures | None:
+    """Return the picture of one jaw's side plane with its points, as training takes it; None if the jaw is not found.
+
+    Raises:
+        LabelFileError: the image has another size than the camera.
+    """
+    height, width = labelled.image.shape[:2]
+    if (width, height) != (view.camera.width, view.camera.height):
+        raise LabelFileError(
+            f"an image of {width}x{height}; expected {view.camera.width}x{view.camera.height}, the camera's"
+        )
+    origin = find_origin(labelled.points, jaw, side, view)
+    if origin is None:
+        return None
+    T_camera_jaw, side_y = jaw_in_camera(view.T_gripper_camera, side, origin), float(jaw.keypoints[:, 1].mean())
+    grid = PlaneGrid().padded(MARGIN)
+    visible = np.isfinite(labelled.points).all(axis=1)
+    xz = np.full((len(visible), 2), np.nan, dtype=np.float32)
+    xz[visible] = grid.pixels(intersect_plane(labelled.points[visible], side_y, T_camera_jaw, view.camera))
+    picture = take_picture(labelled.image, map_picture(grid, side_y, T_camera_jaw, view.camera))
+    names = (*jaw.keypoint_names, "reference")
+    return LabelledPictures(picture=picture[None], xz=xz[None], visible=visible[None], names=names)

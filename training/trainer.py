@@ -1,0 +1,188 @@
+"""The training loop: steps, schedule, averaged weights, log and checkpoints; knows no command line and no export."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import cos, pi
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from training.augment import AugmentSettings
+from training.checkpoint import Checkpoint, save_checkpoint
+from training.dataset import LabelledPictures
+from training.detection import detect
+from training.errors import CheckpointError
+from training.loading import Batch, LoadingSettings, load_batches
+from training.losses import Losses, LossWeights, compute_losses
+from training.network import KeypointNetwork, NetworkShape
+from training.optional import import_torch
+from training.recipe import Recipe
+from training.scoring import Score, score_detections
+
+torch = import_torch()
+
+CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
+SMOOTHING = 0.98  # part of the shown losses that stays in each step
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pictures:
+    """The pictures of one training, which share no shard: those learnt from and those that judge it."""
+
+    train: LabelledPictures
+    validation: LabelledPictures
+
+
+class Trainer:
+    """A network, its average and its optimiser, and how far they are.
+
+    Args:
+        names: (K,) of the points.
+        recipe: how to train.
+        weights: of the loss.
+        network: to begin with; random weights when absent.
+    """
+
+    def __init__(
+        self, names: tuple[str, ...], recipe: Recipe, weights: LossWeights, network: KeypointNetwork | None = None
+    ) -> None:
+        torch.manual_seed(recipe.seed)
+        self.names, self.recipe, self.weights = names, recipe, weights
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        network = network or KeypointNetwork(NetworkShape(points=len(names)))
+        self.network = network.to(self.device, memory_format=torch.channels_last)
+        averaging = torch.optim.swa_utils
+        self.average = averaging.AveragedModel(self.network, avg_fn=self._average, use_buffers=True)
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
+        self.step, self.elapsed = 0, 0.0
+
+    @property
+    def progress(self) -> float:
+        """How much of the training is done, 0 to 1: by steps where the recipe counts them, else by time."""
+        if self.recipe.steps:
+            return min(self.step / self.recipe.steps, 1.0)
+        return min(self.elapsed / (60.0 * self.recipe.minutes), 1.0)
+
+    def learn(self, batch: Batch) -> Losses:
+        """Take one step on a batch and return its losses."""
+        self.network.train()
+        for group in self.optimizer.param_groups:
+            group["lr"] = compute_rate(self.progress, self.recipe)
+        pictures, points, visible = (t.to(self.device) for t in (batch.pictures, batch.points, batch.visible))
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=has_bfloat16(self.device)):
+            logits, locref = self.network(pictures)
+        losses = compute_losses(logits.float(), locref.float(), points, visible, self.weights)
+        self.optimizer.zero_grad(set_to_none=True)
+        losses.total.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.clip)
+        self.optimizer.step()
+        self.average.update_parameters(self.network)
+        self.step += 1
+        return losses
+
+    def _average(self, kept: torch.Tensor, new: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+        """Return the running average of a tensor; the first steps, of hardly trained weights, are forgotten fast."""
+        stay = min(self.recipe.average, (1.0 + int(count)) / (10.0 + int(count)))
+        return torch.lerp(new, kept, stay) if new.is_floating_point() else new
+
+    def score(self, pictures: LabelledPictures) -> Score:
+        """Return how well the averaged network finds the points of pictures."""
+        return score_detections(detect(self.average.module.eval(), pictures))
+
+    def save(self, folder: Path) -> None:
+        """Write the checkpoint of a run."""
+        checkpoint = Checkpoint(
+            shape=self.network.shape,
+            names=self.names,
+            averaged=self.average.module.state_dict(),
+            network=self.network.state_dict(),
+            optimizer=self.optimizer.state_dict(),
+            step=self.step,
+            elapsed=self.elapsed,
+        )
+        save_checkpoint(folder / CHECKPOINT, checkpoint)
+
+    def resume(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint.
+
+        Raises:
+            CheckpointError: it is of another network.
+        """
+        if (checkpoint.names, checkpoint.shape) != (self.names, self.network.shape):
+            raise CheckpointError(f"got a checkpoint of {len(checkpoint.names)} points, expected one of {self.names}")
+        self.network.load_state_dict(checkpoint.network)
+        self.average.module.load_state_dict(checkpoint.averaged)
+        self.average.n_averaged.fill_(checkpoint.step)
+        self.optimizer.load_state_dict(checkpoint.optimizer)
+        self.step, self.elapsed = checkpoint.step, checkpoint.elapsed
+
+
+def compute_rate(progress: float, recipe: Recipe) -> float:
+    """Return the learning rate at a progress from 0 to 1: a linear rise, then half a cosine down to a hundredth."""
+    if progress < recipe.warm_up:
+        return recipe.rate * (0.02 + 0.98 * progress / recipe.warm_up)
+    down = (progress - recipe.warm_up) / (1.0 - recipe.warm_up)
+    return recipe.rate * (0.01 + 0.99 * 0.5 * (1.0 + cos(pi * down)))
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Tell whether a device multiplies bfloat16 faster than float32."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported()
+    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
+
+
+def train(trainer: Trainer, pictures: Pictures, augmentation: AugmentSettings, folder: Path) -> Score:
+    """Train until the recipe's end, with a log of losses and scores and a checkpoint beside it.
+
+    Returns:
+        The score of the averaged network at the end.
+    """
+    recipe = trainer.recipe
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(recipe.threads)
+    loading = LoadingSettings(size=recipe.batch, workers=recipe.workers, seed=recipe.seed, first=trainer.step)
+    batches = load_batches(pictures.train, augmentation, loading)
+    began, next_evaluation = time.monotonic() - trainer.elapsed, trainer.elapsed + 60.0 * recipe.evaluate_every
+    validation = pictures.validation.take(np.arange(min(recipe.validation, len(pictures.validation))))
+    with tqdm(total=100.0, desc="train", unit="%", bar_format="{l_bar}{bar}|{postfix}") as bar:
+        for shown in _follow(trainer, batches):
+            trainer.elapsed = time.monotonic() - began
+            bar.update(100.0 * trainer.progress - bar.n)
+            bar.set_postfix({"step": trainer.step, **{name: f"{value:.3f}" for name, value in shown.items()}})
+            if trainer.elapsed >= next_evaluation and trainer.progress < 1.0:
+                next_evaluation += 60.0 * recipe.evaluate_every
+                _report(trainer, validation, shown, folder)
+        return _report(trainer, validation, shown, folder)
+
+
+def _follow(trainer: Trainer, batches: Iterator[Batch]) -> Iterator[dict[str, float]]:
+    """Yield the smoothed losses after each step, to the end of the training."""
+    shown: dict[str, float] = {}
+    while trainer.progress < 1.0:
+        losses = trainer.learn(next(batches))
+        for name in ("heatmap", "peak", "locref"):
+            value = getattr(losses, name).item()
+            shown[name] = SMOOTHING * shown.get(name, value) + (1.0 - SMOOTHING) * value
+        yield shown
+
+
+def _report(trainer: Trainer, validation: LabelledPictures, shown: dict[str, float], folder: Path) -> Score:
+    """Score the averaged network, add a line to the log, write the checkpoint."""
+    score = trainer.score(validation)
+    line = {
+        "step": trainer.step,
+        "minutes": round(trainer.elapsed / 60.0, 2),
+        "rate": trainer.optimizer.param_groups[0]["lr"],
+    }
+    line |= {name: round(value, 5) for name, value in shown.items()} | score.as_row()
+    with (folder / LOG).open("a", encoding="utf-8") as log:
+        log.write(json.dumps(line) + "\n")
+    tqdm.write(json.dumps(line))
+    trainer.save(folder)
+    return score
