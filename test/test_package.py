@@ -15,7 +15,7 @@ SOURCES = sorted(path for path in ROOT.glob("finforce_*/*.py")) + sorted(ROOT.gl
 ROS = {"rclpy", "builtin_interfaces", "rcl_interfaces", "rosgraph_msgs", "std_srvs"}
 ROS |= {f"{name}_msgs" for name in ("diagnostic", "geometry", "sensor", "std", "visualization")}
 LAUNCH = {"launch", "launch_ros"}  # only where a full ROS 2 is
-MODULES = {"PIL": "pillow", "yaml": "pyyaml"}
+MODULES = {"PIL": "pillow", "yaml": "pyyaml", "cv2": "opencv-contrib-python-headless"}
 
 
 @pytest.fixture(scope="module")
