@@ -109,7 +109,9 @@ def _add_twin(commands: argparse._SubParsersAction) -> None:
     record = actions.add_parser("record", help="render a scene and write it", description="render a scene and write it")
     record.add_argument("scene", metavar="SCENE", help="a name that `finforce twin list` prints")
     record.add_argument("-o", "--output", required=True, metavar="BAG", help="recording to be written, a new folder")
-    record.add_argument("--seed", type=int, default=0, help="of material, textures, light and noise (0)")
+    record.add_argument("--seed", type=int, default=0, help="of textures, light and noise (0)")
+    finger = "seed of the jaws' material; calibration twin is of finger 0 (0)"
+    record.add_argument("--finger", type=int, default=0, metavar="SEED", help=finger)
     record.add_argument("--light", metavar="WORD", help="bright or dim; without it that of the scene")
     record.add_argument("--object", metavar="NAME", help="shape by name, or mesh file; without it that of the scene")
     record.add_argument("--camera", choices=("robot", "bench"), help="two jaws on the wrist, or one on the bench")

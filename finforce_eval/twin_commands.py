@@ -11,7 +11,7 @@ from typing import Any
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.preview import Preview
 from finforce_eval.twin_writer import RecordingForm, write_footage
-from finforce_twin.record import build_footage, parse_size
+from finforce_twin.record import FINGER, build_footage, parse_size
 from finforce_twin.scenarios import SCENARIOS, Scenario, build_scenario
 from finforce_twin.script import write_script
 
@@ -49,24 +49,28 @@ def run_record(options: argparse.Namespace) -> None:
         raise RecordingError(f"{folder}: exists already; a recording is written to a new folder")
     scenario = scenario_from_options(options)
     camera = parse_size(options.size)
+    if min(options.seed, options.finger) < 0:
+        raise OptionError(f"--seed {options.seed} --finger {options.finger}: expected numbers from 0")
     if not 1 <= options.quality <= 95:
         raise OptionError(f"--quality {options.quality}: expected 1 to 95")
     form = RecordingForm(
         compressed=not options.raw, quality=options.quality, farthest=options.farthest, storage=options.storage
     )
-    record_scene(scenario, options.seed, folder, camera=camera, form=form)
+    record_scene(scenario, options.seed, folder, camera=camera, form=form, finger=options.finger)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
     print(f"Recording: {folder} ({size:.1f} MB), preview: {folder / PREVIEW}")
     print(f"Score it with: finforce evaluate {folder} --from images")
 
 
-def record_scene(scenario: Scenario, seed: int, folder: Path, *, camera: Any, form: RecordingForm) -> None:
-    """Render a scene into a new folder, under a progress bar."""
+def record_scene(
+    scenario: Scenario, seed: int, folder: Path, *, camera: Any, form: RecordingForm, finger: int = FINGER
+) -> None:
+    """Render a scene of a finger into a new folder, under a progress bar."""
     from tqdm import tqdm
 
-    footage = build_footage(scenario, seed, camera)
+    footage = build_footage(scenario, seed, camera, finger=finger)
     preview = Preview(len(footage))
-    case = {"scene": scenario.name, "seed": seed, "light": scenario.light, "object": {"kind": scenario.object}}
+    case = {"scene": scenario.name, "seed": seed, "finger": finger, "light": scenario.light, "object": {"kind": scenario.object}}
     with tqdm(total=len(footage), unit="image", desc=scenario.name, disable=None, leave=False) as bar:
 
         def seen(frame: Any) -> None:

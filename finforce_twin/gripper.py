@@ -83,7 +83,8 @@ class TwinGripper:
         self._script = write_script(scenario)
         jaws = {side: load_jaw(scenario.jaw, side) for side in scenario.sides}
         material = jaws["left"].material
-        self.material: PrintedMaterial = draw_material(material, scenario.sides, np.random.default_rng(seed))
+        # always of both jaws: the bench's is the same left one
+        self.material: PrintedMaterial = draw_material(material, ("left", "right"), np.random.default_rng(seed))
         lateral = bool(scenario.mass and scenario.turn_angle)
         self._jaws = {
             side: PressedJaw(jaw, self.material.elastic[side], density, lateral=lateral) for side, jaw in jaws.items()

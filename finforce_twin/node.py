@@ -43,7 +43,8 @@ class TwinCameraNode(Node):
         super().__init__("twin_camera", **options)
         self.parameters = parameters = ros.declare_record(self, TwinParameters)
         ros.name_unknown_parameters(self)
-        self.footage = build(parameters.scenario, parameters.seed, parse_size(parameters.size))
+        size = parse_size(parameters.size)
+        self.footage = build(parameters.scenario, parameters.seed, size, finger=parameters.finger)
         self.reel: list[list[tuple[Any, Any]]] = []
         self.is_over = False
         self._next, self._phase = 0, ""

@@ -19,7 +19,8 @@ class TwinParameters:
     """What a twin camera node is told; units stand in the metadata."""
 
     scene: str = _parameter("grasp_cylinder", "a name that `finforce twin list` prints")
-    seed: int = _parameter(0, "of material, textures, light and noise", unit="", min=0, max=2**31 - 1)
+    seed: int = _parameter(0, "of textures, light and noise", min=0, max=2**31 - 1)
+    finger: int = _parameter(0, "seed of the jaws' material", min=0, max=2**31 - 1)
     light: str = _parameter("", "bright or dim; empty: that of the scene")
     object: str = _parameter("", "a shape by name, or a mesh file; empty: that of the scene")
     size: str = _parameter("640x480", "of the images, WIDTHxHEIGHT [px]")

@@ -88,7 +88,7 @@ class Photographer:
     """
 
     def __init__(self, setting: Setting, seed: int, *, window_only: bool = False) -> None:
-        rng = np.random.default_rng((seed, 1))
+        rng = np.random.default_rng((seed, 7))
         self.setting = setting
         self._wardrobe = Wardrobe.draw(rng)
         self._look: Look = draw_look(rng, setting.light)
@@ -99,7 +99,7 @@ class Photographer:
 
     def shoot(self, state: TwinState) -> Shot:
         """Return the image of a state; the same seed and stamp give the same noise."""
-        rng = np.random.default_rng((self._seed, 2, round(state.stamp * 1e6)))
+        rng = np.random.default_rng((self._seed, 8, round(state.stamp * 1e6)))
         stage = self._build_stage(state)
         truth = {side: self._look_for(side, state, stage) for side in state.jaws}
         camera = self.setting.camera

@@ -22,6 +22,7 @@ from finforce_twin.photographer import Photographer, Setting, Shot
 from finforce_twin.scenarios import Scenario
 
 NANOSECONDS = 1_000_000_000
+FINGER = 0  # seed of the material for which the package has a calibration, `twin`
 START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
 TRACKED_EVERY = 3  # images: the object is tracked at 10 Hz
 POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
@@ -127,18 +128,21 @@ class Footage:
             )
 
 
-def build_footage(scenario: Scenario, seed: int, camera: CameraIntrinsics | None = None) -> Footage:
+def build_footage(
+    scenario: Scenario, seed: int, camera: CameraIntrinsics | None = None, *, finger: int = FINGER
+) -> Footage:
     """Return the footage of a scenario.
 
     Args:
         scenario: what happens, in which light, before which camera.
-        seed: of material, textures, light and noise.
+        seed: of textures, light and noise.
         camera: intrinsics; those of a D405 at 640 x 480 when absent.
+        finger: seed of the jaws' material; what shows the same finger can share a calibration.
 
     Raises:
         FinforceError: the scenario's object or jaw cannot be used, or a library is missing.
     """
-    gripper = TwinGripper(scenario, seed)
+    gripper = TwinGripper(scenario, finger)
     setting = Setting(
         shapes={
             side: DrawnJaw(jaw=jaw, rest=gripper.rest_vertices(side), triangles=gripper.triangles(side))

@@ -9,6 +9,7 @@ from finforce_ifea.bounded import check_bounds, choice, setting
 from finforce_twin.errors import ScenarioError
 
 CAMERAS = ("robot", "bench")
+LIGHTS = ("bright", "dim", "any")
 HELD = 1e-6  # [kg] of mass from which on an object is lifted
 
 
@@ -32,7 +33,7 @@ class Scenario:
     offset: float = setting(0.0, "m", -0.05, 0.05, "x of the object's middle at first, between two jaws")
     shift: float = setting(0.0, "m", -0.05, 0.05, "y of the object's middle")
     camera: str = choice("robot", CAMERAS, "two jaws before the wrist camera, or one before that of the bench")
-    light: str = setting("bright", "", None, None, "word for the lighting")
+    light: str = choice("bright", LIGHTS, "how the scene is lit")
     clearance: float = setting(0.008, "m", 5e-4, 0.06, "from each jaw to first touch while open")
     closing_speed: float = setting(0.020, "m/s", 5e-4, 0.3, "of each jaw")
     displacement: float = setting(0.006, "m", 0.0, 0.02, "of each jaw beyond first touch, at most")

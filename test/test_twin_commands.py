@@ -26,8 +26,8 @@ def asked(monkeypatch):
     """What `twin record` asks the renderer for, which answers with footage by rule."""
     calls = []
 
-    def build(scenario, seed, camera):
-        calls.append((scenario, seed, camera))
+    def build(scenario, seed, camera, *, finger):
+        calls.append((scenario, seed, camera, finger))
         return make_footage(seed=seed)
 
     monkeypatch.setattr(twin_commands, "build_footage", build)
@@ -43,13 +43,14 @@ def test_every_scene_is_listed(capsys):
 
 def test_a_scene_is_recorded_with_its_changes_and_a_picture(asked, tmp_path, capsys):
     bag = tmp_path / "bags" / "twin"
-    words = ["--seed", "7", "--light", "dim", "--object", "block", "--size", "320x240", "--set", "displacement=0.004"]
+    words = ["--seed", "7", "--finger", "3", "--light", "dim", "--object", "block", "--size", "320x240", "--set", "displacement=0.004"]
     assert main(["twin", "record", "grasp_cylinder", "-o", str(bag), *words]) == 0
-    ((scenario, seed, camera),) = asked
-    assert (scenario.light, scenario.object, scenario.displacement, seed) == ("dim", "block", 0.004, 7)
+    ((scenario, seed, camera, finger),) = asked
+    assert (scenario.light, scenario.object, scenario.displacement, seed, finger) == ("dim", "block", 0.004, 7, 3)
     assert (camera.width, camera.height) == (320, 240)
     case = json.loads((bag / "case.json").read_text())
-    assert (case["scene"], case["seed"], case["light"], case["mesh"]) == ("grasp_cylinder", 7, "dim", "twin/object.stl")
+    named = [case[name] for name in ("scene", "seed", "finger", "light", "mesh")]
+    assert named == ["grasp_cylinder", 7, 3, "dim", "twin/object.stl"]
     assert len(read_recording(bag).images) == 12
     with Image.open(bag / twin_commands.PREVIEW) as picture:
         assert picture.size == (4 * 64, 3 * 48)  # six images beside their depth, two in a row

@@ -46,7 +46,7 @@ def probe():
 def start(probe, footage=None, **parameters):
     overrides = [Parameter(name, value=value) for name, value in parameters.items()]
     footage = footage or make_footage(FakeGripper(count=6))
-    node = TwinCameraNode(lambda *_: footage, context=probe.context, parameter_overrides=overrides)
+    node = TwinCameraNode(lambda *_, **__: footage, context=probe.context, parameter_overrides=overrides)
     probe.spinner.add_node(node)
     return node
 

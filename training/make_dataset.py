@@ -27,6 +27,7 @@ from finforce_twin.objects import OBJECT_NAMES, build_object
 from finforce_twin.photographer import Photographer, Setting, Shot
 from training.pressed_shapes import PressedShape, draw_pressed_shapes
 
+SEEDS = 1_000_000_000  # of training's pictures begin here, so that no scene with a seed below was trained on
 MARGIN = 28  # [px] around the network's picture
 SHARD = 256  # pictures a file
 OBJECTS = 240  # pressed into the jaw
@@ -77,7 +78,7 @@ class SceneMaker:
             light="dim" if rng.random() < DIM else "any",
             clutter=True,
         )
-        shot = Photographer(setting, seed, window_only=True).shoot(state)
+        shot = Photographer(setting, SEEDS + seed, window_only=True).shoot(state)
         parts = [self._cut(side, shot, camera) for side in shot.truth]
         return Samples(**{name: np.stack([getattr(part, name) for part in parts]) for name in Samples.__annotations__})
 
