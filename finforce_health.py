@@ -107,14 +107,17 @@ class StampGate:
 class Health:
     """Keeps the last outcomes of a node and says how it is.
 
-    Args:
+    Attributes:
         source: the topic that drives the node.
+
+    Args:
+        source: the same, as far as it is known at the start.
         stale_after: silence after which the node is stale [s].
         window: number of messages that rates and latencies are taken over.
     """
 
     def __init__(self, *, source: str, stale_after: float, window: int = 512) -> None:
-        self._source = source
+        self.source = source
         self._stale_after = stale_after
         self._arrivals: deque[float] = deque(maxlen=window)
         self._latency: deque[float] = deque(maxlen=window)
@@ -166,10 +169,10 @@ class Health:
     def _state(self) -> tuple[Level, str]:
         """Return level and sentence from the messages alone."""
         if not self._arrivals or self._last is None:
-            return Level.STALE, f"nothing has arrived on {self._source}"
+            return Level.STALE, f"nothing has arrived on {self.source}"
         silence = monotonic() - self._arrivals[-1]
         if silence > self._stale_after:
-            return Level.STALE, f"nothing has arrived on {self._source} for {silence:.1f} s"
+            return Level.STALE, f"nothing has arrived on {self.source} for {silence:.1f} s"
         return self._last.level, self._last.text
 
     def _figures(self) -> dict[str, str]:

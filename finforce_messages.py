@@ -53,15 +53,15 @@ def xyz_columns(points: ArrayLike) -> dict[str, NDArray[np.float32]]:
     return dict(zip("xyz", np.asarray(points, dtype=np.float32).reshape(-1, 3).T, strict=True))
 
 
-def image_message(header: Header, picture: NDArray[np.uint8]) -> Image:
-    """Return a picture (h, w, 3) of red, green and blue as an rgb8 image."""
-    height, width, _ = picture.shape
+def image_message(header: Header, picture: NDArray, encoding: str = "rgb8") -> Image:
+    """Return a picture (h, w, 3) of red, green and blue, or (h, w) of another encoding, as an image."""
+    height, width = picture.shape[:2]
     return Image(
         header=header,
         height=height,
         width=width,
-        encoding="rgb8",
-        step=3 * width,
+        encoding=encoding,
+        step=picture.nbytes // height,
         data=array.array("B", picture.tobytes()),  # an ndarray would be checked byte by byte
     )
 

@@ -1,10 +1,10 @@
-"""Values of frozen records against the bounds in their fields' metadata; knows no record and no ROS."""
+"""Fields of nodes' parameters, what all nodes have of them, and their values against their bounds; knows no ROS."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import Field, fields, replace
+from dataclasses import Field, dataclass, field, fields, replace
 from typing import Any, TypeVar
 
 from finforce_ifea.errors import FinforceError
@@ -14,6 +14,22 @@ RecordT = TypeVar("RecordT")
 
 class ParameterError(FinforceError, ValueError):
     """A ROS parameter has a value or a type that its record does not allow."""
+
+
+def parameter(default: Any, description: str, **metadata: Any) -> Any:
+    """Return a dataclass field that says what it is; `metadata` are unit, min, max, choices and settable."""
+    return field(default=default, metadata={"description": description, **metadata})
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeParameters:
+    """What every node that answers images is told about time; units stand in the metadata."""
+
+    max_age: float = parameter(0.2, "greatest age of data at the time of publishing", unit="s", min=0.001, max=60.0)
+    restart_gap: float = parameter(
+        1.0, "stamps that go back by more than this begin a new recording", unit="s", min=0.001, max=3600.0
+    )
+    diagnostics_period: float = parameter(1.0, "time between diagnostics", unit="s", min=0.05, max=60.0)
 
 
 def describe(entry: Field) -> str:

@@ -45,7 +45,6 @@ from finforce_messages import (  # noqa: F401 - for those who publish
 from finforce_records import ParameterError, RecordT, bounds_of, check_value, constraints, describe
 
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 STEADY = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -161,13 +160,14 @@ class LargeSubscription:
         kind: of the messages.
         topic: of the messages.
         callback: takes them.
+        options: of the subscription, as its callback group.
     """
 
-    def __init__(self, qos: QosWatch, kind: type, topic: str, callback: Callable) -> None:
-        self._relax = partial(qos.subscription, kind, topic, callback, SENSOR)
+    def __init__(self, qos: QosWatch, kind: type, topic: str, callback: Callable, **options: Any) -> None:
+        self._relax = partial(qos.subscription, kind, topic, callback, SENSOR, **options)
         self._node, self._topic = qos.node, topic
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch)
-        self.current = qos.node.create_subscription(kind, topic, callback, STEADY, event_callbacks=events)
+        self.current = qos.node.create_subscription(kind, topic, callback, STEADY, event_callbacks=events, **options)
 
     def _on_mismatch(self, _: Any) -> None:
         """Take the messages as they come from a publisher that offers no more."""

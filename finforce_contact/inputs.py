@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from functools import partial
 from importlib import import_module
 from typing import Any, Protocol
@@ -60,13 +60,22 @@ def subscribe(qos: ros.QosWatch, parameters: ContactParameters, session: Contact
 
 def _subscribe_camera(qos: ros.QosWatch, session: ContactSession, handlers: Handlers) -> None:
     """Subscribe to the images in which the object is found; an image that a newer one overtook is passed over."""
-    for kind, topic, take in (
-        (ros.CameraInfo, f"{CAMERA}/color/camera_info", session.take_camera),
-        (ros.Image, "object_mask", session.take_mask),
-        (ros.Image, f"{CAMERA}/aligned_depth_to_color/image_raw", session.take_depth),
+    take_info, group = partial(handlers.on_image, session.take_camera), handlers.camera_group
+    qos.subscription(ros.CameraInfo, f"{CAMERA}/color/camera_info", take_info, ros.SENSOR, callback_group=group)
+    for topic, take in (
+        ("object_mask", session.take_mask),
+        (f"{CAMERA}/aligned_depth_to_color/image_raw", session.take_depth),
     ):
-        group = handlers.camera_group
-        qos.subscription(kind, topic, partial(handlers.on_image, take), ros.NEWEST, callback_group=group)
+        _subscribe_newest(qos, topic, partial(handlers.on_image, take), group)
+
+
+def _subscribe_newest(qos: ros.QosWatch, topic: str, take: Callable[[Any], Awaitable[None]], group: Any) -> None:
+    """Subscribe to the newest of the images on a topic."""
+
+    async def on_image(message: Any) -> None:
+        await take(ros.take_newest(images.current, message)[0])
+
+    images = ros.LargeSubscription(qos, ros.Image, topic, on_image, callback_group=group)
 
 
 def detections_type() -> type:

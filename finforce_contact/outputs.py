@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import finforce_ros as ros
 from finforce_contact.messages import contact_columns
-from finforce_contact.poses import quaternion_from_pose
+from finforce_contact.poses import pose_numbers
 from finforce_ifea.outline_cloud import columns_from_outline
 
 if TYPE_CHECKING:
@@ -41,5 +41,4 @@ class ContactOutputs:
         """Send the object's pose, unless it came by topic."""
         if self.pose is not None:
             header = ros.Header(stamp=ros.stamp_message(found.stamp), frame_id=self._frame)
-            T = found.pose.T_camera_object
-            self.pose.publish(ros.pose_message(header, [*T[:3, 3], *quaternion_from_pose(T)]))
+            self.pose.publish(ros.pose_message(header, pose_numbers(found.pose.T_camera_object)))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from finforce_records import TimeParameters, parameter
 
 if TYPE_CHECKING:
     from finforce_contact.reconstructed import GeneratedMesh
@@ -13,57 +15,47 @@ if TYPE_CHECKING:
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
-def _parameter(default: Any, description: str, **metadata: Any) -> Any:
-    """Return a dataclass field that says what it is; `metadata` are unit, min, max, choices and settable."""
-    return field(default=default, metadata={"description": description, **metadata})
-
-
 @dataclass(frozen=True, kw_only=True)
-class ContactParameters:
+class ContactParameters(TimeParameters):
     """What a contact estimator node is told beside the settings of its parts; units stand in the metadata."""
 
-    jaws: str = _parameter("left", "the jaws whose contacts are estimated", choices=("left", "right", "both"))
-    jaw_file: str = _parameter("bench", "jaw file, or the name of a shipped jaw")
-    calibration_file: str = _parameter(
+    jaws: str = parameter("left", "the jaws whose contacts are estimated", choices=("left", "right", "both"))
+    jaw_file: str = parameter("bench", "jaw file, or the name of a shipped jaw")
+    calibration_file: str = parameter(
         "", "calibration file, or a shipped name, as the solvers have it: it shapes the mesh of the jaw; empty: none"
     )
-    camera_frame: str = _parameter("camera_color_optical_frame", "frame of the poses and images")
-    object_mesh: str = _parameter(
+    camera_frame: str = parameter("camera_color_optical_frame", "frame of the poses and images")
+    object_mesh: str = parameter(
         "", "mesh file of the object; empty: the object is unknown; read again by load_mesh", settable=True
     )
-    object_mesh_unit: str = _parameter(
+    object_mesh_unit: str = parameter(
         "m", "unit of the object's mesh file", choices=("m", "cm", "mm", "inch"), settable=True
     )
-    pose_source: str = _parameter(
+    pose_source: str = parameter(
         "topic",
         "object poses: PoseStamped on object_pose, Detection3DArray on object_detections, or the built-in tracker",
         choices=("topic", "detections", "tracker"),
     )
-    pose_tolerance: float = _parameter(
+    pose_tolerance: float = parameter(
         0.017, "greatest distance between the stamps of a jaw pose and its object pose", unit="s", min=0.0, max=1.0
     )
-    depth_scale: float = _parameter(0.001, "one step of a 16-bit depth image", unit="m", min=1e-6, max=0.01)
-    reconstruct_method: str = _parameter(
+    depth_scale: float = parameter(0.001, "one step of a 16-bit depth image", unit="m", min=1e-6, max=0.01)
+    reconstruct_method: str = parameter(
         "",
         "how reconstruct finds the object; empty: robust with a generated mesh; without, a primitive where that fits, "
         "else completion",
         choices=("", "robust", "paper", "primitive", "completion"),
         settable=True,
     )
-    generated_mesh: str = _parameter(
+    generated_mesh: str = parameter(
         "", "mesh file for reconstruct, made by a generator; empty: there is none", settable=True
     )
-    generated_pose: tuple[float, ...] = _parameter(
+    generated_pose: tuple[float, ...] = parameter(
         IDENTITY, "x, y, z [m], qx, qy, qz, qw of the generated mesh in the camera frame", settable=True
     )
-    generated_scale: float = _parameter(
+    generated_scale: float = parameter(
         1.0, "metres per unit of the generated mesh, as far as it is known", unit="m", min=1e-6, max=1e6, settable=True
     )
-    max_age: float = _parameter(0.2, "greatest age of data at the time of publishing", unit="s", min=0.001, max=60.0)
-    restart_gap: float = _parameter(
-        1.0, "stamps that go back by more than this begin a new recording", unit="s", min=0.001, max=3600.0
-    )
-    diagnostics_period: float = _parameter(1.0, "time between diagnostics", unit="s", min=0.05, max=60.0)
 
     @property
     def sides(self) -> tuple[str, ...]:

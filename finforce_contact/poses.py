@@ -81,6 +81,11 @@ def quaternion_from_pose(T: ArrayLike) -> NDArray:
     return quaternion if quaternion[3] >= 0.0 else -quaternion
 
 
+def pose_numbers(T: ArrayLike) -> tuple[float, ...]:
+    """Returns x, y, z [m], qx, qy, qz, qw of a pose (4, 4); raises PoseError as `check_pose` does."""
+    return tuple(float(number) for number in (*np.asarray(T)[:3, 3], *quaternion_from_pose(T)))
+
+
 def invert_pose(T_a_b: NDArray) -> NDArray:
     """Returns T_b_a (4, 4), [[R^T, -R^T t], [0, 1]], of a rigid pose T_a_b (4, 4)."""
     T_b_a = np.eye(4)

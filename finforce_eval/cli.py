@@ -112,7 +112,7 @@ def _add_twin(commands: argparse._SubParsersAction) -> None:
     record.add_argument("--seed", type=int, default=0, help="of textures, light and noise (0)")
     finger = "seed of the jaws' material; calibration twin is of finger 0 (0)"
     record.add_argument("--finger", type=int, default=0, metavar="SEED", help=finger)
-    record.add_argument("--light", metavar="WORD", help="bright or dim; without it that of the scene")
+    record.add_argument("--light", metavar="WORD", help="bright, dim or any; without it that of the scene")
     record.add_argument("--object", metavar="NAME", help="shape by name, or mesh file; without it that of the scene")
     record.add_argument("--camera", choices=("robot", "bench"), help="two jaws on the wrist, or one on the bench")
     record.add_argument("--size", default="640x480", metavar="WxH", help="of the images (640x480)")
@@ -131,7 +131,7 @@ def _add_twin(commands: argparse._SubParsersAction) -> None:
 def _add_demo(commands: argparse._SubParsersAction) -> None:
     text = "play a recording through the real nodes, from images to force, and write a report"
     parser = commands.add_parser("demo", help=text, description=text)
-    text = "begin with images of a synthetic gripper, rendered at first use, or with the key points of a bench (images)"
+    text = "begin with images of a synthetic gripper, rendered into the report's folder at first use, or with the key points of a bench (images)"
     parser.add_argument("--from", dest="source", default="images", choices=("images", "keypoints"), help=text)
     parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
     parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")

@@ -10,11 +10,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from finforce_eval.changes import parse_changes
 from finforce_eval.contact_setup import build_source
 from finforce_eval.contact_source import ContactSource
 from finforce_eval.contacts import ContactChoice, parse_contacts
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
+from finforce_eval.images import PAIRED
 from finforce_eval.keypoint_source import parse_source
 from finforce_eval.recording import read_recording
 from finforce_eval.results import CaseResult
@@ -25,8 +27,6 @@ from finforce_ifea.errors import FinforceError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
-
-TRUTH_VALUES = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +76,12 @@ def version() -> str:
         return "not installed"
 
 
-def read_recordings(paths: Sequence[str]) -> list[Recording]:
+def read_recordings(paths: Sequence[str], pairing: int = PAIRED) -> list[Recording]:
     """Read recordings and give each a name of its own.
+
+    Args:
+        paths: of the recordings.
+        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
 
     Raises:
         RecordingError: one of them cannot be read.
@@ -85,7 +89,7 @@ def read_recordings(paths: Sequence[str]) -> list[Recording]:
     """
     if len({Path(path).resolve() for path in paths}) < len(paths):
         raise OptionError("a recording was given twice")
-    recordings = [read_recording(path) for path in paths]
+    recordings = [read_recording(path, pairing) for path in paths]
     names = [recording.name for recording in recordings]
     for recording in recordings:
         for note in recording.notes:
@@ -104,7 +108,7 @@ def read_keypoints(options: argparse.Namespace) -> list[Recording]:
     """
     source = parse_source(options)
     recordings = []
-    for read in read_recordings(options.bags):
+    for read in read_recordings(options.bags, source.pairing):
         recording = source.apply(read)
         for note in recording.notes[len(read.notes) :]:
             print(f"note: {recording.name}: {note}", file=sys.stderr)
@@ -151,19 +155,9 @@ def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorS
     Raises:
         OptionError: a name is unknown, or a value is not of the setting's type or out of its bounds.
     """
-    values: dict[str, Any] = {"solver": solver, "mesh": mesh}
-    defaults = asdict(EstimatorSettings())
-    for change in changes:
-        name, _, text = change.partition("=")
-        if name not in defaults:
-            raise OptionError(f"--set {change}: unknown setting; expected one of {', '.join(defaults)}")
-        kind = type(defaults[name])
-        try:
-            values[name] = TRUTH_VALUES[text.lower()] if kind is bool else kind(text)
-        except (KeyError, ValueError):
-            raise OptionError(f"--set {change}: '{text}' is no {kind.__name__}") from None
+    values = parse_changes("--set", "setting", changes, asdict(EstimatorSettings()))
     try:
-        return EstimatorSettings(**values)
+        return EstimatorSettings(**{"solver": solver, "mesh": mesh, **values})
     except FinforceError as error:
         raise OptionError(f"settings: {error}") from error
 
@@ -179,8 +173,13 @@ def run_evaluate(options: argparse.Namespace) -> None:
     if options.report:
         from finforce_eval.report import write_report
 
-        names = setup.jaw.keypoint_names
-        page = write_report(evaluation, options.report, keypoint_names=names, about=setup.about)
+        page = write_report(
+            evaluation,
+            options.report,
+            keypoint_names=setup.jaw.keypoint_names,
+            about=setup.about,
+            recordings=recordings,
+        )
         print(f"Report: {page}")
 
 

@@ -5,6 +5,8 @@ The detector is the one that its node runs: what it says of an image here, it sa
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
@@ -31,6 +33,7 @@ class FoundKeypoints(Protocol):
     valid: NDArray
     stddev: NDArray
     T_camera_jaw: NDArray
+    reasons: NDArray
 
 
 class Detector(Protocol):
@@ -53,6 +56,29 @@ class SideLog:
     step_ms: dict[int, float] = field(default_factory=dict)
 
 
+class Reasons:
+    """Why images were refused: texts that differ in their numbers only are one reason."""
+
+    def __init__(self) -> None:
+        """Begin without any."""
+        self._counts: Counter[str] = Counter()
+        self._texts: dict[str, str] = {}
+
+    def count(self, text: str) -> None:
+        """Take a reason; of a kind, the first text is kept."""
+        kind = re.sub(r"[0-9.]+", "#", text)
+        self._counts[kind] += 1
+        self._texts.setdefault(kind, text)
+
+    def commonest(self) -> str:
+        """Return the text of the most frequent reason, "" without any."""
+        return self._texts[self._counts.most_common(1)[0][0]] if self._counts else ""
+
+    def notes(self) -> list[str]:
+        """Return a line for each reason."""
+        return [f"{count} images refused: {self._texts[kind]}" for kind, count in self._counts.items()]
+
+
 def detect_keypoints(
     recording: Recording, detector: Detector, *, watch: ImageWatch, progress: Callable[[int], Any] = lambda images: None
 ) -> Recording:
@@ -71,7 +97,7 @@ def detect_keypoints(
     """
     images = recording.images
     logs = {side: SideLog() for side in recording.jaws}
-    reasons: dict[str, int] = {}
+    reasons = Reasons()
     for stamp, image in images:
         begin = perf_counter()
         try:
@@ -79,7 +105,7 @@ def detect_keypoints(
             found = detector.detect(image)
         except (KeypointError, ImageError) as error:
             found = {}
-            reasons[str(error)] = reasons.get(str(error), 0) + 1
+            reasons.count(str(error))
         spent = 1e3 * (perf_counter() - begin)
         for side, log in logs.items():
             log.step_ms[stamp] = spent
@@ -87,9 +113,9 @@ def detect_keypoints(
                 log.found[stamp] = found[side]
         progress(1)
     if not any(log.found for log in logs.values()):
-        why = max(reasons, key=reasons.get) if reasons else "no jaw stands where it could be; another --extrinsics?"
+        why = reasons.commonest() or "no jaw stands where it could be; another --extrinsics?"
         raise RecordingError(f"{recording.name}: no key points in {len(images)} images: {why}")
-    notes = [f"{count} images refused: {reason}" for reason, count in reasons.items()]
+    notes = reasons.notes()
     return with_detections(replace(recording, notes=(*recording.notes, *notes)), logs)
 
 
@@ -133,6 +159,7 @@ def _with_detection(track: JawTrack, log: SideLog, stamps: NDArray[np.int64], fr
         pixels=_rows(seen, "pixels", (count, 2)),
         points=points,
         accepted=accepted,
+        reasons=np.array([_reasons(found, count) for found in seen]).reshape(-1, count),
         found=np.array([found is not None for found in seen]),
         step_ms=np.array([log.step_ms.get(int(stamp), np.nan) for stamp in stamps]),
     )
@@ -144,6 +171,11 @@ def _rows(seen: Sequence[FoundKeypoints | None], name: str, shape: tuple[int, ..
     missing = np.full(shape, np.nan)
     rows = [missing if found is None else np.asarray(getattr(found, name), dtype=np.float64) for found in seen]
     return np.array(rows).reshape(-1, *shape)
+
+
+def _reasons(found: FoundKeypoints | None, count: int) -> NDArray[np.str_]:
+    """Return why each key point (count,) was refused, "" where the jaw was not found."""
+    return np.full(count, "", dtype="U16") if found is None else np.asarray(found.reasons, dtype="U16")
 
 
 def _pose_track(log: SideLog, frame_id: str) -> PoseTrack | None:

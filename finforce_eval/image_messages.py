@@ -7,12 +7,14 @@ header on `.../compressedDepth`. It knows no bags and no topics.
 from __future__ import annotations
 
 import io
+import struct
+import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_camera import ImageError, ImageLayout, decode_depth
+from finforce_camera import MILLIMETRE, ImageError, ImageLayout, decode_depth
 from finforce_ifea.errors import MissingDependencyError
 from finforce_keypoints.images import decode_color
 
@@ -21,6 +23,8 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 DEPTH_FORMAT = "16UC1; compressedDepth png"
 DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport: an enum and two numbers for 32-bit depth
 PNG = b"\x89PNG"
+STEPPED = ("", "16UC1", "mono16")  # what a png of depth can be said to hold; of 32FC1 it holds inverse depths
+LARGEST_PICTURE = 50_000_000  # px, of a picture that is unpacked: no camera here makes more
 QUALITY = 90  # of a jpeg, the key points' pixels stay within a few hundredths
 LEVEL = 1  # of png: the highest makes a noisy depth image a quarter smaller, and takes eighty times as long
 
@@ -33,34 +37,39 @@ def color_from_message(message: Any) -> NDArray[np.uint8]:
     """
     if not is_compressed(message):
         return decode_color(message.data, message.encoding, _layout(message))
-    picture = _open_picture(bytes(message.data), f"colour image '{message.format}'")
+    picture = _open_picture(bytes(message.data), f"colour image {message.format!r}")
     return np.array(picture.convert("RGB"))
 
 
-def depth_from_message(message: Any) -> NDArray[np.float32]:
+def depth_from_message(message: Any, scale: float = MILLIMETRE) -> NDArray[np.float32]:
     """Return the depth image (h, w) [m], NaN invalid, of a sensor_msgs/Image or CompressedImage.
+
+    One step of 16 bits is `scale` [m].
 
     Raises:
         ImageError: the encoding is not known, or the data are damaged.
     """
     if not is_compressed(message):
-        return decode_depth(message.data, message.encoding, _layout(message))
-    return decode_depth(depth_millimetres(message), "16UC1")
+        return decode_depth(message.data, message.encoding, _layout(message), scale)
+    return decode_depth(depth_steps(message), "16UC1", scale=scale)
 
 
-def depth_millimetres(message: Any) -> NDArray[np.uint16]:
-    """Return the depth image (h, w) [mm], 0 invalid, of a CompressedImage.
+def depth_steps(message: Any) -> NDArray[np.uint16]:
+    """Return the depth image (h, w) in steps, most cameras' are of 1 mm, 0 invalid, of a CompressedImage.
 
     Raises:
         ImageError: it is no 16-bit png.
     """
+    encoding = message.format.partition(";")[0].strip() if ";" in message.format else ""
+    if encoding not in STEPPED:
+        raise ImageError(f"depth image {message.format!r}: encoding {encoding}; expected '{DEPTH_FORMAT}'")
     data = bytes(message.data)
     begin = data.find(PNG, 0, DEPTH_HEADER + len(PNG))
     if begin < 0:
-        raise ImageError(f"depth image '{message.format}': no png in it; expected '{DEPTH_FORMAT}'")
-    image = np.array(_open_picture(data[begin:], f"depth image '{message.format}'"))
+        raise ImageError(f"depth image {message.format!r}: no png in it; expected '{DEPTH_FORMAT}'")
+    image = np.array(_open_picture(data[begin:], f"depth image {message.format!r}"))
     if image.ndim != 2 or image.dtype.kind not in "ui" or image.dtype == np.uint8:
-        raise ImageError(f"depth image '{message.format}': {image.dtype} {image.shape}; expected 16 bits, one channel")
+        raise ImageError(f"depth image {message.format!r}: {image.dtype} {image.shape}; expected 16 bits, one channel")
     return np.clip(image, 0, 65535).astype(np.uint16)
 
 
@@ -92,11 +101,22 @@ def _layout(message: Any) -> ImageLayout:
 
 def _open_picture(data: bytes, what: str) -> Any:
     """Return a decoded picture of Pillow."""
+    pillow = _pillow()
     try:
-        picture = _pillow().open(io.BytesIO(data))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", pillow.DecompressionBombWarning)  # smaller ones are refused below
+            picture = pillow.open(io.BytesIO(data), formats=("JPEG", "PNG"))
+        if picture.width * picture.height > LARGEST_PICTURE:
+            raise ImageError(f"{what}: {picture.width} x {picture.height}; expected at most {LARGEST_PICTURE} pixels")
         picture.load()
-    except (OSError, SyntaxError, ValueError) as error:
-        raise ImageError(f"{what}: damaged or neither jpeg nor png: {error}") from error
+    except pillow.UnidentifiedImageError as error:
+        raise ImageError(f"{what}: {len(data)} bytes that are neither jpeg nor png") from error
+    except pillow.DecompressionBombError as error:
+        raise ImageError(f"{what}: expected at most {LARGEST_PICTURE} pixels: {error}") from error
+    except ImageError:
+        raise
+    except (OSError, SyntaxError, ValueError, struct.error) as error:
+        raise ImageError(f"{what}: damaged: {error}") from error
     return picture
 
 

@@ -5,34 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_camera import CameraIntrinsics, ImageError, IntrinsicsError
+from finforce_camera import MILLIMETRE, CameraIntrinsics, ImageError, IntrinsicsError
 from finforce_contact.messages import camera_from_info, same_camera
 from finforce_eval.bags import BagReader, check_types, open_bag, read_stamp
 from finforce_eval.errors import RecordingError
 from finforce_eval.image_messages import CAMERA_INFO, COMPRESSED, IMAGE, color_from_message, depth_from_message
 from finforce_ifea.errors import ObservationError
-from finforce_keypoints.images import RgbdImage, check_image
+from finforce_keypoints.images import RgbdImage, StampedImage, check_image
 
-CAMERA = "/camera/camera"
-COLOR, DEPTH = f"{CAMERA}/color/image_raw", f"{CAMERA}/aligned_depth_to_color/image_raw"
-INFO = f"{CAMERA}/color/camera_info"
 # the ends of topics by which the images are found, whatever the camera is called; the first that is there counts
 COLOR_ENDS = tuple(f"color/{name}{end}" for end in ("", "/compressed") for name in ("image_raw", "image_rect_raw"))
 DEPTH_ENDS = tuple(f"aligned_depth_to_color/image_raw{end}" for end in ("", "/compressedDepth", "/compressed"))
 INFO_ENDS = ("color/camera_info",)
 PAIRED = 8_000_000  # as the detector node takes colour and depth for one image: distance of their stamps [ns]
-
-
-class StampedImage(NamedTuple):
-    """An image and its exact stamp [ns]."""
-
-    stamp: int
-    image: RgbdImage
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,6 +38,7 @@ class ImageTrack:
         camera: intrinsics.
         frame_id: of the camera.
         unpaired: colour images left out because no depth image is of their time.
+        depth_scale: one step of a 16-bit depth image [m].
     """
 
     source: Path
@@ -58,6 +49,7 @@ class ImageTrack:
     camera: CameraIntrinsics
     frame_id: str
     unpaired: int = 0
+    depth_scale: float = MILLIMETRE
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -65,6 +57,11 @@ class ImageTrack:
     def between(self, start: int, stop: int) -> ImageTrack:
         """Return the images with start <= stamp < stop [ns]."""
         chosen = (self.stamps >= start) & (self.stamps < stop)
+        return replace(self, stamps=self.stamps[chosen], depth_stamps=self.depth_stamps[chosen])
+
+    def at(self, stamps: NDArray[np.int64]) -> ImageTrack:
+        """Return the images at some stamps [ns]."""
+        chosen = np.isin(self.stamps, stamps)
         return replace(self, stamps=self.stamps[chosen], depth_stamps=self.depth_stamps[chosen])
 
     def __iter__(self) -> Iterator[StampedImage]:
@@ -93,7 +90,7 @@ class ImageTrack:
             image = RgbdImage(
                 stamp=stamp * 1e-9,
                 color=color_from_message(color),
-                depth=depth_from_message(depth),
+                depth=depth_from_message(depth, self.depth_scale),
                 camera=self.camera,
             )
             check_image(image)
@@ -102,8 +99,13 @@ class ImageTrack:
         return StampedImage(stamp, image)
 
 
-def find_images(bag: BagReader, source: Path) -> ImageTrack | None:
+def find_images(bag: BagReader, source: Path, pairing: int = PAIRED) -> ImageTrack | None:
     """Return the images of an open bag; None without colour images.
+
+    Args:
+        bag: where they lie.
+        source: of the bag.
+        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
 
     Raises:
         RecordingError: there are colour images, but no depth, no camera_info or nothing that belongs together; a topic
@@ -124,9 +126,9 @@ def find_images(bag: BagReader, source: Path) -> ImageTrack | None:
         found[raw.topic].append(read_stamp(raw.data))
     stamps = {topic: _rising(times, topic, bag.name) for topic, times in found.items()}
     nearest = _nearest(stamps[depth], stamps[color])
-    paired = np.abs(stamps[depth][nearest] - stamps[color]) <= PAIRED
+    paired = np.abs(stamps[depth][nearest] - stamps[color]) <= pairing
     if not paired.any():
-        raise RecordingError(f"{bag.name}: no depth image on {depth} within {PAIRED // 10**6} ms of one on {color}")
+        raise RecordingError(f"{bag.name}: no depth image on {depth} within {pairing / 10**6:g} ms of one on {color}")
     return ImageTrack(
         source=source,
         name=bag.name,

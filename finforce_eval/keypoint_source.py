@@ -4,18 +4,44 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from finforce_eval.changes import parse_changes
 from finforce_eval.cli import SOURCES
 from finforce_eval.detection import Detector, detect_keypoints
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.tracks import JawTrack, KeypointTrack, Recording
+from finforce_eval.images import PAIRED
+from finforce_eval.tracks import NANOSECONDS, JawTrack, KeypointTrack, Recording
+from finforce_ifea.errors import FinforceError
+
+if TYPE_CHECKING:
+    from finforce_keypoints.dots import DotSettings
+    from finforce_keypoints.parameters import DetectorParameters
+    from finforce_keypoints.settings import DetectorSettings
 
 IMAGES, KEYPOINTS, TRUTH = SOURCES
-TRUTH_VALUES = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+_BY_ENDS = "images of a recording are found by the ends of their topics"
+# parameters of the node that something else decides here
+DECIDED = {
+    "jaws": "the jaws are those of the recording",
+    "jaw_file": "give --jaw",
+    "camera_frame": "the frame is that of the recorded images",
+    "color_topics": _BY_ENDS,
+    "depth_topic": _BY_ENDS,
+    "info_topic": _BY_ENDS,
+}
+LIVE = ("max_age", "restart_gap", "diagnostics_period")  # without meaning where no clock runs
+
+
+class DetectorRecords(NamedTuple):
+    """What a detector is built with."""
+
+    parameters: DetectorParameters
+    settings: DetectorSettings
+    dots: DotSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,25 +105,49 @@ class KeypointSource:
         Raises:
             FinforceError: a parameter, the jaw or the network cannot be used.
         """
-        from finforce_keypoints.dots import DotSettings
         from finforce_keypoints.finders import build_detector
-        from finforce_keypoints.parameters import DetectorParameters, load_jaws
-        from finforce_keypoints.settings import DetectorSettings
+        from finforce_keypoints.parameters import load_jaws
 
-        given = self.node_parameters(recording)
-        records = {"": DetectorParameters, "detector": DetectorSettings, "dots": DotSettings}
-        parameters, settings, dots = (record(**_fields_of(prefix, given)) for prefix, record in records.items())
+        live = next((name for name in LIVE if name in self.parameters), None)
+        if live is not None:
+            raise OptionError(f"--detector {live}: means nothing offline; leave it out, or use finforce replay")
+        parameters, settings, dots = build_records(self.node_parameters(recording))
         return build_detector(load_jaws(parameters), parameters, settings, dots).detector
+
+    @property
+    def pairing(self) -> int:
+        """Greatest distance between the stamps of a colour and a depth image that belong together [ns]."""
+        seconds = self.parameters.get("sync_tolerance")
+        return PAIRED if seconds is None else round(seconds * NANOSECONDS)
 
     def _detect(self, recording: Recording) -> Recording:
         from tqdm import tqdm
 
         from finforce_keypoints.images import ImageWatch
 
-        detector = self.build(recording)
-        count = len(recording.images)
-        with tqdm(total=count, unit="image", desc=recording.name, disable=None, leave=False) as bar:
-            return detect_keypoints(recording, detector, watch=ImageWatch(), progress=bar.update)
+        detector, parameters = self.build(recording), build_records(self.parameters).parameters
+        watch = ImageWatch(parameters.frozen_after)
+        recording = replace(recording, images=replace(recording.images, depth_scale=parameters.depth_scale))
+        with tqdm(total=len(recording.images), unit="image", desc=recording.name, disable=None, leave=False) as bar:
+            return detect_keypoints(recording, detector, watch=watch, progress=bar.update)
+
+
+def build_records(given: Mapping[str, Any]) -> DetectorRecords:
+    """Return the records of a detector with parameters by their ROS names; the others have their defaults.
+
+    Raises:
+        FinforceError: a value is not among its choices or out of its bounds.
+    """
+    return DetectorRecords(*(record(**_fields_of(prefix, given)) for prefix, record in _record_types().items()))
+
+
+def _record_types() -> dict[str, type]:
+    """Return the types of a detector's records by the prefix of their parameters."""
+    from finforce_keypoints.dots import DotSettings
+    from finforce_keypoints.parameters import DetectorParameters
+    from finforce_keypoints.settings import DetectorSettings
+
+    return {"": DetectorParameters, "detector": DetectorSettings, "dots": DotSettings}
 
 
 def _fields_of(prefix: str, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -119,50 +169,40 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
     """Return where the key points come from.
 
     Raises:
-        OptionError: a parameter of the detector is not known or has another type.
+        OptionError: a parameter of the detector is not known, has another type, is out of its bounds, or is decided by
+            something else.
     """
     parameters: dict[str, Any] = {}
     changes, extrinsics = getattr(options, "detector", []), getattr(options, "extrinsics", None)
     if changes:
-        parameters = _parse_changes(changes)
+        parameters = _parse_parameters(changes)
     if extrinsics:
         parameters["T_gripper_camera"] = _parse_extrinsics(extrinsics)
     return KeypointSource(source=getattr(options, "source", None) or "", jaw_file=options.jaw, parameters=parameters)
 
 
-def _parse_changes(changes: Sequence[str]) -> dict[str, Any]:
-    """Return `NAME=VALUE` texts as values of the type of the parameter."""
-    from finforce_keypoints.dots import DotSettings
-    from finforce_keypoints.parameters import DetectorParameters
-    from finforce_keypoints.settings import DetectorSettings
-
-    defaults = dict(asdict(DetectorParameters()))
-    for prefix, record in (("detector", DetectorSettings), ("dots", DotSettings)):
-        defaults |= {f"{prefix}.{entry.name}": getattr(record(), entry.name) for entry in fields(record)}
-    parsed = {}
-    for change in changes:
-        name, _, text = change.partition("=")
-        if name not in defaults:
-            raise OptionError(f"--detector {change}: unknown parameter; expected one of {', '.join(defaults)}")
-        parsed[name] = _parse_value(change, text, defaults[name])
-    return parsed
-
-
-def _parse_value(change: str, text: str, default: Any) -> Any:
-    """Return a text as a value of the type of a default; a list has commas."""
-    if isinstance(default, tuple | list):
-        kind = type(default[0]) if default else str
-        return [_parse_value(change, part, kind()) for part in text.split(",")]
+def _parse_parameters(texts: Sequence[str]) -> dict[str, Any]:
+    """Return `NAME=VALUE` texts as values of the type of the parameter, checked."""
+    defaults = {
+        f"{prefix}.{entry.name}" if prefix else entry.name: entry.default
+        for prefix, record in _record_types().items()
+        for entry in fields(record)
+    }
+    parameters = parse_changes("--detector", "parameter", texts, defaults)
+    for name, reason in DECIDED.items():
+        if name in parameters:
+            raise OptionError(f"--detector {name}: cannot be set here: {reason}")
     try:
-        return TRUTH_VALUES[text.lower()] if isinstance(default, bool) else type(default)(text)
-    except (KeyError, ValueError):
-        raise OptionError(f"--detector {change}: '{text}' is no {type(default).__name__}") from None
+        build_records(parameters)
+    except FinforceError as error:
+        raise OptionError(f"--detector {error}") from error
+    return parameters
 
 
 def _parse_extrinsics(text: str) -> list[float]:
     """Return x, y, z [m], qx, qy, qz, qw of a camera by its name or its numbers."""
+    from finforce_contact.poses import pose_numbers
     from finforce_keypoints.gripper_geometry import BENCH_CAMERA, ROBOT_CAMERA
-    from finforce_keypoints.parameters import pose_numbers
 
     known = {"bench": BENCH_CAMERA, "robot": ROBOT_CAMERA}
     if text in known:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.images import COLOR, DEPTH
 from finforce_eval.live_detection import DetectionLog
 from finforce_eval.places import InnerSurface, true_lines
 from finforce_eval.results import CaseResult, ContactSeries, Snapshot
@@ -18,6 +17,7 @@ from finforce_eval.sight_scoring import compare_sight
 from finforce_eval.tracks import NANOSECONDS, Recording
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_ifea.pointcloud import decode_keypoints
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC
 
 
 @dataclass(kw_only=True)
@@ -79,7 +79,7 @@ class ReplayLog:
 
     def take_sent(self, topic: str, stamp: int, time: float) -> None:
         """Note when a message left [s, monotonic]; those count that a run begins with: key points, or an image."""
-        if topic in (COLOR, DEPTH):
+        if topic in (COLOR_TOPIC, DEPTH_TOPIC):
             # an image is whole with the later of its two messages
             for log in self.jaws.values():
                 log.sent[stamp] = time
@@ -137,11 +137,6 @@ class ReplayLog:
         sent = [log.sent[stamp] for log in self.jaws.values() if stamp in log.sent]
         if sent:
             self.grasp_latency[stamp] = time - min(sent)
-
-    @property
-    def grasp_series(self) -> tuple[Mapping[int, float], Mapping[int, float]]:
-        """Grasp force [N] and the time from the image to it [s], by recorded stamp [ns]."""
-        return self.grasp, self.grasp_latency
 
     def take_diagnostics(self, message: Any) -> None:
         """Keep the last state of every node; that nothing arrives any more after the end is no news."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from finforce_contact.messages import pose_from_message
 from finforce_eval.detection import SideLog
 from finforce_ifea.pointcloud import decode_columns, decode_keypoints
+from finforce_keypoints.jaw_localizer import REASONS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -23,6 +24,7 @@ class HeardKeypoints:
     valid: NDArray[np.bool_]
     stddev: NDArray[np.float64]
     T_camera_jaw: NDArray[np.float64]
+    reasons: NDArray[np.str_]
 
 
 @dataclass(kw_only=True)
@@ -59,7 +61,7 @@ class DetectionLog:
 def heard_keypoints(cloud: Any, T_camera_jaw: NDArray[np.float64]) -> HeardKeypoints:
     """Return the key points of a cloud and the pose (4, 4) that came with it."""
     seen = decode_keypoints(cloud)
-    columns = decode_columns(cloud, ("u", "v"))
+    columns = decode_columns(cloud, ("u", "v", "reason"))
     return HeardKeypoints(
         points=seen.points,
         likelihood=seen.likelihood,
@@ -67,4 +69,5 @@ def heard_keypoints(cloud: Any, T_camera_jaw: NDArray[np.float64]) -> HeardKeypo
         valid=np.isfinite(seen.points).all(axis=1),
         stddev=np.full_like(seen.points, np.nan) if seen.stddev is None else seen.stddev,
         T_camera_jaw=T_camera_jaw,
+        reasons=np.array(["", *REASONS])[columns["reason"]],
     )

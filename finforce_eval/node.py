@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import groupby
@@ -16,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
@@ -23,6 +25,10 @@ import finforce_ros as ros
 from finforce_eval.live import ReplayLog
 from finforce_eval.parameters import PlayerParameters
 from finforce_eval.playback import Playback, RawMessage, read_playback
+
+
+# what is heard while messages are being sent waits its turn; nothing of it may be lost
+HEARD = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class PlayerNode(Node):
@@ -94,8 +100,8 @@ class PlayerNode(Node):
         if offset is None:
             self._start_clock(first)
         began = monotonic()
-        for time, together in groupby(messages, key=attrgetter("time")):
-            due = list(together)  # read and decompressed ahead: what belongs to one image leaves at once
+        # what belongs to one image leaves at once
+        for time, due in read_ahead((time, list(due)) for time, due in groupby(messages, key=attrgetter("time"))):
             self.spin_until(began + (time - first) / (rate * ros.NANOSECONDS))
             if offset is None:
                 self._clock_out.publish(Clock(clock=ros.stamp_message(time)))
@@ -120,7 +126,7 @@ class PlayerNode(Node):
         """Hand results to a log, with the time of their arrival; with those of the key point detector, if it runs."""
 
         def subscribe(kind: type, topic: str, take: Callable[[Any], Any]) -> None:
-            self.create_subscription(kind, topic, take, ros.RESULT)
+            self.create_subscription(kind, topic, take, HEARD)
 
         for side in sides:
             subscribe(WrenchStamped, f"{side}/wrench", lambda m, s=side: log.take_wrench(s, m, monotonic()))
@@ -133,6 +139,18 @@ class PlayerNode(Node):
                 subscribe(PointCloud2, f"{side}/keypoints", lambda m, s=side: log.take_keypoints(s, m, monotonic()))
         subscribe(WrenchStamped, "grasp_wrench", lambda m: log.take_grasp(m, monotonic()))
         subscribe(DiagnosticArray, "/diagnostics", log.take_diagnostics)
+
+
+def read_ahead(items: Generator[Any, None, None]) -> Iterator[Any]:
+    """Yield what a generator gives, of which the next is made in another thread meanwhile; None ends it."""
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        coming = pool.submit(next, items, None)
+        try:
+            while (item := coming.result()) is not None:
+                coming = pool.submit(next, items, None)
+                yield item
+        finally:
+            pool.submit(items.close)  # in the thread that opened the bag
 
 
 @contextmanager

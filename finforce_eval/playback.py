@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 
 from finforce_eval.bags import BagReader, RawSample, bag_source, open_bag, read_stamp, restamp
 from finforce_eval.errors import RecordingError
-from finforce_eval.image_messages import COMPRESSED, IMAGE, color_from_message, depth_millimetres
-from finforce_eval.images import COLOR, COLOR_ENDS, DEPTH, DEPTH_ENDS, INFO, INFO_ENDS
+from finforce_eval.image_messages import COMPRESSED, IMAGE, color_from_message, depth_steps
+from finforce_eval.images import COLOR_ENDS, DEPTH_ENDS, INFO_ENDS
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 HEADER = "std_msgs/msg/Header"
 # where the nodes listen -> the ends of the topics that are played there
-PLAYED = {COLOR: COLOR_ENDS, DEPTH: DEPTH_ENDS, INFO: INFO_ENDS}
+PLAYED = {COLOR_TOPIC: COLOR_ENDS, DEPTH_TOPIC: DEPTH_ENDS, INFO_TOPIC: INFO_ENDS}
 
 
 class RawMessage(NamedTuple):
@@ -105,12 +106,12 @@ def _played_type(msgtype: str) -> str:
 def _decompress(bag: BagReader, raw: RawSample, topic: str) -> bytes:
     """Return the CDR bytes of a sensor_msgs/Image with the pixels of a compressed one."""
     message: Any = bag.decode(raw)
-    pixels = depth_millimetres(message) if topic == DEPTH else color_from_message(message)
+    pixels = depth_steps(message) if topic == DEPTH_TOPIC else color_from_message(message)
     fields = {
         "header": message.header,
         "height": pixels.shape[0],
         "width": pixels.shape[1],
-        "encoding": "16UC1" if topic == DEPTH else "rgb8",
+        "encoding": "16UC1" if topic == DEPTH_TOPIC else "rgb8",
         "is_bigendian": 0,
         "step": pixels.strides[0],
         "data": pixels.reshape(-1).view("u1"),

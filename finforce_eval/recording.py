@@ -11,7 +11,7 @@ import numpy as np
 
 from finforce_eval.bags import Sample, bag_source, check_types, open_bag
 from finforce_eval.errors import RecordingError
-from finforce_eval.images import ImageTrack, find_images
+from finforce_eval.images import PAIRED, ImageTrack, find_images
 from finforce_eval.sight import SightTrack
 from finforce_eval.tracks import (
     JAWS,
@@ -51,7 +51,7 @@ class _Content(NamedTuple):
     notes: list[str]
 
 
-def read_recording(path: str | Path) -> Recording:
+def read_recording(path: str | Path, pairing: int = PAIRED) -> Recording:
     """Read a rosbag2 folder or a single .mcap / .db3 file, with the `case.json` beside it.
 
     Topics that are not ours are not decoded; those of unknown type are named in `notes`. Images are not read yet; a
@@ -59,6 +59,7 @@ def read_recording(path: str | Path) -> Recording:
 
     Args:
         path: the folder or the file.
+        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
 
     Raises:
         RecordingError: nothing there, damaged, empty, without key points and images, or with malformed content.
@@ -67,11 +68,10 @@ def read_recording(path: str | Path) -> Recording:
     source = bag_source(Path(path))
     folder = source if source.is_dir() else source.parent
     name = source.name if source.is_dir() else source.stem
-    samples, images, notes = _read_samples(source, name)
+    samples, images, notes = _read_samples(source, name, pairing)
     jaws = {side: _jaw_track(samples, side, name) for side in JAWS if _has_jaw(samples, side, images is not None)}
     if not jaws:
-        what = "no images either" if images is None else "there are images, but no topic names a jaw"
-        raise RecordingError(f"{name}: no key points: /left/keypoints and /right/keypoints have no messages; {what}")
+        raise RecordingError(f"{name}: {_no_jaw(has_images=images is not None)}")
     phases = samples.get("/bench/phase")
     poses = samples.get("/object_pose")
     return Recording(
@@ -86,13 +86,24 @@ def read_recording(path: str | Path) -> Recording:
     )
 
 
+def _no_jaw(*, has_images: bool) -> str:
+    """Return why nothing is known of a jaw, and what would do."""
+    if not has_images:
+        return "no key points: /left/keypoints and /right/keypoints have no messages; no images either"
+    return (
+        "there are images, but no topic tells which jaws are in them: a score needs their measured force, record "
+        "/left/ground_truth_wrench or /right/ground_truth_wrench (WrenchStamped in left_jaw or right_jaw), too; forces "
+        "without a score: ros2 launch finforce replay.launch.py bag:=FOLDER images:=true contact_height:=METRES"
+    )
+
+
 def _has_jaw(samples: Mapping[str, list[Sample]], side: str, has_images: bool) -> bool:
     """Say whether a recording tells of a jaw: by its key points, or with images by anything that is the jaw's own."""
     topics = [topic for topic in samples if topic.startswith(f"/{side}/")]
     return f"/{side}/keypoints" in topics or (has_images and bool(topics))
 
 
-def _read_samples(source: Path, name: str) -> _Content:
+def _read_samples(source: Path, name: str, pairing: int) -> _Content:
     """Decode the messages of our topics, by topic, and find the images."""
     samples: dict[str, list[Sample]] = {}
     with open_bag(source, name) as bag:
@@ -101,7 +112,7 @@ def _read_samples(source: Path, name: str) -> _Content:
             samples.setdefault(raw.topic, []).append(Sample(raw.time, bag.decode(raw)))
         notes = bag.foreign_notes()
         try:
-            images = find_images(bag, source)
+            images = find_images(bag, source, pairing)
         except RecordingError as error:
             if not any(topic.endswith("/keypoints") for topic in samples):
                 raise

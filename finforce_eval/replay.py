@@ -11,27 +11,25 @@ from tempfile import TemporaryDirectory
 from time import monotonic, time_ns
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from finforce_eval.commands import Setup, truth_sides
 from finforce_eval.contacts import FIXED, ContactChoice
-from finforce_eval.delay_scoring import DelayStats, delay_stats, onset_delays
 from finforce_eval.detection import awaiting_keypoints, with_detections
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluate import Evaluation, check_keypoint_count, score_results
-from finforce_eval.images import COLOR, DEPTH, INFO
+from finforce_eval.grasp_scoring import GraspScore, score_grasp
 from finforce_eval.keypoint_source import IMAGES, TRUTH, KeypointSource
 from finforce_eval.live import ReplayLog, live_result
 from finforce_eval.objects import find_mesh, require_mesh
 from finforce_eval.playback import Playback, RawMessage, read_playback
 from finforce_eval.processes import ProcessError, ProcessGroup
 from finforce_eval.results import CaseResult
-from finforce_eval.scoring import match_truth
 from finforce_eval.tracks import Recording
 from finforce_eval.writer import write_recording
 from finforce_graph import Process, ReplayOptions, replay_processes
 from finforce_ifea.errors import MissingDependencyError
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 PATIENCE = 180.0  # s; a first start compiles the element loops
 LINGER = 0.3  # s; the last answers may still be on their way when the last message has left
@@ -68,13 +66,15 @@ class Replay:
         evaluation: scores and time series; their step times are from key points out to wrench in.
         grasp: stamp [ns] -> grasp force [N].
         health: node -> its last diagnostics.
-        delay: of the grasp force after its true onset.
+        grasp_score: how far the grasp force is from the truth, and how late.
+        recording: that was played, with the key points that it was played with.
     """
 
     evaluation: Evaluation
     grasp: Mapping[int, float]
     health: Mapping[str, Mapping[str, str]]
-    delay: DelayStats
+    grasp_score: GraspScore
+    recording: Recording
 
 
 def replay(
@@ -120,7 +120,13 @@ def replay(
     if source == IMAGES:
         recording = with_detections(recording, {side: found.side_log() for side, found in log.detections.items()})
     evaluation = _score(recording, setup, log)
-    return Replay(evaluation=evaluation, grasp=log.grasp, health=log.health, delay=_grasp_delay(recording, log))
+    return Replay(
+        evaluation=evaluation,
+        grasp=log.grasp,
+        health=log.health,
+        grasp_score=score_grasp(recording, log.grasp, log.grasp_latency),
+        recording=recording,
+    )
 
 
 def _write_truth(recording: Recording, stack: ExitStack) -> Recording:
@@ -137,7 +143,7 @@ def _unplayed(sides: Sequence[str], from_images: bool) -> set[str]:
     """Return the topics that are found anew, or those of the camera where nobody looks at its images."""
     if from_images:
         return {f"/{side}/{name}" for side in sides for name in ("keypoints", "jaw_pose")}
-    return {COLOR, DEPTH, INFO}
+    return {COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC}
 
 
 def _with_detector(processes: Sequence[Process], recording: Recording, keypoints: KeypointSource) -> list[Process]:
@@ -148,17 +154,6 @@ def _with_detector(processes: Sequence[Process], recording: Recording, keypoints
         else process
         for process in processes
     ]
-
-
-def _grasp_delay(recording: Recording, log: ReplayLog) -> DelayStats:
-    """Return what /grasp_wrench took to show after each true onset of the grasp force, the smaller of the jaws'."""
-    sides = truth_sides(recording)
-    if len(sides) < len(recording.jaws):
-        return delay_stats([])
-    stamps = recording.jaw(sides[0]).keypoints.stamps
-    forces = [np.linalg.norm(match_truth(recording.truth(side), stamps), axis=1) for side in sides]
-    said, lag = (np.array([values.get(int(stamp), np.nan) for stamp in stamps]) for values in log.grasp_series)
-    return delay_stats(onset_delays(stamps * 1e-9, np.min(forces, axis=0), said, lag))
 
 
 def _results_of(sides: Sequence[str]) -> set[str]:
@@ -210,7 +205,7 @@ def _run(processes: Sequence[Process], messages: Playback, log: ReplayLog, playi
     awaited = [f"/{side}/keypoints" for side in log.jaws]
     detects = any(process.executable == "keypoint_detector" for process in processes)
     if detects:
-        awaited += [COLOR, DEPTH, INFO]
+        awaited += [COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC]
     if any(process.executable == "contact_estimator" for process in processes):
         awaited += ["/object_pose", *(f"/{side}/jaw_pose" for side in log.jaws)]
     with ExitStack() as stack:

@@ -31,7 +31,7 @@ def format_replay(result: Replay) -> str:
 
 def _shown(result: Replay) -> str:
     """Return in words when the grasp force showed."""
-    delay = result.delay
+    delay = result.grasp_score.delay
     if not delay.n:
         return f", missed at {delay.missed} onsets" if delay.missed else ""
     return f", above 0.1 N {delay.median_ms:.0f} ms (at most {delay.max_ms:.0f} ms) after {delay.n} true onsets"
@@ -76,8 +76,8 @@ def main(argv: Sequence[str]) -> int:
     playing = Playing(
         rate=options.rate, sim_time=options.sim_time, domain=options.domain, parameter_file=options.params
     )
-    recording = read_recording(options.bag)
     keypoints, calibration = parse_source(options), options.calibration or ""
+    recording = read_recording(options.bag, keypoints.pairing)
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
     print(format_replay(result))
     _write(result, setup, options)
@@ -87,10 +87,17 @@ def main(argv: Sequence[str]) -> int:
 def _write(result: Replay, setup: Setup, options: argparse.Namespace) -> None:
     """Write what was asked for."""
     if options.json:
-        write_json(options.json, evaluation_json(result.evaluation, grasp_delay=asdict(result.delay), **setup.about))
+        score = result.grasp_score
+        grasp = {"grasp": asdict(score.error), "grasp_delay": asdict(score.delay)}
+        write_json(options.json, evaluation_json(result.evaluation, **grasp, **setup.about))
     if options.report:
         from finforce_eval.report import write_report
 
-        names = setup.jaw.keypoint_names
-        page = write_report(result.evaluation, options.report, keypoint_names=names, about=setup.about)
+        page = write_report(
+            result.evaluation,
+            options.report,
+            keypoint_names=setup.jaw.keypoint_names,
+            about=setup.about,
+            recordings=[result.recording],
+        )
         print(f"Report: {page}")

@@ -10,6 +10,7 @@ from finforce_eval.evaluate import Evaluation
 from finforce_eval.results import CaseResult
 from finforce_eval.sight_table import markdown_sight
 from finforce_eval.tables import markdown_contact_table, markdown_table, summary_lines
+from finforce_eval.tracks import Recording
 
 
 def write_report(
@@ -18,6 +19,7 @@ def write_report(
     *,
     keypoint_names: Sequence[str],
     about: Mapping[str, str],
+    recordings: Sequence[Recording] = (),
     title: str = "Force from key points",
 ) -> Path:
     """Write pictures and README.md of an evaluation.
@@ -27,6 +29,7 @@ def write_report(
         folder: where to; made when missing, files of the same name are replaced.
         keypoint_names: K names of the key points of the jaw.
         about: what was run: solver, jaw, contact, ...
+        recordings: of the evaluation; where key points were found in images, some of these are shown.
         title: heading of the page.
 
     Returns:
@@ -34,6 +37,7 @@ def write_report(
 
     Raises:
         MissingDependencyError: matplotlib is not installed.
+        RecordingError: an image is damaged.
     """
     from finforce_eval.figures import draw_unity, draw_violins
 
@@ -42,7 +46,8 @@ def write_report(
     results = list(evaluation.results.values())
     draw_unity(results).savefig(folder / "unity.png")
     draw_violins(results).savefig(folder / "violins.png")
-    sections = [_write_case(result, folder, keypoint_names) for result in results]
+    sections = [_write_images(recording, results, folder, keypoint_names) for recording in recordings]
+    sections += [_write_case(result, folder, keypoint_names) for result in results]
     page = folder / "README.md"
     head = [f"# {title}", "", *(f"- {key}: {value}" for key, value in about.items()), ""]
     lines = [*head, *_overview(evaluation), *(line for section in sections for line in section)]
@@ -66,13 +71,40 @@ def _overview(evaluation: Evaluation) -> list[str]:
     ]
 
 
+def _stem(name: str) -> str:
+    """Return the name of a case or a recording as the beginning of file names."""
+    return re.sub(r"[^\w.-]+", "_", name)
+
+
+def _write_images(
+    recording: Recording, results: Sequence[CaseResult], folder: Path, keypoint_names: Sequence[str]
+) -> list[str]:
+    """Write the pictures of what the detector made of a recording's images and return their section of the page."""
+    if recording.images is None or all(track.detection is None for track in recording.jaws.values()):
+        return []
+    from finforce_eval.image_figure import draw_detection, draw_images
+    from finforce_keypoints.report import build_skeleton
+
+    name, stem = recording.name, _stem(recording.name)
+    own = [result for result in results if result.name in (name, f"{name}/{result.side}")]
+    draw_images(recording, own, build_skeleton(keypoint_names)).savefig(folder / f"{stem}_images.png")
+    draw_detection(recording).savefig(folder / f"{stem}_detection.png")
+    return [
+        "",
+        f"## Images of {name}",
+        "",
+        f"![Key points in the images]({stem}_images.png)",
+        f"![Key points found, over time]({stem}_detection.png)",
+    ]
+
+
 def _write_case(result: CaseResult, folder: Path, keypoint_names: Sequence[str]) -> list[str]:
     """Write the pictures of one case and return its section of the page."""
     from finforce_eval.contact_figure import draw_contact
     from finforce_eval.figures import draw_force, draw_keypoints
     from finforce_eval.jaw_figure import draw_jaw
 
-    stem = re.sub(r"[^\w.-]+", "_", result.name)
+    stem = _stem(result.name)
     draw_force(result).savefig(folder / f"{stem}_force.png")
     draw_keypoints(result, keypoint_names).savefig(folder / f"{stem}_keypoints.png")
     lines = ["", f"## {result.name}", "", f"![Force over time]({stem}_force.png)"]

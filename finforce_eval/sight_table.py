@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from finforce_eval.markdown import markdown_rows
 from finforce_eval.scoring import CaseScore
 
 if TYPE_CHECKING:
@@ -67,6 +68,4 @@ def markdown_sight(evaluation: Evaluation) -> list[str]:
     rows = sight_rows(evaluation)
     if not rows:
         return []
-    head = ["case", *HEADER]
-    lines = ["", "| " + " | ".join(head) + " |", "|---" + "|---:" * (len(head) - 1) + "|"]
-    return [*lines, *("| " + " | ".join(row) + " |" for row in rows), "", MEANING]
+    return ["", *markdown_rows(["case", *HEADER], rows), "", MEANING]

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from finforce_eval.evaluate import Evaluation
+from finforce_eval.markdown import markdown_rows
 from finforce_eval.scoring import CaseScore, Spread, Stats
 from finforce_eval.sight_table import format_sight
 
@@ -139,9 +140,7 @@ def summary_lines(evaluation: Evaluation) -> list[str]:
 def markdown_table(evaluation: Evaluation) -> str:
     """Return the table in Markdown."""
     head = ["case", *(f"{phase}: {name}" for phase in PHASES for name in HEADER), "bias/N", "solved/%"]
-    lines = ["| " + " | ".join(head) + " |", "|---" + "|---:" * (len(head) - 1) + "|"]
-    lines += ["| " + " | ".join(row) + " |" for row in table_rows(evaluation)]
-    return "\n".join(lines)
+    return "\n".join(markdown_rows(head, table_rows(evaluation)))
 
 
 def markdown_contact_table(evaluation: Evaluation) -> list[str]:
@@ -149,9 +148,7 @@ def markdown_contact_table(evaluation: Evaluation) -> list[str]:
     rows = contact_rows(evaluation)
     if not rows:
         return []
-    head = ["case", *CONTACT_HEADER]
-    lines = ["", "| " + " | ".join(head) + " |", "|---|---" + "|---:" * (len(head) - 2) + "|"]
-    return [*lines, *("| " + " | ".join(row) + " |" for row in rows), "", *contact_lines()]
+    return ["", *markdown_rows(["case", *CONTACT_HEADER], rows, texts=2), "", *contact_lines()]
 
 
 def evaluation_json(evaluation: Evaluation, **about: Any) -> dict[str, Any]:

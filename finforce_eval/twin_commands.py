@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from finforce_eval.changes import parse_changes
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.preview import Preview
 from finforce_eval.twin_writer import RecordingForm, write_footage
@@ -70,7 +70,13 @@ def record_scene(
 
     footage = build_footage(scenario, seed, camera, finger=finger)
     preview = Preview(len(footage))
-    case = {"scene": scenario.name, "seed": seed, "finger": finger, "light": scenario.light, "object": {"kind": scenario.object}}
+    case = {
+        "scene": scenario.name,
+        "seed": seed,
+        "finger": finger,
+        "light": scenario.light,
+        "object": {"kind": scenario.object},
+    }
     with tqdm(total=len(footage), unit="image", desc=scenario.name, disable=None, leave=False) as bar:
 
         def seen(frame: Any) -> None:
@@ -88,27 +94,9 @@ def scenario_from_options(options: argparse.Namespace) -> Scenario:
         OptionError: a change is no NAME=VALUE, or its value has another type.
         ScenarioError: there is no such scene, or a number is out of its bounds.
     """
-    changes = parse_changes(options.set)
+    defaults = {entry.name: entry.default for entry in fields(Scenario) if entry.name != "name"}
+    changes = parse_changes("--set", "number", options.set, defaults)
     for name in ("light", "object", "camera"):
         if getattr(options, name) is not None:
             changes[name] = getattr(options, name)
     return build_scenario(options.scene, **changes)
-
-
-def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
-    """Return `NAME=VALUE` texts as values of the type of the scene's number.
-
-    Raises:
-        OptionError: a name is not known, or a value is not of its type.
-    """
-    kinds = {entry.name: type(entry.default) for entry in fields(Scenario) if entry.name != "name"}
-    changes = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        if name not in kinds:
-            raise OptionError(f"--set {text}: unknown number; expected one of {', '.join(kinds)}")
-        try:
-            changes[name] = kinds[name](value)
-        except ValueError:
-            raise OptionError(f"--set {text}: '{value}' is no {kinds[name].__name__}") from None
-    return changes

@@ -14,7 +14,7 @@ import numpy as np
 
 from finforce_contact.object_mesh import ObjectMesh
 from finforce_contact.optional import import_trimesh
-from finforce_contact.poses import quaternion_from_pose
+from finforce_contact.poses import pose_numbers, quaternion_from_pose
 from finforce_eval.image_messages import (
     CAMERA_INFO,
     COMPRESSED,
@@ -24,9 +24,9 @@ from finforce_eval.image_messages import (
     compress_depth,
     encode_color,
 )
-from finforce_eval.images import COLOR, DEPTH, INFO
 from finforce_eval.recording import CLOUD, POSE, STRING, TRUE_KEYPOINTS, TRUE_POSE, WRENCH
 from finforce_eval.writer import Entry, MessageFactory, write_entries
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_twin.encoding import encode_depth, info_fields, sight_columns
 from finforce_twin.record import Footage, TrueJaw, TwinFrame
 
@@ -91,8 +91,7 @@ def write_footage(
     if footage.mesh is not None:
         write_mesh(footage.mesh, folder / MESH)
         content["mesh"] = f"{folder.name}/{MESH}"
-    pose = footage.T_gripper_camera
-    content["T_gripper_camera"] = [*map(float, pose[:3, 3]), *map(float, quaternion_from_pose(pose))]
+    content["T_gripper_camera"] = list(pose_numbers(footage.T_gripper_camera))
     (folder / "case.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return folder
 
@@ -119,15 +118,15 @@ class ImageFactory:
         header = self.messages.header(frame.stamp, FRAME)
         region = self._types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
         info = info_fields(footage.camera) | {"binning_x": 0, "binning_y": 0, "roi": region}
-        yield Entry(frame.stamp, INFO, CAMERA_INFO, self._types[CAMERA_INFO](header=header, **info))
+        yield Entry(frame.stamp, INFO_TOPIC, CAMERA_INFO, self._types[CAMERA_INFO](header=header, **info))
         steps = encode_depth(np.where(frame.depth <= self._form.farthest, frame.depth, np.nan))
         if self._form.compressed:
             color = encode_color(frame.color, quality=self._form.quality)
-            yield self._packed(f"{COLOR}/compressed", header, "rgb8; jpeg compressed bgr8", color)
-            yield self._packed(f"{DEPTH}/compressedDepth", header, DEPTH_FORMAT, compress_depth(steps))
+            yield self._packed(f"{COLOR_TOPIC}/compressed", header, "rgb8; jpeg compressed bgr8", color)
+            yield self._packed(f"{DEPTH_TOPIC}/compressedDepth", header, DEPTH_FORMAT, compress_depth(steps))
         else:
-            yield self._plain(COLOR, header, "rgb8", frame.color)
-            yield self._plain(DEPTH, header, "16UC1", steps)
+            yield self._plain(COLOR_TOPIC, header, "rgb8", frame.color)
+            yield self._plain(DEPTH_TOPIC, header, "16UC1", steps)
 
     def _packed(self, topic: str, header: Any, form: str, data: bytes) -> Entry:
         message = self._types[COMPRESSED](header=header, format=form, data=np.frombuffer(data, dtype=np.uint8))

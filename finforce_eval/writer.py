@@ -13,7 +13,7 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.recording import CLOUD, POSE, STRING, WRENCH
 from finforce_eval.tracks import NANOSECONDS, KeypointTrack, PhaseTrack, PoseTrack, Recording, WrenchTrack
 from finforce_ifea.errors import MissingDependencyError
-from finforce_ifea.pointcloud import encode_cloud
+from finforce_ifea.pointcloud import STDDEV_COLUMNS, encode_cloud
 
 
 class Entry(NamedTuple):
@@ -155,10 +155,12 @@ def recording_entries(recording: Recording, factory: MessageFactory) -> Iterator
 
 
 def _keypoint_entries(track: KeypointTrack, side: str, factory: MessageFactory) -> Iterator[Entry]:
-    for stamp, points, likelihood in zip(track.stamps, track.points, track.likelihood, strict=True):
-        columns = {axis: points[:, i].astype(np.float32) for i, axis in enumerate("xyz")}
-        columns["likelihood"] = likelihood.astype(np.float32)
-        cloud = factory.cloud(stamp, f"{side}_jaw", columns)
+    for index, stamp in enumerate(track.stamps):
+        columns = {axis: track.points[index, :, i] for i, axis in enumerate("xyz")}
+        columns["likelihood"] = track.likelihood[index]
+        if track.stddev is not None:
+            columns |= {name: track.stddev[index, :, i] for i, name in enumerate(STDDEV_COLUMNS)}
+        cloud = factory.cloud(stamp, f"{side}_jaw", {name: value.astype(np.float32) for name, value in columns.items()})
         yield Entry(int(stamp), f"/{side}/keypoints", CLOUD, cloud)
 
 

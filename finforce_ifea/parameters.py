@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from finforce_ifea.contact_feed import ContactFeed
 from finforce_ifea.observation import Contact
+from finforce_records import TimeParameters, parameter
 
 if TYPE_CHECKING:
     from finforce_ifea.estimator import JawEstimator
@@ -15,43 +16,33 @@ if TYPE_CHECKING:
     from finforce_ifea.settings import EstimatorSettings
 
 
-def _parameter(default: Any, description: str, **metadata: Any) -> Any:
-    """Return a dataclass field that says what it is; `metadata` are unit, min, max and choices."""
-    return field(default=default, metadata={"description": description, **metadata})
-
-
 @dataclass(frozen=True, kw_only=True)
-class NodeParameters:
+class NodeParameters(TimeParameters):
     """What a solver node is told beside the estimator's own settings; units stand in the metadata."""
 
-    jaw_name: str = _parameter("left", "the jaw that this node solves", choices=("left", "right"))
-    jaw_file: str = _parameter("bench", "jaw file, or the name of a shipped jaw")
-    calibration_file: str = _parameter("", "calibration file, or a shipped name; empty: the material of the jaw file")
-    jaw_frame: str = _parameter("", "frame of key points, contact and wrench; empty: <jaw_name>_jaw")
-    gripper_frame: str = _parameter("gripper_base", "frame of grasp_wrench and manipulation_wrench")
-    contact_height: float = _parameter(
+    jaw_name: str = parameter("left", "the jaw that this node solves", choices=("left", "right"))
+    jaw_file: str = parameter("bench", "jaw file, or the name of a shipped jaw")
+    calibration_file: str = parameter("", "calibration file, or a shipped name; empty: the material of the jaw file")
+    jaw_frame: str = parameter("", "frame of key points, contact and wrench; empty: <jaw_name>_jaw")
+    gripper_frame: str = parameter("gripper_base", "frame of grasp_wrench and manipulation_wrench")
+    contact_height: float = parameter(
         math.nan,
         "height of first touch above the clamped base; NaN: contacts come on <jaw_name>/contact",
         unit="m",
         min=0.0,
         max=1.0,
     )
-    contact_free: bool = _parameter(False, "the solver may move a contact that came on the topic")
-    max_age: float = _parameter(0.2, "greatest age of data at the time of publishing", unit="s", min=0.001, max=60.0)
-    restart_gap: float = _parameter(
-        1.0, "stamps that go back by more than this begin a new recording", unit="s", min=0.001, max=3600.0
-    )
-    peer: str = _parameter(
+    contact_free: bool = parameter(False, "the solver may move a contact that came on the topic")
+    peer: str = parameter(
         "",
         "the other jaw, whose wrenches complete grasp_wrench and manipulation_wrench here; empty: none",
         choices=("", "left", "right"),
     )
-    completes_grasp: bool = _parameter(False, "without a peer: publish this jaw's force as grasp_wrench")
-    publish_surface: bool = _parameter(True, "publish the deformed mesh vertices with every solved image")
-    marker_rate: float = _parameter(
+    completes_grasp: bool = parameter(False, "without a peer: publish this jaw's force as grasp_wrench")
+    publish_surface: bool = parameter(True, "publish the deformed mesh vertices with every solved image")
+    marker_rate: float = parameter(
         10.0, "greatest rate of the markers, which are sent only to listeners", unit="Hz", min=0.1, max=60.0
     )
-    diagnostics_period: float = _parameter(1.0, "time between diagnostics", unit="s", min=0.05, max=60.0)
 
     @property
     def frame(self) -> str:

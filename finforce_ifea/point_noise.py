@@ -26,12 +26,14 @@ class PointNoise(NamedTuple):
         gain: regression of x and z on y in this image (K, 2).
         width_variance: along y in this image (K,) [m^2].
         trust: variance in the tare over that in this image (K,), at most 1.
+        standing: variance that was stated in the tare beyond what its images scattered (K,) [m^2].
     """
 
     plane: NDArray
     gain: NDArray
     width_variance: NDArray
     trust: NDArray
+    standing: NDArray
 
 
 def match_stated(scatter: NDArray, stddev: NDArray, floor: float) -> StatedNoise:
@@ -73,6 +75,13 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
 
     A key point that states less than in the tare counts as it did there: nothing has shown that it is better.
 
+    A detector errs in the same way while it sees the same: what is stated and does not scatter in the tare stands still
+    there, is taken off with the offsets, and comes back in another shape with the next sight. No averaging removes it,
+
+        standing_k = max(0, (s_kx^2 + s_kz^2) / 2 - tr N_k), zero when nothing is stated;
+
+    up to twice the variance of the scatter is taken for chance.
+
     Args:
         usual: of each key point in the tare.
         stddev: stated in this image (K, 3) [m], NaN where there is no key point; None when nothing is stated.
@@ -80,15 +89,17 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
     plane, gain = condition_on_width(usual.covariance)
     width_variance = usual.covariance[:, 1, 1]
     if stddev is None:
-        return PointNoise(plane, gain, width_variance, np.ones(len(plane)))
+        return PointNoise(plane, gain, width_variance, np.ones(len(plane)), np.zeros(len(plane)))
     growth = np.fmax(1.0, stddev / usual.stddev)
     across, along = growth[:, [0, 2]], growth[:, 1]
     own = np.einsum("kaa->ka", plane)
+    stated = (usual.stddev[:, [0, 2]] ** 2).sum(axis=1)
     return PointNoise(
         plane=plane,
         gain=gain * across / along[:, None],
         width_variance=width_variance * along**2,
         trust=own.sum(axis=1) / (own * across**2).sum(axis=1),
+        standing=np.maximum(0.0, 0.5 * stated - np.einsum("kaa->k", usual.covariance[:, ::2, ::2])),
     )
 
 

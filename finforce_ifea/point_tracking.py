@@ -116,7 +116,7 @@ class PointTracker:
         known = np.isfinite(targets[:, 0])
         noise = tare.point_noise(stddev)
         scatter = np.trace(noise.plane, axis1=1, axis2=2) / 2.0 / noise.trust
-        variance = scatter + tare.offset_variance(self.settings.offset_stddev)
+        variance = scatter + noise.standing + tare.offset_variance(self.settings.offset_stddev)
         try:
             if self.paper:
                 result, weights = self._solve(targets, None), known.astype(float)

@@ -85,7 +85,7 @@ class PlaceTracker:
         place = forecast.place
         q = self.q + self._modes @ (self._reachable(place) - self._reached)
         measured, unseen = points - tare.offsets, self.settings.offset_stddev
-        chance = self._expect_errors(noise, tare.offset_variance(unseen), forecast)
+        chance = self._expect_errors(noise, tare.offset_variance(unseen) + noise.standing, forecast)
         update, settled, iteration, share, last = None, False, 0, 1.0, np.zeros(3)
         while not settled and iteration < self.settings.iterations:
             iteration += 1

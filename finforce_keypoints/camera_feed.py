@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from time import monotonic
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,45 +14,51 @@ from finforce_camera import CameraIntrinsics, ImageError, ImageLayout
 from finforce_contact.messages import camera_from_info, depth_from_image, same_camera, stamp_of
 from finforce_ifea.messages import check_frame
 from finforce_keypoints.errors import SyncError
-from finforce_keypoints.images import ImageWatch, RgbdImage, check_image, decode_color
+from finforce_keypoints.images import ImageWatch, RgbdImage, StampedImage, check_image, decode_color
 from finforce_keypoints.parameters import DetectorParameters
 
 SECOND = 1e-9  # s/ns
+SILENCE = 1.0  # s without an image, after which another colour topic may be the camera's
 WAITING = 3  # colour images that may wait for their depth: a tenth of a second at 30 Hz
-
-
-class StampedImage(NamedTuple):
-    """A whole image and its exact stamp [ns]."""
-
-    stamp: int
-    image: RgbdImage
 
 
 class CameraFeed:
     """Brings the images of a camera together by their stamps, the newest first, and refuses what no camera sees.
 
-    A colour image waits for its depth image; one that a newer whole image overtook is passed over.
+    A colour image waits for its depth image; one that a newer whole image overtook is passed over. Of several colour
+    topics the first that brings an image is listened to, until it is silent.
 
     Attributes:
         camera: intrinsics of both images, None until they came.
         passed: colour images that were overtaken while they waited.
+        topic: the colour topic that is listened to, None before the first image.
 
     Args:
         parameters: frame, topics, unit of depth and greatest distance of stamps.
+        clock: the time [s] of an arrival.
     """
 
-    def __init__(self, parameters: DetectorParameters) -> None:
-        self._parameters = parameters
+    def __init__(self, parameters: DetectorParameters, clock: Callable[[], float] = monotonic) -> None:
+        self._parameters, self._clock = parameters, clock
         self._tolerance = round(parameters.sync_tolerance / SECOND)
         self.camera: CameraIntrinsics | None = None
         self.passed = 0
-        self._topic: str | None = None
+        self.topic: str | None = None
+        self._heard = clock()
         self.reset()
 
+    @property
+    def source(self) -> str:
+        """The colour topic that is listened to, or those that may be."""
+        return self.topic or " or ".join(self._parameters.color_topics)
+
     def reset(self) -> None:
-        """Forget all images; the intrinsics stay."""
-        self._colors: deque[Any] = deque()
+        """Forget all images; intrinsics and topic stay."""
+        self._forget_colors()
         self._depths: deque[Any] = deque(maxlen=WAITING + 1)
+
+    def _forget_colors(self) -> None:
+        self._colors: deque[Any] = deque()
         self._watch = ImageWatch(self._parameters.frozen_after)
 
     def take_info(self, info: Any) -> None:
@@ -64,18 +72,25 @@ class CameraFeed:
         if not same_camera(self.camera, camera):
             self.camera = camera
 
-    def take_color(self, topic: str, message: Any) -> StampedImage | None:
-        """Take a colour image and return it with its depth; None while that has not come.
+    def listens(self, topic: str) -> bool:
+        """Say whether an image that has come on a colour topic is to be taken; after a silence another topic may be."""
+        now = self._clock()
+        if self.topic != topic and (self.topic is None or now - self._heard > SILENCE):
+            self.topic = topic
+            self._forget_colors()
+        if self.topic == topic:
+            self._heard = now
+        return self.topic == topic
 
-        Only the first topic that brings an image is listened to.
+    def take_color(self, topic: str, message: Any) -> StampedImage | None:
+        """Take a colour image and return it with its depth; None while that has not come, or of another topic.
 
         Raises:
             SyncError: no depth image came for an earlier image.
             ObservationError: the frame is another one.
             ImageError: the images cannot be used, or the intrinsics are not known yet.
         """
-        self._topic = self._topic or topic
-        if topic != self._topic:
+        if not self.listens(topic):
             return None
         self._colors.append(message)
         found = self._match()

@@ -14,6 +14,8 @@ DEFAULT_STDDEV = np.array([[0.05, 20.0], [0.2, 10.0], [0.4, 5.0], [0.6, 3.0], [0
 LARGEST_OFFSET = 20.0
 _LOG_FLOOR = 1e-2  # of the peak: a neighbour below it says nothing of the place between the cells
 _STEP_ROWS, _STEP_COLUMNS = (steps.ravel() - 1 for steps in np.indices((3, 3)))
+_FEW_CELLS = 36
+_LARGEST_PEAK = 0.5  # share of a map's cells that may reach half of its highest score: a map without a peak is no map
 _CENTRE = 4  # of the 3 x 3 cells in row order; 3 and 5 are its neighbours in the row, 1 and 7 in the column
 
 
@@ -61,11 +63,12 @@ class Peaks:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Cells:
-    """The 3 x 3 cells around n peaks: rows, columns and scores (n, 9); the score is NaN outside the map."""
+    """The 3 x 3 cells around n peaks: rows, columns and scores (n, 9), NaN outside the map; is it a peak (n,)."""
 
     rows: NDArray
     columns: NDArray
     scores: NDArray
+    is_peak: NDArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,7 +87,8 @@ def decode(heatmap: NDArray, locref: NDArray | None, rule: DecodingRule, size: t
     score = heatmap[k, r, c], or its sigmoid, clipped to 0..1.
 
     Maps reach beyond the image, by the network's border and by padding: cells that begin outside it are not searched,
-    a place up to half a cell outside is moved to the border, one farther out is dropped. So is what is not finite.
+    a place up to half a cell outside is moved to the border, one farther out is dropped. So is what is not finite, and
+    the highest cell of a map that is about as high everywhere.
 
     Args:
         heatmap: (B, K, h, w) scores.
@@ -100,7 +104,7 @@ def decode(heatmap: NDArray, locref: NDArray | None, rule: DecodingRule, size: t
     places = _place_by_scores(cells, rule) if locref is None else _place_by_offsets(cells, locref, rule)
     scores = cells.scores[:, _CENTRE]
     is_astray = places.offset > max(LARGEST_OFFSET, 1.5 * rule.stride)
-    is_good = np.isfinite(scores) & ~is_astray & _is_near(places.pixels, 0.5 * rule.stride, size)
+    is_good = np.isfinite(scores) & cells.is_peak & ~is_astray & _is_near(places.pixels, 0.5 * rule.stride, size)
     likelihood = np.where(is_good, np.clip(scores, 0.0, 1.0), 0.0)
     stddev = np.fmax(stddev_from_likelihood(likelihood, rule.likelihood_stddev), places.spread)
     pixels = np.clip(places.pixels, 0.0, (size[1] - 1.0, size[0] - 1.0))
@@ -145,9 +149,14 @@ def _find_cells(heatmap: NDArray, rule: DecodingRule, size: tuple[int, int]) -> 
     is_inside = (r >= 0) & (r < rows) & (c >= 0) & (c < columns)
     r, c = np.clip(r, 0, rows - 1), np.clip(c, 0, columns - 1)
     scores = np.take_along_axis(maps, r * columns + c, axis=1).astype(float)
+    half = 0.5 * scores[:, _CENTRE]
     if rule.apply_sigmoid:
         scores = 1.0 / (1.0 + np.exp(-np.clip(scores, -50.0, 50.0)))
-    return _Cells(rows=r, columns=c, scores=np.where(is_inside, scores, np.nan))
+        half = np.log(0.5 * scores[:, _CENTRE] / (1.0 - 0.5 * scores[:, _CENTRE]))
+    is_peak = (maps >= half[:, None]).mean(axis=1) <= _LARGEST_PEAK
+    # of a negative peak, half is higher than it; a map of a few cells is nearly all peak
+    is_peak |= ~(scores[:, _CENTRE] > 0.0) | (maps.shape[1] < _FEW_CELLS)
+    return _Cells(rows=r, columns=c, scores=np.where(is_inside, scores, np.nan), is_peak=is_peak)
 
 
 def _place_by_scores(cells: _Cells, rule: DecodingRule) -> _Places:
@@ -159,7 +168,8 @@ def _place_by_scores(cells: _Cells, rule: DecodingRule) -> _Places:
     scores, between = cells.scores, np.zeros((len(cells.scores), 2))
     if rule.sub_cell:
         peak = np.maximum(scores[:, _CENTRE], np.finfo(float).tiny)[:, None]
-        logs = np.log(np.maximum(scores / peak, _LOG_FLOOR))
+        with np.errstate(invalid="ignore"):
+            logs = np.log(np.maximum(scores / peak, _LOG_FLOOR))
         before, after = logs[:, [3, 1]], logs[:, [5, 7]]
         bend = before + after
         between = 0.5 * (before - after) / np.where(bend < 0.0, bend, -np.inf)
@@ -178,7 +188,8 @@ def _place_by_offsets(cells: _Cells, locref: NDArray, rule: DecodingRule) -> _Pl
     count = locref.shape[1] // 2
     image, part = (index[:, None] for index in np.divmod(np.arange(len(cells.scores)), count))
     dx, dy = (locref[image, 2 * part + axis, cells.rows, cells.columns] for axis in (0, 1))
-    offsets = rule.locref_std * np.stack((dx, dy), axis=-1).astype(float)
+    with np.errstate(invalid="ignore"):
+        offsets = rule.locref_std * np.stack((dx, dy), axis=-1).astype(float)
     votes = (np.stack((cells.columns, cells.rows), axis=-1) + 0.5) * rule.stride + offsets
     weights = np.where(np.isfinite(votes).all(axis=-1), np.nan_to_num(np.clip(cells.scores, 0.0, 1.0)), 0.0)
     weights /= np.maximum(weights.sum(axis=1), np.finfo(float).tiny)[:, None]

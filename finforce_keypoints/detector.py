@@ -16,10 +16,12 @@ from finforce_keypoints.finder import PixelFinder, PixelFinding
 from finforce_keypoints.images import RgbdImage, check_image
 from finforce_keypoints.jaw_localizer import JawKeypoints, JawLocalizer
 from finforce_keypoints.localization import DepthScale
+from finforce_keypoints.plane_picture import find_side
 from finforce_keypoints.settings import DetectorSettings
 
 __all__ = ["JawKeypoints", "KeypointDetector"]
 
+_SAME_SIDE = 2e-3  # [m] by which a reference point may lie off the plane of the key points
 _LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is better than this
 
 
@@ -29,7 +31,8 @@ class KeypointDetector:
     A finder gives their pixels; the jaws' places, depths, and what is believed, are found here.
 
     Raises:
-        GeometryError: there is no jaw, or a jaw is not the one of its side.
+        GeometryError: there is no jaw, a jaw is not the one of its side, or its reference point is not on the side of
+            its key points.
         PoseError: the camera's pose is none.
         MeshError: a jaw's mesh is bad.
     """
@@ -46,6 +49,8 @@ class KeypointDetector:
         wrong = [side for side, jaw in jaws.items() if jaw.side != side]
         if wrong or not jaws:
             raise GeometryError(f"jaws {sorted(jaws)}, wrong side: {wrong}; expected left, right or both")
+        for jaw in jaws.values():
+            check_reference(jaw)
         T_gripper_camera = check_pose(T_gripper_camera, "T_gripper_camera")
         self._finder = finder
         self._counts_of = {side: len(jaw.keypoints) + 1 for side, jaw in jaws.items()}
@@ -129,3 +134,19 @@ class KeypointDetector:
         self.counts[side] += 1
         for reason in keypoints.reasons[~keypoints.valid]:
             self.counts[f"{side}/{reason}"] += 1
+
+
+def check_reference(jaw: Jaw) -> None:
+    """Refuse a jaw whose reference point the camera cannot see on the side of its key points.
+
+    Raises:
+        GeometryError: it lies off their plane by more than 2 mm.
+    """
+    left = jaw if jaw.side == "left" else jaw.mirrored()  # as the jaw file has it
+    side_y, (x, y, z) = find_side(left), left.reference_point + 0.0  # no -0 in the message
+    if not abs(y - side_y) <= _SAME_SIDE:
+        raise GeometryError(
+            f"jaw '{jaw.name}': got the reference point [{x:g}, {y:g}, {z:g}] m, expected it on the side that the "
+            f"camera sees, y = {side_y:g} m like the key points' ({1e3 * _SAME_SIDE:g} mm more or less), on the rigid "
+            "holder; set reference_point in the jaw file"
+        )

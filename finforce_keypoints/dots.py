@@ -13,9 +13,8 @@ from scipy.optimize import linear_sum_assignment
 from finforce_camera import CameraIntrinsics, project
 from finforce_keypoints.dot_image import Dots, DotSettings, find_dots
 from finforce_keypoints.finder import PixelFinding
-from finforce_keypoints.gripper_geometry import ROBOT_CAMERA, jaw_in_camera
+from finforce_keypoints.gripper_geometry import ROBOT_CAMERA, OpeningRange
 from finforce_keypoints.optional import import_cv2
-from finforce_keypoints.plane_finder import OpeningRange
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw import Jaw
@@ -118,9 +117,7 @@ class DotFinder:
         """Return where a jaw is expected, or all places where a lost one can be; none behind the camera."""
         poses = [T_camera_jaw]
         if T_camera_jaw is None:
-            sign = -1.0 if side == "left" else 1.0
-            places = np.arange(self._opening.nearest, self._opening.farthest + _SEARCH_STEP, _SEARCH_STEP)
-            poses = [jaw_in_camera(self._T_gripper_camera, side, sign * x) for x in places]
+            poses = self._opening.place_jaw(self._T_gripper_camera, side, _SEARCH_STEP)
         patterns = [_build_pattern(self._points[side], np.asarray(T, dtype=float), camera) for T in poses]
         return [pattern for pattern in patterns if np.isfinite(pattern.pixels).all()]
 

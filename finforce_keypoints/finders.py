@@ -68,7 +68,8 @@ def build_finder(
     jaws: Mapping[str, Jaw], parameters: DetectorParameters, settings: DetectorSettings, dots: DotSettings | None = None
 ) -> BuiltFinder:
     """Return what finds the pixels of key points; see `build_detector`."""
-    from finforce_keypoints.plane_finder import OpeningRange, PlaneFinder
+    from finforce_keypoints.gripper_geometry import OpeningRange
+    from finforce_keypoints.plane_finder import PlaneFinder
 
     opening = OpeningRange(nearest=settings.opening_min, farthest=settings.opening_max)
     if parameters.finder == "dots":
@@ -76,10 +77,10 @@ def build_finder(
 
         return BuiltFinder(DotFinder(jaws, dots, parameters.camera_pose, opening), FinderCard(name="dots"))
     model = load_model(parameters)
-    if parameters.finder == "network":
-        finder = PlaneFinder(model, jaws, parameters.camera_pose, opening)
-    else:
+    if parameters.finder == "frame":
         finder = _build_frame_finder(model, jaws, parameters)
+    else:
+        finder = PlaneFinder(model, jaws, parameters.camera_pose, opening)
     return BuiltFinder(finder, FinderCard(name=f"{parameters.finder} {model.path.stem}", sha256=model.sha256))
 
 
@@ -87,15 +88,13 @@ def load_model(parameters: DetectorParameters) -> KeypointModel:
     """Load the network that the parameters name, the shipped one without a name.
 
     Raises:
-        ModelError: its files are missing, or do not agree with the metadata and the parameters.
+        ModelError: its files are missing, do not agree with the metadata and the parameters, or are not for the finder.
         MissingDependencyError: onnxruntime is not installed.
     """
     from finforce_keypoints.errors import ModelError
     from finforce_keypoints.model import KeypointModel, ModelOverrides
 
     size = tuple(parameters.input_size)
-    if len(size) != 2:
-        raise ModelError(f"input_size: got {size}, expected height and width [px], or two zeros")
     overrides = ModelOverrides(
         stride=parameters.stride or None,
         locref_std=parameters.locref_std or None,
@@ -103,7 +102,18 @@ def load_model(parameters: DetectorParameters) -> KeypointModel:
         normalize=ANSWERS[parameters.normalize],
         input_size=size if any(size) else None,
     )
-    return KeypointModel(parameters.model or SHIPPED, overrides, threads=parameters.threads)
+    if parameters.finder == "frame" and not parameters.model:
+        raise ModelError(
+            "finder frame: got no model, and the shipped network sees rectified side planes; expected the folder of a "
+            "DeepLabCut network as `model`, or finder network"
+        )
+    model = KeypointModel(parameters.model or SHIPPED, overrides, threads=parameters.threads)
+    if parameters.finder == "frame" and "plane" in model.metadata.extra:
+        raise ModelError(
+            f"finder frame: {model.path.parent} holds a network of rectified side planes (finforce: plane in its "
+            "metadata); expected one that sees the image, or finder network"
+        )
+    return model
 
 
 def _build_frame_finder(model: KeypointModel, jaws: Mapping[str, Jaw], parameters: DetectorParameters) -> PixelFinder:

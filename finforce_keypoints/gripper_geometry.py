@@ -3,6 +3,8 @@
 The gripper base has x along the closing axis, from the left to the right jaw, and z along the approach direction.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -30,6 +32,21 @@ def jaw_in_gripper(side: str, origin_x: float) -> NDArray:
 def jaw_in_camera(T_gripper_camera: NDArray, side: str, origin_x: float) -> NDArray:
     """Return T_camera_jaw (4, 4) = T_gripper_camera^-1 T_gripper_jaw(origin_x [m])."""
     return invert_pose(T_gripper_camera) @ jaw_in_gripper(side, origin_x)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpeningRange:
+    """How far from the middle of the gripper a jaw's origin can be along the closing axis [m]."""
+
+    nearest: float = 0.010
+    farthest: float = 0.070
+
+    def place_jaw(self, T_gripper_camera: NDArray, side: str, step: float) -> list[NDArray]:
+        """Return T_camera_jaw (4, 4) at places from one end of the range to the other, at most `step` [m] apart."""
+        count = max(2, int(np.ceil((self.farthest - self.nearest) / step)) + 1)
+        sign = -1.0 if side == "left" else 1.0
+        places = np.linspace(self.nearest, self.farthest, count)
+        return [jaw_in_camera(T_gripper_camera, side, sign * place) for place in places]
 
 
 def look_at(position: ArrayLike, target: ArrayLike, right: ArrayLike) -> NDArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ _PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
 _WATCHED_STEP = 8  # every so many rows and columns are looked at
 _DARKEST = 10  # of 255: a picture whose brightest hundredth is below this shows nothing
 _BRIGHTEST_PERCENT = 99.0
+_TILES = 4  # rows and columns of parts, each of which can stand still
+_NEAR_BLACK, _NEAR_WHITE = 8, 247  # of 255: what is beyond may stay the same without a fault
+_LIVELY = 0.2  # share of a part's pixels between these, from which on it has to change
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,6 +36,13 @@ class RgbdImage:
     color: NDArray
     depth: NDArray | None
     camera: CameraIntrinsics
+
+
+class StampedImage(NamedTuple):
+    """A whole image and its exact stamp [ns]."""
+
+    stamp: int
+    image: RgbdImage
 
 
 def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | None = None) -> NDArray:
@@ -104,7 +115,7 @@ def lie_inside(image: RgbdImage, pixels: NDArray) -> NDArray:
 
 
 class ImageWatch:
-    """Notices a camera that gives black pictures, or the same one again and again."""
+    """Notices a camera that gives black pictures, or the same one, or the same part of one, again and again."""
 
     def __init__(self, frozen_after: int = 5) -> None:
         """Keeps after how many identical pictures in a row the camera counts as frozen."""
@@ -113,22 +124,21 @@ class ImageWatch:
 
     def reset(self) -> None:
         """Forget the last picture."""
-        self._last: NDArray | None = None
-        self._same = 0
+        self._color = self._depth = np.empty(0)
+        self._same, self._same_tiles, self._same_depth = 0, np.zeros((_TILES, _TILES), dtype=int), 0
 
     def check(self, image: RgbdImage) -> None:
         """Refuse a picture that shows nothing, or nothing new.
 
-        A real sensor has noise: two pictures are never alike, not even of a scene at rest.
+        A real sensor has noise: two pictures are never alike, not even of a scene at rest. A part of a picture that is
+        neither black nor white has some, too, and so has depth.
 
         Raises:
             BlackImageError: nearly all of the picture is black.
-            FrozenImageError: it is the same as the ones before.
+            FrozenImageError: it, a part of it, or the depth image is the same as the ones before.
         """
         seen = image.color[::_WATCHED_STEP, ::_WATCHED_STEP].copy()
-        is_same = self._last is not None and np.array_equal(seen, self._last)
-        self._same = self._same + 1 if is_same else 0
-        self._last = seen
+        self._count_same(seen, image.depth)
         brightest = float(np.percentile(seen.max(axis=2), _BRIGHTEST_PERCENT))
         if brightest < _DARKEST:
             raise BlackImageError(
@@ -139,3 +149,35 @@ class ImageWatch:
             raise FrozenImageError(
                 f"frozen camera: {self._same + 1} identical pictures; expected noise between them; restart the camera"
             )
+        frozen = self._same_tiles >= self._frozen_after
+        if frozen.any():
+            row, column = np.argwhere(frozen)[0] + 1
+            raise FrozenImageError(
+                f"frozen camera: {frozen.sum()} of {frozen.size} parts of the picture (the first in row {row}, column "
+                f"{column} of {_TILES}) are identical again and again; expected noise; restart the camera"
+            )
+        if self._same_depth >= self._frozen_after:
+            raise FrozenImageError(
+                f"frozen camera: {self._same_depth + 1} identical depth images, the colours change; expected noise "
+                "between them; restart the camera"
+            )
+
+    def _count_same(self, seen: NDArray, depth: NDArray | None) -> None:
+        """Count how often in a row the picture, its parts and the depth were what they had been before."""
+        is_known = seen.shape == self._color.shape
+        same = (seen == self._color).all(axis=2) if is_known else np.zeros(seen.shape[:2], dtype=bool)
+        lively = ((seen > _NEAR_BLACK) & (seen < _NEAR_WHITE)).all(axis=2)
+        self._same = self._same + 1 if same.all() else 0
+        for place in np.ndindex(_TILES, _TILES):
+            tile = tuple(
+                slice(number * size // _TILES, (number + 1) * size // _TILES)
+                for number, size in zip(place, same.shape, strict=True)
+            )
+            is_still = same[tile].size > 0 and same[tile].all() and lively[tile].mean() >= _LIVELY
+            self._same_tiles[place] = self._same_tiles[place] + 1 if is_still else 0
+        measured = np.empty(0) if depth is None else depth[::_WATCHED_STEP, ::_WATCHED_STEP].copy()
+        # a plain depth image, or one without any depth, is no camera's: it is refused for what it is
+        is_plain = len(np.unique(measured[np.isfinite(measured)])) < 2
+        is_same = not is_plain and np.array_equal(measured, self._depth, equal_nan=True)
+        self._same_depth = self._same_depth + 1 if is_same else 0
+        self._color, self._depth = seen, measured

@@ -22,8 +22,11 @@ from finforce_keypoints.localization import (
     look_along,
     rays_through,
 )
+from finforce_keypoints.reference_patch import ReferencePatch
 from finforce_keypoints.settings import DetectorSettings
 
+_LEAST_SEEN = 3  # points, or all there are: fewer likely ones are no jaw
+_LEAST_FOUND = 1 / 3  # share of the points that have to be likely where no jaw was known before
 REASONS = ("image", "likelihood", "depth", "workspace")
 
 
@@ -75,6 +78,7 @@ class JawLocalizer:
         """Prepare where to sample depth on the jaw."""
         self._settings = settings
         self._origin, self._track = OriginFinder(jaw, T_gripper_camera, settings), OriginTrack(settings)
+        self._patch = ReferencePatch(jaw)
         self._samples = build_side_samples(jaw, settings.window, settings.edge)
         self._rest = np.vstack((jaw.keypoints, jaw.reference_point))
         self._model = SideModel(
@@ -89,6 +93,7 @@ class JawLocalizer:
     def reset(self) -> None:
         """Forget where the jaw was."""
         self._track.reset()
+        self._patch.reset()
 
     @property
     def is_lost(self) -> bool:
@@ -115,6 +120,10 @@ class JawLocalizer:
         rays = rays_through(np.where(inside[:, None], finding.pixels, np.nan), image.camera)
         ray_stddev = finding.stddev / np.sqrt(image.camera.fx * image.camera.fy)
         measured = self._origin.measure(np.where(likely[:, None], rays, np.nan), ray_stddev)
+        if not self._is_there(likely):
+            measured = None
+        if measured is not None and likely[-1]:
+            measured = self._patch.refine(image.color, image.camera, measured, self._origin.place)
         origin = self._track.update(image.stamp, measured)
         if origin is None:
             return None
@@ -139,6 +148,11 @@ class JawLocalizer:
             reasons=reasons,
         )
         return Located(keypoints=keypoints, scale=side.fit.scale)
+
+    def _is_there(self, likely: NDArray) -> bool:
+        """Say whether enough of the points (K + 1,) bool are likely for a jaw, more of them for one that was lost."""
+        least = min(_LEAST_SEEN, len(likely))
+        return likely.sum() >= (max(least, _LEAST_FOUND * len(likely)) if self.is_lost else least)
 
     def _find_likely(self, image: RgbdImage, finding: PixelFinding) -> NDArray:
         """Return which points (K + 1,) bool the finder believes in."""

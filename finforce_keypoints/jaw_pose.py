@@ -13,6 +13,7 @@ from finforce_keypoints.settings import DetectorSettings
 
 _BENT_AT = 0.010  # height for which the bending is given [m]
 _HIGHEST_RIGID = 3.5e-3  # key points that bend more than this say nothing about the jaw's place [m]
+_LEAST_AGREEMENT = 0.6  # share of the points near the base that stand where the jaw is said to be: of a jaw, all do
 _SET_ASIDE = 3  # consecutive places off the course that are believed when they agree
 _LONGEST_STEP = 0.5  # [s] without an image, after which the course starts anew
 
@@ -59,6 +60,7 @@ class OriginFinder:
         """Return the origin that rays show, None when they show none within the opening range.
 
         The reference point decides; without it, the key points near the clamped base do, less exactly as they bend.
+        What most of them contradict is no jaw.
 
         Args:
             rays: (K + 1, 3) through the jaw's points, camera frame, z = 1; NaN: not seen.
@@ -68,7 +70,8 @@ class OriginFinder:
         with np.errstate(invalid="ignore"):
             fits = (off <= self._tolerance) & (x >= self._low) & (x <= self._high) & np.isfinite(self._bent)
         if fits[-1]:
-            return Origin(x=float(x[-1]), stddev=float(error[-1]))
+            origin = Origin(x=float(x[-1]), stddev=float(error[-1]))
+            return origin if self._agrees(origin, x, off) else None
         if fits.sum() < 2:
             return None
         x, error, bent = x[fits], error[fits], self._bent[fits]
@@ -76,6 +79,14 @@ class OriginFinder:
         # bent points do not err independently: what they share is no smaller than the least bending
         spread = np.sqrt(1.0 / weights.sum() + bent.min() ** 2)
         return Origin(x=float(weights @ x / weights.sum()), stddev=float(spread))
+
+    def _agrees(self, origin: Origin, x: NDArray, off: NDArray) -> bool:
+        """Say whether the points near the base, by origins (K + 1,) and distances (K + 1,), are of a jaw there."""
+        near = np.isfinite(x) & np.isfinite(self._bent)
+        near[-1] = False
+        bent = self._bent[near]
+        there = (np.abs(x[near] - origin.x) <= self._tolerance + 3.0 * bent) & (off[near] <= self._tolerance + bent)
+        return bool(there.sum() >= _LEAST_AGREEMENT * near.sum())
 
     def _solve(self, rays: NDArray, stddev: NDArray) -> NDArray:
         """Return rows (3, K + 1): origin, its standard deviation, distance of the line of motion from the ray [m]."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import prod
 from numbers import Real
 from pathlib import Path
+from reprlib import repr as shorten
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,9 @@ from finforce_keypoints.errors import ModelError
 METADATA_FILE = "pytorch_config.yaml"
 LOCREF_STD = 7.2801  # DeepLabCut's default scale of its offset channels [px]
 _PREDICTOR = "HeatmapPredictor"
+_BEYOND = 1e30  # no number of a configuration is so large; NaN is not below it
 _HEAD = "model.heads.bodypart"
+LARGEST_SIDE = 4096  # px of a picture: more is a mistake, and takes gigabytes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,9 +66,20 @@ class ModelMetadata:
         if size is None:
             return None
         numbers = [size.get("height"), size.get("width")] if isinstance(size, Mapping) else []
-        if len(numbers) != 2 or not all(isinstance(n, int) and n > 0 for n in numbers):
-            raise ModelError(f"finforce.training_size: got {size!r}, expected {{height: px, width: px}}")
+        if len(numbers) != 2 or not all(type(n) is int and 0 < n <= LARGEST_SIDE for n in numbers):
+            raise ModelError(
+                f"finforce.training_size: got {shorten(size)}, expected {{height: px, width: px}} up to {LARGEST_SIDE}"
+            )
         return numbers[0], numbers[1]
+
+    @property
+    def pooled(self) -> bool:
+        """Whether the offsets around a peak are averaged (`finforce: pooled`).
+
+        Raises:
+            ModelError: it is neither true nor false.
+        """
+        return _look_up(self.extra, "pooled", bool, False)
 
     @property
     def likelihood_stddev(self) -> NDArray | None:
@@ -85,15 +100,15 @@ def check_stddev_table(rows: Any) -> NDArray:
     """
     try:
         table = np.array(rows, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         table = np.empty(0)
     if table.ndim != 2 or table.shape[1] != 2 or len(table) < 1 or not np.isfinite(table).all():
-        raise ModelError(f"finforce.likelihood_stddev: got {rows!r}, expected rows of [likelihood, stddev px]")
+        raise ModelError(f"finforce.likelihood_stddev: got {shorten(rows)}, expected rows of [likelihood, stddev px]")
     likelihood, stddev = table.T
     if (np.diff(likelihood) <= 0.0).any() or likelihood[0] < 0.0 or likelihood[-1] > 1.0 or (stddev <= 0.0).any():
         raise ModelError(
-            f"finforce.likelihood_stddev: got {table.tolist()}, expected likelihoods that rise from 0 to 1 and "
-            "positive standard deviations [px]"
+            f"finforce.likelihood_stddev: got {shorten(table.tolist())}, expected likelihoods that rise from 0 to "
+            "1 and positive standard deviations [px]"
         )
     return table
 
@@ -110,9 +125,10 @@ def read_metadata(path: str | Path) -> ModelMetadata:
     path = Path(path)
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
         raise ModelError(
-            f"{path}: cannot be read ({error}); expected DeepLabCut's {METADATA_FILE} beside the network, which alone "
+            f"{path}: cannot be read ({reason}); expected DeepLabCut's {METADATA_FILE} beside the network, which alone "
             "knows the body parts"
         ) from error
     try:
@@ -169,9 +185,9 @@ def _check_method(content: Mapping) -> None:
 def _parse_bodyparts(content: Mapping) -> tuple[str, ...]:
     """Return the names of the body parts, all different."""
     names = _look_up(content, "metadata.bodyparts", list, [])
-    if not names or not all(isinstance(name, str) for name in names):
-        raise ModelError(f"metadata.bodyparts: got {names!r}, expected the list of the body parts' names")
-    doubled = sorted({name for name in names if names.count(name) > 1})
+    if not names or not all(isinstance(name, str) and name.strip() and name.isprintable() for name in names):
+        raise ModelError(f"metadata.bodyparts: got {shorten(names)}, expected the list of the body parts' names")
+    doubled = sorted(name for name, count in Counter(names).items() if count > 1)
     if doubled:
         raise ModelError(f"metadata.bodyparts: {', '.join(doubled)} more than once, expected each name once")
     return tuple(names)
@@ -191,8 +207,11 @@ def _parse_divisors(content: Mapping) -> tuple[int, int]:
         return 1, 1
     height = _look_up(content, f"{padding}.pad_height_divisor", int, 1)
     width = _look_up(content, f"{padding}.pad_width_divisor", int, 1)
-    if height < 1 or width < 1:
-        raise ModelError(f"{padding}: got divisors {height} and {width}, expected positive whole numbers")
+    if not 1 <= min(height, width) <= max(height, width) <= LARGEST_SIDE:
+        raise ModelError(
+            f"{padding}: got divisors {shorten(height)} and {shorten(width)}, expected whole numbers from 1 to "
+            f"{LARGEST_SIDE}"
+        )
     return height, width
 
 
@@ -202,9 +221,10 @@ def _parse_stride(content: Mapping) -> float | None:
     if stride is None:
         return None
     steps = _look_up(content, f"{_HEAD}.heatmap_config.strides", list, [])
-    if stride <= 0 or not all(isinstance(step, Real) and step > 0 for step in steps):
+    if stride <= 0 or not all(is_number(step) and 1e-3 < step < 1e3 for step in steps):
         raise ModelError(
-            f"model.backbone.output_stride {stride}, heatmap_config.strides {steps}: expected positive numbers"
+            f"model.backbone.output_stride {shorten(stride)}, heatmap_config.strides {shorten(steps)}: expected "
+            "positive numbers"
         )
     return float(stride) / prod(steps)
 
@@ -214,11 +234,15 @@ def _look_up(content: Mapping, place: str, kind: type, default: Any) -> Any:
     value: Any = content
     for key in place.split("."):
         if not isinstance(value, Mapping):
-            raise ModelError(f"{place}: got {value!r} on the way there, expected a table")
+            raise ModelError(f"{place}: got {shorten(value)} on the way there, expected a table")
         value = value.get(key)
         if value is None:
             return default
-    is_flag_for_number = isinstance(value, bool) and kind in (int, Real)
-    if not isinstance(value, kind) or is_flag_for_number:
-        raise ModelError(f"{place}: got {value!r}, expected {'a number' if kind is Real else kind.__name__}")
+    if not isinstance(value, kind) or (kind in (int, Real) and not is_number(value)):
+        raise ModelError(f"{place}: got {shorten(value)}, expected {'a number' if kind is Real else kind.__name__}")
     return value
+
+
+def is_number(value: Any) -> bool:
+    """Say whether a value is a finite number, neither a flag nor a whole number beyond all floats."""
+    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) < _BEYOND

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from finforce_keypoints.decoding import DEFAULT_STDDEV, DecodingRule, Peaks, decode, stride_from_shapes
 from finforce_keypoints.errors import DetectionError, ModelError
-from finforce_keypoints.metadata import METADATA_FILE, ModelMetadata, read_metadata
+from finforce_keypoints.metadata import LARGEST_SIDE, METADATA_FILE, ModelMetadata, read_metadata
 from finforce_keypoints.network import COLOURS, CPU, Network, OutputLayout, find_outputs
 
 # ImageNet's, which DeepLabCut takes off
@@ -50,6 +50,8 @@ class ModelOverrides:
         numbers = [value for value in (self.stride, self.locref_std, *(self.input_size or ())) if value is not None]
         if not all(np.isfinite(value) and value > 0 for value in numbers):
             raise ModelError(f"overrides {self}: expected positive stride, locref_std and input_size [px]")
+        if max(self.input_size or (0,)) > LARGEST_SIDE:
+            raise ModelError(f"input_size {self.input_size}: expected at most {LARGEST_SIDE} px each way")
 
 
 class KeypointModel:
@@ -131,6 +133,10 @@ class KeypointModel:
             DetectionError: it is no batch of colour pictures, or the network is frozen to another size.
         """
         heatmap, locref = self._outputs.split(self._network.run(self.preprocess(batch)))
+        if len(heatmap) != len(batch):
+            raise DetectionError(
+                f"the network made maps {heatmap.shape} of {len(batch)} pictures; expected one set each"
+            )
         return heatmap, locref if self.metadata.location_refinement else None
 
     def locate(self, batch: NDArray) -> Peaks:
@@ -197,14 +203,17 @@ class KeypointModel:
             locref_std=_first(chosen.locref_std, metadata.locref_std),
             apply_sigmoid=_first(chosen.apply_sigmoid, metadata.apply_sigmoid),
             sub_cell=_first(chosen.sub_cell, True),
-            pooled=_first(chosen.pooled, bool(metadata.extra.get("pooled", False))),
+            pooled=_first(chosen.pooled, metadata.pooled),
             likelihood_stddev=_first(metadata.likelihood_stddev, DEFAULT_STDDEV),
         )
 
     def _probe(self) -> OutputLayout:
         """Return the layout of the outputs after a try with a grey picture."""
         height, width = self.training_size or (_PROBE, _PROBE)
-        batch = np.full((1, self.frozen_size[0] or height, self.frozen_size[1] or width, COLOURS), 128, np.uint8)
+        size = self.frozen_size[0] or height, self.frozen_size[1] or width
+        if max(self._pad_size(size)) > LARGEST_SIDE:
+            raise ModelError(f"pictures of {size[0]}x{size[1]} px, expected at most {LARGEST_SIDE} px each way")
+        batch = np.full((1, *size, COLOURS), 128, np.uint8)
         tensor = self.preprocess(batch)
         arrays = self._network.run(tensor)
         shapes = [(name, array.shape) for name, array in zip(self._network.output_names, arrays, strict=True)]
@@ -215,6 +224,8 @@ class KeypointModel:
                 "predictor.location_refinement: false"
             )
         heatmap, _ = layout.split(arrays)
+        if len(heatmap) != 1:
+            raise ModelError(f"the network made maps {heatmap.shape} of one picture; expected one set for each picture")
         self.find_rule(self._pad_size(batch.shape[1:3]), heatmap.shape[2:])
         return layout
 
@@ -267,9 +278,14 @@ def find_network(path: str | Path) -> Path:
         ModelError: there is none, or there are several.
     """
     path = Path(path)
-    if path.is_file():
-        return path
-    found = sorted(path.glob("*.onnx"))
+    try:
+        if path.is_file():
+            return path
+        found = sorted(path.glob("*.onnx"))
+    except OSError as error:
+        raise ModelError(
+            f"model: cannot be looked for ({error.strerror}); expected a folder with one .onnx file"
+        ) from error
     if len(found) != 1:
         names = ", ".join(file.name for file in found) or "none"
         raise ModelError(f"{path}: expected a folder with one .onnx file and {METADATA_FILE}, found {names}")

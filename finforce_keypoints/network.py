@@ -58,15 +58,29 @@ class OutputLayout:
     count: int
 
     def split(self, outputs: Sequence[NDArray]) -> tuple[NDArray, NDArray | None]:
-        """Return the heatmaps (B, K, h, w) and the offsets (B, 2K, h, w) or None, float32, of the outputs."""
-        heatmap = self._move_channels(outputs[self.heatmap])
-        if self.locref is None:
-            return heatmap, None
+        """Return the heatmaps (B, K, h, w) and the offsets (B, 2K, h, w) or None, float32, of the outputs.
+
+        Raises:
+            DetectionError: they are not of these shapes; a network may make others of other pictures.
+        """
+        heatmap, locref = self._move_channels(outputs[self.heatmap]), None
         if self.locref == self.heatmap:
-            return heatmap[:, : self.count], heatmap[:, self.count :]
-        return heatmap, self._move_channels(outputs[self.locref])
+            heatmap, locref = heatmap[:, : self.count], heatmap[:, self.count :]
+        elif self.locref is not None:
+            locref = self._move_channels(outputs[self.locref])
+        batch, count, *cells = heatmap.shape
+        is_odd = locref is not None and locref.shape != (batch, 2 * self.count, *cells)
+        if count != self.count or 0 in heatmap.shape or is_odd:
+            offsets = None if locref is None else locref.shape
+            raise DetectionError(
+                f"heatmaps {heatmap.shape} and offsets {offsets}; expected {self.count} and {2 * self.count} maps of "
+                "the same number of cells"
+            )
+        return heatmap, locref
 
     def _move_channels(self, maps: NDArray) -> NDArray:
+        if maps.ndim != 4:
+            raise DetectionError(f"output of shape {maps.shape}; expected maps (batch, parts, h, w)")
         return np.moveaxis(maps, self.channel_axis, 1).astype(np.float32, copy=False)
 
 
@@ -100,7 +114,9 @@ class Network:
         try:
             self._session = runtime.InferenceSession(str(path), options, providers=list(providers))
         except Exception as error:  # onnxruntime has no base class of its errors
-            raise ModelError(f"{path}: onnxruntime cannot load it ({error}); expected an ONNX network") from error
+            raise ModelError(
+                f"{path}: onnxruntime cannot load it ({_on_one_line(error)}); expected an ONNX network"
+            ) from error
         self.input = find_input([(item.name, item.shape, item.type) for item in self._session.get_inputs()])
         self.output_names = tuple(item.name for item in self._session.get_outputs())
 
@@ -122,9 +138,19 @@ class Network:
 
     def _run_once(self, tensor: NDArray) -> list[NDArray]:
         try:
-            return self._session.run(None, {self.input.name: tensor})
+            outputs = self._session.run(None, {self.input.name: tensor})
         except Exception as error:  # as above
-            raise DetectionError(f"the network cannot be computed for an input of {tensor.shape}: {error}") from error
+            raise DetectionError(
+                f"the network cannot be computed for an input of {tensor.shape}: {_on_one_line(error)}"
+            ) from error
+        strange = [
+            name
+            for name, output in zip(self.output_names, outputs, strict=True)
+            if not isinstance(output, np.ndarray) or output.dtype.kind not in "fiu"
+        ]
+        if strange:
+            raise DetectionError(f"the network's outputs {strange} are no arrays of numbers, expected heatmaps")
+        return outputs
 
 
 def find_input(inputs: Sequence[tuple]) -> InputLayout:
@@ -209,6 +235,10 @@ def _refuse_other_ranks(shapes: Sequence[tuple[str, tuple[int, ...]]]) -> None:
     raise ModelError(
         f"outputs {list(shapes)}: {hint}expected heatmaps (batch, parts, h, w); export a network with a heatmap head"
     )
+
+
+def _on_one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def _frozen(size: int | str | None) -> int | None:

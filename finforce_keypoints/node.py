@@ -16,9 +16,10 @@ from sensor_msgs.msg import CameraInfo, Image
 import finforce_ros as ros
 from finforce_health import Health, Outcome, Report, StampGate
 from finforce_ifea.errors import FinforceError
-from finforce_keypoints.camera_feed import CameraFeed, StampedImage
+from finforce_keypoints.camera_feed import CameraFeed
 from finforce_keypoints.dot_image import DotSettings
 from finforce_keypoints.finders import BuiltDetector, build_detector
+from finforce_keypoints.images import StampedImage
 from finforce_keypoints.outputs import DetectorOutputs
 from finforce_keypoints.parameters import DetectorParameters, load_jaws
 from finforce_keypoints.report import describe, outcome_of_keypoints
@@ -52,7 +53,7 @@ class KeypointDetectorNode(Node):
         self.detector, self.card = build(jaws, parameters, settings, dots)
         self.feed = CameraFeed(parameters)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
-        source, age = parameters.color_topics[0], parameters.max_age
+        source, age = self.feed.source, parameters.max_age
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}
         self.qos = ros.QosWatch(self)
@@ -81,9 +82,12 @@ class KeypointDetectorNode(Node):
         }
 
     def _on_color(self, topic: str, message: Image) -> None:
-        """Take the newest colour image."""
+        """Take the newest colour image of the camera's topic."""
         message, superseded = ros.take_newest(self.colors[topic].current, message)
+        if not self.feed.listens(topic):
+            return
         for health in self.health.values():
+            health.source = self.feed.source
             health.arrive(superseded)
         self._take(partial(self.feed.take_color, topic), message)
 

@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import finforce_ros as ros
+from finforce_contact.poses import pose_numbers
+from finforce_keypoints.jaw_localizer import REASONS
 from finforce_keypoints.overlay import draw_keypoints
-from finforce_keypoints.parameters import DetectorParameters, pose_numbers
+from finforce_keypoints.parameters import DetectorParameters
 from finforce_keypoints.report import build_skeleton, describe_names
 
 if TYPE_CHECKING:
-    from finforce_keypoints.camera_feed import StampedImage
     from finforce_keypoints.detector import JawKeypoints
     from finforce_keypoints.finders import FinderCard
+    from finforce_keypoints.images import StampedImage
 
 
 class DetectorOutputs:
@@ -68,5 +70,11 @@ def keypoint_columns(found: JawKeypoints) -> dict[str, NDArray]:
         "u": u,
         "v": v,
         "valid": np.asarray(found.valid, dtype=np.uint8),
+        "reason": reason_codes(found.reasons),
         **dict(zip(("stddev_x", "stddev_y", "stddev_z"), stddev, strict=True)),
     }
+
+
+def reason_codes(reasons: NDArray) -> NDArray[np.uint8]:
+    """Return why key points (K,) are refused as numbers: 0 for one that is used, else its place in `REASONS` from 1."""
+    return np.select([reasons == reason for reason in REASONS], range(1, len(REASONS) + 1), default=0).astype(np.uint8)

@@ -23,11 +23,16 @@ LINE = (250, 230, 60)
 
 
 def draw_keypoints(
-    color: NDArray[np.uint8], jaws: Iterable[JawKeypoints], skeleton: Sequence[Sequence[int]] = ()
+    color: NDArray[np.uint8],
+    jaws: Iterable[JawKeypoints],
+    skeleton: Sequence[Sequence[int]] = (),
+    *,
+    radius: float = RADIUS,
 ) -> NDArray[np.uint8]:
     """Return a copy of a picture (h, w, 3) with a disc per key point, and lines between used neighbours.
 
     Green is used; red, blue, orange and grey say why not: likelihood, depth, workspace, outside the image.
+    `radius` is that of the discs [px]; a quarter of it stays free.
     """
     picture = color.copy()
     for jaw in jaws:
@@ -36,7 +41,7 @@ def draw_keypoints(
                 _draw_line(picture, jaw.pixels[one], jaw.pixels[other])
         for pixel, reason in zip(jaw.pixels, jaw.reasons, strict=True):
             if np.isfinite(pixel).all():
-                _draw_disc(picture, pixel, COLORS.get(str(reason), COLORS["image"]))
+                _draw_disc(picture, pixel, COLORS.get(str(reason), COLORS["image"]), radius)
     return picture
 
 
@@ -46,12 +51,12 @@ def _draw_line(picture: NDArray[np.uint8], start: NDArray, end: NDArray) -> None
     _paint(picture, np.linspace(start, end, count), LINE)
 
 
-def _draw_disc(picture: NDArray[np.uint8], pixel: NDArray, color: Sequence[int]) -> None:
+def _draw_disc(picture: NDArray[np.uint8], pixel: NDArray, color: Sequence[int], radius: float) -> None:
     """Colour a disc with a dark rim about a pixel (2,), column and row; its centre stays as it was."""
-    reach = int(RADIUS)
+    reach = int(radius)
     columns, rows = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
     distance = np.hypot(columns, rows)
-    for near, far, shade in ((RADIUS - 1.0, RADIUS, (0, 0, 0)), (1.0, RADIUS - 1.0, color)):
+    for near, far, shade in ((radius - 1.0, radius, (0, 0, 0)), (0.25 * radius, radius - 1.0, color)):
         ring = (distance > near) & (distance <= far)
         _paint(picture, np.stack((columns[ring], rows[ring]), axis=-1) + pixel, shade)
 

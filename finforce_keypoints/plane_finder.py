@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from finforce_camera import CameraIntrinsics
 from finforce_keypoints.errors import ModelError
 from finforce_keypoints.finder import REFERENCE, PixelFinding
-from finforce_keypoints.gripper_geometry import jaw_in_camera
-from finforce_keypoints.plane_picture import PlaneGrid, map_picture, project_plane, take_picture
+from finforce_keypoints.gripper_geometry import OpeningRange
+from finforce_keypoints.plane_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw import Jaw
@@ -24,14 +24,6 @@ if TYPE_CHECKING:
 SAME_PLACE = 0.2e-3  # [m] by which a jaw may move before its picture is mapped anew
 SEARCH_STEP = 10e-3  # [m] between the places where a lost jaw is looked for
 LEAST_SCORE = 0.35  # mean likelihood of a jaw's points, below which it is not there
-
-
-@dataclass(frozen=True, kw_only=True)
-class OpeningRange:
-    """How far from the middle of the gripper a jaw's origin can be along the closing axis [m]."""
-
-    nearest: float = 0.010
-    farthest: float = 0.070
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,13 +57,10 @@ class PlaneFinder:
         T_gripper_camera: NDArray,
         opening: OpeningRange | None = None,
     ) -> None:
-        opening = opening or OpeningRange()
-        self._model, self._T_gripper_camera = model, T_gripper_camera
+        self._model, self._T_gripper_camera, self._opening = model, T_gripper_camera, opening or OpeningRange()
         self._grid = grid_from_metadata(model.metadata.extra)
         self._order = {side: _order_names(model, jaw) for side, jaw in jaws.items()}
-        self._side_y = {side: float(jaw.keypoints[:, 1].mean()) for side, jaw in jaws.items()}
-        count = max(2, int(np.ceil((opening.farthest - opening.nearest) / SEARCH_STEP)) + 1)
-        self._search = np.linspace(opening.nearest, opening.farthest, count)
+        self._side_y = {side: find_side(jaw) for side, jaw in jaws.items()}
         self._kept: dict[str, _View] = {}
         self._camera: CameraIntrinsics | None = None
 
@@ -104,8 +93,8 @@ class PlaneFinder:
     def _views_of(self, side: str, pose: NDArray | None) -> list[_View]:
         """Return where to look for one jaw: where it is expected, or all along the closing axis."""
         if pose is None:
-            sign = -1.0 if side == "left" else 1.0
-            return [self._view(side, jaw_in_camera(self._T_gripper_camera, side, sign * x)) for x in self._search]
+            poses = self._opening.place_jaw(self._T_gripper_camera, side, SEARCH_STEP)
+            return [self._view(side, place) for place in poses]
         kept = self._kept.get(side)
         if kept is None or np.abs(kept.T_camera_jaw - pose).max() > SAME_PLACE:
             kept = self._kept[side] = self._view(side, pose)

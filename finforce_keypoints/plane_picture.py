@@ -7,11 +7,15 @@ and the row r of the picture are x = x_0 + c s and z = z_0 + r s on it; left and
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce_camera import CameraIntrinsics, project, rays_from_pixels
+
+if TYPE_CHECKING:
+    from finforce_ifea.jaw import Jaw
 
 COARSE = 4  # [px] between the places that are projected exactly; between them a line is right within 0.04 px
 
@@ -51,6 +55,11 @@ class PlaneGrid:
     def pixels(self, places: NDArray) -> NDArray:
         """Return the pixels (n, 2) of the picture at x and z (n, 2) [m]."""
         return (np.asarray(places, dtype=float) - (self.x, self.z)) / self.scale
+
+
+def find_side(jaw: Jaw) -> float:
+    """Return the y [m] of a jaw's side plane: the mean of its key points'."""
+    return float(jaw.keypoints[:, 1].mean())
 
 
 def project_plane(places: NDArray, side_y: float, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:

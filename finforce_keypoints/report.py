@@ -35,6 +35,7 @@ def describe(feed: CameraFeed, card: FinderCard, found: JawKeypoints | None) -> 
     camera = feed.camera
     known = {
         "finder": card.name,
+        "colour images": feed.topic or "none yet",
         "camera": "no camera_info yet" if camera is None else f"{camera.width} x {camera.height}",
         "overtaken while waiting for depth": str(feed.passed),
     }

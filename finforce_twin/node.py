@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import array
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from time import monotonic
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.executors import Executor
 from rclpy.node import Node
@@ -16,13 +14,13 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header, String
 
 import finforce_ros as ros
-from finforce_contact.poses import quaternion_from_pose
+from finforce_contact.poses import pose_numbers
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_twin.encoding import encode_depth, info_fields, sight_columns
 from finforce_twin.parameters import TwinParameters
 from finforce_twin.record import Footage, TwinFrame, build_footage, parse_size
 from finforce_twin.script import RATE
 
-CAMERA = "/camera/camera"
 TOLD_EVERY = 5.0  # s between two words on how far the rendering is
 
 
@@ -87,12 +85,11 @@ class TwinCameraNode(Node):
             yield self._output(PointCloud2, f"{side}/ground_truth_keypoints"), cloud
         header = Header(frame_id=self.parameters.camera_frame)
         if frame.T_camera_object is not None:
-            pose = (*frame.T_camera_object[:3, 3], *quaternion_from_pose(frame.T_camera_object))
-            yield self._output(PoseStamped, "object_pose"), ros.pose_message(header, pose)
-        yield self._output(CameraInfo, f"{CAMERA}/color/camera_info"), camera_info(header, self.footage)
-        depth = picture_message(header, "16UC1", encode_depth(frame.depth))
-        yield self._output(Image, f"{CAMERA}/aligned_depth_to_color/image_raw"), depth
-        yield self._output(Image, f"{CAMERA}/color/image_raw"), picture_message(header, "rgb8", frame.color)
+            pose = ros.pose_message(header, pose_numbers(frame.T_camera_object))
+            yield self._output(PoseStamped, "object_pose"), pose
+        yield self._output(CameraInfo, INFO_TOPIC), camera_info(header, self.footage)
+        yield self._output(Image, DEPTH_TOPIC), ros.image_message(header, encode_depth(frame.depth), "16UC1")
+        yield self._output(Image, COLOR_TOPIC), ros.image_message(header, frame.color)
 
     def _output(self, kind: type, topic: str) -> Any:
         """Return the publisher of a topic."""
@@ -107,13 +104,6 @@ def camera_info(header: Header, footage: Footage) -> CameraInfo:
     return CameraInfo(
         header=header, **{name: value.tolist() if hasattr(value, "tolist") else value for name, value in values.items()}
     )
-
-
-def picture_message(header: Header, encoding: str, pixels: np.ndarray) -> Image:
-    """Return pixels (h, w) or (h, w, 3) as an image."""
-    height, width = pixels.shape[:2]
-    data = array.array("B", np.ascontiguousarray(pixels).tobytes())  # an ndarray would be checked byte by byte
-    return Image(header=header, height=height, width=width, encoding=encoding, step=len(data) // height, data=data)
 
 
 def play_scene(node: TwinCameraNode, executor: Executor) -> None:

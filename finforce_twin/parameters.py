@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from finforce_records import parameter
 
 if TYPE_CHECKING:
     from finforce_twin.scenarios import Scenario
-
-
-def _parameter(default: Any, description: str, **metadata: Any) -> Any:
-    """Return a dataclass field that says what it is; `metadata` are unit, min, max and choices."""
-    return field(default=default, metadata={"description": description, **metadata})
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwinParameters:
     """What a twin camera node is told; units stand in the metadata."""
 
-    scene: str = _parameter("grasp_cylinder", "a name that `finforce twin list` prints")
-    seed: int = _parameter(0, "of textures, light and noise", min=0, max=2**31 - 1)
-    finger: int = _parameter(0, "seed of the jaws' material", min=0, max=2**31 - 1)
-    light: str = _parameter("", "bright or dim; empty: that of the scene")
-    object: str = _parameter("", "a shape by name, or a mesh file; empty: that of the scene")
-    size: str = _parameter("640x480", "of the images, WIDTHxHEIGHT [px]")
-    loop: bool = _parameter(True, "begin again at the end; else the node ends with the scene")
-    camera_frame: str = _parameter("camera_color_optical_frame", "frame of the images")
+    scene: str = parameter("grasp_cylinder", "a name that `finforce twin list` prints")
+    seed: int = parameter(0, "of textures, light and noise", min=0, max=2**31 - 1)
+    finger: int = parameter(0, "seed of the jaws' material", min=0, max=2**31 - 1)
+    light: str = parameter("", "bright, dim or any; empty: that of the scene")
+    object: str = parameter("", "a shape by name, or a mesh file; empty: that of the scene")
+    size: str = parameter("640x480", "of the images, WIDTHxHEIGHT [px]")
+    loop: bool = parameter(True, "begin again at the end; else the node ends with the scene")
+    camera_frame: str = parameter("camera_color_optical_frame", "frame of the images")
 
     @property
     def scenario(self) -> Scenario:

@@ -64,10 +64,11 @@ class FakePhotographer:
     """Noise for pictures; the last key point is hidden in every image."""
 
     black: tuple = ()
+    frozen: tuple = ()
     shots: int = 0
 
     def shoot(self, state):
-        rng = np.random.default_rng(round(1e6 * state.stamp))
+        rng = np.random.default_rng(0 if self.shots in self.frozen else round(1e6 * state.stamp) + 1)
         size = (CAMERA.height, CAMERA.width)
         patches = rng.integers(0, 255, (size[0] // 8, size[1] // 8, 3), dtype=np.uint8)
         color = patches.repeat(8, axis=0).repeat(8, axis=1)
@@ -106,6 +107,7 @@ class FakeKeypoints:
     valid: np.ndarray
     stddev: np.ndarray
     T_camera_jaw: np.ndarray
+    reasons: np.ndarray
 
 
 @dataclass
@@ -136,4 +138,5 @@ class FakeDetector:
             valid=np.array(self.accepted),
             stddev=np.full((KEYPOINTS, 3), 2e-4),
             T_camera_jaw=jaw_in_camera(BENCH_CAMERA, side, -0.055 if side == "left" else 0.055),
+            reasons=np.where(self.accepted, "", "likelihood"),
         )

@@ -1,12 +1,13 @@
 """Claims about the contact estimator that finds the object's pose itself, in depth images with masks."""
 
-from time import time_ns
+from time import sleep, time_ns
 
 import numpy as np
 import pytest
 from contact_node_fakes import CAMERA, MESH, ContactBench, call, cylinder_before_jaw, header, pose
 from geometry_msgs.msg import PoseStamped
 from node_fakes import ros_domain
+from rclpy.qos import ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 
@@ -67,13 +68,13 @@ def camera_info(stamp, camera):
 class TrackingBench(ContactBench):
     """A contact estimator that is fed with images."""
 
-    def __init__(self, probe, camera, **parameters):
+    def __init__(self, probe, camera, *, qos=ros.RESULT, **parameters):
         probe.hear("object_pose", PoseStamped)
         super().__init__(probe, pose_source="tracker", max_age=5.0, **parameters)
         self.camera = camera
         self.info = probe.speak(f"{CAMERA_TOPICS}/color/camera_info", CameraInfo)
-        self.depth = probe.speak(f"{CAMERA_TOPICS}/aligned_depth_to_color/image_raw", Image)
-        self.mask = probe.speak("object_mask", Image)
+        self.depth = probe.speak(f"{CAMERA_TOPICS}/aligned_depth_to_color/image_raw", Image, qos)
+        self.mask = probe.speak("object_mask", Image, qos)
         for out in (self.info, self.depth, self.mask):
             probe.connected(out)
         probe.wait_for(lambda: self.node.out.pose.get_subscription_count() == 1)
@@ -218,3 +219,35 @@ def test_a_mask_of_another_kind_is_refused(scene, encoding, word):
     message.height += 1
     with pytest.raises(ValueError, match=word):
         mask_from_image(message, CAMERA)
+
+
+def test_images_are_asked_for_reliably_and_those_of_best_effort_are_taken_too(probe, camera, scene):
+    bench = TrackingBench(probe, camera, qos=ros.SENSOR)
+    topics = (f"{CAMERA_TOPICS}/aligned_depth_to_color/image_raw", "/object_mask")
+
+    def reliability(topic):
+        return probe.get_subscriptions_info_by_topic(topic)[0].qos_profile.reliability
+
+    probe.wait_for(lambda: all(reliability(topic) == ReliabilityPolicy.BEST_EFFORT for topic in topics))
+    bench.see(scene, masked=True)
+    probe.wait_for(lambda: bench.poses)
+
+
+def test_large_images_come_again_where_their_publisher_keeps_them(probe, camera):
+    TrackingBench(probe, camera)
+    for topic in (f"{CAMERA_TOPICS}/aligned_depth_to_color/image_raw", "/object_mask"):
+        (heard,) = probe.get_subscriptions_info_by_topic(topic)
+        assert heard.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+
+def test_of_the_images_that_wait_only_the_newest_is_looked_at(probe, camera, scene):
+    bench = TrackingBench(probe, camera)
+    bench.see(scene, masked=True)
+    probe.wait_for(lambda: bench.poses)
+    stamps = [time_ns() + k * 1_000_000 for k in range(4)]
+    for stamp in stamps:
+        bench.depth.publish(depth_image(stamp, scene[0]))
+    sleep(0.1)  # until they have arrived
+    probe.wait_for(lambda: len(bench.poses) == 2)
+    probe.spin(0.2)
+    assert [ros.nanoseconds(found.header.stamp) for found in bench.poses[1:]] == stamps[-1:]

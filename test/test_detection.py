@@ -1,11 +1,13 @@
 """Claims about key points from the images of a recording, and how well they were seen."""
 
 import argparse
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from rgbd_fakes import FakeDetector, FakeGripper, FakePhotographer, make_footage
 
+from finforce_eval.cli import main
 from finforce_eval.commands import make_setup
 from finforce_eval.detection import awaiting_keypoints, detect_keypoints
 from finforce_eval.errors import OptionError, RecordingError
@@ -14,6 +16,7 @@ from finforce_eval.objects import track_object
 from finforce_eval.recording import read_recording
 from finforce_eval.sight_scoring import compare_sight, sight_stats
 from finforce_eval.twin_writer import write_footage
+from finforce_eval.writer import write_recording
 from finforce_keypoints.images import ImageWatch
 
 
@@ -37,6 +40,12 @@ def test_every_image_is_seen_once_in_order_and_its_key_points_take_their_place(r
     assert np.isnan(track.keypoints.points[:, 2:]).all()  # not valid: the solver gets no place
     np.testing.assert_array_equal(track.keypoints.stddev[:, 0], np.full((12, 3), 2e-4))
     assert track.detection.accepted.tolist() == [[True, True, False, False]] * 12
+
+
+def test_why_a_key_point_was_refused_is_kept(recording):
+    detection = detect(recording, lost=(4,))[0].jaws["left"].detection
+    assert detection.reasons[3].tolist() == ["", "", "likelihood", "likelihood"]
+    assert detection.reasons[4].tolist() == [""] * 4
 
 
 def test_an_image_without_the_jaw_has_no_key_points_and_no_pose(recording):
@@ -150,3 +159,83 @@ def test_key_points_of_two_jaws_come_in_one_pass(tmp_path):
 def test_the_set_up_needs_no_source():
     names = argparse.Namespace(jaw="bench", solver="default", mesh="default", contact=[], calibration=None)
     assert "images" in make_setup(names).about["keypoints"]
+
+
+class Watching(FakeDetector):
+    """Keeps the depth images that it is shown."""
+
+    def detect(self, image):
+        self.__dict__.setdefault("depths", []).append(image.depth)
+        return super().detect(image)
+
+
+def detect_with(recording, monkeypatch, *changes):
+    """The recording with its key points, and the detector that found them, as `--detector` CHANGES would have it."""
+    detector = Watching(recording)
+    monkeypatch.setattr(KeypointSource, "build", lambda source, recording: detector)
+    return parse_source(options(source="images", detector=list(changes))).apply(recording), detector
+
+
+@pytest.mark.parametrize(("changes", "seen"), [((), 12 - 3), (("frozen_after=1",), 12 - 4), (("frozen_after=9",), 12)])
+def test_a_camera_is_frozen_offline_when_it_is_in_the_node(tmp_path, monkeypatch, changes, seen):
+    photographer = FakePhotographer(frozen=(3, 4, 5, 6, 7))
+    recording = read_recording(write_footage(make_footage(photographer=photographer), tmp_path / "twin"))
+    found, detector = detect_with(recording, monkeypatch, *changes)
+    assert len(detector.stamps) == seen
+    assert any("frozen" in note for note in found.notes) == (seen < 12)
+
+
+def test_the_step_of_the_depth_image_is_that_of_the_parameter(recording, monkeypatch):
+    _, fine = detect_with(recording, monkeypatch, "depth_scale=0.0001")
+    _, plain = detect_with(recording, monkeypatch)
+    np.testing.assert_allclose(fine.depths, 0.1 * np.array(plain.depths), rtol=1e-6)
+
+
+def test_colour_and_depth_belong_together_as_the_parameter_says():
+    assert parse_source(options()).pairing == 8_000_000
+    assert parse_source(options(detector=["sync_tolerance=0.012"])).pairing == 12_000_000
+
+
+DECIDED = ("jaws=left", "jaw_file=steel", "camera_frame=cam", "color_topics=/a", "depth_topic=/b", "info_topic=/c")
+
+
+@pytest.mark.parametrize("change", DECIDED)
+def test_what_something_else_decides_is_refused_by_name(change):
+    with pytest.raises(OptionError, match=f"--detector {change.split('=')[0]}: cannot be set here"):
+        parse_source(options(detector=[change]))
+
+
+@pytest.mark.parametrize("name", ["max_age", "restart_gap", "diagnostics_period"])
+def test_what_needs_a_clock_is_refused_offline_and_reaches_the_node_of_a_replay(recording, name):
+    source = parse_source(options(source="images", detector=[f"{name}=0.5"]))
+    with pytest.raises(OptionError, match=f"--detector {name}: means nothing offline"):
+        source.apply(recording)
+    assert source.node_parameters(recording)[name] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ("finder=foo", "finder: got 'foo', expected one of network, frame, dots"),
+        ("apply_sigmoid=maybe", "apply_sigmoid: got 'maybe', expected one of auto, yes, no"),
+        ("threads=0", "threads: got 0, expected 1 to 64"),
+        ("detector.gate=9", "gate: got 9.0, expected"),
+        ("dots.kind=green", "kind: got 'green', expected"),
+        ("threads=many", "'many' is no int"),
+        ("treads=2", "unknown parameter; expected one of max_age"),
+    ],
+)
+def test_a_parameter_of_the_detector_that_cannot_be_is_one_line_and_two(capsys, change, reason):
+    for command in ("evaluate", "replay"):
+        assert main([command, "no_such_bag", "--from", "images", "--detector", change]) == 2
+        said = capsys.readouterr().err.strip().splitlines()
+        assert len(said) == 1 and "--detector" in said[0] and reason in said[0]
+
+
+def test_a_track_with_standard_deviations_comes_back_from_a_bag(recording, tmp_path):
+    found, _ = detect(recording)
+    plain = replace(found, images=None, case={})
+    track = read_recording(write_recording(plain, tmp_path / "bag")).jaws["left"].keypoints
+    for name in ("stamps", "points", "stddev"):
+        expected = getattr(found.jaws["left"].keypoints, name)
+        np.testing.assert_allclose(getattr(track, name), expected, rtol=1e-6)  # single precision

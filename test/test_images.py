@@ -13,15 +13,15 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.image_messages import (
     compress_depth,
     depth_from_message,
-    depth_millimetres,
+    depth_steps,
     encode_color,
 )
-from finforce_eval.images import COLOR, DEPTH, INFO
 from finforce_eval.objects import find_mesh
 from finforce_eval.playback import read_playback
 from finforce_eval.recording import read_recording
 from finforce_eval.twin_writer import ImageFactory, RecordingForm, _footage_entries, write_footage
 from finforce_eval.writer import MessageFactory, write_entries
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_twin.encoding import encode_depth
 
 FORMS = {
@@ -131,7 +131,7 @@ def test_a_part_in_time_has_the_images_of_that_time(written):
     assert [stamp for stamp, _ in part] == images.stamps[2:5].tolist()
 
 
-@pytest.mark.parametrize(("topic", "reason"), [(DEPTH, "aligned_depth_to_color"), (INFO, "camera_info")])
+@pytest.mark.parametrize(("topic", "reason"), [(DEPTH_TOPIC, "aligned_depth_to_color"), (INFO_TOPIC, "camera_info")])
 def test_images_without_depth_or_camera_info_are_refused(tmp_path, topic, reason):
     with pytest.raises(RecordingError, match=reason):
         read_recording(write_without(tmp_path / "bag", topic))
@@ -139,18 +139,27 @@ def test_images_without_depth_or_camera_info_are_refused(tmp_path, topic, reason
 
 def test_depth_that_is_always_late_is_refused_and_some_lost_depth_leaves_its_images_out(tmp_path):
     def late(entry):
-        if entry.topic == DEPTH:
+        if entry.topic == DEPTH_TOPIC:
             entry.message.header.stamp.nanosec += 9_000_000
         return entry
 
     def lost(entry):
-        is_fifth = entry.topic == DEPTH and entry.stamp == list(make_footage())[5].stamp
+        is_fifth = entry.topic == DEPTH_TOPIC and entry.stamp == list(make_footage())[5].stamp
         return None if is_fifth else entry
 
-    with pytest.raises(RecordingError, match="no depth image"):
-        read_recording(write_without(tmp_path / "late", edit=separate_headers(late)))
+    folder = write_without(tmp_path / "late", edit=separate_headers(late))
+    with pytest.raises(RecordingError, match="no depth image .* within 8 ms"):
+        read_recording(folder)
+    assert len(read_recording(folder, pairing=9_000_000).images) == 12
     images = read_recording(write_without(tmp_path / "lost", edit=lost)).images
     assert images.unpaired == 1 and len(list(images)) == 11
+
+
+def test_images_without_any_topic_of_a_jaw_are_refused_with_what_would_do(tmp_path):
+    own = [f"/left/{name}" for name in ("ground_truth_wrench", "ground_truth_keypoints", "ground_truth_jaw_pose")]
+    with pytest.raises(RecordingError, match="no topic tells which jaws.*/left/ground_truth_wrench.*images:=true"):
+        read_recording(write_without(tmp_path / "bag", *own))
+    assert set(read_recording(write_without(tmp_path / "measured", *own[1:])).jaws) == {"left"}
 
 
 def separate_headers(edit):
@@ -158,7 +167,7 @@ def separate_headers(edit):
     factory = MessageFactory()
 
     def edited(entry):
-        if entry.topic == DEPTH:
+        if entry.topic == DEPTH_TOPIC:
             entry.message.header = factory.header(entry.stamp, entry.message.header.frame_id)
         return edit(entry)
 
@@ -171,7 +180,7 @@ def separate_headers(edit):
 )
 def test_a_colour_image_that_cannot_be_read_is_named_with_its_time(tmp_path, field, value, reason):
     def edit(entry):
-        if entry.topic == COLOR:
+        if entry.topic == COLOR_TOPIC:
             setattr(entry.message, field, value)
         return entry
 
@@ -184,7 +193,7 @@ def test_a_camera_that_changes_is_refused(tmp_path):
     seen = []
 
     def edit(entry):
-        if entry.topic == INFO:
+        if entry.topic == INFO_TOPIC:
             seen.append(entry)
             entry.message.k[0] += 1.0 if len(seen) > 5 else 0.0
         return entry
@@ -198,7 +207,7 @@ def test_depth_images_survive_packing_and_others_are_refused():
     steps = encode_depth(depth)
     assert steps.tolist() == [[70, 500, 0], [65535, 0, 0]]
     packed = Message(format="16UC1; compressedDepth png", data=compress_depth(steps))
-    np.testing.assert_array_equal(depth_millimetres(packed), steps)
+    np.testing.assert_array_equal(depth_steps(packed), steps)
     bare = Message(format="png", data=compress_depth(steps)[12:])
     np.testing.assert_allclose(depth_from_message(bare), [[0.07, 0.5, np.nan], [65.535, np.nan, np.nan]])
     grey = Message(format="png", data=encode_color(np.zeros((2, 2, 3), np.uint8), "png"))
@@ -214,14 +223,16 @@ def test_compressed_images_are_played_as_plain_ones_under_the_names_the_nodes_li
 
     folder = write_footage(make_footage(), tmp_path / "twin")
     played = list(read_playback(folder))
-    color = [deserialize_message(message.data, Image) for message in played if message.topic == COLOR]
-    depth = [deserialize_message(message.data, Image) for message in played if message.topic == DEPTH]
+    color = [deserialize_message(message.data, Image) for message in played if message.topic == COLOR_TOPIC]
+    depth = [deserialize_message(message.data, Image) for message in played if message.topic == DEPTH_TOPIC]
     frames = list(make_footage())
     assert len(color) == len(depth) == len(frames)
     assert {(image.encoding, image.width, image.height, image.step) for image in depth} == {("16UC1", 64, 48, 128)}
     assert {(image.encoding, image.step) for image in color} == {("rgb8", 192)}
     np.testing.assert_array_equal(np.frombuffer(depth[3].data, "<u2").reshape(48, 64), encode_depth(frames[3].depth))
-    assert {message.msgtype for message in played if message.topic in (COLOR, DEPTH)} == {"sensor_msgs/msg/Image"}
+    assert {message.msgtype for message in played if message.topic in (COLOR_TOPIC, DEPTH_TOPIC)} == {
+        "sensor_msgs/msg/Image"
+    }
 
 
 def test_footage_that_breaks_off_leaves_no_recording(tmp_path):
@@ -248,6 +259,6 @@ def test_key_points_that_were_recorded_do_not_need_whole_images(tmp_path):
     factory = MessageFactory()
     entries = sorted(recording_entries(recording, factory), key=lambda entry: entry.stamp)
     footage = _footage_entries(make_footage(), ImageFactory(factory, FORMS["raw"]), lambda frame: None)
-    colors = [entry for entry in footage if entry.topic == COLOR]
+    colors = [entry for entry in footage if entry.topic == COLOR_TOPIC]
     read = read_recording(write_entries([*entries, *colors], tmp_path / "bag", factory))
     assert read.images is None and any("aligned_depth" in note for note in read.notes)

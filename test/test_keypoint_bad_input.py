@@ -4,9 +4,11 @@ from time import time_ns
 
 import numpy as np
 import pytest
-from keypoint_node_fakes import HEIGHT, MILLISECOND, TOPICS, WIDTH, CameraBench, camera_info
+from keypoint_node_fakes import HEIGHT, MILLISECOND, OLD_COLOR, TOPICS, WIDTH, CameraBench, camera_info
 from node_fakes import ros_domain
+from sensor_msgs.msg import Image
 
+import finforce_keypoints.camera_feed as camera_feed
 from finforce_health import Level
 
 PERIOD = 33 * MILLISECOND
@@ -186,3 +188,31 @@ def test_a_camera_that_falls_silent_is_noticed(probe):
 def test_a_camera_that_never_speaks_is_named(probe):
     bench = CameraBench(probe)
     bench.diagnosis(level=Level.STALE, word=TOPICS.color_topics[0])
+
+
+def speaks_on_another_topic(probe):
+    """A camera that was heard, and has the other name from now on."""
+    bench = CameraBench(probe)
+    recovers(bench)
+    bench.color_out = probe.speak(OLD_COLOR, Image)
+    probe.connected(bench.color_out)
+    return bench
+
+
+def test_a_camera_that_restarts_under_the_other_name_is_heard_and_named(probe, monkeypatch):
+    monkeypatch.setattr(camera_feed, "SILENCE", 0.0)
+    bench = speaks_on_another_topic(probe)
+    bench.shoot()
+    bench.wait_for_clouds(2)
+    state = bench.diagnosis(level=Level.STALE, word=f"nothing has arrived on {OLD_COLOR}")
+    assert {entry.key: entry.value for entry in state.values}["colour images"] == OLD_COLOR
+
+
+def test_images_of_the_topic_that_is_not_listened_to_hide_no_silence(probe, monkeypatch):
+    monkeypatch.setattr(camera_feed, "SILENCE", 1e9)
+    bench = speaks_on_another_topic(probe)
+    probe.got["/diagnostics"].clear()
+    for _ in range(15):  # more than max_age
+        bench.color(time_ns())
+    bench.diagnosis(level=Level.STALE, word=f"nothing has arrived on {TOPICS.color_topics[0]}")
+    assert len(bench.clouds()) == 1

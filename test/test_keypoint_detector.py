@@ -6,7 +6,7 @@ import pytest
 from keypoint_scene_fakes import CAMERA, Bend, FakeFinder, FakeScene, bare_image
 
 from finforce_camera import ImageError, compute_rays
-from finforce_keypoints.detector import KeypointDetector
+from finforce_keypoints.detector import KeypointDetector, check_reference
 from finforce_keypoints.errors import DetectionError, GeometryError, ImageOrderError
 from finforce_keypoints.finder import PixelFinding
 from finforce_keypoints.gripper_geometry import jaw_in_camera
@@ -269,3 +269,19 @@ def test_random_findings_never_give_a_valid_point_that_is_no_number():
             valid = keypoints.valid
             assert np.isfinite(keypoints.points[valid]).all() and np.isfinite(keypoints.stddev[valid]).all()
             assert (np.abs(keypoints.points[valid]) < 0.15).all() and valid.sum() <= 5
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_reference_point_off_the_side_of_the_key_points_is_refused_with_its_place(side):
+    scene, _ = scene_of("robot")
+    jaw = scene.jaws[side]
+    inside = replace(jaw, reference_point=np.zeros(3))
+    with pytest.raises(GeometryError, match=r"reference point \[0, 0, 0\] m.*y = 0.01 m.*set reference_point"):
+        KeypointDetector(FakeFinder(scene.pixels()), {side: inside}, scene.T_gripper_camera)
+    for share, error in ((0.81, False), (0.79, True)):  # 1.9 and 2.1 mm off
+        moved = replace(jaw, reference_point=jaw.reference_point * (1.0, share, 1.0))
+        if error:
+            with pytest.raises(GeometryError):
+                check_reference(moved)
+        else:
+            check_reference(moved)

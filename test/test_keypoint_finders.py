@@ -55,15 +55,21 @@ def test_body_parts_get_other_names_by_parameter(tmp_path):
         (replace(ONE_JAW, names=("a", "b", "c")), {"finder": "frame"}, NamingError, "missing"),
         (replace(ONE_JAW, outputs="three", output_names=("a", "b")), {"finder": "frame"}, ModelError, "outputs"),
         (replace(ONE_JAW, outputs="simcc"), {"finder": "frame"}, ModelError, "simcc"),
-        (ONE_JAW, {"finder": "frame", "input_size": (480,)}, ModelError, "input_size"),
+        (replace(ONE_JAW, size=(224, 176)), {"finder": "frame", "plane": PLANE}, ModelError, "rectified side planes"),
         (replace(ONE_JAW, size=(64, 64)), {"finder": "frame", "input_size": (480, 640)}, ModelError, "frozen"),
         (ONE_JAW, {"finder": "frame", "stride": 32}, ModelError, "stride"),
     ],
 )
 def test_a_network_that_does_not_fit_is_refused_at_the_start(tmp_path, fake, given, error, word):
-    folder = write_model(tmp_path / "net", fake)
+    plane = {"finforce__plane": given.pop("plane")} if "plane" in given else {}
+    folder = write_model(tmp_path / "net", fake, **plane)
     with pytest.raises(error, match=word):
         finder_of(model=str(folder), **given)
+
+
+def test_a_frame_finder_without_a_network_is_refused_and_not_given_the_shipped_one():
+    with pytest.raises(ModelError, match="finder frame: got no model.*expected the folder"):
+        finder_of(finder="frame")
 
 
 def test_overrides_reach_the_network(tmp_path, monkeypatch):

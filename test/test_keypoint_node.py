@@ -33,7 +33,7 @@ from finforce_health import Level
 from finforce_ifea.pointcloud import decode_cloud
 from finforce_keypoints.errors import DetectionError
 
-COLUMNS = ("x", "y", "z", "likelihood", "u", "v", "valid", "stddev_x", "stddev_y", "stddev_z")
+COLUMNS = ("x", "y", "z", "likelihood", "u", "v", "valid", "reason", "stddev_x", "stddev_y", "stddev_z")
 
 
 @pytest.fixture
@@ -61,6 +61,7 @@ def test_key_points_and_pose_carry_the_stamp_of_the_image_and_all_columns(probe)
     np.testing.assert_array_equal(found["likelihood"], np.float32(keypoints.likelihood))
     np.testing.assert_array_equal(found["stddev_z"], np.float32(keypoints.stddev[:, 2]))
     assert found["valid"].dtype == np.uint8 and found["valid"].tolist() == [int(k != 3) for k in range(COUNT)]
+    assert found["reason"].dtype == np.uint8 and found["reason"].tolist() == [4 * (k == 3) for k in range(COUNT)]
     pose = bench.poses()[-1]
     assert ros.nanoseconds(pose.header.stamp) == stamp
     # 1e-9: of a quaternion in double precision
@@ -286,8 +287,8 @@ def test_dots_on_the_jaws_become_key_points_in_the_jaw_frame(probe, side):
     bench.info_out.publish(info_of(CAMERA))
     probe.spin(0.05)
     for _ in range(3):
-        color[:4] = rng.integers(60, 70, (4, CAMERA.width, 3))
-        bench.shoot(color=color, depth=depth)
+        noise, depth[:4] = rng.integers(0, 3, color.shape, dtype=np.uint8), rng.integers(340, 360, (4, CAMERA.width))
+        bench.shoot(color=color + noise, depth=depth)
     bench.wait_for_clouds(3, side)
     found = columns(bench.clouds(side)[-1])
     used = found["valid"] == 1
@@ -295,3 +296,18 @@ def test_dots_on_the_jaws_become_key_points_in_the_jaw_frame(probe, side):
     assert used.sum() >= 10
     # 1.5 mm: depth in steps of 1 mm, and dots that are not all whole; a wrong frame or side is off by centimetres
     assert np.linalg.norm(error[used], axis=1).max() < 1.5e-3
+
+
+def test_what_a_cloud_says_against_each_key_point_is_what_the_detector_said():
+    from keypoint_node_fakes import FakeKeypoints
+
+    from finforce_eval.live_detection import heard_keypoints
+    from finforce_keypoints.jaw_localizer import REASONS
+    from finforce_keypoints.outputs import keypoint_columns
+
+    said = FakeKeypoints()
+    said.reasons[: len(REASONS)] = REASONS
+    said.valid[: len(REASONS)] = False
+    cloud = ros.cloud_message(ros.Header(frame_id="left_jaw"), keypoint_columns(said))
+    heard = heard_keypoints(cloud, said.T_camera_jaw)
+    assert heard.reasons.tolist() == said.reasons.tolist() and heard.valid.tolist() == said.valid.tolist()

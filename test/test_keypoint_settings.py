@@ -6,6 +6,7 @@ import pytest
 
 import finforce_keypoints
 from finforce_keypoints.errors import DetectorSettingsError
+from finforce_keypoints.parameters import DetectorParameters
 from finforce_keypoints.settings import DetectorSettings
 
 NUMBERS = [item for item in fields(DetectorSettings) if item.metadata.get("min") is not None]
@@ -38,3 +39,26 @@ def test_bounds_that_cross_are_refused():
         DetectorSettings(wide_gate=2e-3, gate=3e-3)
     with pytest.raises(DetectorSettingsError, match="opening_max"):
         DetectorSettings(opening_min=0.05, opening_max=0.04)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("finder", "foo"),
+        ("jaws", "middle"),
+        ("apply_sigmoid", "maybe"),
+        ("normalize", ""),
+        ("threads", 0),
+        ("stride", -8),
+        ("depth_scale", float("nan")),
+        ("sync_tolerance", 0.5),
+        ("frozen_after", 0),
+        ("color_topics", ()),
+        ("color_topics", ("",)),
+        ("input_size", (480,)),
+        ("input_size", (480, -1)),
+    ],
+)
+def test_a_parameter_that_cannot_be_is_refused_by_name(name, value):
+    with pytest.raises(DetectorSettingsError, match=f"^{name}: got .*expected"):
+        DetectorParameters(**{name: value})

@@ -40,7 +40,7 @@ def imported(path):
     """The top names of what a file imports; optional libraries by their adapters' calls."""
     names = set()
     if path.name == "optional.py":
-        names |= set(re.findall(r'_import\("(\w+)"', path.read_text(encoding="utf-8")))
+        names |= set(re.findall(r'import_library\("(\w+)"', path.read_text(encoding="utf-8")))
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}

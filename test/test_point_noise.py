@@ -30,6 +30,7 @@ from finforce_ifea.tare import compute_tare
 
 FLOOR = 0.02e-3
 K = len(BENCH.keypoints)
+GIVEN_HEIGHT = Contact.fixed(BENCH, 0.04)
 GIVEN = Contact(points=np.array([[BENCH.inner_face_x, 0.0, 0.04]]), weights=np.ones(1))
 # Every other key point has five times the noise of its neighbours.
 COARSE = np.where(np.arange(K) % 2, 5.0, 1.0)
@@ -126,7 +127,7 @@ def record(coarse, *, seed, stated, noise=1.0):
             stamp=10.0 + PERIOD * (i + 1),
             points=points[i],
             likelihood=np.full(K, 0.9),
-            stddev=size[i] if stated else None,
+            stddev=noise * size[i] if stated else None,
         )
         for i in range(len(depths))
     ]
@@ -164,11 +165,44 @@ def test_images_that_state_more_than_the_tare_count_less():
     assert measure_noise(True, late=4.0) < 0.97 * measure_noise(False, late=4.0)
 
 
-@pytest.mark.parametrize("share", [0.25, 4.0])
-def test_a_common_factor_of_all_stated_deviations_changes_nothing(share):
+@pytest.mark.parametrize("share", [0.25, 1.2])
+def test_a_common_factor_within_the_scatter_changes_nothing(share):
     press = record(COARSE, seed=0, stated=True)
     scaled = replace(press, observations=[replace(o, stddev=share * o.stddev) for o in press.observations])
     np.testing.assert_allclose(errors(scaled, run(scaled)), errors(press, run(press)), rtol=0, atol=1e-6)
+
+
+def test_what_is_stated_far_beyond_the_scatter_stands_still():
+    usual = match_stated(scatter_of(STATED), stated_by(4.0 * STATED, 4000), FLOOR)
+    standing = compute_point_noise(usual, 4.0 * STATED).standing
+    # (16 - 2) times the variance in plane, of which the tare's 4000 images tell the scatter within a few per cent
+    np.testing.assert_allclose(standing, 14.0 * STATED[:, 0] ** 2, rtol=0.05)
+    assert not compute_point_noise(usual, None).standing.any()
+    modest = match_stated(scatter_of(STATED), stated_by(STATED, 4000), FLOOR)
+    assert not compute_point_noise(modest, STATED).standing.any()
+
+
+def test_a_detector_that_errs_anew_in_every_shape_is_believed_as_far_as_it_says():
+    # jitter of 0.02 mm at rest, and an error of 0.3 mm that each point keeps while the jaw keeps its shape
+    depths = ramp(2, 5)
+    random, (clean, forces) = np.random.default_rng(4), true_course(depths, 25, 40)
+    steps = {depth: 0.3e-3 * random.normal(size=(K, 3)) * [1.0, 0.0, 1.0] for depth in sorted(set(depths))}
+    points = clean + [steps[depth] for depth in depths] + 0.02e-3 * random.normal(size=clean.shape)
+    stated = np.full((K, 3), 0.3e-3)
+    found = {}
+    for name, stddev in (("stated", stated), ("silent", None)):
+        observations = [
+            Observation(stamp=10.0 + PERIOD * (i + 1), points=points[i], likelihood=np.full(K, 0.9), stddev=stddev)
+            for i in range(len(depths))
+        ]
+        press = Press(observations=observations, contact=GIVEN_HEIGHT, depths=depths, forces=forces)
+        solutions = run(press)
+        loaded = loaded_frames(press)
+        found[name] = np.mean(
+            [solution.trusted for solution, is_loaded in zip(solutions, loaded, strict=True) if is_loaded]
+        )
+    assert found["stated"] == 1.0
+    assert found["silent"] < 0.9
 
 
 def spoiled(value):

@@ -1,12 +1,16 @@
 """Label files of DeepLabCut come in whole, and their points land on the right place of the jaw's picture."""
 
+import re
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+import training
 from finforce_ifea.jaw import load_jaw
 from finforce_keypoints.errors import NamingError
 from finforce_keypoints.gripper_geometry import ROBOT_CAMERA, jaw_in_camera
@@ -15,6 +19,8 @@ from training.dataset import MARGIN
 from training.errors import LabelFileError
 from training.finetune import Project, load_project
 from training.labels import parse_labels, read_labels
+from training.make_dataset import SceneMaker
+from training.pressed_shapes import PressedShape
 from training.rectification import CameraView, LabelledImage, find_origin, parse_camera, read_camera, rectify
 
 CAMERA = {
@@ -181,3 +187,26 @@ def test_absent_torch_is_told_with_the_command_that_installs_it():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode != 0
     assert "MissingDependencyError: training of key point networks needs torch: pip install torch" in done.stderr
+
+
+def test_the_camera_of_the_instructions_is_the_robots():
+    page = Path(training.__file__).with_name("README.md").read_text(encoding="utf-8")
+    view = parse_camera(yaml.safe_load(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1]))
+    np.testing.assert_allclose(view.T_gripper_camera, ROBOT_CAMERA, atol=2e-6)  # six decimals of a quaternion
+
+
+def test_pictures_of_the_twin_show_the_plane_of_the_key_points_wherever_the_reference_point_lies():
+    jaw = load_jaw("bench")
+    jaw = replace(jaw, reference_point=jaw.reference_point * (1.0, 0.85, 1.0))  # 1.5 mm behind the others
+    rest = PressedShape(
+        vertices=jaw.build_mesh("default").nodes,
+        keypoints=jaw.keypoints,
+        size=np.full(2, 0.02),
+        is_round=True,
+        centre=np.array([0.024, 0.04]),
+    )
+    samples = SceneMaker(jaw, [rest]).draw(0)
+    expected = PlaneGrid().padded(MARGIN).pixels(jaw.keypoints[:, [0, 2]])
+    for places in samples.xz[:, :-1]:
+        # single precision; a plane that is 1.5 mm off shifts them by a pixel
+        np.testing.assert_allclose(places, expected, atol=1e-3)

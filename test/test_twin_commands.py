@@ -43,7 +43,7 @@ def test_every_scene_is_listed(capsys):
 
 def test_a_scene_is_recorded_with_its_changes_and_a_picture(asked, tmp_path, capsys):
     bag = tmp_path / "bags" / "twin"
-    words = ["--seed", "7", "--finger", "3", "--light", "dim", "--object", "block", "--size", "320x240", "--set", "displacement=0.004"]
+    words = "--seed 7 --finger 3 --light dim --object block --size 320x240 --set displacement=0.004".split()
     assert main(["twin", "record", "grasp_cylinder", "-o", str(bag), *words]) == 0
     ((scenario, seed, camera, finger),) = asked
     assert (scenario.light, scenario.object, scenario.displacement, seed, finger) == ("dim", "block", 0.004, 7, 3)
@@ -67,6 +67,7 @@ def test_a_scene_is_recorded_with_its_changes_and_a_picture(asked, tmp_path, cap
         (["grasp_cylinder", "--set", "colour=red"], "unknown number"),
         (["grasp_cylinder", "--set", "closing_speed=9"], "closing_speed"),
         (["grasp_cylinder", "--camera", "moon"], "moon"),
+        (["grasp_cylinder", "--light", "moonlight"], "light: got 'moonlight', expected one of bright, dim, any"),
     ],
 )
 def test_what_cannot_be_recorded_is_one_line_and_two(asked, tmp_path, capsys, words, reason):

@@ -113,6 +113,10 @@ def test_the_scene_takes_what_the_parameters_change():
     scenario = TwinParameters(scene="grasp_cylinder", light="dim", object="block").scenario
     assert (scenario.light, scenario.object) == ("dim", "block")
     assert TwinParameters(scene="weight_turn_dim").scenario.light == "dim"
+    for light in ("bright", "dim", "any"):
+        assert TwinParameters(light=light).scenario.light == light
+    with pytest.raises(ScenarioError, match="light: got 'moonlight', expected one of bright, dim, any"):
+        TwinParameters(light="moonlight").scenario  # noqa: B018 - the property checks
 
 
 def test_every_parameter_is_read():

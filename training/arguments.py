@@ -1,10 +1,14 @@
-"""Settings records as options of a command; knows no record."""
+"""What the commands of training share: settings as options, and errors in one line; knows no record."""
 
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
+
+from finforce_ifea.errors import FinforceError
 
 
 def add_settings(parser: ArgumentParser, record: type) -> None:
@@ -22,3 +26,12 @@ def add_settings(parser: ArgumentParser, record: type) -> None:
 def settings_from(arguments: Namespace, record: type) -> Any:
     """Return the settings record that the options make; what it raises is its own."""
     return record(**{item.name: getattr(arguments, item.name) for item in fields(record)})
+
+
+@contextmanager
+def one_line_errors() -> Iterator[None]:
+    """End the process with one line and status 1 where an error of ours leaves the `with` block."""
+    try:
+        yield
+    except FinforceError as error:
+        raise SystemExit(f"training: {error}") from error

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from finforce_ifea.errors import FinforceError
 from finforce_keypoints.model import KeypointModel, ModelOverrides
+from training.arguments import one_line_errors
 from training.augment import AugmentSettings, Sample, augment, crop_centre
 from training.dataset import VALIDATION, LabelledPictures, load_pictures
 from training.drawing import draw_sheet
@@ -39,12 +39,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--worst", type=Path, help="picture file for the worst pictures")
     parser.add_argument("--json", type=Path, help="file for the scores")
     options = parser.parse_args(arguments)
-    try:
+    with one_line_errors():
         pictures = load_pictures(options.dataset, options.part, options.limit)
         samples = augment_all(pictures) if options.augmented else crop_all(pictures)
         detections = detect_samples(build_model(options.network, options.pooled), samples)
-    except FinforceError as error:
-        raise SystemExit(f"training: {error}") from error
     scores = score_groups(detections, samples, pictures.light, options.threshold)
     scores |= {f"likelihood from {limit:g}": score_detections(detections, limit) for limit in THRESHOLDS}
     print(format_scores(scores))

@@ -13,10 +13,10 @@ from typing import Any
 
 import yaml
 
-from finforce_ifea.errors import FinforceError
 from finforce_ifea.jaw import load_jaw
 from finforce_keypoints.metadata import METADATA_FILE
-from finforce_keypoints.plane_picture import PlaneGrid
+from finforce_keypoints.plane_picture import PlaneGrid, find_side
+from training.arguments import one_line_errors
 from training.checkpoint import build_averaged, load_checkpoint
 from training.dataset import VALIDATION, load_pictures
 from training.errors import CheckpointError
@@ -41,20 +41,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--pooled", action="store_true", help="let the product average the places around each peak")
     parser.add_argument("--jaw", default="bench", help="jaw whose side plane the pictures show")
     options = parser.parse_args(arguments)
-    try:
+    with one_line_errors():
         checkpoint = load_checkpoint(options.checkpoint)
         network = build_averaged(checkpoint)
         card = Sidecar(
             names=checkpoint.names,
             shape=network.shape,
-            side_y=float(load_jaw(options.jaw).keypoints[:, 1].mean()),
+            side_y=find_side(load_jaw(options.jaw)),
             pooled=options.pooled,
         )
         write_network(network, options.output, card)
         detections = detect_with_model(options.output, load_pictures(options.dataset, VALIDATION))
         write_sidecar(options.output, replace(card, likelihood_stddev=fit_stddev(detections)))
-    except FinforceError as error:
-        raise SystemExit(f"training: {error}") from error
     print(score_detections(detections))
     print(f"{options.output / NETWORK_FILE}: {(options.output / NETWORK_FILE).stat().st_size / 1e6:.2f} MB")
 

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_ifea.errors import FinforceError
 from finforce_ifea.jaw import load_jaw
 from finforce_keypoints.gripper_geometry import SIDES
 from finforce_keypoints.naming import build_name_map, parse_mapping
 from finforce_keypoints.optional import import_cv2
+from training.arguments import one_line_errors
 from training.dataset import TRAIN, LabelledPictures, join_pictures, load_pictures
 from training.errors import LabelFileError
 from training.evaluate import build_model, crop_all, detect_samples, format_scores
@@ -46,10 +46,8 @@ class Project:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Fine-tune a network, print its scores on pictures held back, before and after, and export it."""
     options = build_parser().parse_args(arguments)
-    try:
+    with one_line_errors():
         run(options)
-    except FinforceError as error:
-        raise SystemExit(f"training: {error}") from error
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,19 +16,21 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from finforce_camera import CameraIntrinsics
 from finforce_contact.object_mesh import ObjectMesh
 from finforce_ifea.jaw import Jaw, load_jaw
 from finforce_keypoints.gripper_geometry import BENCH_CAMERA, ROBOT_CAMERA
-from finforce_keypoints.plane_picture import PlaneGrid, intersect_plane, map_picture, take_picture
+from finforce_keypoints.plane_picture import PlaneGrid, find_side, intersect_plane, map_picture, take_picture
 from finforce_twin.bodies import DrawnJaw, draw_jaws
 from finforce_twin.depth_camera import build_d405, build_d405_vga
 from finforce_twin.gripper import JawState, TwinState
 from finforce_twin.objects import OBJECT_NAMES, build_object
 from finforce_twin.photographer import Photographer, Setting, Shot
+from training.arguments import one_line_errors
+from training.dataset import MARGIN, TRAIN, VALIDATION, LabelledPictures, join_pictures, save_shard
 from training.pressed_shapes import PressedShape, draw_pressed_shapes
 
 SEEDS = 1_000_000_000  # of training's pictures begin here, so that no scene with a seed below was trained on
-MARGIN = 28  # [px] around the network's picture
 SHARD = 256  # pictures a file
 OBJECTS = 240  # pressed into the jaw
 SEGMENTS = 64
@@ -37,15 +39,6 @@ APART = 0.2  # share of the scenes whose object does not touch
 SKEWED = 0.12  # share of the scenes with an object of another kind, anyhow between the jaws
 ONE_JAW = 0.25  # share of the scenes with one jaw, before the bench's camera
 DIM = 0.3  # share of the scenes in dim light
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Samples:
-    """Pictures (n, h, w, 3) uint8, their true key points (n, K + 1, 2) [px] and which are visible (n, K + 1)."""
-
-    picture: NDArray
-    xz: NDArray
-    visible: NDArray
 
 
 class SceneMaker:
@@ -63,7 +56,7 @@ class SceneMaker:
         self._others = [build_object(name) for name in OBJECT_NAMES]
         self._grid = PlaneGrid().padded(MARGIN)
 
-    def draw(self, seed: int) -> Samples:
+    def draw(self, seed: int) -> LabelledPictures:
         """Return the pictures of one scene, one per jaw."""
         rng = np.random.default_rng((seed, 5))
         one_jaw = rng.random() < ONE_JAW
@@ -79,8 +72,7 @@ class SceneMaker:
             clutter=True,
         )
         shot = Photographer(setting, SEEDS + seed, window_only=True).shoot(state)
-        parts = [self._cut(side, shot, camera) for side in shot.truth]
-        return Samples(**{name: np.stack([getattr(part, name) for part in parts]) for name in Samples.__annotations__})
+        return join_pictures([self._cut(side, shot, camera) for side in shot.truth])
 
     def _draw_state(self, rng: np.random.Generator, sides: tuple[str, ...]) -> tuple[ObjectMesh | None, TwinState]:
         """Return an object, or none, and the jaws around it."""
@@ -117,12 +109,13 @@ class SceneMaker:
             torque=np.zeros(3),
         )
 
-    def _cut(self, side: str, shot: Shot, camera: object) -> Samples:
+    def _cut(self, side: str, shot: Shot, camera: CameraIntrinsics) -> LabelledPictures:
         """Return the picture of one jaw."""
-        truth, side_y = shot.truth[side], float(self._jaws[side].reference_point[1])
+        truth, side_y = shot.truth[side], find_side(self._jaws[side])
         picture = take_picture(shot.color, map_picture(self._grid, side_y, truth.T_camera_jaw, camera))
         places = intersect_plane(truth.pixels, side_y, truth.T_camera_jaw, camera)
-        return Samples(picture=picture, xz=self._grid.pixels(places).astype(np.float32), visible=truth.visible)
+        xz = self._grid.pixels(places).astype(np.float32)
+        return LabelledPictures(picture=picture[None], xz=xz[None], visible=truth.visible[None])
 
 
 def _disturb(T_gripper_camera: NDArray, rng: np.random.Generator) -> NDArray:
@@ -162,19 +155,17 @@ def _build_rod(shape: PressedShape, rng: np.random.Generator) -> ObjectMesh:
 
 def make_shards(maker: SceneMaker, seeds: range, folder: Path, name: str) -> None:
     """Render scenes and write their pictures as `NAME_NNNN.npz`."""
-    for number, samples in enumerate(_gather(maker, seeds, name)):
-        np.savez_compressed(folder / f"{name}_{number:04d}.npz", **vars(samples))
+    for number, pictures in enumerate(_gather(maker, seeds, name)):
+        save_shard(folder / f"{name}_{number:04d}.npz", pictures)
 
 
-def _gather(maker: SceneMaker, seeds: range, name: str) -> Iterator[Samples]:
+def _gather(maker: SceneMaker, seeds: range, name: str) -> Iterator[LabelledPictures]:
     """Yield the pictures of many scenes in portions."""
-    waiting: list[Samples] = []
+    waiting: list[LabelledPictures] = []
     for seed in tqdm(seeds, desc=name, disable=None, smoothing=0.0):
         waiting.append(maker.draw(seed))
-        if sum(len(samples.picture) for samples in waiting) >= SHARD or seed == seeds[-1]:
-            yield Samples(
-                **{name: np.concatenate([getattr(part, name) for part in waiting]) for name in Samples.__annotations__}
-            )
+        if sum(map(len, waiting)) >= SHARD or seed == seeds[-1]:
+            yield join_pictures(waiting)
             waiting = []
 
 
@@ -187,15 +178,21 @@ def main() -> None:
     parser.add_argument("--validation", type=int, default=250, help="scenes for validation (250)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene, to share the work (0)")
     options = parser.parse_args()
+    with one_line_errors():
+        run(options)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Render what the options say."""
     options.folder.mkdir(parents=True, exist_ok=True)
     jaw = load_jaw(options.jaw)
     # validation has its own objects, not only its own materials and lights
     for name, first, count, seed in (
-        ("val", 10_000_000 + options.first, options.validation, 2),
-        ("train", options.first, options.scenes, 1),
+        (VALIDATION, 10_000_000 + options.first, options.validation, 2),
+        (TRAIN, options.first, options.scenes, 1),
     ):
         if count:
-            maker = SceneMaker(jaw, draw_pressed_shapes(jaw, OBJECTS if name == "train" else OBJECTS // 6, seed))
+            maker = SceneMaker(jaw, draw_pressed_shapes(jaw, OBJECTS if name == TRAIN else OBJECTS // 6, seed))
             make_shards(maker, range(first, first + count), options.folder, f"{name}_{options.first}")
 
 

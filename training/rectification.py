@@ -15,7 +15,7 @@ from finforce_camera import CameraIntrinsics
 from finforce_contact.poses import pose_from_quaternion
 from finforce_ifea.jaw import Jaw
 from finforce_keypoints.gripper_geometry import jaw_in_camera, jaw_in_gripper
-from finforce_keypoints.plane_picture import PlaneGrid, intersect_plane, map_picture, take_picture
+from finforce_keypoints.plane_picture import PlaneGrid, find_side, intersect_plane, map_picture, take_picture
 from training.dataset import MARGIN, LabelledPictures
 from training.errors import LabelFileError
 
@@ -90,7 +90,7 @@ def find_origin(points: NDArray, jaw: Jaw, side: str, view: CameraView) -> float
     if not chosen.any():
         return None
     at_zero = jaw_in_camera(view.T_gripper_camera, side, 0.0)
-    places = intersect_plane(points[chosen], float(jaw.keypoints[:, 1].mean()), at_zero, view.camera)
+    places = intersect_plane(points[chosen], find_side(jaw), at_zero, view.camera)
     along = float((places[:, 0] - rest[chosen, 0]).mean())
     return along * float(jaw_in_gripper(side, 0.0)[0, 0])
 
@@ -109,7 +109,7 @@ def rectify(labelled: LabelledImage, jaw: Jaw, side: str, view: CameraView) -> L
     origin = find_origin(labelled.points, jaw, side, view)
     if origin is None:
         return None
-    T_camera_jaw, side_y = jaw_in_camera(view.T_gripper_camera, side, origin), float(jaw.keypoints[:, 1].mean())
+    T_camera_jaw, side_y = jaw_in_camera(view.T_gripper_camera, side, origin), find_side(jaw)
     grid = PlaneGrid().padded(MARGIN)
     visible = np.isfinite(labelled.points).all(axis=1)
     xz = np.full((len(visible), 2), np.nan, dtype=np.float32)

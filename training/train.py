@@ -6,9 +6,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from finforce_ifea.errors import FinforceError
 from finforce_ifea.jaw import load_jaw
-from training.arguments import add_settings, settings_from
+from training.arguments import add_settings, one_line_errors, settings_from
 from training.augment import AugmentSettings
 from training.checkpoint import load_checkpoint
 from training.dataset import TRAIN, VALIDATION, LabelledPictures, load_pictures
@@ -20,10 +19,8 @@ from training.trainer import CHECKPOINT, Pictures, Trainer, train
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train on the shards of a folder and leave log and checkpoint in another one."""
     options = build_parser().parse_args(arguments)
-    try:
+    with one_line_errors():
         run(options)
-    except FinforceError as error:
-        raise SystemExit(f"training: {error}") from error
 
 
 def build_parser() -> argparse.ArgumentParser:
