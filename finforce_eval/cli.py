@@ -131,7 +131,8 @@ def _add_twin(commands: argparse._SubParsersAction) -> None:
 def _add_demo(commands: argparse._SubParsersAction) -> None:
     text = "play a recording through the real nodes, from images to force, and write a report"
     parser = commands.add_parser("demo", help=text, description=text)
-    text = "begin with images of a synthetic gripper, rendered into the report's folder at first use, or with the key points of a bench (images)"
+    text = "begin with images of a synthetic gripper, rendered into the report's folder at first use, or with the key "
+    text += "points of a bench (images)"
     parser.add_argument("--from", dest="source", default="images", choices=("images", "keypoints"), help=text)
     parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
     parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")

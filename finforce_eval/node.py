@@ -26,7 +26,6 @@ from finforce_eval.live import ReplayLog
 from finforce_eval.parameters import PlayerParameters
 from finforce_eval.playback import Playback, RawMessage, read_playback
 
-
 # what is heard while messages are being sent waits its turn; nothing of it may be lost
 HEARD = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from math import prod
 from numbers import Real
 from pathlib import Path
-from reprlib import repr as shorten
+from reprlib import Repr
 from typing import Any
 
 import numpy as np
@@ -246,3 +246,10 @@ def _look_up(content: Mapping, place: str, kind: type, default: Any) -> Any:
 def is_number(value: Any) -> bool:
     """Say whether a value is a finite number, neither a flag nor a whole number beyond all floats."""
     return isinstance(value, Real) and not isinstance(value, bool) and abs(value) < _BEYOND
+
+
+def shorten(value: Any) -> str:
+    """Return a value as Python writes it, long and deep ones in part: aliases let a small file stand for gigabytes."""
+    short = Repr()
+    short.maxlevel, short.maxstring = 2, 60
+    return " ".join(short.repr(value).split())

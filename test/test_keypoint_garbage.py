@@ -1,4 +1,4 @@
-"""Claims about rubbish: odd networks and configurations are named at the start, no picture of nothing has key points."""
+"""Claims about rubbish: odd networks and configurations are named at the start, pictures of nothing have no points."""
 
 from dataclasses import replace
 
@@ -25,7 +25,9 @@ def write_constant(folder, *outputs, kind=TensorProto.FLOAT, operator="Identity"
     """A folder with a network that says the same of every picture."""
     folder.mkdir(parents=True, exist_ok=True)
     names = ("heatmap", "locref")[: len(outputs)]
-    constants = [numpy_helper.from_array(np.asarray(array), f"c_{name}") for name, array in zip(names, outputs)]
+    constants = [
+        numpy_helper.from_array(np.asarray(array), f"c_{name}") for name, array in zip(names, outputs, strict=True)
+    ]
     nodes = [helper.make_node(operator, [f"c_{name}"], [name]) for name in names]
     make = helper.make_tensor_sequence_value_info if operator == "SequenceConstruct" else helper.make_tensor_value_info
     graph = helper.make_graph(

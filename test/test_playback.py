@@ -1,5 +1,7 @@
 """Claims about recorded messages that are published again."""
 
+from threading import Event, get_ident
+
 import pytest
 from eval_fakes import START, make_recording
 from rclpy.serialization import deserialize_message
@@ -7,6 +9,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from finforce_eval.errors import RecordingError
+from finforce_eval.node import read_ahead
 from finforce_eval.playback import RawMessage, read_playback
 from finforce_eval.writer import write_recording
 
@@ -58,3 +61,50 @@ def test_a_bag_without_anything_to_play_is_refused(folder):
     every = {message.topic for message in read_playback(folder)}
     with pytest.raises(RecordingError, match="nothing to be played"):
         read_playback(folder, without=every)
+
+
+def test_the_next_message_is_read_while_the_one_before_is_sent():
+    read, threads = {2: Event(), 3: Event()}, set()
+
+    def items():
+        for number in (1, 2, 3):
+            threads.add(get_ident())
+            if number in read:
+                read[number].set()
+            yield number
+
+    ahead = read_ahead(items())
+    assert next(ahead) == 1
+    # 10 s: nobody asks for it, and it comes all the same
+    assert read[2].wait(10.0) and not read[3].is_set()
+    assert list(ahead) == [2, 3]
+    assert len(threads) == 1 and get_ident() not in threads
+
+
+def test_what_fails_in_reading_ahead_is_said_and_a_reader_that_is_left_is_closed():
+    closed = Event()
+
+    def items():
+        try:
+            yield 1
+            raise RecordingError("damaged")
+        finally:
+            closed.set()
+
+    ahead = read_ahead(items())
+    assert next(ahead) == 1
+    with pytest.raises(RecordingError, match="damaged"):
+        next(ahead)
+    closed.clear()
+    ahead = read_ahead(number for number in endless(closed))
+    next(ahead)
+    ahead.close()
+    assert closed.wait(10.0)
+
+
+def endless(closed):
+    try:
+        while True:
+            yield 1
+    finally:
+        closed.set()

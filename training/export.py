@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from math import log
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from training.errors import CheckpointError
 from training.evaluate import detect_with_model
 from training.network import LOCREF_STD, STRIDE, ExportedNetwork, KeypointNetwork, NetworkShape
 from training.optional import import_onnx, import_torch
-from training.scoring import fit_stddev, score_detections
+from training.scoring import THRESHOLD, fit_stddev, score_detections
 
 torch = import_torch()
 
@@ -39,11 +40,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the exported network")
     parser.add_argument("--dataset", type=Path, required=True, help="folder with the shards val_*.npz")
     parser.add_argument("--pooled", action="store_true", help="let the product average the places around each peak")
+    parser.add_argument(
+        "--operating-point",
+        type=float,
+        default=THRESHOLD,
+        metavar="LIKELIHOOD",
+        help=f"of the trained network that becomes {THRESHOLD}, the detector's threshold (no change)",
+    )
     parser.add_argument("--jaw", default="bench", help="jaw whose side plane the pictures show")
     options = parser.parse_args(arguments)
     with one_line_errors():
         checkpoint = load_checkpoint(options.checkpoint)
-        network = build_averaged(checkpoint)
+        network = move_operating_point(build_averaged(checkpoint), options.operating_point)
         card = Sidecar(
             names=checkpoint.names,
             shape=network.shape,
@@ -74,6 +82,21 @@ class Sidecar:
     side_y: float
     pooled: bool = False
     likelihood_stddev: Sequence[Sequence[float]] = UNMEASURED
+
+
+def move_operating_point(network: KeypointNetwork, likelihood: float) -> KeypointNetwork:
+    """Return the network with all likelihoods moved so that a given one becomes the detector's threshold.
+
+    A shift of the heat maps' bias, logit p' = logit p + logit(threshold) - logit(likelihood): no peak moves.
+
+    Raises:
+        CheckpointError: the likelihood is not between 0 and 1.
+    """
+    if not 0.0 < likelihood < 1.0:
+        raise CheckpointError(f"operating point {likelihood:g}: expected a likelihood between 0 and 1")
+    with torch.no_grad():
+        network.heatmap.bias += log(THRESHOLD / (1.0 - THRESHOLD)) - log(likelihood / (1.0 - likelihood))
+    return network
 
 
 def write_network(network: KeypointNetwork, folder: Path, sidecar: Sidecar) -> None:
