@@ -43,7 +43,20 @@ def test_every_scene_is_listed(capsys):
 
 def test_a_scene_is_recorded_with_its_changes_and_a_picture(asked, tmp_path, capsys):
     bag = tmp_path / "bags" / "twin"
-    words = "--seed 7 --finger 3 --light dim --object block --size 320x240 --set displacement=0.004".split()
+    words = [
+        "--seed",
+        "7",
+        "--finger",
+        "3",
+        "--light",
+        "dim",
+        "--object",
+        "block",
+        "--size",
+        "320x240",
+        "--set",
+        "displacement=0.004",
+    ]
     assert main(["twin", "record", "grasp_cylinder", "-o", str(bag), *words]) == 0
     ((scenario, seed, camera, finger),) = asked
     assert (scenario.light, scenario.object, scenario.displacement, seed, finger) == ("dim", "block", 0.004, 7, 3)
