@@ -13,6 +13,7 @@ from finforce_ifea.errors import FinforceError
 DEPTH_TYPES = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}
 MILLIMETRE = 1e-3  # the unit of 16-bit depth images (REP 118)
 FARTHEST_CENTRE = 10.0  # of a principal point outside its image, in sizes of that image; a cut-out has one
+SHORTEST_FOCAL, LONGEST_FOCAL = 0.01, 1000.0  # of a focal length, in sizes of the image; a cut-out's is long
 UNDISTORTION_STEPS = 50
 UNDISTORTION_TOLERANCE = 1e-10  # of a ray with z = 1
 
@@ -39,8 +40,8 @@ class CameraIntrinsics:
         distortion: (5,) plumb-bob coefficients k1, k2, p1, p2, k3.
 
     Raises:
-        IntrinsicsError: a size or a focal length is not positive, a number is not finite, or the principal point is far
-            outside the image.
+        IntrinsicsError: a size or a focal length is not positive, a number is not finite, the principal point is far
+            outside the image, or a focal length is out of proportion to it.
     """
 
     width: int
@@ -62,6 +63,12 @@ class CameraIntrinsics:
             raise IntrinsicsError(
                 f"intrinsics {self.width}x{self.height}, cx cy = {numbers[2:].tolist()}: expected a principal point in "
                 "or near the image [px]"
+            )
+        proportion = numbers[:2] / (self.width, self.height)
+        if proportion.min() < SHORTEST_FOCAL or proportion.max() > LONGEST_FOCAL:
+            raise IntrinsicsError(
+                f"intrinsics {self.width}x{self.height}, fx fy = {numbers[:2].tolist()}: expected focal lengths in "
+                f"proportion to the image, {SHORTEST_FOCAL:g} to {LONGEST_FOCAL:g} of its size [px]"
             )
         distortion = np.asarray(self.distortion, dtype=float).ravel()
         if len(distortion) not in (0, 4, 5) or not np.isfinite(distortion).all():

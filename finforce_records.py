@@ -17,7 +17,7 @@ class ParameterError(FinforceError, ValueError):
 
 
 def parameter(default: Any, description: str, **metadata: Any) -> Any:
-    """Return a dataclass field that says what it is; `metadata` are unit, min, max, choices and settable."""
+    """Return a dataclass field that says what it is; `metadata` are unit, min, max, choices, topic and settable."""
     return field(default=default, metadata={"description": description, **metadata})
 
 

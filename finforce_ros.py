@@ -19,12 +19,15 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.subscription import Subscription
 from rclpy.task import Future
+from rclpy.validate_full_topic_name import validate_full_topic_name
+from rclpy.validate_topic_name import validate_topic_name
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: F401 - for those who subscribe
 from std_msgs.msg import Header, String  # noqa: F401 - for those who publish
 from std_srvs.srv import Trigger
@@ -65,7 +68,8 @@ provide_transport()  # read when the first context is made, whoever makes it
 def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> RecordT:
     """Declare a ROS parameter for every field of a frozen dataclass and return the record.
 
-    Field metadata: `description`, `unit`, `min`, `max`, `choices`, `settable` (not read-only); NaN may be a default.
+    Field metadata: `description`, `unit`, `min`, `max`, `choices`, `topic` (names one, or several), `settable` (not
+    read-only); NaN may be a default.
 
     Args:
         node: the node that gets the parameters.
@@ -73,18 +77,42 @@ def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> Recor
         prefix: put before each name, with a dot.
 
     Raises:
-        ParameterError: a value has the wrong type or is out of bounds.
+        ParameterError: a value has the wrong type or is out of bounds, or a topic's name cannot be one.
     """
     values = {}
     for entry in fields(record):
         name = f"{prefix}.{entry.name}" if prefix else entry.name
-        try:
-            value = node.declare_parameter(name, entry.default, describe_field(entry)).value
-        except ParameterException as error:
-            raise ParameterError(f"parameter {name}: {error}") from error
+        value = _read_value(node, name, entry)
         check_value(name, value, entry)
+        if entry.metadata.get("topic"):
+            for topic in (value,) if isinstance(value, str) else value:
+                _check_topic(node, name, topic)
         values[entry.name] = value
     return record(**values)
+
+
+def _read_value(node: Node, name: str, entry: Field) -> Any:
+    """Declare a parameter and return its value; an empty list, which has no type in ROS, is one of the field's."""
+    try:
+        value = node.declare_parameter(name, entry.default, describe_field(entry)).value
+    except ParameterException as error:
+        raise ParameterError(f"parameter {name}: {error}") from error
+    if value is not None:
+        return value
+    if not isinstance(entry.default, (tuple, list)):
+        raise ParameterError(f"parameter {name} is empty; expected a value such as {entry.default!r}")
+    return ()
+
+
+def _check_topic(node: Node, name: str, topic: str) -> None:
+    """Refuse a parameter whose value is no name of a topic."""
+    try:
+        validate_topic_name(topic)
+        validate_full_topic_name(expand_topic_name(topic, node.get_name(), node.get_namespace()))
+    except (NameValidationException, ValueError) as error:
+        # rclpy draws the place under the name, and tells where it was found out
+        why = str(error).splitlines()[0].partition(": ")[2].partition(", at /")[0].rstrip(":")
+        raise ParameterError(f"parameter {name} is {topic!r}; expected the name of a topic: {why}") from error
 
 
 def name_unknown_parameters(node: Node) -> None:

@@ -73,12 +73,16 @@ def camera_from_info(info: Any, frame: str) -> CameraIntrinsics:
 
     Raises:
         ObservationError: the frame is another one.
-        IntrinsicsError: the numbers are no camera's, or the distortion is not plumb-bob.
+        IntrinsicsError: the numbers are no camera's, its axes are skew, or the distortion is not plumb-bob.
     """
     check_frame(info, frame, "the camera info")
     if info.distortion_model not in ("plumb_bob", ""):
         raise IntrinsicsError(f"distortion model '{info.distortion_model}'; expected plumb_bob, or rectified images")
     k = info.k
+    if any(k[index] != 0.0 for index in (1, 3, 6, 7)):
+        raise IntrinsicsError(
+            f"camera matrix K {[float(number) for number in k]}: expected no skew, [fx 0 cx 0 fy cy 0 0 1]"
+        )
     return CameraIntrinsics(
         width=info.width, height=info.height, fx=k[0], fy=k[4], cx=k[2], cy=k[5], distortion=np.array(info.d)
     )

@@ -37,7 +37,13 @@ class FoundKeypoints(Protocol):
 
 
 class Detector(Protocol):
-    """Finds the key points of all jaws in one image after the other."""
+    """Finds the key points of all jaws in one image after the other.
+
+    Attributes:
+        warnings: what is suspicious about a jaw, by side.
+    """
+
+    warnings: Mapping[str, str]
 
     def detect(self, image: RgbdImage) -> Mapping[str, FoundKeypoints]:
         """Return what was found, by side; a jaw that was not found is absent."""
@@ -112,10 +118,11 @@ def detect_keypoints(
             if side in found:
                 log.found[stamp] = found[side]
         progress(1)
+    warnings = [f"{side} jaw: {warning}" for side, warning in detector.warnings.items()]
     if not any(log.found for log in logs.values()):
-        why = reasons.commonest() or "no jaw stands where it could be; another --extrinsics?"
+        why = reasons.commonest() or "; ".join(warnings) or "no jaw stands where it could be; another --extrinsics?"
         raise RecordingError(f"{recording.name}: no key points in {len(images)} images: {why}")
-    notes = reasons.notes()
+    notes = reasons.notes() + warnings
     return with_detections(replace(recording, notes=(*recording.notes, *notes)), logs)
 
 

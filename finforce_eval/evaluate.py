@@ -67,7 +67,7 @@ def evaluate_recording(
             raise RecordingError(f"{recording.name}: {error}") from error
         progress(1)
     result = log.result(truth)
-    _check_solved(result)
+    _check_solved(result, recording)
     return result
 
 
@@ -83,8 +83,10 @@ def check_keypoint_count(recording: Recording, side: str, jaw: Any) -> None:
         raise RecordingError(f"{recording.name}: {what} (another --jaw?)")
 
 
-def _check_solved(result: CaseResult) -> None:
+def _check_solved(result: CaseResult, recording: Recording) -> None:
     """Refuse a recording of which nothing can be said."""
+    if not result.scored.any():
+        raise RecordingError(f"{result.name}: {_why_unscored(result, recording)}")
     if not result.counted.any():
         unmatched = result.scored & result.solved & ~np.isfinite(result.true_magnitude)
         if unmatched.any():
@@ -93,6 +95,17 @@ def _check_solved(result: CaseResult) -> None:
         statuses = ", ".join(f"{count} {word}" for word, count in zip(words, counts, strict=True))
         reason = f" ({statuses}): {result.message}" if result.message else f" ({statuses})"
         raise RecordingError(f"{result.name}: none of the frames to be scored was solved{reason}")
+
+
+def _why_unscored(result: CaseResult, recording: Recording) -> str:
+    """Return why no frame of a recording is to be scored."""
+    count, phases = len(result.stamps), recording.phases
+    if not count:
+        return "there are no frames to be scored: no image has key points"
+    none = f"none of the {count} frames is to be scored: "
+    if phases is not None and not (phases.stage == "record").any():
+        return f"{none}/bench/phase names no 'record' phase; expected one, or no /bench/phase: then all are scored"
+    return f"{none}its 'record' phases lie at none of their stamps (two clocks?)"
 
 
 def score_results(results: Sequence[CaseResult], recordings: Sequence[Recording]) -> Evaluation:

@@ -170,15 +170,19 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
 
     Raises:
         OptionError: a parameter of the detector is not known, has another type, is out of its bounds, or is decided by
-            something else.
+            something else; or no detector is needed.
     """
     parameters: dict[str, Any] = {}
     changes, extrinsics = getattr(options, "detector", []), getattr(options, "extrinsics", None)
+    source = getattr(options, "source", None) or ""
+    for name, given in (("--detector", changes), ("--extrinsics", extrinsics)):
+        if given and source in (KEYPOINTS, TRUTH):
+            raise OptionError(f"{name}: --from {source} needs no detector; leave it out, or give --from {IMAGES}")
     if changes:
         parameters = _parse_parameters(changes)
     if extrinsics:
         parameters["T_gripper_camera"] = _parse_extrinsics(extrinsics)
-    return KeypointSource(source=getattr(options, "source", None) or "", jaw_file=options.jaw, parameters=parameters)
+    return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters)
 
 
 def _parse_parameters(texts: Sequence[str]) -> dict[str, Any]:

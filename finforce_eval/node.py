@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import groupby
@@ -25,6 +24,7 @@ import finforce_ros as ros
 from finforce_eval.live import ReplayLog
 from finforce_eval.parameters import PlayerParameters
 from finforce_eval.playback import Playback, RawMessage, read_playback
+from finforce_eval.read_ahead import ReadAhead
 
 # what is heard while messages are being sent waits its turn; nothing of it may be lost
 HEARD = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -39,9 +39,10 @@ class PlayerNode(Node):
         self._spinner.add_node(self)
         self._outputs: dict[str, Any] = {}
         self._clock_out: Any = None
+        self._coming: ReadAhead | None = None
 
     def offer(self, messages: Playback) -> None:
-        """Create a publisher for every topic; a type that is not installed is named and left out."""
+        """Create a publisher for every topic, and begin to read; a type that is not installed is named and left out."""
         for topic, msgtype in messages.types.items():
             package, _, name = msgtype.split("/")
             try:
@@ -50,6 +51,15 @@ class PlayerNode(Node):
                 self.get_logger().warning(f"{topic} is not played: {msgtype} is not installed")
                 continue
             self._outputs[topic] = self.create_publisher(kind, topic, ros.RESULT)
+        # what belongs to one image leaves at once
+        portions = groupby(messages, key=attrgetter("time"))
+        self._coming = ReadAhead((time, list(due)) for time, due in portions)
+
+    def destroy_node(self) -> None:
+        """End the node, and the reading of what was not played."""
+        if self._coming is not None:
+            self._coming.close()
+        super().destroy_node()
 
     def has_listeners(self, topics: Iterable[str]) -> bool:
         """Say whether somebody listens to each of the topics, whether they are played from here or not."""
@@ -87,7 +97,7 @@ class PlayerNode(Node):
         offset: int | None = None,
         sent: Callable[[RawMessage], Any] = lambda message: None,
     ) -> None:
-        """Publish the messages at their pace.
+        """Publish the messages that were offered, once, at their pace.
 
         Args:
             messages: in the order of their receipt.
@@ -99,8 +109,7 @@ class PlayerNode(Node):
         if offset is None:
             self._start_clock(first)
         began = monotonic()
-        # what belongs to one image leaves at once
-        for time, due in read_ahead((time, list(due)) for time, due in groupby(messages, key=attrgetter("time"))):
+        for time, due in self._coming:
             self.spin_until(began + (time - first) / (rate * ros.NANOSECONDS))
             if offset is None:
                 self._clock_out.publish(Clock(clock=ros.stamp_message(time)))
@@ -138,18 +147,6 @@ class PlayerNode(Node):
                 subscribe(PointCloud2, f"{side}/keypoints", lambda m, s=side: log.take_keypoints(s, m, monotonic()))
         subscribe(WrenchStamped, "grasp_wrench", lambda m: log.take_grasp(m, monotonic()))
         subscribe(DiagnosticArray, "/diagnostics", log.take_diagnostics)
-
-
-def read_ahead(items: Generator[Any, None, None]) -> Iterator[Any]:
-    """Yield what a generator gives, of which the next is made in another thread meanwhile; None ends it."""
-    with ThreadPoolExecutor(max_workers=1) as pool:
-        coming = pool.submit(next, items, None)
-        try:
-            while (item := coming.result()) is not None:
-                coming = pool.submit(next, items, None)
-                yield item
-        finally:
-            pool.submit(items.close)  # in the thread that opened the bag
 
 
 @contextmanager

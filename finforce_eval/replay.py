@@ -29,6 +29,7 @@ from finforce_eval.tracks import Recording
 from finforce_eval.writer import write_recording
 from finforce_graph import Process, ReplayOptions, replay_processes
 from finforce_ifea.errors import MissingDependencyError
+from finforce_ifea.jaw import Jaw
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 PATIENCE = 180.0  # s; a first start compiles the element loops
@@ -102,22 +103,15 @@ def replay(
         MissingDependencyError: ROS 2 is not installed.
     """
     playing, keypoints = playing or Playing(), keypoints or KeypointSource(jaw_file=str(setup.jaw.path))
-    source, sides = keypoints.source_of(recording), tuple(recording.jaws)
+    sides, from_images = tuple(recording.jaws), keypoints.source_of(recording) == IMAGES
     with ExitStack() as stack:
-        if source == IMAGES:
-            recording = awaiting_keypoints(recording)
-        elif source == TRUTH:
-            recording = _write_truth(keypoints.apply(recording), stack)
-        for side in truth_sides(recording):
-            if source != IMAGES:
-                check_keypoint_count(recording, side, setup.jaw)
-        without = _results_of(sides) | _unplayed(sides, source == IMAGES)
-        messages = read_playback(recording.path, without=without)
+        recording = _choose_keypoints(recording, setup.jaw, keypoints, stack)
+        messages = read_playback(recording.path, without=_results_of(sides) | _unplayed(sides, from_images))
         options = _graph_options(recording, setup, calibration_file, playing)
-        processes = replay_processes(replace(options, images=source == IMAGES), Path())
+        processes = replay_processes(replace(options, images=from_images), Path())
         log = ReplayLog(sides)
         _run(_with_detector(processes, recording, keypoints), messages, log, playing)
-    if source == IMAGES:
+    if from_images:
         recording = with_detections(recording, {side: found.side_log() for side, found in log.detections.items()})
     evaluation = _score(recording, setup, log)
     return Replay(
@@ -127,6 +121,23 @@ def replay(
         grasp_score=score_grasp(recording, log.grasp, log.grasp_latency),
         recording=recording,
     )
+
+
+def _choose_keypoints(recording: Recording, jaw: Jaw, keypoints: KeypointSource, stack: ExitStack) -> Recording:
+    """Return a recording with the key points that are played, without any where images will give them.
+
+    Raises:
+        RecordingError: there is no ground truth, or another number of key points than the jaw's.
+    """
+    source = keypoints.source_of(recording)
+    if source == IMAGES:
+        recording = awaiting_keypoints(recording)
+    elif source == TRUTH:
+        recording = _write_truth(keypoints.apply(recording), stack)
+    for side in truth_sides(recording):
+        if source != IMAGES:
+            check_keypoint_count(recording, side, jaw)
+    return recording
 
 
 def _write_truth(recording: Recording, stack: ExitStack) -> Recording:

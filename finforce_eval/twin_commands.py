@@ -45,14 +45,15 @@ def run_record(options: argparse.Namespace) -> None:
         FinforceError: an option or the scene cannot be used, or the folder exists.
     """
     folder = Path(options.output)
-    if folder.exists():
-        raise RecordingError(f"{folder}: exists already; a recording is written to a new folder")
+    check_new(folder)
     scenario = scenario_from_options(options)
     camera = parse_size(options.size)
     if min(options.seed, options.finger) < 0:
         raise OptionError(f"--seed {options.seed} --finger {options.finger}: expected numbers from 0")
     if not 1 <= options.quality <= 95:
         raise OptionError(f"--quality {options.quality}: expected 1 to 95")
+    if not options.farthest > 0.0:
+        raise OptionError(f"--farthest {options.farthest:g}: expected a distance above 0 [m]")
     form = RecordingForm(
         compressed=not options.raw, quality=options.quality, farthest=options.farthest, storage=options.storage
     )
@@ -60,6 +61,29 @@ def run_record(options: argparse.Namespace) -> None:
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
     print(f"Recording: {folder} ({size:.1f} MB), preview: {folder / PREVIEW}")
     print(f"Score it with: finforce evaluate {folder} --from images")
+
+
+def check_new(folder: Path) -> None:
+    """Refuse a folder that exists, or that cannot be made, before the work that would fill it.
+
+    Raises:
+        RecordingError: it is one of these.
+    """
+    try:
+        folder.mkdir(parents=True)
+        folder.rmdir()
+    except FileExistsError as error:
+        if folder.exists():
+            raise RecordingError(f"{folder}: exists already; a recording is written to a new folder") from error
+        raise _not_made(folder, error) from error
+    except OSError as error:
+        raise _not_made(folder, error) from error
+
+
+def _not_made(folder: Path, error: OSError) -> RecordingError:
+    return RecordingError(
+        f"-o {folder}: cannot be made ({error.strerror}); expected a new folder where one may be written"
+    )
 
 
 def record_scene(

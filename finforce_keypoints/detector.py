@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_camera import CameraIntrinsics
 from finforce_contact.poses import check_pose
 from finforce_ifea.jaw import Jaw
-from finforce_keypoints.errors import DetectionError, GeometryError, ImageOrderError
+from finforce_keypoints.errors import DetectionError, GeometryError, ImageOrderError, KeypointError
 from finforce_keypoints.finder import PixelFinder, PixelFinding
 from finforce_keypoints.images import RgbdImage, check_image
 from finforce_keypoints.jaw_localizer import JawKeypoints, JawLocalizer
@@ -22,6 +24,7 @@ from finforce_keypoints.settings import DetectorSettings
 __all__ = ["JawKeypoints", "KeypointDetector"]
 
 _SAME_SIDE = 2e-3  # [m] by which a reference point may lie off the plane of the key points
+_PRACTICE_SIZE, _RATE = (640, 480), 30.0  # px, Hz
 _LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is better than this
 
 
@@ -71,9 +74,26 @@ class KeypointDetector:
         return tuple(side for side, jaw in self._jaws.items() if jaw.is_lost)
 
     @property
+    def warnings(self) -> Mapping[str, str]:
+        """What is suspicious about a jaw, by side, in a sentence; nothing is refused for it."""
+        return {side: jaw.warning for side, jaw in self._jaws.items() if jaw.warning}
+
+    @property
     def depth_scale(self) -> DepthScale:
         """The relative error of the depth image's scale, as the rigid reference points show it."""
         return self._scale
+
+    def warm_up(self) -> None:
+        """Do once all that images need, so that the first of them waits for no library; the jaws are forgotten."""
+        image = _practice_image()
+        for expected in ({side: None for side in self._jaws}, {side: jaw.middle for side, jaw in self._jaws.items()}):
+            with suppress(KeypointError):  # a network of images of another size
+                self._finder.find(image, expected)
+        for jaw in self._jaws.values():
+            for number in range(2):  # the second is compared with the first
+                later = replace(image, stamp=image.stamp + number / _RATE)
+                jaw.locate(later, jaw.imagine(image.camera), self._scale)
+        self.reset()
 
     def detect(self, image: RgbdImage) -> Mapping[str, JawKeypoints]:
         """Return the key points of the jaws in an image; a jaw that is not found is absent.
@@ -134,6 +154,18 @@ class KeypointDetector:
         self.counts[side] += 1
         for reason in keypoints.reasons[~keypoints.valid]:
             self.counts[f"{side}/{reason}"] += 1
+
+
+def _practice_image() -> RgbdImage:
+    """Return an image of noise, as large as a D405's, with something as far away as jaws are."""
+    width, height = _PRACTICE_SIZE
+    camera = CameraIntrinsics(
+        width=width, height=height, fx=0.67 * width, fy=0.67 * width, cx=0.5 * width, cy=0.5 * height
+    )
+    rng = np.random.default_rng(0)
+    color = rng.integers(60, 180, (height, width, 3), dtype=np.uint8)
+    depth = rng.uniform(0.12, 0.14, (height, width)).astype(np.float32)
+    return RgbdImage(stamp=0.0, color=color, depth=depth, camera=camera)
 
 
 def check_reference(jaw: Jaw) -> None:

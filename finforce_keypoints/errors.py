@@ -32,6 +32,10 @@ class BlackImageError(KeypointError, ImageError):
     """A picture shows nothing."""
 
 
+class EmptyDepthError(KeypointError, ImageError):
+    """A depth image has no depth anywhere."""
+
+
 class FrozenImageError(KeypointError, ImageError):
     """A camera gives the same picture again and again."""
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_camera import CameraIntrinsics, ImageError, ImageLayout
-from finforce_keypoints.errors import BlackImageError, FrozenImageError
+from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError
 
 COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
 _PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
@@ -91,6 +91,7 @@ def check_image(image: RgbdImage) -> None:
 
     Raises:
         ImageError: colour or depth has another size than the camera, another type, or the stamp is no time.
+        EmptyDepthError: there is a depth image, without any depth.
     """
     size = (image.camera.height, image.camera.width)
     if not np.isfinite(image.stamp):
@@ -104,6 +105,11 @@ def check_image(image: RgbdImage) -> None:
         raise ImageError(
             f"depth image: {image.depth.dtype} of shape {np.shape(image.depth)}; expected metres of shape {size}, "
             "that of the colour image; use the depth that is aligned to colour"
+        )
+    if image.depth is not None and not np.isfinite(image.depth).any():
+        raise EmptyDepthError(
+            "the depth image is empty: no pixel has a depth; expected some; is the camera covered, or its depth stream "
+            "off?"
         )
 
 

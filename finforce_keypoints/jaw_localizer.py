@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_camera import CameraIntrinsics, project
 from finforce_ifea.jaw import Jaw
 from finforce_keypoints.depth import DepthEvidence, build_side_samples, sample_depths, weigh_depths
 from finforce_keypoints.finder import PixelFinding
 from finforce_keypoints.images import RgbdImage, lie_inside
-from finforce_keypoints.jaw_pose import OriginFinder, OriginTrack
+from finforce_keypoints.jaw_pose import Origin, OriginFinder, OriginTrack
 from finforce_keypoints.localization import (
     DepthScale,
     SideFit,
@@ -23,6 +24,7 @@ from finforce_keypoints.localization import (
     rays_through,
 )
 from finforce_keypoints.reference_patch import ReferencePatch
+from finforce_keypoints.rest_check import RestCheck
 from finforce_keypoints.settings import DetectorSettings
 
 _LEAST_SEEN = 3  # points, or all there are: fewer likely ones are no jaw
@@ -71,6 +73,17 @@ class Located:
     scale: DepthScale
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Seen:
+    """One image, what was found in it, which points (K + 1,) are likely, their rays (K + 1, 3) and these' errors."""
+
+    image: RgbdImage
+    finding: PixelFinding
+    likely: NDArray
+    rays: NDArray
+    ray_stddev: NDArray
+
+
 class JawLocalizer:
     """Follows one jaw; raises MeshError when the jaw's mesh is bad."""
 
@@ -78,7 +91,8 @@ class JawLocalizer:
         """Prepare where to sample depth on the jaw."""
         self._settings = settings
         self._origin, self._track = OriginFinder(jaw, T_gripper_camera, settings), OriginTrack(settings)
-        self._patch = ReferencePatch(jaw)
+        self._patch, self._rest_check = ReferencePatch(jaw), RestCheck(jaw.keypoints)
+        self._unconfirmed = 0
         self._samples = build_side_samples(jaw, settings.window, settings.edge)
         self._rest = np.vstack((jaw.keypoints, jaw.reference_point))
         self._model = SideModel(
@@ -94,11 +108,37 @@ class JawLocalizer:
         """Forget where the jaw was."""
         self._track.reset()
         self._patch.reset()
+        self._rest_check.reset()
+        self._unconfirmed = 0
+
+    @property
+    def warning(self) -> str:
+        """What is suspicious about this jaw, in a sentence; "" for nothing."""
+        distance = self._rest_check.distance
+        if not distance > self._settings.rest_tolerance:
+            return ""
+        return (
+            f"the key points at rest lie {1e3 * distance:.1f} mm from the jaw file: are the camera's extrinsics right?"
+        )
 
     @property
     def is_lost(self) -> bool:
         """Whether the jaw has to be looked for everywhere."""
         return self._track.is_lost
+
+    @property
+    def middle(self) -> NDArray:
+        """T_camera_jaw (4, 4) in the middle of the opening range."""
+        return self._origin.place(self._origin.middle)
+
+    def imagine(self, camera: CameraIntrinsics) -> PixelFinding:
+        """Return the finding of a jaw at rest, seen without error in the middle of the opening range."""
+        T, count = self.middle, len(self._rest)
+        return PixelFinding(
+            pixels=project(self._rest @ T[:3, :3].T + T[:3, 3], camera),
+            likelihood=np.ones(count),
+            stddev=np.full(count, 0.5),
+        )
 
     def expect(self, stamp: float) -> NDArray | None:
         """Return T_camera_jaw (4, 4) where the jaw should be at a time [s]; None when it is lost."""
@@ -116,38 +156,68 @@ class JawLocalizer:
         if finding is None:
             self._track.update(image.stamp, None)
             return None
-        inside, likely = lie_inside(image, finding.pixels), self._find_likely(image, finding)
-        rays = rays_through(np.where(inside[:, None], finding.pixels, np.nan), image.camera)
-        ray_stddev = finding.stddev / np.sqrt(image.camera.fx * image.camera.fy)
-        measured = self._origin.measure(np.where(likely[:, None], rays, np.nan), ray_stddev)
-        if not self._is_there(likely):
-            measured = None
-        if measured is not None and likely[-1]:
-            measured = self._patch.refine(image.color, image.camera, measured, self._origin.place)
-        origin = self._track.update(image.stamp, measured)
+        seen = self._look(image, finding)
+        origin = self._track.update(image.stamp, self._measure(seen))
         if origin is None:
             return None
+        located = self._describe(seen, scale, origin)
+        # without one key point that depth confirms, a picture of a jaw would do as well
+        self._unconfirmed = 0 if located.keypoints.valid.any() else self._unconfirmed + 1
+        if self._unconfirmed >= self._settings.lost_images:
+            self._track.reset()
+            return None
+        return located
+
+    def _look(self, image: RgbdImage, finding: PixelFinding) -> _Seen:
+        """Return the rays to the points that were found."""
+        inside = lie_inside(image, finding.pixels)
+        return _Seen(
+            image=image,
+            finding=finding,
+            likely=self._find_likely(image, finding),
+            rays=rays_through(np.where(inside[:, None], finding.pixels, np.nan), image.camera),
+            ray_stddev=finding.stddev / np.sqrt(image.camera.fx * image.camera.fy),
+        )
+
+    def _measure(self, seen: _Seen) -> Origin | None:
+        """Return where one image shows the jaw; None where it does not."""
+        measured = self._origin.measure(np.where(seen.likely[:, None], seen.rays, np.nan), seen.ray_stddev)
+        if measured is None or not self._is_there(seen.likely):
+            return None
+        if seen.likely[-1]:
+            return self._patch.refine(seen.image.color, seen.image.camera, measured, self._origin.place)
+        return measured
+
+    def _describe(self, seen: _Seen, scale: DepthScale, origin: Origin) -> Located:
+        """Return the key points of the jaw at an origin."""
         T_camera_jaw = self._origin.place(origin)
-        sight = look_along(rays, T_camera_jaw)
-        side = self._fit_side(image, sight, likely, scale, T_camera_jaw)
+        sight = look_along(seen.rays, T_camera_jaw)
+        side = self._fit_side(seen.image, sight, seen.likely, scale, T_camera_jaw)
         depths = sight.depths_at(self._rest[:, 1] + side.fit.y)
+        self._check_rest(seen, sight, side)
         points = np.where(side.has_depth[:, None], sight.camera + depths[:, None] * sight.rays, np.nan)
-        stddev = compute_stddev(sight, depths, side.fit.stddev, ray_stddev)
+        stddev = compute_stddev(sight, depths, side.fit.stddev, seen.ray_stddev)
         stddev[:, 0] = np.hypot(stddev[:, 0], origin.stddev)
-        reasons = self._judge(image, finding, side, points)
+        reasons = self._judge(seen.image, seen.finding, side, points)
         valid = reasons == ""
         count = len(valid)
         keypoints = JawKeypoints(
-            stamp=image.stamp,
+            stamp=seen.image.stamp,
             points=points[:count],
-            likelihood=np.where(valid, finding.likelihood[:count], 0.0),
-            pixels=finding.pixels[:count],
+            likelihood=np.where(valid, seen.finding.likelihood[:count], 0.0),
+            pixels=seen.finding.pixels[:count],
             valid=valid,
             stddev=stddev[:count],
             T_camera_jaw=T_camera_jaw,
             reasons=reasons,
         )
         return Located(keypoints=keypoints, scale=side.fit.scale)
+
+    def _check_rest(self, seen: _Seen, sight: Sight, side: SideEvidence) -> None:
+        """Compare the likely points with the jaw file: along the side where their rays meet it, across it by depth."""
+        points = sight.points_at(self._rest[:, 1])
+        points[:, 1] += side.fit.y
+        self._rest_check.take(np.where(seen.likely[:, None], points, np.nan)[:-1])
 
     def _is_there(self, likely: NDArray) -> bool:
         """Say whether enough of the points (K + 1,) bool are likely for a jaw, more of them for one that was lost."""

@@ -50,6 +50,11 @@ class OriginFinder:
         sign = -1.0 if jaw.side == "left" else 1.0
         self._low, self._high = sorted((sign * settings.opening_min, sign * settings.opening_max))
 
+    @property
+    def middle(self) -> Origin:
+        """The middle of the opening range."""
+        return Origin(x=0.5 * (self._low + self._high), stddev=0.0)
+
     def place(self, origin: Origin) -> NDArray:
         """Return T_camera_jaw (4, 4) of an origin."""
         T = self._T_camera_middle.copy()

@@ -58,6 +58,7 @@ class KeypointDetectorNode(Node):
         self.found: Mapping[str, JawKeypoints] = {}
         self.qos = ros.QosWatch(self)
         self.out = DetectorOutputs(self.qos, parameters, names, self.card)
+        self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
         self._subscribe()
         self.get_logger().info(f"jaws: {parameters.jaws}, ready, key points by {self.card.name}")
@@ -107,7 +108,7 @@ class KeypointDetectorNode(Node):
         self.found = found = self.detector.detect(taken.image)
         self.gate.check_age(taken.stamp, self._now())
         for side, health in self.health.items():
-            outcome = outcome_of_keypoints(found.get(side), side)
+            outcome = outcome_of_keypoints(found.get(side), side, self.detector.warnings.get(side, ""))
             if side not in found:
                 self._refuse(outcome, (side,))
                 continue

@@ -34,10 +34,12 @@ class DetectorParameters(TimeParameters):
         pose_numbers(ROBOT_CAMERA), "x, y, z [m], qx, qy, qz, qw of the colour camera in the gripper's frame"
     )
     color_topics: tuple[str, ...] = parameter(
-        (COLOR_TOPIC, OLD_COLOR_TOPIC), "colour images; the first topic that brings one is used, until it is silent"
+        (COLOR_TOPIC, OLD_COLOR_TOPIC),
+        "colour images; the first topic that brings one is used, until it is silent",
+        topic=True,
     )
-    depth_topic: str = parameter(DEPTH_TOPIC, "depth images, aligned to the colour images")
-    info_topic: str = parameter(INFO_TOPIC, "intrinsics of the colour camera")
+    depth_topic: str = parameter(DEPTH_TOPIC, "depth images, aligned to the colour images", topic=True)
+    info_topic: str = parameter(INFO_TOPIC, "intrinsics of the colour camera", topic=True)
     finder: str = parameter(
         "network",
         "what finds the key points: a network that sees the jaws' side planes (the shipped one), any DeepLabCut "

@@ -20,14 +20,16 @@ if TYPE_CHECKING:
 LEAST_VISIBLE = 3  # key points; a solver gives no force with fewer
 
 
-def outcome_of_keypoints(found: JawKeypoints | None, side: str) -> Outcome:
-    """Return how well a jaw was seen; None: it was not found."""
+def outcome_of_keypoints(found: JawKeypoints | None, side: str, warning: str = "") -> Outcome:
+    """Return how well a jaw was seen, None: it was not found; with what the detector warns of, "" for nothing."""
+    more = f"; {warning}" if warning else ""
     if found is None:
-        return Outcome(level=Level.WARN, reason="lost", text=f"the {side} jaw was not found in the image")
+        return Outcome(level=Level.WARN, reason="lost", text=f"the {side} jaw was not found in the image{more}")
     visible, total = int(np.sum(found.valid)), len(found.valid)
-    text = f"{visible} of {total} key points visible"
+    text = f"{visible} of {total} key points visible{more}"
     enough = visible >= LEAST_VISIBLE
-    return Outcome(level=Level.OK if enough else Level.WARN, reason="visible" if enough else "hidden", text=text)
+    level = Level.OK if enough and not warning else Level.WARN
+    return Outcome(level=level, reason="visible" if enough else "hidden", text=text)
 
 
 def describe(feed: CameraFeed, card: FinderCard, found: JawKeypoints | None) -> dict[str, str]:

@@ -46,7 +46,12 @@ class DetectorSettings:
         0.3e-3, "m", 1e-5, 0.01, "bending of the jaw 10 mm above its base, more with the square of the height"
     )
     origin_stddev: float = setting(0.6e-3, "m", 1e-5, 0.02, "a jaw whose place is less well known is not found")
-    lost_images: int = setting(5, "images", 1, 1000, "after so many images without it a jaw is looked for everywhere")
+    rest_tolerance: float = setting(
+        1.1e-3, "m", 1e-4, 0.1, "key points at rest that lie farther from the jaw file, root mean square, are warned of"
+    )
+    lost_images: int = setting(
+        5, "images", 1, 1000, "after so many images without it, or without a valid key point, a jaw is lost"
+    )
 
     def __post_init__(self) -> None:
         """Refuse values out of bounds.

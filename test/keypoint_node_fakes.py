@@ -46,6 +46,7 @@ class FakeDetector:
     def __init__(self, sides):
         self.answer = {side: FakeKeypoints() for side in sides}
         self.images, self.resets, self.error, self.delay = [], 0, None, 0.0
+        self.warnings, self.warmed = {}, False
 
     def detect(self, image):
         self.images.append(image)
@@ -56,6 +57,9 @@ class FakeDetector:
 
     def reset(self):
         self.resets += 1
+
+    def warm_up(self):
+        self.warmed = True
 
 
 def start_detector(probe, **parameters):

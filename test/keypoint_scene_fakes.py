@@ -1,6 +1,7 @@
 """Depth pictures of fin-ray jaws, and a finder that knows the truth and errs as told, for tests of the detector."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -8,9 +9,11 @@ from finforce_camera import CameraIntrinsics, project
 from finforce_contact.object_mesh import ObjectMesh
 from finforce_contact.views import MeshView
 from finforce_ifea.jaw import load_jaw
+from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.finder import PixelFinding
 from finforce_keypoints.gripper_geometry import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, jaw_in_camera
 from finforce_keypoints.images import RgbdImage
+from finforce_keypoints.settings import DetectorSettings
 from finforce_twin.depth_camera import D405_DISTORTION, DepthNoise, disturb_depth
 
 CAMERA = CameraIntrinsics(
@@ -122,3 +125,18 @@ class FakeFinder:
                 pixels=rows + noise, likelihood=self.likelihood[side], stddev=np.full(len(rows), self.stddev)
             )
         return findings
+
+
+@lru_cache(maxsize=16)
+def scene_of(view, bend=None):
+    """A scene and its true depths, drawn once."""
+    scene = FakeScene(view, bend)
+    return scene, scene.depth()
+
+
+def build(view="robot", bend=None, rng=None, **settings):
+    """A scene, its true depths, a finder that knows its pixels, and a detector around that."""
+    scene, depth = scene_of(view, bend)
+    finder = FakeFinder(scene.pixels(), rng)
+    detector = KeypointDetector(finder, scene.jaws, scene.T_gripper_camera, DetectorSettings(**settings))
+    return scene, depth, finder, detector

@@ -121,6 +121,7 @@ class FakeDetector:
     lost: tuple = ()
     refused: tuple = ()
     stamps: list = field(default_factory=list)
+    warnings: dict = field(default_factory=dict)
 
     def detect(self, image) -> Mapping[str, FakeKeypoints]:
         index = int(np.argmin(np.abs(self.recording.images.stamps * 1e-9 - image.stamp)))

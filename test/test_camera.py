@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -49,6 +51,14 @@ def test_distortion_follows_its_published_formula():
     u = 33.0 * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + 31.0
     v = 32.0 * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + 24.5
     np.testing.assert_allclose(project(np.array([[0.2, 0.1, 0.5]]), make_camera(D405)), [[u, v]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("focal", [1e300, 1e6, 0.05])
+@pytest.mark.parametrize("axis", ["fx", "fy"])
+def test_a_focal_length_out_of_proportion_to_the_image_is_refused(axis, focal):
+    with pytest.raises(IntrinsicsError, match="focal lengths in proportion to the image"):
+        replace(make_camera(), **{axis: focal})
+    replace(make_camera(), fx=300.0, fy=290.0)  # a part cut out of an image ten times as wide
 
 
 def test_distortion_that_cannot_be_inverted_is_refused():

@@ -17,7 +17,7 @@ from finforce_eval.recording import read_recording
 from finforce_eval.sight_scoring import compare_sight, sight_stats
 from finforce_eval.twin_writer import write_footage
 from finforce_eval.writer import write_recording
-from finforce_keypoints.images import ImageWatch
+from finforce_keypoints.images import ImageWatch, check_image
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +60,30 @@ def test_what_a_detector_refuses_is_counted_and_the_rest_goes_on(recording):
     found, _ = detect(recording, refused=(2, 3))
     assert found.notes[-1] == "2 images refused: no picture for this finder"
     assert found.jaws["left"].detection.found.sum() == 10
+
+
+def test_what_a_detector_warns_of_is_a_note_once(recording):
+    found, _ = detect(recording, warnings={"left": "it lies 3.1 mm off"})
+    assert [note for note in found.notes if "3.1" in note] == ["left jaw: it lies 3.1 mm off"]
+    with pytest.raises(RecordingError, match="left jaw: it lies 3.1 mm off"):
+        detect(recording, warnings={"left": "it lies 3.1 mm off"}, lost=range(12))
+
+
+class WithoutDepth(FakeDetector):
+    """Sees no depth in two images."""
+
+    def detect(self, image):
+        if len(self.stamps) < 2:
+            image = replace(image, depth=np.full_like(image.depth, np.nan))
+        self.stamps.append(image.stamp)
+        check_image(image)
+        return super().detect(image)
+
+
+def test_images_without_depth_are_a_note(recording):
+    found = detect_keypoints(recording, WithoutDepth(recording), watch=ImageWatch())
+    assert found.notes[-1].startswith("2 images refused: the depth image is empty")
+    assert found.jaws["left"].detection.found.tolist() == [False, False] + [True] * 10
 
 
 def test_a_black_picture_gives_no_key_points(tmp_path):
@@ -194,6 +218,14 @@ def test_the_step_of_the_depth_image_is_that_of_the_parameter(recording, monkeyp
 def test_colour_and_depth_belong_together_as_the_parameter_says():
     assert parse_source(options()).pairing == 8_000_000
     assert parse_source(options(detector=["sync_tolerance=0.012"])).pairing == 12_000_000
+
+
+@pytest.mark.parametrize("source", ["truth", "keypoints"])
+@pytest.mark.parametrize("given", [{"detector": ["threads=1"]}, {"extrinsics": "bench"}])
+def test_options_of_the_detector_are_refused_where_it_finds_nothing(source, given):
+    (name,) = given
+    with pytest.raises(OptionError, match=f"--{name}: --from {source} needs no detector; leave it out"):
+        parse_source(options(source=source, **given))
 
 
 DECIDED = ("jaws=left", "jaw_file=steel", "camera_frame=cam", "color_topics=/a", "depth_topic=/b", "info_topic=/c")

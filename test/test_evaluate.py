@@ -75,6 +75,16 @@ def test_frames_before_the_first_phase_are_not_scored():
     assert result.direction[0] == ""
 
 
+def test_without_a_frame_to_be_scored_the_phases_are_named():
+    recording = make_recording()
+    settling = replace(recording.phases, stage=np.full_like(recording.phases.stage, "settle"))
+    with pytest.raises(RecordingError, match="none of the 60 frames is to be scored: /bench/phase names no 'record'"):
+        run(replace(recording, phases=settling), truth_of(recording))
+    late = replace(recording.phases, stamps=recording.phases.stamps + 1000 * PERIOD)
+    with pytest.raises(RecordingError, match="its 'record' phases lie at none of their stamps"):
+        run(replace(recording, phases=late), truth_of(recording))
+
+
 def test_untrusted_steps_are_skipped_and_keep_their_status():
     recording = make_recording()
     forces = [None if index % 3 == 0 else force for index, force in enumerate(truth_of(recording))]

@@ -82,7 +82,12 @@ def test_camera_info_of_another_size_is_refused(probe):
 
 @pytest.mark.parametrize(
     ("changes", "word"),
-    [({"distortion_model": "equidistant"}, "equidistant"), ({"k": [0.0] * 9}, "focal")],
+    [
+        ({"distortion_model": "equidistant"}, "equidistant"),
+        ({"k": [0.0] * 9}, "focal"),
+        ({"k": [1e300, 0.0, 32.0, 0.0, 1e300, 24.0, 0.0, 0.0, 1.0]}, "focal lengths in proportion"),
+        ({"k": [60.0, 2.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0]}, "skew"),
+    ],
 )
 def test_camera_info_that_no_camera_has_is_refused(probe, changes, word):
     bench = CameraBench(probe, info=False)
@@ -101,6 +106,13 @@ def test_depth_of_another_size_is_refused(probe):
     bench = CameraBench(probe)
     bench.shoot(depth=np.full((HEIGHT // 2, WIDTH), 120, dtype=np.uint16))
     bench.refused("aligned to colour", Level.ERROR)
+    recovers(bench)
+
+
+def test_a_depth_image_without_any_depth_is_refused(probe):
+    bench = CameraBench(probe)
+    bench.shoot(depth=np.zeros((HEIGHT, WIDTH), dtype=np.uint16))
+    bench.refused("the depth image is empty", Level.ERROR)
     recovers(bench)
 
 

@@ -1,32 +1,17 @@
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import pytest
-from keypoint_scene_fakes import CAMERA, Bend, FakeFinder, FakeScene, bare_image
+from keypoint_scene_fakes import CAMERA, Bend, FakeFinder, bare_image, build, scene_of
 
 from finforce_camera import ImageError, compute_rays
 from finforce_keypoints.detector import KeypointDetector, check_reference
-from finforce_keypoints.errors import DetectionError, GeometryError, ImageOrderError
+from finforce_keypoints.errors import DetectionError, EmptyDepthError, GeometryError, ImageOrderError
 from finforce_keypoints.finder import PixelFinding
 from finforce_keypoints.gripper_geometry import jaw_in_camera
-from finforce_keypoints.settings import DetectorSettings
 
 RATE = 30.0
 PUSHED = Bend(push=0.012, lean=0.0015)
-
-
-@lru_cache(maxsize=8)
-def scene_of(view, bend=None):
-    scene = FakeScene(view, bend)
-    return scene, scene.depth()
-
-
-def build(view="robot", bend=None, rng=None, **settings):
-    scene, depth = scene_of(view, bend)
-    finder = FakeFinder(scene.pixels(), rng)
-    detector = KeypointDetector(finder, scene.jaws, scene.T_gripper_camera, DetectorSettings(**settings))
-    return scene, depth, finder, detector
 
 
 def run(view, bend=None, scale=0.0, count=5):
@@ -168,10 +153,14 @@ def test_a_hole_in_the_depth_is_bridged_by_the_shared_plane_only_if_that_is_allo
     assert np.linalg.norm(found.points[3] - scene.keypoints("left")[3]) < 0.3e-3
 
 
-def test_a_depth_image_full_of_holes_gives_no_point():
+def test_a_depth_image_without_any_depth_is_an_error_and_one_with_a_little_is_not():
     _, _, _, detector = build()
-    found = detector.detect(bare_image(0.0, np.full((480, 640), np.nan, np.float32)))
-    assert not any(keypoints.valid.any() for keypoints in found.values())
+    depth = np.full((480, 640), np.nan, np.float32)
+    with pytest.raises(EmptyDepthError, match="the depth image is empty"):
+        detector.detect(bare_image(0.0, depth))
+    depth[0, 0] = 0.3
+    found = detector.detect(bare_image(0.0, depth))
+    assert set(found) == {"left", "right"} and not any(keypoints.valid.any() for keypoints in found.values())
 
 
 def test_a_closing_jaw_is_expected_where_it_will_be():
@@ -199,6 +188,21 @@ def test_a_lost_jaw_is_absent_looked_for_everywhere_and_found_again():
     finder.pixels = {"left": seen, **finder.pixels}
     finder.likelihood["left"] = np.full(16, 0.95)
     assert "left" in detector.detect(replace(image, stamp=1.0))
+
+
+def test_a_jaw_that_no_depth_confirms_is_lost_and_found_again_by_one_that_does():
+    scene, depth, finder, detector = build(lost_images=4)
+    whole = bare_image(0.0, depth.astype(np.float32))
+    flat = replace(whole, depth=np.full_like(whole.depth, 0.35))  # a picture of jaws on a wall
+    assert set(detector.detect(whole)) == {"left", "right"}
+    for n in range(1, 12):
+        found = detector.detect(replace(flat, stamp=n / RATE))
+        assert set(found) == ({"left", "right"} if n < 4 else set())
+        assert not any(keypoints.valid.any() for keypoints in found.values())
+    assert set(detector.lost_sides) == {"left", "right"} and finder.expected[-1] == {"left": None, "right": None}
+    found = detector.detect(replace(whole, stamp=0.5))
+    assert set(found) == {"left", "right"} and found["left"].valid.all() and not detector.lost_sides
+    assert set(detector.detect(replace(flat, stamp=0.53))) == {"left", "right"}  # counted anew
 
 
 def test_a_jaw_whose_reference_point_is_hidden_for_a_moment_goes_on():

@@ -32,6 +32,7 @@ from finforce_contact.messages import pose_from_message
 from finforce_health import Level
 from finforce_ifea.pointcloud import decode_cloud
 from finforce_keypoints.errors import DetectionError
+from finforce_keypoints.node import KeypointDetectorNode
 
 COLUMNS = ("x", "y", "z", "likelihood", "u", "v", "valid", "reason", "stddev_x", "stddev_y", "stddev_z")
 
@@ -240,6 +241,19 @@ def test_a_jaw_that_is_not_found_is_silent_and_the_other_is_not(probe):
     assert not bench.clouds("left") and not bench.poses("left")
 
 
+@pytest.mark.parametrize("lost", [False, True])
+def test_what_the_detector_warns_of_is_said_and_refuses_nothing(probe, lost):
+    bench = CameraBench(probe)
+    bench.node.detector.warnings = {"left": "the key points at rest lie 3.1 mm from the jaw file"}
+    if lost:
+        del bench.node.detector.answer["left"]
+    bench.shoot()
+    bench.diagnosis(level=Level.WARN, word="; the key points at rest lie 3.1 mm from the jaw file")
+    bench.diagnosis("right", level=Level.OK, word="visible")
+    if not lost:
+        bench.wait_for_clouds()
+
+
 def test_hidden_key_points_are_counted_by_reason(probe):
     bench = CameraBench(probe)
     hidden = bench.node.detector.answer["left"]
@@ -258,6 +272,16 @@ def test_what_the_detector_refuses_is_said_and_not_published(probe):
     bench.node.detector.error = None
     bench.shoot()
     bench.wait_for_clouds()
+
+
+def test_the_detector_is_warm_before_the_first_image_can_come(probe, monkeypatch):
+    seen = []
+    subscribe = KeypointDetectorNode._subscribe
+    monkeypatch.setattr(
+        KeypointDetectorNode, "_subscribe", lambda node: seen.append(node.detector.warmed) or subscribe(node)
+    )
+    start_detector(probe)
+    assert seen == [True]
 
 
 def test_reset_forgets_the_jaws(probe):

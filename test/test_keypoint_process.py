@@ -26,12 +26,22 @@ def test_a_signal_ends_the_node_cleanly(number):
         ("T_gripper_camera:=[0.0, 0.0, 0.1]", "quaternion of shape"),
         ("T_gripper_camera:=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0]", "norm"),
         ("detector.likelihood:=2.0", "detector.likelihood"),
+        ("color_topics:=[]", "color_topics: got (), expected at least one topic"),
+        ("input_size:=[]", "input_size: got (), expected height and width"),
+        ("T_gripper_camera:=[]", "quaternion of shape"),
+        ("threads:=[]", "parameter threads is empty; expected a value such as 2"),
+        ("depth_topic:=''", "parameter depth_topic is ''; expected the name of a topic: topic name must not be empty"),
+        ("info_topic:=a b", "parameter info_topic is 'a b'; expected the name of a topic: topic name must not contain"),
+        ("color_topics:=[/x, /a//b]", "parameter color_topics is '/a//b'; expected the name of a topic"),
+        ("depth_topic:=/{camera}/depth", "parameter depth_topic is '/{camera}/depth'; expected the name of a topic"),
     ],
 )
 def test_what_cannot_be_set_up_ends_with_two_and_one_reason(given, reason):
     done = run_node(command_of("keypoint_detector", given))
     assert done.returncode == 2
-    assert reason in done.stderr.strip().splitlines()[-1] and "Traceback" not in done.stderr
+    said = done.stderr.strip().splitlines()
+    assert reason in said[-1] and "Traceback" not in done.stderr
+    assert sum(line.startswith("keypoint_detector: ") for line in said) == 1
 
 
 def test_heavy_libraries_wait_until_they_are_needed():

@@ -9,8 +9,8 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from finforce_eval.errors import RecordingError
-from finforce_eval.node import read_ahead
 from finforce_eval.playback import RawMessage, read_playback
+from finforce_eval.read_ahead import ReadAhead
 from finforce_eval.writer import write_recording
 
 
@@ -63,41 +63,38 @@ def test_a_bag_without_anything_to_play_is_refused(folder):
         read_playback(folder, without=every)
 
 
-def test_the_next_message_is_read_while_the_one_before_is_sent():
-    read, threads = {2: Event(), 3: Event()}, set()
+def test_messages_are_read_before_they_are_asked_for_up_to_the_depth():
+    read, threads = {2: Event(), 3: Event(), 4: Event()}, set()
 
     def items():
-        for number in (1, 2, 3):
+        for number in (1, 2, 3, 4):
             threads.add(get_ident())
             if number in read:
                 read[number].set()
             yield number
 
-    ahead = read_ahead(items())
-    assert next(ahead) == 1
-    # 10 s: nobody asks for it, and it comes all the same
-    assert read[2].wait(10.0) and not read[3].is_set()
-    assert list(ahead) == [2, 3]
+    ahead = ReadAhead(items(), depth=2)
+    # 10 s: nobody asks, and they come all the same; one more is in the hand
+    assert read[2].wait(10.0) and read[3].wait(10.0)
+    assert not read[4].wait(0.3)
+    assert list(ahead) == [1, 2, 3, 4]
     assert len(threads) == 1 and get_ident() not in threads
 
 
-def test_what_fails_in_reading_ahead_is_said_and_a_reader_that_is_left_is_closed():
-    closed = Event()
-
+def test_what_fails_in_reading_ahead_is_said_in_its_place():
     def items():
-        try:
-            yield 1
-            raise RecordingError("damaged")
-        finally:
-            closed.set()
+        yield 1
+        raise RecordingError("damaged")
 
-    ahead = read_ahead(items())
+    ahead = iter(ReadAhead(items()))
     assert next(ahead) == 1
     with pytest.raises(RecordingError, match="damaged"):
         next(ahead)
-    closed.clear()
-    ahead = read_ahead(number for number in endless(closed))
-    next(ahead)
+
+
+def test_a_reader_that_is_left_is_closed():
+    closed = Event()
+    ahead = ReadAhead(endless(closed), depth=3)
     ahead.close()
     assert closed.wait(10.0)
 

@@ -76,6 +76,9 @@ def test_a_scene_is_recorded_with_its_changes_and_a_picture(asked, tmp_path, cap
         (["nothing"], "expected one of"),
         (["grasp_cylinder", "--size", "640"], "WIDTHxHEIGHT"),
         (["grasp_cylinder", "--quality", "0"], "--quality 0"),
+        (["grasp_cylinder", "--farthest", "nan"], "--farthest nan: expected a distance above 0"),
+        (["grasp_cylinder", "--farthest", "-1"], "--farthest -1: expected a distance above 0"),
+        (["grasp_cylinder", "--farthest", "0"], "--farthest 0: expected a distance above 0"),
         (["grasp_cylinder", "--set", "mass"], "is no float"),
         (["grasp_cylinder", "--set", "colour=red"], "unknown number"),
         (["grasp_cylinder", "--set", "closing_speed=9"], "closing_speed"),
@@ -97,6 +100,15 @@ def test_a_folder_that_exists_is_left_alone(asked, tmp_path, capsys):
     (tmp_path / "bag").mkdir()
     assert main(["twin", "record", "grasp_cylinder", "-o", str(tmp_path / "bag")]) == 2
     assert not asked and "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("place", ["file/bag", "file/deeper/bag", "x" * 300])
+def test_a_folder_that_cannot_be_made_is_named_before_anything_is_rendered(asked, tmp_path, capsys, place):
+    (tmp_path / "file").write_text("no folder")
+    assert main(["twin", "record", "grasp_cylinder", "-o", str(tmp_path / place)]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert not asked and len(said) == 1 and str(tmp_path / place) in said[0]
+    assert "cannot be made" in said[0] and "expected a new folder where one may be written" in said[0]
 
 
 @pytest.fixture(scope="module")
