@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from finforce_keypoints.images import RgbdImage
     from finforce_keypoints.model import KeypointModel
 
-SAME_PLACE = 0.2e-3  # [m] by which a jaw may move before its picture is mapped anew
+SAME_PLACE = 1e-3  # [m] by which a jaw may move before its picture is mapped anew; places are exact all the same
 SEARCH_STEP = 20e-3  # [m] between the places where a lost jaw is looked for; a picture shows 79 mm
 LEAST_SCORE = 0.35  # mean likelihood of a jaw's points, below which it is not there
 

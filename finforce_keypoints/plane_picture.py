@@ -89,16 +89,16 @@ def map_picture(grid: PlaneGrid, side_y: float, T_camera_jaw: NDArray, camera: C
     rows = np.arange(0, grid.height + COARSE, COARSE)
     knots = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     exact = project_plane(grid.places(knots), side_y, T_camera_jaw, camera)
-    exact = np.where(np.isfinite(exact), exact, -1e4).reshape(len(rows), len(columns), 2)
+    exact = np.where(np.isfinite(exact), exact, -1e4).astype(np.float32).reshape(len(rows), len(columns), 2)
     down = _interpolate(exact, grid.height)
-    return _interpolate(down.swapaxes(0, 1), grid.width).swapaxes(0, 1).astype(np.float32)
+    return np.ascontiguousarray(_interpolate(down.swapaxes(0, 1), grid.width).swapaxes(0, 1))
 
 
 def _interpolate(knots: NDArray, count: int) -> NDArray:
     """Return values (count, ...) between knots (k, ...) that are COARSE apart, linearly."""
     at, share = np.divmod(np.arange(count), COARSE)
-    share = (share / COARSE).reshape(-1, *([1] * (knots.ndim - 1)))
-    return (1.0 - share) * knots[at] + share * knots[at + 1]
+    share = (share / COARSE).astype(np.float32).reshape(-1, *([1] * (knots.ndim - 1)))
+    return knots[at] + share * np.diff(knots, axis=0)[at]
 
 
 def take_picture(image: NDArray, mapping: NDArray) -> NDArray:
