@@ -111,6 +111,8 @@ def _add_twin(commands: argparse._SubParsersAction) -> None:
     record.add_argument("-o", "--output", required=True, metavar="BAG", help="recording to be written, a new folder")
     record.add_argument("--seed", type=int, default=0, help="of textures, light and noise (0)")
     finger = "seed of the jaws' material; calibration twin is of finger 0 (0)"
+    steps = "of the depth in mm: 1 as the ROS driver gives it, 0.1 as the camera itself does (1)"
+    record.add_argument("--depth-step", type=float, default=1.0, choices=(1.0, 0.1), help=steps)
     record.add_argument("--finger", type=int, default=0, metavar="SEED", help=finger)
     record.add_argument("--light", metavar="WORD", help="bright, dim or any; without it that of the scene")
     record.add_argument("--object", metavar="NAME", help="shape by name, or mesh file; without it that of the scene")

@@ -95,6 +95,9 @@ class KeypointSource:
         pose = recording.case.get("T_gripper_camera")
         if isinstance(pose, list):
             own["T_gripper_camera"] = [float(number) for number in pose]
+        step = recording.case.get("depth_scale")
+        if isinstance(step, float):
+            own |= {"depth_scale": step, "detector.quantum": step}
         sides = list(recording.jaws)
         jaws = "both" if len(sides) == 2 else sides[0]
         return {"jaws": jaws, "jaw_file": self.jaw_file, **own, **self.parameters}
@@ -125,7 +128,7 @@ class KeypointSource:
 
         from finforce_keypoints.images import ImageWatch
 
-        detector, parameters = self.build(recording), build_records(self.parameters).parameters
+        detector, parameters = self.build(recording), build_records(self.node_parameters(recording)).parameters
         watch = ImageWatch(parameters.frozen_after)
         recording = replace(recording, images=replace(recording.images, depth_scale=parameters.depth_scale))
         with tqdm(total=len(recording.images), unit="image", desc=recording.name, disable=None, leave=False) as bar:

@@ -55,7 +55,11 @@ def run_record(options: argparse.Namespace) -> None:
     if not options.farthest > 0.0:
         raise OptionError(f"--farthest {options.farthest:g}: expected a distance above 0 [m]")
     form = RecordingForm(
-        compressed=not options.raw, quality=options.quality, farthest=options.farthest, storage=options.storage
+        compressed=not options.raw,
+        quality=options.quality,
+        farthest=options.farthest,
+        storage=options.storage,
+        depth_step=1e-3 * options.depth_step,
     )
     record_scene(scenario, options.seed, folder, camera=camera, form=form, finger=options.finger)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
@@ -92,7 +96,7 @@ def record_scene(
     """Render a scene of a finger into a new folder, under a progress bar."""
     from tqdm import tqdm
 
-    footage = build_footage(scenario, seed, camera, finger=finger)
+    footage = build_footage(scenario, seed, camera, finger=finger, depth_step=form.depth_step)
     preview = Preview(len(footage))
     case = {
         "scene": scenario.name,

@@ -43,12 +43,14 @@ class RecordingForm:
         quality: of a jpeg, 1 to 95.
         farthest: depth beyond it is left away, which makes a recording smaller [m].
         storage: "mcap" or "sqlite3".
+        depth_step: of the depth image [m], that of the footage.
     """
 
     compressed: bool = True
     quality: int = QUALITY
     farthest: float = math.inf
     storage: str = "mcap"
+    depth_step: float = 1e-3
 
 
 def write_footage(
@@ -91,6 +93,7 @@ def write_footage(
     if footage.mesh is not None:
         write_mesh(footage.mesh, folder / MESH)
         content["mesh"] = f"{folder.name}/{MESH}"
+    content["depth_scale"] = footage.depth_step
     content["T_gripper_camera"] = list(pose_numbers(footage.T_gripper_camera))
     (folder / "case.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     return folder
@@ -119,7 +122,7 @@ class ImageFactory:
         region = self._types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
         info = info_fields(footage.camera) | {"binning_x": 0, "binning_y": 0, "roi": region}
         yield Entry(frame.stamp, INFO_TOPIC, CAMERA_INFO, self._types[CAMERA_INFO](header=header, **info))
-        steps = encode_depth(np.where(frame.depth <= self._form.farthest, frame.depth, np.nan))
+        steps = encode_depth(np.where(frame.depth <= self._form.farthest, frame.depth, np.nan), footage.depth_step)
         if self._form.compressed:
             color = encode_color(frame.color, quality=self._form.quality)
             yield self._packed(f"{COLOR_TOPIC}/compressed", header, "rgb8; jpeg compressed bgr8", color)

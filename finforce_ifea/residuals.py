@@ -87,15 +87,13 @@ def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
     """
     noise, gain, width_variance, trust, offset_variance, depth_variance, model_error, gate = chance
     count = len(measured)
-    r, modes = np.zeros((count, 2)), np.empty((count, 2, 3))
-    weights, bias = np.zeros(count), np.empty(count)
-    asked, say = np.zeros(count), np.zeros(count)
+    r, modes = np.zeros((count, 2)), motions[:, ::2].copy()
+    weights, asked, say = np.zeros(count), np.zeros(count), np.zeros(count)
+    way = ((positions - rest) ** 2).sum(axis=1)
+    bias = _MODEL_FLOOR**2 + model_error**2 * way + offset_variance
     used, known = 0, 0
     least = (noise[:, 0, 0] + noise[:, 1, 1]).min()
     for k in range(count):
-        modes[k, 0], modes[k, 1] = motions[k, 0], motions[k, 2]
-        way = ((positions[k] - rest[k]) ** 2).sum()
-        bias[k] = _MODEL_FLOOR**2 + model_error**2 * way + offset_variance[k]
         if not np.isfinite(measured[k, 0] + measured[k, 1] + measured[k, 2]):
             continue
         off = measured[k, 1] - positions[k, 1]

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from finforce_camera import CameraIntrinsics
 from finforce_twin.record import TrueJaw
 
-MILLIMETRES = 1000.0
-FARTHEST = 65535.0  # [mm] in 16 bits
+FARTHEST = 65535.0  # steps in 16 bits
 
 
-def encode_depth(depth: NDArray) -> NDArray[np.uint16]:
-    """Return a depth image (h, w) [m] in steps of 1 mm, 0 where it is NaN or too far for 16 bits."""
-    steps = np.round(MILLIMETRES * np.nan_to_num(np.asarray(depth, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0))
+def encode_depth(depth: NDArray, step: float = 1e-3) -> NDArray[np.uint16]:
+    """Return a depth image (h, w) [m] in steps [m], 0 where it is NaN or too far for 16 bits."""
+    steps = np.round(np.nan_to_num(np.asarray(depth, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0) / step)
     return np.where((steps > 0.0) & (steps <= FARTHEST), steps, 0.0).astype(np.uint16)
 
 

@@ -42,7 +42,9 @@ class TwinCameraNode(Node):
         self.parameters = parameters = ros.declare_record(self, TwinParameters)
         ros.name_unknown_parameters(self)
         size = parse_size(parameters.size)
-        self.footage = build(parameters.scenario, parameters.seed, size, finger=parameters.finger)
+        self.footage = build(
+            parameters.scenario, parameters.seed, size, finger=parameters.finger, depth_step=parameters.depth_step
+        )
         self.reel: list[list[tuple[Any, Any]]] = []
         self.is_over = False
         self._next, self._phase = 0, ""
@@ -88,7 +90,10 @@ class TwinCameraNode(Node):
             pose = ros.pose_message(header, pose_numbers(frame.T_camera_object))
             yield self._output(PoseStamped, "object_pose"), pose
         yield self._output(CameraInfo, INFO_TOPIC), camera_info(header, self.footage)
-        yield self._output(Image, DEPTH_TOPIC), ros.image_message(header, encode_depth(frame.depth), "16UC1")
+        yield (
+            self._output(Image, DEPTH_TOPIC),
+            ros.image_message(header, encode_depth(frame.depth, self.footage.depth_step), "16UC1"),
+        )
         yield self._output(Image, COLOR_TOPIC), ros.image_message(header, frame.color)
 
     def _output(self, kind: type, topic: str) -> Any:

@@ -21,6 +21,7 @@ class TwinParameters:
     light: str = parameter("", "bright, dim or any; empty: that of the scene")
     object: str = parameter("", "a shape by name, or a mesh file; empty: that of the scene")
     size: str = parameter("640x480", "of the images, WIDTHxHEIGHT [px]")
+    depth_step: float = parameter(0.001, "of the depth image", unit="m", min=1e-5, max=0.01)
     loop: bool = parameter(True, "begin again at the end; else the node ends with the scene")
     camera_frame: str = parameter("camera_color_optical_frame", "frame of the images")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +16,7 @@ from finforce_keypoints.gripper_geometry import jaw_in_camera
 from finforce_twin.bodies import DrawnJaw, Wardrobe, draw_occluders, dress_jaw, dress_object, dress_palm
 from finforce_twin.lighting import Look, draw_look
 from finforce_twin.render import Stage, Window
-from finforce_twin.sensor import expose, measure_depth
+from finforce_twin.sensor import D405_NOISE, expose, measure_depth
 
 if TYPE_CHECKING:
     from finforce_twin.gripper import TwinState
@@ -68,6 +68,7 @@ class Setting:
         T_gripper_camera: (4, 4).
         light: "bright", "dim" or "any".
         clutter: whether bars may stand before the jaws.
+        depth_step: of the depth image [m]; the ROS driver of a D405 gives 1 mm, the camera itself 0.1 mm.
     """
 
     shapes: Mapping[str, DrawnJaw]
@@ -76,6 +77,7 @@ class Setting:
     T_gripper_camera: NDArray
     light: str = "bright"
     clutter: bool = False
+    depth_step: float = 1e-3
 
 
 class Photographer:
@@ -105,7 +107,7 @@ class Photographer:
         camera = self.setting.camera
         picture = stage.render(camera, self._window(truth) if self._window_only else None)
         color = expose(picture.color, self._look.exposure, rng, self._smear(state.stamp, truth))
-        depth = measure_depth(picture.depth, color, camera, rng)
+        depth = measure_depth(picture.depth, color, camera, rng, replace(D405_NOISE, quantum=self.setting.depth_step))
         return Shot(color=color, depth=depth, truth=truth)
 
     def _build_stage(self, state: TwinState) -> Stage:

@@ -97,6 +97,7 @@ class Footage:
         camera: intrinsics.
         T_gripper_camera: (4, 4).
         mesh: of the object in its own frame; None without one.
+        depth_step: of the depth images [m].
 
     Args:
         gripper: what is filmed.
@@ -108,6 +109,7 @@ class Footage:
     def __init__(self, gripper: Gripper, photographer: Camera, setting: Setting, seed: int) -> None:
         self._gripper, self._photographer, self._seed = gripper, photographer, seed
         self.camera, self.T_gripper_camera, self.mesh = setting.camera, setting.T_gripper_camera, setting.mesh
+        self.depth_step = setting.depth_step
 
     def __len__(self) -> int:
         return len(self._gripper)
@@ -129,7 +131,12 @@ class Footage:
 
 
 def build_footage(
-    scenario: Scenario, seed: int, camera: CameraIntrinsics | None = None, *, finger: int = FINGER
+    scenario: Scenario,
+    seed: int,
+    camera: CameraIntrinsics | None = None,
+    *,
+    finger: int = FINGER,
+    depth_step: float = 1e-3,
 ) -> Footage:
     """Return the footage of a scenario.
 
@@ -138,6 +145,7 @@ def build_footage(
         seed: of textures, light and noise.
         camera: intrinsics; those of a D405 at 640 x 480 when absent.
         finger: seed of the jaws' material; what shows the same finger can share a calibration.
+        depth_step: of the depth images [m].
 
     Raises:
         FinforceError: the scenario's object or jaw cannot be used, or a library is missing.
@@ -152,6 +160,7 @@ def build_footage(
         camera=camera or build_d405_vga(),
         T_gripper_camera=CAMERAS[scenario.camera],
         light=scenario.light,
+        depth_step=depth_step,
     )
     return Footage(gripper, Photographer(setting, seed), setting, seed)
 

@@ -17,6 +17,7 @@ GAMMA = 2.2
 FLAT_CONTRAST = 0.03  # of grey levels around a pixel, below which stereo finds too little to match
 HOLES_IN_FLAT = 0.25  # share of the depth lost there, and in the dark
 DARK_LEVEL = 0.06  # of an 8-bit image's range
+D405_NOISE = DepthNoise(hole_fraction=0.005, fattening=1)
 HOLE_SIZE = 3.0  # [px] standard deviation of the field that is cut to make holes
 
 
@@ -85,7 +86,7 @@ def measure_depth(
     Returns:
         (h, w) float32 [m], NaN where nothing was measured.
     """
-    noise = noise or DepthNoise(hole_fraction=0.005, fattening=1)
+    noise = noise or D405_NOISE
     measured = disturb_depth(depth, camera, rng, replace(noise, hole_fraction=0.0))
     chance = noise.hole_fraction + HOLES_IN_FLAT * (noise.hole_fraction > 0.0) * _is_hard_to_match(color)
     field = smooth_field(measured.shape, HOLE_SIZE, rng)

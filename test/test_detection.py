@@ -160,6 +160,14 @@ def test_the_camera_of_the_recording_is_the_one_of_the_node(recording):
     assert other["T_gripper_camera"] == [0.0] * 6 + [1.0]
 
 
+def test_the_depth_step_of_the_recording_is_that_of_the_detector(recording):
+    assert KeypointSource().node_parameters(recording)["depth_scale"] == 1e-3
+    fine = replace(recording, case={**recording.case, "depth_scale": 1e-4})
+    own = KeypointSource().node_parameters(fine)
+    assert (own["depth_scale"], own["detector.quantum"]) == (1e-4, 1e-4)
+    assert KeypointSource(parameters={"depth_scale": 0.002}).node_parameters(fine)["depth_scale"] == 0.002
+
+
 def options(**given):
     return argparse.Namespace(**{"jaw": "bench", "source": None, "detector": [], "extrinsics": None, **given})
 

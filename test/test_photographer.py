@@ -73,3 +73,11 @@ def test_the_dot_on_the_holder_is_where_the_reference_point_is(shot):
         dot = shot.color[row - 1 : row + 2, column - 1 : column + 2].mean()
         around = shot.color[row - 14 : row + 15, column - 14 : column + 15].astype(float)
         assert abs(dot - np.median(around)) > 20.0  # grey levels
+
+
+def test_depth_comes_in_the_steps_that_were_asked_for(setting, pressed):
+    for step in (1e-3, 1e-4):
+        depth = Photographer(replace(setting, depth_step=step), 3).shoot(pressed).depth
+        depth = depth[np.isfinite(depth)].astype(float)
+        np.testing.assert_allclose(depth / step, np.round(depth / step), atol=1e-3)  # float32 metres
+        assert len(np.unique(np.round(depth / step))) > (50 if step == 1e-3 else 500)

@@ -26,8 +26,8 @@ def asked(monkeypatch):
     """What `twin record` asks the renderer for, which answers with footage by rule."""
     calls = []
 
-    def build(scenario, seed, camera, *, finger):
-        calls.append((scenario, seed, camera, finger))
+    def build(scenario, seed, camera, *, finger, depth_step):
+        calls.append((scenario, seed, camera, finger, depth_step))
         return make_footage(seed=seed)
 
     monkeypatch.setattr(twin_commands, "build_footage", build)
@@ -46,6 +46,8 @@ def test_a_scene_is_recorded_with_its_changes_and_a_picture(asked, tmp_path, cap
     words = [
         "--seed",
         "7",
+        "--depth-step",
+        "0.1",
         "--finger",
         "3",
         "--light",
@@ -58,7 +60,8 @@ def test_a_scene_is_recorded_with_its_changes_and_a_picture(asked, tmp_path, cap
         "displacement=0.004",
     ]
     assert main(["twin", "record", "grasp_cylinder", "-o", str(bag), *words]) == 0
-    ((scenario, seed, camera, finger),) = asked
+    ((scenario, seed, camera, finger, depth_step),) = asked
+    assert depth_step == pytest.approx(1e-4)
     assert (scenario.light, scenario.object, scenario.displacement, seed, finger) == ("dim", "block", 0.004, 7, 3)
     assert (camera.width, camera.height) == (320, 240)
     case = json.loads((bag / "case.json").read_text())
