@@ -86,12 +86,11 @@ def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
         chance: see `Uncertainty`.
     """
     noise, gain, width_variance, trust, offset_variance, depth_variance, model_error, gate = chance
-    count = len(measured)
+    count, used, known = len(measured), 0, 0
     r, modes = np.zeros((count, 2)), motions[:, ::2].copy()
     weights, asked, say = np.zeros(count), np.zeros(count), np.zeros(count)
     way = ((positions - rest) ** 2).sum(axis=1)
     bias = _MODEL_FLOOR**2 + model_error**2 * way + offset_variance
-    used, known = 0, 0
     least = (noise[:, 0, 0] + noise[:, 1, 1]).min()
     for k in range(count):
         if not np.isfinite(measured[k, 0] + measured[k, 1] + measured[k, 2]):
