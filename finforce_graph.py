@@ -211,6 +211,7 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
     else:
         solvers = [solver_process(options.jaws, options, completes_grasp=True)]
     awaited = {"awaits_poses": True} if options.object_mesh else {}
+    awaited |= {"awaits_images": True} if options.images else {}
     player = Process(
         executable="recording_player",
         name="recording_player",

@@ -25,6 +25,8 @@ from finforce_eval.live import ReplayLog
 from finforce_eval.parameters import PlayerParameters
 from finforce_eval.playback import Playback, RawMessage, read_playback
 from finforce_eval.read_ahead import ReadAhead
+from finforce_eval.tracks import JAWS
+from finforce_keypoints.parameters import COLOR_TOPIC
 
 # what is heard while messages are being sent waits its turn; nothing of it may be lost
 HEARD = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -166,13 +168,21 @@ def open_player(domain: int) -> Iterator[PlayerNode]:
         rclpy.try_shutdown(context=context)
 
 
+def find_awaited(types: Iterable[str], parameters: PlayerParameters) -> set[str]:
+    """Return the topics for which somebody has to listen before a recording with some topics is played."""
+    kinds = ("keypoints", "jaw_pose") if parameters.awaits_poses else ("keypoints",)
+    if not parameters.awaits_images:
+        return {topic for topic in types if topic.endswith(tuple(f"/{kind}" for kind in kinds))}
+    sides = [side for side in JAWS if any(topic.startswith(f"/{side}/") for topic in types)]
+    return {COLOR_TOPIC, *(f"/{side}/{kind}" for side in sides for kind in kinds)}
+
+
 def play_recording(node: PlayerNode, _: Executor) -> None:
     """Play the recording that the parameters name, once."""
     parameters = ros.declare_record(node, PlayerParameters)
     messages = read_playback(parameters.bag)
     node.offer(messages)
-    ends = ("/keypoints", "/jaw_pose") if parameters.awaits_poses else ("/keypoints",)
-    awaited = {topic for topic in messages.types if topic.endswith(ends)}
+    awaited = find_awaited(messages.types, parameters)
     if not node.wait_for(lambda: node.has_listeners(awaited), parameters.patience):
         node.get_logger().warning(f"nobody listens to one of {', '.join(awaited)}; all are played all the same")
     node.play(messages, rate=parameters.rate)

@@ -17,6 +17,10 @@ class PlayerParameters:
     awaits_poses: bool = field(
         default=False, metadata={"description": "wait for listeners to the poses of the jaws, too"}
     )
+    awaits_images: bool = field(
+        default=False,
+        metadata={"description": "wait for who finds key points in the images, and for those who use the key points"},
+    )
     patience: float = field(
         default=120.0,
         metadata={

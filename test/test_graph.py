@@ -62,6 +62,9 @@ def test_the_player_runs_only_with_a_bag_and_its_end_ends_all():
     assert player.parameters == {"bag": "x", "rate": 2.0} and player.ends_all
     waiting = by_name(replay_processes(ReplayOptions(bag="x", object_mesh="can.stl"), ROOT))["recording_player"]
     assert waiting.parameters["awaits_poses"] is True
+    assert "awaits_images" not in waiting.parameters
+    seeing = by_name(replay_processes(ReplayOptions(bag="x", images=True), ROOT))["recording_player"]
+    assert seeing.parameters["awaits_images"] is True
 
 
 def test_what_was_not_asked_for_stays_the_nodes_own():

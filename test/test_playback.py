@@ -9,9 +9,12 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from finforce_eval.errors import RecordingError
+from finforce_eval.node import find_awaited
+from finforce_eval.parameters import PlayerParameters
 from finforce_eval.playback import RawMessage, read_playback
 from finforce_eval.read_ahead import ReadAhead
 from finforce_eval.writer import write_recording
+from finforce_keypoints.parameters import COLOR_TOPIC
 
 
 @pytest.fixture(scope="module", params=["mcap", "sqlite3"])
@@ -105,3 +108,21 @@ def endless(closed):
             yield 1
     finally:
         closed.set()
+
+
+TOPICS = ("/left/ground_truth_wrench", "/right/ground_truth_wrench", COLOR_TOPIC, "/object_pose", "/left/keypoints")
+
+
+@pytest.mark.parametrize(
+    ("asked", "awaited"),
+    [
+        ({}, {"/left/keypoints"}),
+        ({"awaits_images": True}, {COLOR_TOPIC, "/left/keypoints", "/right/keypoints"}),
+        (
+            {"awaits_images": True, "awaits_poses": True},
+            {COLOR_TOPIC, *(f"/{side}/{kind}" for side in ("left", "right") for kind in ("keypoints", "jaw_pose"))},
+        ),
+    ],
+)
+def test_a_recording_waits_for_those_who_need_it_from_its_first_image(asked, awaited):
+    assert find_awaited(TOPICS, PlayerParameters(**asked)) == awaited
