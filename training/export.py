@@ -60,7 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         write_network(network, options.output, card)
         detections = detect_with_model(options.output, load_pictures(options.dataset, VALIDATION))
-        write_sidecar(options.output, replace(card, likelihood_stddev=fit_stddev(detections)))
+        measured = fit_stddev(detections)
+        write_sidecar(options.output, replace(card, likelihood_stddev=measured or UNMEASURED))
+    if not measured:
+        print("too few validation pictures to measure standard deviations; those of a network never measured stay")
     print(score_detections(detections))
     print(f"{options.output / NETWORK_FILE}: {(options.output / NETWORK_FILE).stat().st_size / 1e6:.2f} MB")
 
