@@ -27,7 +27,7 @@ def rendered(monkeypatch):
     """What was asked of the renderer, which answers with footage by rule."""
     calls = []
 
-    def build(scenario, seed, camera, *, finger):
+    def build(scenario, seed, camera, *, finger, depth_step):
         calls.append((scenario.name, seed, finger))
         return make_footage(seed=seed)
 
