@@ -124,6 +124,16 @@ def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Proc
     )
 
 
+def _jaws_process(name: str, jaws: str, asked: Mapping[str, Any], options: SolverOptions) -> Process:
+    """Return a node that serves "left", "right" or "both" jaws, called as its executable."""
+    return Process(
+        executable=name,
+        name=name,
+        parameters={"jaws": jaws, **_given(asked), "use_sim_time": options.use_sim_time},
+        parameter_file=options.parameter_file,
+    )
+
+
 def contact_processes(jaws: str, options: SolverOptions) -> list[Process]:
     """Return the contact estimator of "left", "right" or "both" jaws, if an object mesh is named."""
     if not options.object_mesh:
@@ -137,14 +147,7 @@ def contact_processes(jaws: str, options: SolverOptions) -> list[Process]:
         "contact.mode": options.contact,
         "contact.mesh": "coarse" if options.solver == "paper" else options.mesh,
     }
-    return [
-        Process(
-            executable="contact_estimator",
-            name="contact_estimator",
-            parameters={"jaws": jaws, **_given(asked), "use_sim_time": options.use_sim_time},
-            parameter_file=options.parameter_file,
-        )
-    ]
+    return [_jaws_process("contact_estimator", jaws, asked, options)]
 
 
 def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
@@ -161,14 +164,7 @@ def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
         "model": options.model,
         "T_gripper_camera": _numbers("T_gripper_camera", options.T_gripper_camera, 7),
     }
-    return [
-        Process(
-            executable="keypoint_detector",
-            name="keypoint_detector",
-            parameters={"jaws": jaws, **_given(asked), "use_sim_time": options.use_sim_time},
-            parameter_file=options.parameter_file,
-        )
-    ]
+    return [_jaws_process("keypoint_detector", jaws, asked, options)]
 
 
 def _numbers(name: str, text: str, count: int) -> list[float] | None:

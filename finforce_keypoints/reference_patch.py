@@ -2,7 +2,7 @@
 
 A network places the reference point a little differently in every light and before every background, and all key points
 of the jaw would share the error. What surrounds the point is rigid and does not change: how far it has slid since the
-first images is seen a hundredth of a pixel for a tenth of the network's.
+first images is told ten times as exactly.
 """
 
 from __future__ import annotations

@@ -107,10 +107,8 @@ def _move(points: NDArray, T: NDArray) -> NDArray:
 
 def draw_jaws(jaws: Mapping[str, Jaw], density: str) -> dict[str, DrawnJaw]:
     """Return the shapes of jaws by side, of meshes with a density."""
-    from finforce_ifea.mesh import surface_triangles
-
     shapes = {}
     for side, jaw in jaws.items():
         mesh = jaw.build_mesh(density)
-        shapes[side] = DrawnJaw(jaw=jaw, rest=mesh.nodes, triangles=surface_triangles(mesh.elements))
+        shapes[side] = DrawnJaw(jaw=jaw, rest=mesh.nodes, triangles=mesh.surface)
     return shapes
