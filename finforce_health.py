@@ -10,7 +10,7 @@ from time import monotonic
 
 import numpy as np
 
-from finforce_ifea.errors import FinforceError
+from finforce_errors import FinforceError
 
 NANOSECONDS = 1_000_000_000
 

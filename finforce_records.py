@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import Field, dataclass, field, fields, replace
 from typing import Any, TypeVar
 
-from finforce_ifea.errors import FinforceError
+from finforce_errors import FinforceError
 
 RecordT = TypeVar("RecordT")
 

@@ -33,8 +33,8 @@ from std_msgs.msg import Header, String  # noqa: F401 - for those who publish
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who publish
 
+from finforce_errors import FinforceError
 from finforce_health import NANOSECONDS, Level, Outcome, Report  # noqa: F401 - for those with stamps
-from finforce_ifea.errors import FinforceError
 from finforce_messages import (  # noqa: F401 - for those who publish
     cloud_message,
     image_message,

@@ -12,13 +12,24 @@ setup(
     description="Grasp force from the key points of fin-ray jaws, by a mechanical model of the jaw.",
     license="Apache-2.0",
     python_requires=">=3.10",
-    packages=["finforce_contact", "finforce_eval", "finforce_ifea", "finforce_keypoints", "finforce_twin"],
+    packages=[
+        "finforce_contact",
+        "finforce_driver",
+        "finforce_driver.emulator",
+        "finforce_eval",
+        "finforce_ifea",
+        "finforce_keypoints",
+        "finforce_twin",
+    ],
     py_modules=[
+        "finforce_bounded",
         "finforce_camera",
+        "finforce_errors",
         "finforce_graph",
         "finforce_health",
         "finforce_launch",
         "finforce_messages",
+        "finforce_optional",
         "finforce_records",
         "finforce_ros",
         "finforce_start",
@@ -34,6 +45,7 @@ setup(
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/config", glob("config/*.yaml")),
         (f"share/{NAME}/rviz", glob("rviz/*")),
+        (f"share/{NAME}/urdf", glob("urdf/*")),
     ],
     zip_safe=False,
     install_requires=[
@@ -52,6 +64,7 @@ setup(
         "open3d; platform_machine != 'x86_64' or sys_platform != 'linux'",
         "onnxruntime",  # runs key point networks, without their makers' frameworks
         "opencv-contrib-python-headless",  # warps, resizes and decodes images; finds dots
+        "pyserial",  # the serial port of the CAN adapter
         "matplotlib",  # pictures of the reports
         "tqdm",  # progress bars
     ],
@@ -63,15 +76,18 @@ setup(
             "ros-jazzy-common-interfaces",
             "ros-jazzy-ament-index-python",
         ],
+        # other CAN adapters than SLCAN ones: SocketCAN and more; 4.6.0 cannot open SLCAN
+        "can": ["python-can>=4.3,!=4.6.0"],
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
-        "test": ["pytest", "hypothesis", "onnx"],
+        "test": ["pytest", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0"],
         "lint": ["ruff"],
     },
     entry_points={
         "console_scripts": [
             "finforce = finforce_eval.cli:main",
             "contact_estimator = finforce_start:contact_estimator",
+            "gripper_driver = finforce_start:gripper_driver",
             "ifea_solver = finforce_start:ifea_solver",
             "keypoint_detector = finforce_start:keypoint_detector",
             "recording_player = finforce_start:recording_player",

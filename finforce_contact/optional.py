@@ -2,7 +2,7 @@
 
 from types import ModuleType
 
-from finforce_ifea.optional import import_library
+from finforce_optional import import_library
 
 
 def import_manifold3d() -> ModuleType:

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from finforce_bounded import check_bounds, setting
 from finforce_contact.errors import PoseError
-from finforce_ifea.bounded import check_bounds, setting
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,6 @@
-"""The errors that finforce raises on purpose; what is not listed here is a defect."""
+"""What can be wrong with jaws, key points and contacts; what is not raised on purpose is a defect."""
 
-
-class FinforceError(Exception):
-    """The base of every error that finforce raises on purpose."""
+from finforce_errors import FinforceError, MissingDependencyError  # noqa: F401 - the base of those here
 
 
 class JawFileError(FinforceError, ValueError):
@@ -36,6 +34,3 @@ class NotEnoughDataError(FinforceError, RuntimeError):
 class UnobservableError(NotEnoughDataError):
     """The key points that are seen do not tell what was asked."""
 
-
-class MissingDependencyError(FinforceError, ImportError):
-    """An optional library is needed and not installed."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from finforce_ifea.bounded import check_bounds, choice, setting
+from finforce_bounded import check_bounds, choice, setting
 from finforce_ifea.errors import ObservationError
 
 SOLVERS = ("default", "solid", "frame", "paper")

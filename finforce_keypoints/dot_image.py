@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.bounded import check_bounds, choice, setting
+from finforce_bounded import check_bounds, choice, setting
 from finforce_keypoints.errors import DetectorSettingsError
 from finforce_keypoints.optional import import_cv2
 

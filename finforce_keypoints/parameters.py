@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
+from finforce_bounded import check_bounds
 from finforce_contact.poses import pose_from_quaternion, pose_numbers
-from finforce_ifea.bounded import check_bounds
 from finforce_keypoints.errors import DetectorSettingsError
 from finforce_keypoints.gripper_geometry import ROBOT_CAMERA
 from finforce_records import TimeParameters, parameter

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from finforce_ifea.bounded import check_bounds, setting
+from finforce_bounded import check_bounds, setting
 from finforce_keypoints.errors import DetectorSettingsError
 
 

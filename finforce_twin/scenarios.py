@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from finforce_ifea.bounded import check_bounds, choice, setting
+from finforce_bounded import check_bounds, choice, setting
 from finforce_twin.errors import ScenarioError
 
 CAMERAS = ("robot", "bench")

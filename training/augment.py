@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.bounded import check_bounds, setting
+from finforce_bounded import check_bounds, setting
 from finforce_keypoints.optional import import_cv2
 from training.dataset import MARGIN
 from training.errors import RecipeError

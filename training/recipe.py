@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from finforce_ifea.bounded import check_bounds, setting
+from finforce_bounded import check_bounds, setting
 from training.errors import RecipeError
 
 

@@ -3,7 +3,7 @@
 from importlib import import_module
 from types import ModuleType
 
-from finforce_ifea.errors import MissingDependencyError
+from finforce_errors import MissingDependencyError
 
 
 def import_library(name: str, purpose: str, package: str = "") -> ModuleType:

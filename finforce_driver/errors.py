@@ -1,0 +1,31 @@
+"""What can be wrong with a gripper, its link and what is asked of it."""
+
+from finforce_errors import FinforceError
+
+
+class DriverError(FinforceError):
+    """The base of the errors of this package."""
+
+
+class FrameError(DriverError, ValueError):
+    """A CAN frame cannot be: its identifier or data are out of range."""
+
+
+class LinkError(DriverError, OSError):
+    """The port to the CAN adapter is absent, busy, gone, or does not take what is sent."""
+
+
+class TargetError(DriverError, ValueError):
+    """An opening, speed, force or time that was asked for is no number or out of bounds."""
+
+
+class GripperStateError(DriverError, RuntimeError):
+    """The gripper is not in a state in which it could do what was asked: absent, not calibrated, faulty, stopped."""
+
+
+class GripperTimeoutError(DriverError, TimeoutError):
+    """The gripper did not reach what was waited for in time."""
+
+
+class GraspError(DriverError, RuntimeError):
+    """A force-controlled grasp was ended for safety; the message says why."""

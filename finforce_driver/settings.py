@@ -1,0 +1,41 @@
+"""What can be set on a gripper: defaults, units, bounds and meanings; knows no ROS and no file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from finforce_bounded import check_bounds, setting
+from finforce_driver.errors import TargetError
+
+
+@dataclass(frozen=True, kw_only=True)
+class GripperSettings:
+    """Settings of `Gripper`; each field's metadata says unit, bounds and meaning."""
+
+    node_id: int = setting(0, "", 0, 15, "CAN node of the gripper")
+    poll_rate: float = setting(50.0, "Hz", 5.0, 200.0, "how often the gripper is asked for its state")
+    reply_timeout: float = setting(0.05, "s", 0.005, 1.0, "longest wait for a reply")
+    missed_replies: int = setting(25, "", 2, 1000, "requests in a row without a reply after which the port is reopened")
+    stroke: float = setting(0.048, "m", 0.001, 0.5, "opening of the mechanism between its end stops")
+    closed_opening: float = setting(0.0, "m", 0.0, 0.2, "between the jaws' inner faces when the mechanism is closed")
+    pinion_radius: float = setting(0.006, "m", 0.001, 0.1, "of the pinion between the two racks")
+    force_per_current: float = setting(47.7, "N/A", 1.0, 500.0, "slope of the maker's curve of grip force")
+    least_current: float = setting(0.15, "A", 0.05, 1.0, "below it the gripper is unstable")
+    largest_current: float = setting(1.3, "A", 0.15, 1.5, "greatest current limit that may be asked for")
+    default_speed: float = setting(0.02, "m/s", 1e-4, 0.37, "of the opening, where a command names none")
+    default_current: float = setting(0.5, "A", 0.15, 1.5, "current limit where a command names no force")
+    telemetry_period: float = setting(1.0, "s", 0.05, 3600.0, "between two questions for temperature, supply or errors")
+    release_on_stop: bool = setting(False, "", None, None, "let go when the driver ends; else it goes on holding")
+
+    def __post_init__(self) -> None:
+        """Refuses values out of bounds.
+
+        Raises:
+            TargetError: a value is out of its bounds, or the default current lies outside the currents' range.
+        """
+        check_bounds(self, TargetError)
+        if not self.least_current <= self.default_current <= self.largest_current:
+            raise TargetError(
+                f"default_current: got {self.default_current:g} A, expected {self.least_current:g} to "
+                f"{self.largest_current:g} A, the range of least_current and largest_current"
+            )
