@@ -35,6 +35,7 @@ def build_parser() -> Parser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
     _add_evaluate(commands)
     _add_calibrate(commands)
+    _add_weigh(commands)
     replay = "play a recording through the real nodes in real time and score it"
     commands.add_parser("replay", help=replay, add_help=False)
     _add_twin(commands)
@@ -98,6 +99,22 @@ def _add_calibrate(commands: argparse._SubParsersAction) -> None:
     _add_set(parser)
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration to be written")
     parser.set_defaults(run="finforce_eval.commands:run_calibrate")
+
+
+def _add_weigh(commands: argparse._SubParsersAction) -> None:
+    text = "scale the stiffness of a finger by the readings of a kitchen scale, one for each steady hold of a recording"
+    parser = commands.add_parser("weigh", help=text, description=text)
+    parser.add_argument("bags", nargs=1, metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
+    add_jaw_options(parser)
+    add_source_options(parser)
+    parser.add_argument("--side", default="left", choices=("left", "right"), help="the jaw that pressed (left)")
+    text = "what the scale showed at the end of each hold, in their order; without it the holds are listed"
+    parser.add_argument("--grams", nargs="+", type=float, metavar="G", help=text)
+    text = "calibration that is scaled, a file or a shipped name; without it the jaw file's own material"
+    parser.add_argument("--calibration", metavar="FILE", help=text)
+    _add_set(parser)
+    parser.add_argument("-o", "--output", metavar="FILE", help="calibration to be written; needs --grams")
+    parser.set_defaults(run="finforce_eval.weigh_command:run_weigh")
 
 
 def _add_twin(commands: argparse._SubParsersAction) -> None:
