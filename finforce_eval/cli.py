@@ -36,6 +36,7 @@ def build_parser() -> Parser:
     _add_evaluate(commands)
     _add_calibrate(commands)
     _add_weigh(commands)
+    _add_extrinsics(commands)
     replay = "play a recording through the real nodes in real time and score it"
     commands.add_parser("replay", help=replay, add_help=False)
     _add_twin(commands)
@@ -115,6 +116,21 @@ def _add_weigh(commands: argparse._SubParsersAction) -> None:
     _add_set(parser)
     parser.add_argument("-o", "--output", metavar="FILE", help="calibration to be written; needs --grams")
     parser.set_defaults(run="finforce_eval.weigh_command:run_weigh")
+
+
+def _add_extrinsics(commands: argparse._SubParsersAction) -> None:
+    text = "find where the camera is in the gripper, from images of jaws that are open, still and unloaded"
+    parser = commands.add_parser("extrinsics", help=text, description=text)
+    parser.add_argument("bags", nargs=1, metavar="BAG", help="rosbag2 folder, .mcap or .db3 file with images")
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
+    parser.add_argument("--jaws", default="both", choices=("left", "right", "both"), help="in the images (both)")
+    text = "where the camera is about: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
+    parser.add_argument("--extrinsics", metavar="POSE", help=text)
+    text = "change a parameter of the key point detector, as model=FOLDER; repeatable"
+    parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
+    text = "how many images at the beginning show the jaws at rest (45)"
+    parser.add_argument("--images", type=int, default=45, metavar="N", help=text)
+    parser.set_defaults(run="finforce_eval.extrinsics_command:run_extrinsics")
 
 
 def _add_twin(commands: argparse._SubParsersAction) -> None:

@@ -76,12 +76,13 @@ def version() -> str:
         return "not installed"
 
 
-def read_recordings(paths: Sequence[str], pairing: int = PAIRED) -> list[Recording]:
+def read_recordings(paths: Sequence[str], pairing: int = PAIRED, sides: Sequence[str] = ()) -> list[Recording]:
     """Read recordings and give each a name of its own.
 
     Args:
         paths: of the recordings.
         pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
+        sides: jaws that are in the images, whether or not a topic tells of them.
 
     Raises:
         RecordingError: one of them cannot be read.
@@ -89,7 +90,7 @@ def read_recordings(paths: Sequence[str], pairing: int = PAIRED) -> list[Recordi
     """
     if len({Path(path).resolve() for path in paths}) < len(paths):
         raise OptionError("a recording was given twice")
-    recordings = [read_recording(path, pairing) for path in paths]
+    recordings = [read_recording(path, pairing, sides) for path in paths]
     names = [recording.name for recording in recordings]
     for recording in recordings:
         for note in recording.notes:
@@ -100,15 +101,19 @@ def read_recordings(paths: Sequence[str], pairing: int = PAIRED) -> list[Recordi
     ]
 
 
-def read_keypoints(options: argparse.Namespace) -> list[Recording]:
+def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> list[Recording]:
     """Read the recordings with the key points that were asked for.
+
+    Args:
+        options: of the command line.
+        sides: jaws that are in the images, whether or not a topic tells of them.
 
     Raises:
         FinforceError: one of them cannot be read, or has no such key points.
     """
     source = parse_source(options)
     recordings = []
-    for read in read_recordings(options.bags, source.pairing):
+    for read in read_recordings(options.bags, source.pairing, sides):
         recording = source.apply(read)
         for note in recording.notes[len(read.notes) :]:
             print(f"note: {recording.name}: {note}", file=sys.stderr)

@@ -51,7 +51,7 @@ class _Content(NamedTuple):
     notes: list[str]
 
 
-def read_recording(path: str | Path, pairing: int = PAIRED) -> Recording:
+def read_recording(path: str | Path, pairing: int = PAIRED, sides: Sequence[str] = ()) -> Recording:
     """Read a rosbag2 folder or a single .mcap / .db3 file, with the `case.json` beside it.
 
     Topics that are not ours are not decoded; those of unknown type are named in `notes`. Images are not read yet; a
@@ -60,6 +60,7 @@ def read_recording(path: str | Path, pairing: int = PAIRED) -> Recording:
     Args:
         path: the folder or the file.
         pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
+        sides: jaws that are in the images, whether or not a topic tells of them.
 
     Raises:
         RecordingError: nothing there, damaged, empty, without key points and images, or with malformed content.
@@ -69,7 +70,8 @@ def read_recording(path: str | Path, pairing: int = PAIRED) -> Recording:
     folder = source if source.is_dir() else source.parent
     name = source.name if source.is_dir() else source.stem
     samples, images, notes = _read_samples(source, name, pairing)
-    jaws = {side: _jaw_track(samples, side, name) for side in JAWS if _has_jaw(samples, side, images is not None)}
+    known = [side for side in JAWS if _has_jaw(samples, side, images is not None) or (images and side in sides)]
+    jaws = {side: _jaw_track(samples, side, name) for side in known}
     if not jaws:
         raise RecordingError(f"{name}: {_no_jaw(has_images=images is not None)}")
     phases = samples.get("/bench/phase")

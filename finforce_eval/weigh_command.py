@@ -21,7 +21,7 @@ def run_weigh(options: argparse.Namespace) -> None:
     if options.output and not options.grams:
         raise OptionError("-o needs --grams: the readings of the scale, one for each hold")
     setup = make_setup(options).side(options.side)
-    (recording,) = read_keypoints(options)
+    (recording,) = read_keypoints(options, (options.side,))
     check_keypoint_count(recording, options.side, setup.jaw)
     stamps = recording.jaw(options.side).keypoints.stamps
     with tqdm(total=len(stamps), unit="frame", desc=recording.name, disable=None, leave=False) as bar:
