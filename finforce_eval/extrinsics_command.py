@@ -21,7 +21,7 @@ from finforce_ifea.jaw import Jaw, load_jaw
 from finforce_keypoints.extrinsics import Extrinsics, SeenJaw, find_extrinsics
 
 ROUNDS = 4  # of finding the key points with the place found before
-_LOOSE = {"detector.reference_tolerance": 0.02}  # [m]; a guess is allowed to be that far off
+_LOOSE = {"detector.reference_tolerance": 0.02, "detector.lost_images": 1000}  # [m]; a guess is allowed to be far off
 _STILL = 0.05e-3  # [m] below which another round changes nothing
 _OFTEN = 0.5  # share of the images in which a key point has to be seen
 
