@@ -70,3 +70,7 @@ class Bus(Protocol):
     @property
     def counts(self) -> Mapping[str, int]:
         """What happened since the bus was made, by name: frames, lines that were no frames, refusals (BELL)."""
+
+    @property
+    def suspicion(self) -> str:
+        """What seems wrong with the link, in a sentence of advice; "" when nothing does."""
