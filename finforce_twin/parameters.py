@@ -23,6 +23,10 @@ class TwinParameters:
     size: str = parameter("640x480", "of the images, WIDTHxHEIGHT [px]")
     depth_step: float = parameter(0.001, "of the depth image", unit="m", min=1e-5, max=0.01)
     loop: bool = parameter(True, "begin again at the end; else the node ends with the scene")
+    gripper_link: str = parameter(
+        "", "where an emulated gripper shall wait for its driver: the scene is what it grasps; empty: as scripted"
+    )
+    gripper_firmware: str = parameter("new", "of the emulated gripper", choices=("new", "old"))
     camera_frame: str = parameter("camera_color_optical_frame", "frame of the images")
 
     @property

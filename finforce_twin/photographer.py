@@ -15,7 +15,7 @@ from finforce_contact.poses import invert_pose
 from finforce_keypoints.gripper_geometry import jaw_in_camera
 from finforce_twin.bodies import DrawnJaw, Wardrobe, draw_occluders, dress_jaw, dress_object, dress_palm
 from finforce_twin.lighting import Look, draw_look
-from finforce_twin.render import Stage, Window
+from finforce_twin.render import Picture, Stage, Window
 from finforce_twin.sensor import D405_NOISE, expose, measure_depth
 
 if TYPE_CHECKING:
@@ -54,6 +54,14 @@ class Shot:
 
     color: NDArray
     depth: NDArray
+    truth: Mapping[str, TrueKeypoints]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """What comes through the lens: light and true depth, and the truth by side."""
+
+    picture: Picture
     truth: Mapping[str, TrueKeypoints]
 
 
@@ -101,14 +109,29 @@ class Photographer:
 
     def shoot(self, state: TwinState) -> Shot:
         """Return the image of a state; the same seed and stamp give the same noise."""
-        rng = np.random.default_rng((self._seed, 8, round(state.stamp * 1e6)))
+        view = self.look(state)
+        return self.develop(view, state.stamp, self._smear(state.stamp, view.truth))
+
+    def look(self, state: TwinState) -> View:
+        """Return what a perfect sensor would see of a state."""
         stage = self._build_stage(state)
         truth = {side: self._look_for(side, state, stage) for side in state.jaws}
-        camera = self.setting.camera
-        picture = stage.render(camera, self._window(truth) if self._window_only else None)
-        color = expose(picture.color, self._look.exposure, rng, self._smear(state.stamp, truth))
-        depth = measure_depth(picture.depth, color, camera, rng, replace(D405_NOISE, quantum=self.setting.depth_step))
-        return Shot(color=color, depth=depth, truth=truth)
+        window = self._window(truth) if self._window_only else None
+        return View(picture=stage.render(self.setting.camera, window), truth=truth)
+
+    def develop(self, view: View, stamp: float, smear: NDArray | None = None) -> Shot:
+        """Return a view as the sensor gives it.
+
+        Args:
+            view: through the lens.
+            stamp: [s] that makes, with the seed, the noise.
+            smear: (2,) standard deviations along the rows and columns by which motion blurs [px].
+        """
+        rng = np.random.default_rng((self._seed, 8, round(stamp * 1e6)))
+        noise = replace(D405_NOISE, quantum=self.setting.depth_step)
+        color = expose(view.picture.color, self._look.exposure, rng, smear)
+        depth = measure_depth(view.picture.depth, color, self.setting.camera, rng, noise)
+        return Shot(color=color, depth=depth, truth=view.truth)
 
     def _build_stage(self, state: TwinState) -> Stage:
         T, bodies = self._T_camera_gripper, [dress_palm(self._T_camera_gripper, self._wardrobe), *self._clutter]

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from finforce_camera import CameraIntrinsics
 from finforce_contact.poses import invert_pose
 from finforce_keypoints.gripper_geometry import BENCH_CAMERA, ROBOT_CAMERA
+from finforce_twin.assembly import Assembly
 from finforce_twin.bodies import DrawnJaw
 from finforce_twin.depth_camera import build_d405_vga
 from finforce_twin.errors import ScenarioError
@@ -125,8 +126,8 @@ class Footage:
                 phase=state.phase,
                 color=shot.color,
                 depth=shot.depth,
-                jaws={side: _true_jaw(state, shot, side) for side in state.jaws},
-                T_camera_object=_disturb_pose(T_camera_gripper @ state.T_gripper_object, rng) if tracked else None,
+                jaws={side: true_jaw(state, shot, side) for side in state.jaws},
+                T_camera_object=disturb_pose(T_camera_gripper @ state.T_gripper_object, rng) if tracked else None,
             )
 
 
@@ -151,18 +152,23 @@ def build_footage(
         FinforceError: the scenario's object or jaw cannot be used, or a library is missing.
     """
     gripper = TwinGripper(scenario, finger)
-    setting = Setting(
+    setting = set_stage(gripper, camera or build_d405_vga(), depth_step)
+    return Footage(gripper, Photographer(setting, seed), setting, seed)
+
+
+def set_stage(assembly: Assembly, camera: CameraIntrinsics, depth_step: float) -> Setting:
+    """Return jaws and object before the scenario's camera, with depth images in steps [m]."""
+    return Setting(
         shapes={
-            side: DrawnJaw(jaw=jaw, rest=gripper.rest_vertices(side), triangles=gripper.triangles(side))
-            for side, jaw in gripper.jaws.items()
+            side: DrawnJaw(jaw=jaw, rest=assembly.rest_vertices(side), triangles=assembly.triangles(side))
+            for side, jaw in assembly.jaws.items()
         },
-        mesh=gripper.object_mesh,
-        camera=camera or build_d405_vga(),
-        T_gripper_camera=CAMERAS[scenario.camera],
-        light=scenario.light,
+        mesh=assembly.object_mesh,
+        camera=camera,
+        T_gripper_camera=CAMERAS[assembly.scenario.camera],
+        light=assembly.scenario.light,
         depth_step=depth_step,
     )
-    return Footage(gripper, Photographer(setting, seed), setting, seed)
 
 
 def parse_size(text: str) -> CameraIntrinsics:
@@ -192,7 +198,7 @@ def parse_size(text: str) -> CameraIntrinsics:
     )
 
 
-def _true_jaw(state: TwinState, shot: Shot, side: str) -> TrueJaw:
+def true_jaw(state: TwinState, shot: Shot, side: str) -> TrueJaw:
     """Return the truth about a jaw, without its reference point."""
     truth, jaw = shot.truth[side], state.jaws[side]
     return TrueJaw(
@@ -205,7 +211,7 @@ def _true_jaw(state: TwinState, shot: Shot, side: str) -> TrueJaw:
     )
 
 
-def _disturb_pose(T: NDArray, rng: np.random.Generator) -> NDArray:
+def disturb_pose(T: NDArray, rng: np.random.Generator) -> NDArray:
     """Return a pose (4, 4) as a tracker measures it."""
     measured = T.copy()
     measured[:3, :3] = Rotation.from_rotvec(rng.normal(0.0, ANGLE_STDDEV, 3)).as_matrix() @ T[:3, :3]

@@ -2,24 +2,31 @@
 
 from dataclasses import fields
 from pathlib import Path
+from time import monotonic, sleep
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from node_fakes import ros_domain
+from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rgbd_fakes import FakeGripper, make_footage
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import String
+from twin_fakes import FakeLens
 
 import finforce_ros as ros
 from finforce_ifea.pointcloud import decode_columns
+from finforce_records import ParameterError
 from finforce_twin import node as twin_node
 from finforce_twin.encoding import encode_depth
 from finforce_twin.errors import ScenarioError
+from finforce_twin.live import LiveScene
 from finforce_twin.node import TwinCameraNode
 from finforce_twin.parameters import TwinParameters
+from finforce_twin.pressing import PressedGrasp
 from finforce_twin.record import parse_size
+from finforce_twin.scenarios import build_scenario
 
 COLOR = "/camera/camera/color/image_raw"
 DEPTH = "/camera/camera/aligned_depth_to_color/image_raw"
@@ -90,6 +97,86 @@ def test_the_parts_of_an_image_have_one_stamp_and_stamps_are_those_of_now(probe)
     assert len(probe.got["/object_pose"]) == 2
     info = probe.got[INFO][0]
     assert (info.width, info.height, info.k[0], info.k[5], info.d[0]) == (64, 48, 43.0, 23.5, 0.01)
+
+
+@pytest.fixture(scope="module")
+def grasp():
+    return PressedGrasp(build_scenario("grasp_cylinder"), 3, "coarse", step=1e-3)
+
+
+class EndingLens(FakeLens):
+    """Has the context of a node end, as Ctrl-C does, once the first images have become messages."""
+
+    node = None
+
+    def look(self, state):
+        if self.looks == 10:
+            until = monotonic() + 5.0
+            while len(self.node._outputs) < 5 and monotonic() < until:
+                sleep(1e-3)
+            self.node.context.try_shutdown()
+        return super().look(state)
+
+
+def start_live(probe, grasp, link, lens=None, **parameters):
+    """Add a node that plays what an emulated gripper does."""
+    overrides = [Parameter(name, value=value) for name, value in {"gripper_link": str(link), **parameters}.items()]
+    node = TwinCameraNode(
+        build_live=lambda *_, **__: LiveScene(grasp, lens or FakeLens(), 5),
+        context=probe.context,
+        parameter_overrides=overrides,
+    )
+    probe.spinner.add_node(node)
+    return node
+
+
+def test_images_and_forces_are_those_of_the_gripper_at_the_link(probe, grasp, tmp_path):
+    node = start_live(probe, grasp, tmp_path / "gripper")
+    node.film()
+    assert (tmp_path / "gripper").is_char_device()
+    probe.wait_for(lambda: len(probe.got[COLOR]) > 3)
+    assert {message.wrench.force.x for message in probe.got["/left/ground_truth_wrench"]} == {0.0}
+    jaws = node.gripper.gripper.jaws
+    jaws.load = None  # which would push limp jaws open
+    jaws.ticks = jaws.ticks_at(0.013)
+    probe.wait_for(lambda: probe.got["/left/ground_truth_wrench"][-1].wrench.force.x < -1.0)
+    held = len(probe.got["/left/ground_truth_wrench"])
+    probe.wait_for(lambda: len(probe.got["/left/ground_truth_wrench"]) > held + 30)
+    forces = [-message.wrench.force.x for message in probe.got["/left/ground_truth_wrench"][held:]]
+    assert forces[-1] < forces[0] and forces[-1] > grasp.elastic_force(0.013)  # it relaxes, and takes seconds
+    shown = decode_columns(probe.got["/left/ground_truth_keypoints"][-1], ("x", "z"))
+    state = grasp.state(node.scene.reel.openings[node.scene.reel.find(jaws.opening)])
+    np.testing.assert_allclose(shown["x"], state.jaws["left"].keypoints[:, 0], atol=1e-6)
+    assert probe.got["/bench/phase"] == []
+
+
+def test_images_of_a_gripper_are_stamped_as_those_of_a_script_and_never_alike(probe, grasp, tmp_path):
+    node = start_live(probe, grasp, tmp_path / "gripper")
+    node.film()
+    probe.wait_for(lambda: min(len(probe.got[topic]) for topic in (COLOR, DEPTH, INFO)) >= 8)
+    stamps = [[ros.nanoseconds(message.header.stamp) for message in probe.got[topic][:8]] for topic in (COLOR, DEPTH)]
+    assert stamps[0] == stamps[1] and (np.diff(stamps[0]) > 0).all()
+    pictures = [message.data.tobytes() for message in probe.got[COLOR]]
+    assert all(a != b for a, b in zip(pictures[:-1], pictures[1:], strict=True))
+    assert {message.header.frame_id for message in probe.got["/object_pose"]} == {"camera_color_optical_frame"}
+    assert len(probe.got["/object_pose"]) < len(pictures) / 2
+    probe.spinner.remove_node(node)
+    node.destroy_node()
+    assert not (tmp_path / "gripper").is_symlink()
+
+
+def test_rendering_ends_with_the_node(probe, grasp, tmp_path):
+    lens = EndingLens()
+    node = lens.node = start_live(probe, grasp, tmp_path / "gripper", lens)
+    with pytest.raises(ExternalShutdownException):
+        node.film()
+    assert lens.looks < 80  # of 169
+    assert not (tmp_path / "gripper").exists()
+
+
+def test_a_gripper_s_firmware_that_there_is_not_is_a_start_up_error(probe, grasp, tmp_path):
+    with pytest.raises(ParameterError, match="gripper_firmware is 'newest'; expected one of"):
+        start_live(probe, grasp, tmp_path / "gripper", gripper_firmware="newest")
 
 
 def test_a_scene_begins_again(probe):
