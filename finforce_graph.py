@@ -1,4 +1,4 @@
-"""The processes of a system, their parameters and remappings, described once; starts nothing itself."""
+"""The processes of a system, their parameters and remappings, described once; starts nothing, knows no hardware."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from finforce_options import ReplayOptions, SolverOptions
 
 # small matrices: more threads per process cost time and make it vary
 SINGLE_THREAD = {
@@ -29,6 +31,8 @@ class Process:
         remappings: topic names as the node knows them -> as they are here.
         arguments: of the program, before those of ROS.
         ends_all: the whole system ends with this process.
+        optional: the rest starts without it where its package is not installed.
+        advice: what else would do, for who has not got the package.
     """
 
     package: str = "finforce"
@@ -39,6 +43,8 @@ class Process:
     remappings: Mapping[str, str] = field(default_factory=dict)
     arguments: tuple[str, ...] = ()
     ends_all: bool = False
+    optional: bool = False
+    advice: str = ""
 
     def command(self) -> list[str]:
         """Return the command line that runs one of our nodes with this Python, without `ros2`."""
@@ -53,56 +59,30 @@ class Process:
         return words
 
 
+@dataclass(frozen=True, kw_only=True)
+class Include:
+    """A launch file of another package, which sees none of our arguments.
+
+    Attributes:
+        package: that holds the file.
+        file: in the package's folder `launch`.
+        arguments: of that file.
+        environment: variables for its processes only.
+        programs: that it calls, each named as the package it comes with.
+        advice: what else would do, for who has not got the package.
+    """
+
+    package: str
+    file: str
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=dict)
+    programs: tuple[str, ...] = ()
+    advice: str = ""
+
+
 def _yaml(value: Any) -> str:
     """Return a value as YAML with its type beyond doubt, which JSON is, but for NaN."""
     return ".nan" if value != value else json.dumps(value)
-
-
-def _option(default: Any, description: str, **metadata: Any) -> Any:
-    """Return a dataclass field that becomes a launch argument."""
-    return field(default=default, metadata={"description": description, **metadata})
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolverOptions:
-    """What every graph with solvers is asked for; NaN and empty texts leave the node's own default."""
-
-    jaw_file: str = _option("", "jaw file, or the name of a shipped jaw")
-    calibration_file: str = _option("", "calibration file, or a shipped name")
-    contact_height: float = _option(
-        math.nan,
-        "height of first touch above the clamped base [m]; nan: contacts come by topic, as with an object mesh",
-    )
-    object_mesh: str = _option("", "mesh file of the object, whose contacts are then estimated; empty: none is known")
-    object_mesh_unit: str = _option("", "unit of the mesh file: m, cm, mm or inch")
-    contact: str = _option("", "how the contact is estimated: estimate, paper or closest")
-    pose_source: str = _option("", "object poses: topic, detections or tracker")
-    images: bool = _option(False, "find the key points in images of a camera; else they come by topic")
-    finder: str = _option("", "what finds key points in images: network, frame (any DeepLabCut network) or dots")
-    model: str = _option("", "folder of a network and its pytorch_config.yaml; empty: the shipped network")
-    T_gripper_camera: str = _option("", "camera in the gripper's frame: x y z [m] qx qy qz qw")
-    solver: str = _option("", "model and objective: default, solid, frame or paper")
-    mesh: str = _option("", "mesh density: default, coarse or fine")
-    parameter_file: str = _option("", "YAML file with ROS parameters of the nodes")
-    use_sim_time: bool = _option(False, "take the time from /clock")
-    rviz: bool = _option(False, "show the markers in RViz")
-
-
-@dataclass(frozen=True, kw_only=True)
-class BenchOptions(SolverOptions):
-    """One jaw, live."""
-
-    jaw: str = _option("left", "the jaw that is on the bench: left or right")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReplayOptions(SolverOptions):
-    """The jaws of a recording."""
-
-    jaws: str = _option("left", "the jaws of the recording: left, right or both")
-    bag: str = _option("", "recording to be played; empty: somebody else plays it, with /clock")
-    rate: float = _option(1.0, "speed of playing")
-    use_sim_time: bool = _option(True, "take the time from /clock")
 
 
 def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Process:
@@ -119,7 +99,7 @@ def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Proc
     return Process(
         executable="ifea_solver",
         name=f"{side}_ifea_solver",
-        parameters={"jaw_name": side, **_given(asked), **parameters, "use_sim_time": options.use_sim_time},
+        parameters={"jaw_name": side, **given(asked), **parameters, "use_sim_time": options.use_sim_time},
         parameter_file=options.parameter_file,
     )
 
@@ -129,14 +109,17 @@ def _jaws_process(name: str, jaws: str, asked: Mapping[str, Any], options: Solve
     return Process(
         executable=name,
         name=name,
-        parameters={"jaws": jaws, **_given(asked), "use_sim_time": options.use_sim_time},
+        parameters={"jaws": jaws, **given(asked), "use_sim_time": options.use_sim_time},
         parameter_file=options.parameter_file,
     )
 
 
-def contact_processes(jaws: str, options: SolverOptions) -> list[Process]:
-    """Return the contact estimator of "left", "right" or "both" jaws, if an object mesh is named."""
-    if not options.object_mesh:
+def contact_processes(jaws: str, options: SolverOptions, *, waits: bool = False) -> list[Process]:
+    """Return the contact estimator of "left", "right" or "both" jaws, if an object mesh is named.
+
+    Where it `waits` for a mesh, which its services can bring, it is there unless the height of first touch is given.
+    """
+    if not options.object_mesh and not (waits and math.isnan(options.contact_height)):
         return []
     asked = {
         "jaw_file": options.jaw_file,
@@ -162,13 +145,17 @@ def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
         "jaw_file": options.jaw_file,
         "finder": options.finder,
         "model": options.model,
-        "T_gripper_camera": _numbers("T_gripper_camera", options.T_gripper_camera, 7),
+        "T_gripper_camera": read_numbers("T_gripper_camera", options.T_gripper_camera, 7),
     }
     return [_jaws_process("keypoint_detector", jaws, asked, options)]
 
 
-def _numbers(name: str, text: str, count: int) -> list[float] | None:
-    """Return the numbers of an option, None for an empty text."""
+def read_numbers(name: str, text: str, count: int) -> list[float] | None:
+    """Return the numbers of an option, None for an empty text.
+
+    Raises:
+        ValueError: they are not so many, or none.
+    """
     words = text.replace(",", " ").split()
     if not words:
         return None
@@ -181,20 +168,9 @@ def _numbers(name: str, text: str, count: int) -> list[float] | None:
     return numbers
 
 
-def _given(asked: Mapping[str, Any]) -> dict[str, Any]:
+def given(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return what was asked for; the rest is the node's own."""
     return {name: value for name, value in asked.items() if value not in ("", None)}
-
-
-def bench_processes(options: BenchOptions, share: Path) -> list[Process]:
-    """Return the processes of one jaw on a bench; its force is the grasp force; `images` start the detector."""
-    solver = solver_process(options.jaw, options, completes_grasp=True)
-    return [
-        solver,
-        *contact_processes(options.jaw, options),
-        *detector_processes(options.jaw, options),
-        *_viewer(options, share),
-    ]
 
 
 def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
@@ -216,20 +192,20 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
     )
     played = [player] if options.bag else []
     estimators = [*contact_processes(options.jaws, options), *detector_processes(options.jaws, options)]
-    return [*solvers, *estimators, *played, *_viewer(options, share)]
+    return [*solvers, *estimators, *played, *viewer(options, share)]
 
 
-def _viewer(options: SolverOptions, share: Path) -> list[Process]:
-    """Return RViz with the shipped configuration, if it was asked for."""
+def viewer(options: SolverOptions, share: Path, config: str = "finforce.rviz") -> list[Process]:
+    """Return RViz with a shipped configuration, if it was asked for."""
     if not options.rviz:
         return []
-    config = str(share / "rviz" / "finforce.rviz")
     return [
         Process(
             package="rviz2",
             executable="rviz2",
             name="rviz",
             parameters={"use_sim_time": options.use_sim_time},
-            arguments=("-d", config),
+            arguments=("-d", str(share / "rviz" / config)),
+            advice="or leave rviz:=true out",
         )
     ]

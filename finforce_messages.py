@@ -9,14 +9,16 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3, Wrench, WrenchStamped
 from numpy.typing import ArrayLike, NDArray
-from sensor_msgs.msg import Image, PointCloud2, PointField
+from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
-from finforce_health import NANOSECONDS
+from finforce_health import NANOSECONDS, Report
 from finforce_ifea.errors import ObservationError
+from finforce_ifea.messages import check_frame, contact_from_cloud
 from finforce_ifea.pointcloud import encode_cloud
 
 MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
@@ -82,11 +84,56 @@ def _vector(xyz: Sequence[float]) -> Vector3:
     return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
 
 
+def grasp_force(message: WrenchStamped, frame: str) -> float:
+    """Return the grasp force [N] of a grasp_wrench, as it came: it may be no number.
+
+    Raises:
+        ObservationError: the frame is another one.
+    """
+    check_frame(message, frame, "the grasp wrench")
+    return message.wrench.force.x
+
+
+def is_touching(cloud: PointCloud2, frame: str) -> bool:
+    """Say whether a contact estimator's cloud shows the object to touch the jaw.
+
+    Raises:
+        ObservationError: the frame, the height, the fields or the buffer are wrong.
+        ContactError: a coordinate or a weight is not finite.
+    """
+    return bool(contact_from_cloud(cloud, frame, free=False).touching)
+
+
+def joint_state_message(
+    header: Header, names: Sequence[str], positions: ArrayLike, velocities: ArrayLike, efforts: ArrayLike
+) -> JointState:
+    """Return the state of joints (n,) by position [m], velocity [m/s] and effort [N].
+
+    Raises:
+        ObservationError: a number is not finite; such a state must not leave.
+    """
+    columns = [[float(value) for value in values] for values in (positions, velocities, efforts)]
+    if not all(math.isfinite(value) for values in columns for value in values):
+        raise ObservationError(f"the joints' state is not finite: {columns}")
+    return JointState(header=header, name=list(names), position=columns[0], velocity=columns[1], effort=columns[2])
+
+
 def pose_message(header: Header, numbers: Sequence[float]) -> PoseStamped:
     """Return a pose from x, y, z [m], qx, qy, qz, qw."""
     x, y, z, *turn = map(float, numbers)
     orientation = Quaternion(**dict(zip("xyzw", turn, strict=True)))
     return PoseStamped(header=header, pose=Pose(position=Point(x=x, y=y, z=z), orientation=orientation))
+
+
+def status_message(name: str, source: str, report: Report) -> DiagnosticStatus:
+    """Return a report as the status `name` of a node `source`."""
+    return DiagnosticStatus(
+        level=bytes([report.level]),
+        name=name,
+        message=report.message,
+        hardware_id=source,
+        values=[KeyValue(key=key, value=value) for key, value in report.values.items()],
+    )
 
 
 def points_marker(

@@ -13,7 +13,7 @@ from threading import Thread
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: F401 - for those who publish
 from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: F401 - for those who publish
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -28,20 +28,24 @@ from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rclpy.validate_full_topic_name import validate_full_topic_name
 from rclpy.validate_topic_name import validate_topic_name
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: F401 - for those who subscribe
+from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2  # noqa: F401 - for those who subscribe
 from std_msgs.msg import Header, String  # noqa: F401 - for those who publish
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who publish
 
 from finforce_errors import FinforceError
 from finforce_health import NANOSECONDS, Level, Outcome, Report  # noqa: F401 - for those with stamps
 from finforce_messages import (  # noqa: F401 - for those who publish
     cloud_message,
+    grasp_force,
     image_message,
+    is_touching,
+    joint_state_message,
     nanoseconds,
     points_marker,
     pose_message,
     stamp_message,
+    status_message,
     wrench_message,
     xyz_columns,
 )
@@ -97,11 +101,9 @@ def _read_value(node: Node, name: str, entry: Field) -> Any:
         value = node.declare_parameter(name, entry.default, describe_field(entry)).value
     except ParameterException as error:
         raise ParameterError(f"parameter {name}: {error}") from error
-    if value is not None:
-        return value
-    if not isinstance(entry.default, (tuple, list)):
+    if value is None and not isinstance(entry.default, (tuple, list)):
         raise ParameterError(f"parameter {name} is empty; expected a value such as {entry.default!r}")
-    return ()
+    return () if value is None else value
 
 
 def _check_topic(node: Node, name: str, topic: str) -> None:
@@ -213,16 +215,8 @@ def publish_diagnostics(
 
     def publish() -> None:
         alarms = [Outcome(level=Level.ERROR, reason="qos", text=fault) for fault in qos.faults()]
-        state = report(alarms)
-        status = DiagnosticStatus(
-            level=bytes([state.level]),
-            name=name,
-            message=state.message,
-            hardware_id=node.get_name(),
-            values=[KeyValue(key=key, value=value) for key, value in state.values.items()],
-        )
-        header = Header(stamp=node.get_clock().now().to_msg())
-        publisher.publish(DiagnosticArray(header=header, status=[status]))
+        status = status_message(name, node.get_name(), report(alarms))
+        publisher.publish(DiagnosticArray(header=Header(stamp=node.get_clock().now().to_msg()), status=[status]))
 
     # on the steady clock: a stopped /clock must show, too
     node.create_timer(period, publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -230,15 +224,27 @@ def publish_diagnostics(
 
 def serve_trigger(node: Node, name: str, action: Callable[[], str], *, aside: bool = False) -> None:
     """Offer an action as a Trigger service, run `aside` if it takes long; what it refuses comes back as the message."""
+    _serve(node, Trigger, name, lambda _: action(), aside)
 
-    async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+
+def serve_switch(node: Node, name: str, action: Callable[[bool], str]) -> None:
+    """Offer an action that is told yes or no as a SetBool service; what it refuses comes back as the message."""
+    _serve(node, SetBool, name, lambda request: action(request.data), False)
+
+
+def _serve(node: Node, kind: type, name: str, action: Callable[[Any], str], aside: bool) -> None:
+    def attempt(request: Any) -> tuple[bool, str]:
         try:
-            response.success, response.message = True, await run_aside(node, action) if aside else action()
+            return True, action(request)
         except FinforceError as error:
-            response.success, response.message = False, str(error)
+            return False, str(error)
+
+    async def answer(request: Any, response: Any) -> Any:
+        answered = await run_aside(node, partial(attempt, request)) if aside else attempt(request)
+        response.success, response.message = answered
         return response
 
-    node.create_service(Trigger, name, answer, callback_group=MutuallyExclusiveCallbackGroup() if aside else None)
+    node.create_service(kind, name, answer, callback_group=MutuallyExclusiveCallbackGroup() if aside else None)
 
 
 async def run_aside(node: Node, action: Callable[[], Any]) -> Any:

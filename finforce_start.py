@@ -11,6 +11,7 @@ NODES = {
     "ifea_solver": "finforce_ifea.node",
     "contact_estimator": "finforce_contact.node",
     "keypoint_detector": "finforce_keypoints.node",
+    "gripper_driver": "finforce_driver.node",
     "recording_player": "finforce_eval.node",
     "twin_camera": "finforce_twin.node",
 }
@@ -30,6 +31,11 @@ def contact_estimator() -> int:
 def keypoint_detector() -> int:
     """Run the key point detector of one jaw or both."""
     return start("keypoint_detector")
+
+
+def gripper_driver() -> int:
+    """Run the driver of the gripper."""
+    return start("gripper_driver")
 
 
 def recording_player() -> int:

@@ -1,17 +1,18 @@
 """One jaw on a bench, live: `ros2 launch finforce bench.launch.py contact_height:=0.040 images:=true`.
 
-Without `images` the key points come by topic.
+Without `images` the key points come by topic. `gripper_port:=/dev/ttyACM0` drives a gripper; `sim:=true` needs no
+hardware.
 """
 
 from pathlib import Path
 
-from finforce_graph import BenchOptions, bench_processes
 from finforce_launch import describe_launch
+from finforce_options import BenchOptions
+from finforce_setups import bench_processes
 
 SHARE = Path(__file__).resolve().parents[1]
 
 
 def generate_launch_description():
-    """Return the solver of the jaw, and what feeds it, with `config/bench.yaml`."""
-    parameter_file = str(SHARE / "config" / "bench.yaml")
-    return describe_launch(BenchOptions, bench_processes, SHARE, parameter_file=parameter_file)
+    """Return the solver, what feeds it, the gripper if it has a port; with `config/bench.yaml` or `bench_sim.yaml`."""
+    return describe_launch(BenchOptions, bench_processes, SHARE)

@@ -6,8 +6,9 @@ points in the images of the recording.
 
 from pathlib import Path
 
-from finforce_graph import ReplayOptions, replay_processes
+from finforce_graph import replay_processes
 from finforce_launch import describe_launch
+from finforce_options import ReplayOptions
 
 SHARE = Path(__file__).resolve().parents[1]
 

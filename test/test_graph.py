@@ -3,6 +3,7 @@
 import ast
 import json
 import math
+import re
 from dataclasses import fields
 from pathlib import Path
 
@@ -12,14 +13,11 @@ import yaml
 
 from finforce_contact.parameters import ContactParameters
 from finforce_contact.settings import ContactSettings
+from finforce_driver.grasp_settings import GraspSettings
+from finforce_driver.parameters import DriverParameters
+from finforce_driver.settings import GripperSettings
 from finforce_eval.parameters import PlayerParameters
-from finforce_graph import (
-    BenchOptions,
-    Process,
-    ReplayOptions,
-    bench_processes,
-    replay_processes,
-)
+from finforce_graph import Process, replay_processes
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.dot_image import DotSettings
@@ -27,6 +25,10 @@ from finforce_keypoints.gripper_geometry import BENCH_CAMERA
 from finforce_keypoints.parameters import DetectorParameters
 from finforce_keypoints.settings import DetectorSettings
 from finforce_launch import options_from_texts
+from finforce_options import BenchOptions, ReplayOptions, RobotOptions
+from finforce_records import TimeParameters
+from finforce_setups import bench_processes
+from finforce_twin.parameters import TwinParameters
 
 ROOT = Path(__file__).resolve().parents[1]
 SOLVER_PARAMETERS = {entry.name for entry in fields(NodeParameters)}
@@ -144,8 +146,9 @@ def test_a_camera_pose_that_is_not_seven_numbers_is_named(text):
         bench_processes(BenchOptions(images=True, T_gripper_camera=text), ROOT)
 
 
-def test_the_bench_configuration_has_the_camera_of_the_bench():
-    bench = yaml.safe_load((ROOT / "config" / "bench.yaml").read_text(encoding="utf-8"))
+@pytest.mark.parametrize("name", ["bench", "bench_sim"])
+def test_the_bench_configuration_has_the_camera_of_the_bench(name):
+    bench = yaml.safe_load((ROOT / "config" / f"{name}.yaml").read_text(encoding="utf-8"))
     numbers = tuple(bench["keypoint_detector"]["ros__parameters"]["T_gripper_camera"])
     # 1e-7: of the printed digits
     np.testing.assert_allclose(DetectorParameters(T_gripper_camera=numbers).camera_pose, BENCH_CAMERA, atol=1e-7)
@@ -187,23 +190,54 @@ def test_a_launch_argument_that_means_nothing_is_named(name, text):
 
 
 def test_every_launch_argument_has_a_description():
-    for record in (BenchOptions, ReplayOptions):
+    for record in (BenchOptions, ReplayOptions, RobotOptions):
         assert all(entry.metadata["description"] for entry in fields(record))
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "config").glob("*.yaml")), ids=lambda path: path.name)
+def defaults_of(record, prefix=""):
+    return {prefix + entry.name: entry.default for entry in fields(record)}
+
+
+SOLVER = defaults_of(NodeParameters) | defaults_of(EstimatorSettings, "estimator.")
+PARAMETERS = {
+    "left_ifea_solver": SOLVER,
+    "right_ifea_solver": SOLVER,
+    "contact_estimator": defaults_of(ContactParameters) | defaults_of(ContactSettings, "contact."),
+    "keypoint_detector": defaults_of(DetectorParameters) | defaults_of(DetectorSettings, "detector."),
+    "gripper_driver": defaults_of(DriverParameters)
+    | defaults_of(GripperSettings, "gripper.")
+    | defaults_of(GraspSettings, "grasp."),
+    "twin_camera": defaults_of(TwinParameters),
+    "/**": defaults_of(TimeParameters),
+}
+NODE_FILES = [path for path in sorted((ROOT / "config").glob("*.yaml")) if path.name != "d405.yaml"]
+
+
+@pytest.mark.parametrize("path", NODE_FILES, ids=lambda path: path.name)
 def test_every_key_of_a_configuration_is_a_parameter_and_differs_from_its_default(path):
-    solver = {entry.name: entry.default for entry in fields(NodeParameters)}
-    solver |= {f"estimator.{entry.name}": entry.default for entry in fields(EstimatorSettings)}
-    detector = {entry.name: entry.default for entry in fields(DetectorParameters)}
-    detector |= {f"detector.{entry.name}": entry.default for entry in fields(DetectorSettings)}
     for node, section in yaml.safe_load(path.read_text(encoding="utf-8")).items():
-        defaults = detector if node == "keypoint_detector" else solver
+        defaults = PARAMETERS[node]
         for name, value in section["ros__parameters"].items():
             value = tuple(value) if isinstance(value, list) else value
             assert name in defaults
             assert value != defaults[name]
             assert type(value) is type(defaults[name])
+
+
+@pytest.mark.parametrize("path", NODE_FILES, ids=lambda path: path.name)
+def test_a_configuration_has_no_aliases_which_ros_cannot_read(path):
+    tokens = yaml.scan(path.read_text(encoding="utf-8"))
+    assert not any(isinstance(token, yaml.tokens.AliasToken) for token in tokens)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "config").glob("*.yaml")), ids=lambda path: path.name)
+def test_every_value_of_a_configuration_has_its_unit_or_reason_beside_it(path):
+    lines = path.read_text(encoding="utf-8").splitlines()
+    values = [number for number, line in enumerate(lines) if re.match(r"\s*[\w.]+: *[^\s#]", line)]
+    assert values
+    # a repeated value has the comment of the first, and a long one that of the line above
+    known = {lines[number].split("#")[0].strip() for number in values if "#" in lines[number]}
+    assert all(lines[n].split("#")[0].strip() in known or "#" in lines[n - 1] for n in values)
 
 
 @pytest.mark.parametrize(
@@ -218,6 +252,7 @@ def test_every_key_of_a_configuration_is_a_parameter_and_differs_from_its_defaul
         (DotSettings, "finforce_keypoints"),
         (ReplayOptions, "."),
         (BenchOptions, "."),
+        (RobotOptions, "."),
     ],
 )
 def test_every_field_is_read(record, folder):
@@ -234,8 +269,9 @@ def test_the_foxglove_layout_shows_our_topics():
     assert {"/left/markers", "/left/keypoints", "/left/object_outline"} <= set(topics)
 
 
-def test_the_rviz_configuration_shows_our_topics_in_the_jaws_frame():
-    manager = yaml.safe_load((ROOT / "rviz" / "finforce.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
+@pytest.mark.parametrize(("name", "frame"), [("finforce", "left_jaw"), ("robot", "gripper_base")])
+def test_the_rviz_configuration_shows_our_topics_in_the_setups_frame(name, frame):
+    manager = yaml.safe_load((ROOT / "rviz" / f"{name}.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
     topics = {display["Topic"]["Value"] for display in manager["Displays"] if "Topic" in display}
     assert {"/left/markers", "/left/keypoints", "/left/object_outline", "/right/markers"} <= topics
-    assert manager["Global Options"]["Fixed Frame"] == "left_jaw"
+    assert manager["Global Options"]["Fixed Frame"] == frame

@@ -21,7 +21,11 @@ import finforce_ros as ros
 from finforce_contact.parameters import ContactParameters
 from finforce_contact.pose_settings import TrackerSettings
 from finforce_contact.settings import ContactSettings
+from finforce_driver.grasp_settings import GraspSettings
+from finforce_driver.parameters import DriverParameters
+from finforce_driver.settings import GripperSettings
 from finforce_eval.parameters import PlayerParameters
+from finforce_health import Level, Report
 from finforce_ifea.errors import FinforceError, ObservationError
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.pointcloud import decode_keypoints
@@ -41,6 +45,9 @@ RECORDS = (
     DetectorParameters,
     DetectorSettings,
     DotSettings,
+    DriverParameters,
+    GripperSettings,
+    GraspSettings,
 )
 
 
@@ -69,6 +76,30 @@ def test_a_wrench_that_is_not_finite_cannot_be_made(bad):
     assert ros.wrench_message(Header(), (1, 2, 3), (4, 5, 6)).wrench.torque.z == 6.0
     with pytest.raises(ObservationError, match="not finite"):
         ros.wrench_message(Header(), (1, 2, 3), (4, bad, 6))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_joint_state_that_is_not_finite_cannot_be_made(bad):
+    state = ros.joint_state_message(Header(), ("a", "b"), (1, 2), (3, 4), (5, 6))
+    assert (list(state.name), list(state.position), list(state.velocity)) == (["a", "b"], [1.0, 2.0], [3.0, 4.0])
+    assert list(state.effort) == [5.0, 6.0]
+    with pytest.raises(ObservationError, match="not finite"):
+        ros.joint_state_message(Header(), ("a", "b"), (1, 2), (3, bad), (5, 6))
+
+
+def test_a_cloud_touches_if_any_of_its_contacts_does():
+    points = np.zeros((2, 3))
+    for touching in ([0, 0], [0, 1]):
+        columns = {**ros.xyz_columns(points), "touching": np.array(touching, dtype=np.uint8)}
+        assert ros.is_touching(ros.cloud_message(Header(frame_id="a"), columns), "a") is any(touching)
+    assert ros.is_touching(ros.cloud_message(Header(frame_id="a"), ros.xyz_columns(points)), "a") is False
+
+
+def test_a_report_is_a_status_of_its_node():
+    report = Report(level=Level.WARN, message="warm", values={"temperature": "60"})
+    status = ros.status_message("gripper", "driver", report)
+    assert (status.level, status.name, status.hardware_id, status.message) == (b"\x01", "gripper", "driver", "warm")
+    assert [(entry.key, entry.value) for entry in status.values] == [("temperature", "60")]
 
 
 def test_a_marker_without_points_is_deleted():

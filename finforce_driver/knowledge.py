@@ -1,0 +1,122 @@
+"""What the replies say of the gripper: the believed reply, place, speed, faults; knows nothing of what is wanted."""
+
+from __future__ import annotations
+
+import math
+
+from finforce_driver.history import History
+from finforce_driver.protocol import LARGEST_BYTE, Flag, Move, Reply
+from finforce_driver.reply_filter import Expectation, ReplyFilter, Sample
+from finforce_driver.telemetry import Telemetry
+
+FASTEST = 2000.0  # [counts/s] that anything can move the jaws with; 80000 ticks/s are 1932
+REACH_MARGIN = 1.5  # of the commanded speed
+
+
+class Knowledge:
+    """Keeps what was believed.
+
+    Attributes:
+        reply: the last believed one; None before the first.
+        stamp: when it came [s]; NaN before the first.
+        half_calibrated: a calibration was cut short, the gripper's flag says nothing.
+        telemetry: temperature, supply, errors.
+        filter: what decides on belief.
+        history: places over time [counts].
+
+    Args:
+        telemetry_period: between two questions for telemetry [s].
+    """
+
+    def __init__(self, telemetry_period: float) -> None:
+        self.half_calibrated = False
+        self.telemetry = Telemetry(telemetry_period)
+        self.filter = ReplyFilter()
+        self.history = History()
+        self.reply: Reply | None = None
+        self.stamp = math.nan
+        self._contact_since = math.inf
+
+    def forget(self) -> None:
+        """Know nothing any more; only that a calibration was cut short does not heal by itself."""
+        self.reply, self.stamp, self._contact_since = None, math.nan, math.inf
+        self.telemetry.forget()
+        self.filter.forget()
+        self.history.forget()
+
+    def restart_places(self) -> None:
+        """Forget all places but the last one: they were told between other end stops."""
+        self.history.forget()
+        if self.reply is not None and self.reply.calibrated:
+            self.history.add(self.stamp, estimate_place(self.reply, None))
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the place means something."""
+        return self.reply is not None and self.reply.calibrated and not self.half_calibrated
+
+    @property
+    def error(self) -> bool:
+        """Whether a fault is latched."""
+        return self.reply is not None and self.reply.error
+
+    @property
+    def driving(self) -> bool:
+        """Whether the gripper's power stage moves or holds the jaws."""
+        reply = self.reply
+        return reply is not None and reply.activated and reply.action and not reply.error
+
+    @property
+    def contact_time(self) -> float:
+        """Return for how long the gripper has told of contact [s]."""
+        return max(0.0, self.stamp - self._contact_since)
+
+    @property
+    def place(self) -> float:
+        """Return the best estimate of the last place [counts]; NaN unknown."""
+        return self.history.last if self.calibrated else math.nan
+
+    def place_now(self, now: float) -> float:
+        """Return where the jaws are by now, at the speed of the last replies [counts]."""
+        ahead = self.place + self.history.speed() * max(0.0, now - self.stamp)
+        return min(max(ahead, 0.0), float(LARGEST_BYTE))
+
+    def take(self, reply: Reply, now: float, order: Move | None, speed: float) -> Reply | None:
+        """Take a reply, and return what is believed after it; None: ask again.
+
+        Args:
+            reply: as it came.
+            now: when [s].
+            order: the gripper's, as far as it is known.
+            speed: that the order allows [counts/s].
+        """
+        drift = self.history.speed()
+        reach = FASTEST if order is None else max(REACH_MARGIN * speed, 2.0 * abs(drift))
+        believed = self.filter.take(Sample(reply=reply, time=now), Expectation(drift=drift, reach=reach))
+        if believed is None:
+            return None
+        self.reply, self.stamp = believed, now
+        self._contact_since = min(self._contact_since, now) if believed.contact else math.inf
+        if believed.calibrated:
+            self.history.add(now, estimate_place(believed, order))
+        else:
+            self.history.forget()
+        return believed
+
+    def faults(self, stopped: bool) -> tuple[str, ...]:
+        """Return the names of what is latched; `stopped`: an emergency stop of ours is among it."""
+        reply, names = self.reply, []
+        if reply is not None and reply.error:
+            names = list(self.telemetry.errors.faults) if self.telemetry.errors else []
+            bits = {"temperature": reply.overheated, "watchdog": reply.watchdog, "E-stop": reply.estopped}
+            names += [name for name, present in bits.items() if present and name not in names]
+        if stopped and "E-stop" not in names:
+            names.append("E-stop")
+        return tuple(names) or (("unknown",) if self.error else ())
+
+
+def estimate_place(reply: Reply, order: Move | None) -> float:
+    """Return where the jaws are [counts]: in the middle of what the truncated byte allows, or at the target."""
+    if order is not None and order.flags & Flag.GO and reply.at_target and 0 <= order.position - reply.position <= 1:
+        return float(order.position)
+    return float(reply.position) if reply.position in (0, LARGEST_BYTE) else reply.position + 0.5

@@ -1,0 +1,71 @@
+"""Messages into what a gripper is asked for; any object with a message's attributes will do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from finforce_driver.errors import TargetError
+from finforce_driver.grasp_settings import GraspGoal
+
+
+@dataclass(frozen=True, kw_only=True)
+class MoveRequest:
+    """What a command asks for, as it came.
+
+    Attributes:
+        opening: to go to [m].
+        speed: of the opening [m/s]; None: the driver's own.
+        force: grip force by the motor's current [N]; None: the driver's own.
+    """
+
+    opening: float
+    speed: float | None = None
+    force: float | None = None
+
+
+def move_from_joint_state(message: Any) -> MoveRequest:
+    """Return the move of a sensor_msgs/JointState: position = opening, velocity = speed, effort = grip force.
+
+    Raises:
+        TargetError: there is no opening, or a field has several values.
+    """
+    opening = _single(message.position, "position, the opening [m]")
+    if opening is None:
+        raise TargetError("a command without position; expected one value, the opening between the jaws [m]")
+    speed = _single(message.velocity, "velocity, the speed of the opening [m/s]")
+    return MoveRequest(opening=opening, speed=speed, force=_single(message.effort, "effort, the grip force [N]"))
+
+
+def move_from_gripper_command(command: Any) -> MoveRequest:
+    """Return the move of a control_msgs/GripperCommand: position = opening, max_effort = grip force, 0 for none."""
+    return MoveRequest(opening=command.position, force=command.max_effort or None)
+
+
+def goal_from_joint_state(message: Any, last: GraspGoal) -> GraspGoal:
+    """Return the goal of a sensor_msgs/JointState: effort = force, velocity = speed, position = least opening.
+
+    Args:
+        message: what it does not say stays as it was.
+        last: how it was.
+
+    Raises:
+        TargetError: there is nothing in it, a field has several values, or a value cannot be.
+    """
+    given = {
+        "force": _single(message.effort, "effort, the force to hold [N]"),
+        "speed": _single(message.velocity, "velocity, the speed of the opening [m/s]"),
+        "least_opening": _single(message.position, "position, the least opening [m]"),
+    }
+    changes = {name: value for name, value in given.items() if value is not None}
+    if not changes:
+        raise TargetError("an empty grasp goal; expected effort, the force to hold [N]")
+    return replace(last, **changes)
+
+
+def _single(values: Sequence[float], what: str) -> float | None:
+    """Return the only value of a field, None of an empty one."""
+    if len(values) > 1:
+        raise TargetError(f"{len(values)} values of {what}; expected one for both jaws together, or none")
+    return float(values[0]) if len(values) else None

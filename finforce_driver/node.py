@@ -1,0 +1,189 @@
+"""The node of the SSG-48 gripper: commands and forces in, joint states out; it converts, calls and publishes."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import WrenchStamped
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.node import Node
+from sensor_msgs.msg import JointState, PointCloud2
+
+import finforce_ros as ros
+from finforce_driver.command_action import GripperCommandAction
+from finforce_driver.force_feed import ForceSample
+from finforce_driver.grasp_session import GraspSession
+from finforce_driver.grasp_settings import GraspSettings
+from finforce_driver.messages import goal_from_joint_state, move_from_joint_state
+from finforce_driver.outputs import DriverOutputs
+from finforce_driver.parameters import DriverParameters, build_gripper
+from finforce_driver.report import GripperHealth, describe_grasp, describe_state, gripper_alarms, news_of_state
+from finforce_driver.settings import GripperSettings
+from finforce_driver.state import GripperState
+from finforce_driver.tasks import GripperTasks
+from finforce_driver.times import MessageTimes
+from finforce_errors import FinforceError, MissingDependencyError
+from finforce_health import Outcome, Report
+from finforce_optional import import_library
+
+JAWS = ("left", "right")
+
+
+class GripperDriverNode(Node):
+    """Drives one gripper; what is wrong with a command leaves it as it was.
+
+    Args:
+        build: makes the gripper's driver from parameters and settings.
+        options: of `rclpy.node.Node`.
+
+    Raises:
+        FinforceError: a parameter cannot be used.
+    """
+
+    def __init__(self, build: Callable[..., Any] = build_gripper, **options: Any) -> None:
+        super().__init__("gripper_driver", **options)
+        self.parameters = parameters = ros.declare_record(self, DriverParameters)
+        settings = ros.declare_record(self, GripperSettings, "gripper")
+        grasp = ros.declare_record(self, GraspSettings, "grasp")
+        ros.name_unknown_parameters(self)
+        self.gripper = build(parameters, settings)
+        self.wake = self.create_guard_condition(self._on_states)
+        self.session = GraspSession(self.gripper, parameters.goal, grasp, self.wake.trigger)
+        self.tasks = GripperTasks(self.gripper, self.session, parameters)
+        gate = {"max_age": parameters.max_age, "restart_gap": parameters.restart_gap}
+        self.times = MessageTimes(self.gripper.clock, ("force", *JAWS), **gate)
+        self.health = GripperHealth(source=parameters.port, stale_after=parameters.max_age)
+        self.qos = ros.QosWatch(self)
+        self.out = DriverOutputs(self.qos, parameters)
+        self.arrived: deque[GripperState] = deque(maxlen=100)
+        self.published = -math.inf
+        self._serve()
+        self._subscribe()
+        self.forget = self.gripper.listen(self._take_state)
+        self.gripper.start()
+        self.get_logger().info(f"gripper on {parameters.port} ({parameters.interface}), ready")
+
+    def _serve(self) -> None:
+        """Offer services, whose waiting holds up nothing else, and diagnostics."""
+        tasks = self.tasks
+        for name in ("estop", "stop"):
+            ros.serve_trigger(self, f"~/{name}", getattr(tasks, name))
+        for name in ("calibrate", "clear_errors", "grasp", "grasp_without_vision", "release"):
+            ros.serve_trigger(self, f"~/{name}", getattr(tasks, name), aside=True)
+        ros.serve_switch(self, "~/activate", tasks.activate)
+        self.action = self._offer_action()
+        ros.publish_diagnostics(self, self.qos, "finforce: gripper", self.parameters.diagnostics_period, self._report)
+
+    def _offer_action(self) -> ActionServer | None:
+        """Offer the standard action, if it is installed; a newer goal ends an older one."""
+        try:
+            kind = import_library("control_msgs.action", "~/gripper_cmd").GripperCommand
+        except MissingDependencyError:
+            self.get_logger().info("no action ~/gripper_cmd: control_msgs is not installed")
+            return None
+        action = GripperCommandAction(kind, self.gripper, self.tasks)
+
+        async def execute(handle: Any) -> Any:
+            return await ros.run_aside(self, partial(action.execute, handle))
+
+        return ActionServer(self, kind, "~/gripper_cmd", execute, cancel_callback=lambda _: CancelResponse.ACCEPT)
+
+    def _subscribe(self) -> None:
+        """Create the subscriptions; a node that has them is ready."""
+        self.qos.subscription(JointState, "~/command", self._on_command, ros.RESULT)
+        self.qos.subscription(JointState, "~/grasp_goal", self._on_goal, ros.RESULT)
+        self.qos.subscription(WrenchStamped, "grasp_wrench", self._on_wrench, ros.SENSOR)
+        for side in JAWS:
+            self.qos.subscription(PointCloud2, f"{side}/contact", partial(self._on_contact, side), ros.SENSOR)
+
+    def _take_state(self, state: GripperState) -> None:
+        """Keep a state, in the gripper's thread, until the node's own thread has time for it."""
+        self.arrived.append(state)
+        self.wake.trigger()
+
+    def _on_states(self) -> None:
+        """Publish the states that have come, and go on with the grasp."""
+        while self.arrived:
+            state = self.arrived.popleft()
+            self.session.update(state)
+            if state.stamp > self.published:
+                self.published = state.stamp
+                self.health.take(state, self.gripper.clock.now())
+                with self._refusals("joint state"):
+                    self.out.send_joints(self.times.to_stamp(state.stamp, self._now()), state)
+            if self.health.is_news("gripper", text := news_of_state(state)):
+                self.get_logger().info(text)
+        self.out.send_grasp(self.session.status)
+
+    def _on_command(self, message: JointState) -> None:
+        """Move as a message says."""
+        with self._refusals("command", stream=False):
+            self.tasks.move(move_from_joint_state(message))
+
+    def _on_goal(self, message: JointState) -> None:
+        """Set the goal of the grasp that runs, and of the next."""
+        with self._refusals("grasp goal", stream=False):
+            self.session.set_goal(goal_from_joint_state(message, self.session.goal))
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        """Hand the force of an image to the grasp."""
+        with self._refusals("force"):
+            force, stamp = ros.grasp_force(message, self.parameters.gripper_frame), self._enter("force", message)
+            self.session.take_force(ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force))
+            self.out.send_grasp(self.session.status)
+
+    def _on_contact(self, side: str, cloud: PointCloud2) -> None:
+        """Hand to the grasp whether a jaw touches the object."""
+        with self._refusals("contact"):
+            touching, stamp = ros.is_touching(cloud, f"{side}_jaw"), self._enter(side, cloud)
+            self.session.take_touch(side, touching, stamp)
+
+    def _enter(self, source: str, message: Any) -> float:
+        """Return the stamp of a fresh message on the gripper's clock [s]."""
+        return self.times.enter(source, ros.nanoseconds(message.header.stamp), self._now())
+
+    @contextmanager
+    def _refusals(self, what: str, stream: bool = True) -> Iterator[None]:
+        """Survive what is wrong with a message, and say it; in a stream only once while its kind is the same."""
+        kind = ""
+        try:
+            yield
+        except FinforceError as error:
+            self.health.refuse(outcome := Outcome.of_error(error))
+            kind = outcome.reason
+            if self.health.is_news(what, kind) or not stream:
+                self.get_logger().warning(f"{what} refused: {error}")
+        self.health.is_news(what, kind)
+
+    def _report(self, alarms: list[Outcome]) -> Report:
+        """Return how gripper and grasp are doing."""
+        state = self.gripper.state
+        values = describe_state(state) | describe_grasp(self.session.status)
+        return self.health.report([*alarms, *gripper_alarms(state)], values)
+
+    def _now(self) -> int:
+        return self.get_clock().now().nanoseconds
+
+    def destroy_node(self) -> None:
+        """Leave the gripper holding, or limp where the parameters say so, and end the node."""
+        self.tasks.close()
+        self.forget()
+        self.gripper.close()
+        if self.action is not None:
+            self.action.destroy()
+        super().destroy_node()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node until Ctrl-C."""
+    return ros.run_node("gripper_driver", GripperDriverNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

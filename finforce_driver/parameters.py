@@ -1,0 +1,70 @@
+"""The parameters of a gripper driver node, and the gripper that they ask for; knows no ROS."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from finforce_driver.grasp_settings import GraspGoal
+from finforce_records import ParameterError, TimeParameters, parameter
+
+if TYPE_CHECKING:
+    from finforce_driver.gripper import Gripper
+    from finforce_driver.settings import GripperSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriverParameters(TimeParameters):
+    """What a gripper driver node is told beside the settings of gripper and grasp; units stand in the metadata."""
+
+    port: str = parameter("/dev/ttyACM0", "serial port of the CAN adapter, or python-can's channel, such as can0")
+    interface: str = parameter("slcan", "slcan: a serial adapter; any other word: python-can's interface of that name")
+    baud_rate: int = parameter(115200, "of the serial port; of no effect on USB", unit="1/s", min=1200, max=10_000_000)
+    bit_rate: int = parameter(1_000_000, "of the CAN bus", unit="bit/s", min=10_000, max=1_000_000)
+    joint_names: tuple[str, ...] = parameter(
+        ("left_jaw_joint", "right_jaw_joint"), "of the two jaws in joint_states; the value of each is half the opening"
+    )
+    gripper_frame: str = parameter("gripper_base", "frame of grasp_wrench")
+    grasp_force: float = parameter(1.0, "that grasp holds until grasp_goal says another", unit="N", min=0.1, max=30.0)
+    grasp_speed: float = parameter(0.004, "of the opening while a grasp closes", unit="m/s", min=1e-4, max=0.1)
+    grasp_least_opening: float = parameter(
+        0.0, "at which a grasp that has met nothing gives up", unit="m", min=0.0, max=0.5
+    )
+    grasp_time_limit: float = parameter(20.0, "for a grasp to reach its force", unit="s", min=0.1, max=3600.0)
+    motor_force: float = parameter(
+        10.0, "grip force by the motor's current, of grasp_without_vision", unit="N", min=1.0, max=100.0
+    )
+    release_opening: float = parameter(
+        math.nan, "to which release opens; NaN: as far as it goes", unit="m", min=0.0, max=0.5
+    )
+    release_speed: float = parameter(0.02, "of the opening while release opens", unit="m/s", min=1e-4, max=0.37)
+
+    def __post_init__(self) -> None:
+        """Refuses joints that are not two.
+
+        Raises:
+            ParameterError: these are others.
+        """
+        if len(self.joint_names) != 2 or len(set(self.joint_names)) != 2:
+            raise ParameterError(f"joint_names: got {self.joint_names!r}, expected two names, left and right")
+
+    @property
+    def goal(self) -> GraspGoal:
+        """The first goal of a grasp."""
+        names = ("force", "speed", "least_opening", "time_limit")
+        return GraspGoal(**{name: getattr(self, f"grasp_{name}") for name in names})
+
+
+def build_gripper(parameters: DriverParameters, settings: GripperSettings) -> Gripper:
+    """Make the driver of the gripper that the parameters name; nothing is opened before it starts.
+
+    Raises:
+        TargetError: a rate is none that ports or SLCAN know.
+    """
+    from finforce_driver.buses import build_bus
+    from finforce_driver.gripper import Gripper
+
+    rates = {"baud_rate": parameters.baud_rate, "bit_rate": parameters.bit_rate}
+    bus = build_bus(parameters.port, parameters.interface, **rates)
+    return Gripper(bus, settings)

@@ -1,0 +1,113 @@
+"""Decides which replies are believed: what goes on from the last one at once, anything else when it is repeated.
+
+A digit that fell over on the serial line makes a valid reply that is wrong; it must never become a state. Knows neither
+what the gripper was told nor what follows from its state.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from statistics import median_low
+
+from finforce_driver.protocol import Reply
+
+CURRENT_STEP = 100.0  # [mA] that the current may change by between two replies without being doubted
+CURRENT_RATE = 25_000.0  # [mA/s], of the greatest current limit within the 20 ms in which it settles, rounded
+FLAGS = ("activated", "action", "overheated", "watchdog", "estopped", "calibrated", "error", "code")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Expectation:
+    """How the position may change.
+
+    Attributes:
+        drift: present speed [counts/s], positive while closing.
+        reach: greatest speed that is possible now [counts/s].
+    """
+
+    drift: float = 0.0
+    reach: float = 2000.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """A reply and when it came [s]."""
+
+    reply: Reply
+    time: float
+
+
+class ReplyFilter:
+    """Passes on believed replies.
+
+    Attributes:
+        doubted: number of replies that were not believed at first.
+    """
+
+    def __init__(self) -> None:
+        self.doubted = 0
+        self._believed: Sample | None = None
+        self._doubts: deque[Sample] = deque(maxlen=2)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether a further reply is wanted at once."""
+        return bool(self._doubts)
+
+    def forget(self) -> None:
+        """Begin anew: the next reply goes on from nothing."""
+        self._believed = None
+        self._doubts.clear()
+
+    def take(self, sample: Sample, expected: Expectation) -> Reply | None:
+        """Return what to believe after a reply: it, the middle of three that disagree, or None for now."""
+        if self._believed is not None and goes_on(self._believed, sample, expected):
+            return self._believe(sample)
+        if any(_agree(doubt, sample, expected) for doubt in self._doubts):
+            return self._believe(sample)
+        self.doubted += 1
+        if len(self._doubts) == 2:
+            return self._believe(Sample(reply=_middle([*self._doubts, sample]), time=sample.time))
+        self._doubts.append(sample)
+        return None
+
+    def _believe(self, sample: Sample) -> Reply:
+        """Keep a sample and return its reply."""
+        self._believed = sample
+        self._doubts.clear()
+        return sample.reply
+
+
+def goes_on(before: Sample, after: Sample, expected: Expectation) -> bool:
+    """Return whether a reply needs no repetition: same flags, position as expected, hardly another current."""
+    way = expected.drift * (after.time - before.time)
+    # at rest nothing may change; in motion the truncation of both counts and of the speed adds up to some two
+    tolerance = 1.0 + min(1.0, abs(way)) + 0.1 * abs(way) if expected.drift else 0.0
+    return (
+        _flags(before.reply) == _flags(after.reply)
+        and abs(after.reply.position - before.reply.position - way) <= tolerance
+        and abs(after.reply.current_mA - before.reply.current_mA) <= CURRENT_STEP
+    )
+
+
+def _agree(first: Sample, second: Sample, expected: Expectation) -> bool:
+    """Return whether two replies can both be true."""
+    span = second.time - first.time
+    return (
+        _flags(first.reply) == _flags(second.reply)
+        and abs(second.reply.position - first.reply.position) <= 1.0 + expected.reach * span
+        and abs(second.reply.current_mA - first.reply.current_mA) <= CURRENT_STEP + CURRENT_RATE * span
+    )
+
+
+def _flags(reply: Reply) -> tuple[int, ...]:
+    """Return what of a reply has to be equal."""
+    return tuple(getattr(reply, name) for name in FLAGS)
+
+
+def _middle(samples: list[Sample]) -> Reply:
+    """Return the reply of which every part is the middle one of three."""
+    replies = [sample.reply for sample in samples]
+    names = (*FLAGS, "position", "current_mA")
+    return replace(replies[-1], **{name: median_low([getattr(reply, name) for reply in replies]) for name in names})

@@ -1,0 +1,129 @@
+"""SI units at the edge, bytes inside, and the refusal of what the gripper cannot do; knows no time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from finforce_driver.errors import TargetError
+from finforce_driver.protocol import LARGEST_BYTE
+from finforce_driver.settings import GripperSettings
+
+TICKS_PER_TURN = 16384  # of the encoder
+SLOWEST_TICKS = 40  # per second, at speed byte 0
+TICKS_SPAN = 79960  # per second, from speed byte 0 to 255
+SLOWEST_BYTE = 3  # below it the gripper mistakes slow motion for contact
+LEAST_SPEED = 1e-5  # [m/s] of the opening: a stroke in 80 minutes
+ROUNDING = 1e-9  # [m], [N]: what a value may lie out of bounds by arithmetic alone
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pace:
+    """How a speed is carried out.
+
+    Attributes:
+        byte: speed byte of the frames.
+        speed: of the opening that results [m/s].
+        stepped: the speed is below what the byte can do, the target has to be moved on in steps.
+        note: what was changed in what was asked for; empty when nothing was.
+    """
+
+    byte: int
+    speed: float
+    stepped: bool = False
+    note: str = ""
+
+
+class GripperScale:
+    """Converts openings, speeds and forces into bytes and back.
+
+    Args:
+        settings: stroke, offset and pinion of the gripper, slope of its force, limits of its current.
+    """
+
+    def __init__(self, settings: GripperSettings) -> None:
+        self._closed = settings.closed_opening
+        self._stroke = settings.stroke
+        self._force_per_current = settings.force_per_current
+        self._least_current, self._largest_current = settings.least_current, settings.largest_current
+        # both racks move by the pinion's circumference per turn
+        self._opening_per_tick = 4.0 * math.pi * settings.pinion_radius / TICKS_PER_TURN
+
+    @property
+    def resolution(self) -> float:
+        """Opening per count of the position byte [m]."""
+        return self._stroke / LARGEST_BYTE
+
+    @property
+    def largest_opening(self) -> float:
+        """Opening at the open stop [m]."""
+        return self._closed + self._stroke
+
+    @property
+    def slowest_direct(self) -> float:
+        """Slowest speed of the opening without steps [m/s]."""
+        return self.speed_of(SLOWEST_BYTE)
+
+    @property
+    def fastest(self) -> float:
+        """Fastest speed of the opening [m/s]."""
+        return self.speed_of(LARGEST_BYTE)
+
+    def opening_of(self, position: float) -> float:
+        """Return the opening [m] of a position [counts]: closed + stroke (1 - position / 255)."""
+        return self._closed + self._stroke * (1.0 - position / LARGEST_BYTE)
+
+    def counts_of(self, opening: float) -> float:
+        """Return the position [counts] of an opening [m], neither rounded nor bounded."""
+        return LARGEST_BYTE * (1.0 - (opening - self._closed) / self._stroke)
+
+    def position_of(self, opening: float) -> int:
+        """Return the position byte next to an opening [m].
+
+        Raises:
+            TargetError: it is no number, or outside the stroke.
+        """
+        low, high = self._closed, self.largest_opening
+        if not low - ROUNDING <= opening <= high + ROUNDING:
+            raise TargetError(f"opening: got {opening:g} m, expected {low:g} to {high:g} m, what the gripper can open")
+        return round(min(max(self.counts_of(opening), 0.0), float(LARGEST_BYTE)))
+
+    def speed_of(self, byte: int) -> float:
+        """Return the speed of the opening [m/s] of a speed byte."""
+        return (SLOWEST_TICKS + byte * TICKS_SPAN // LARGEST_BYTE) * self._opening_per_tick
+
+    def pace_of(self, speed: float) -> Pace:
+        """Return how a speed of the opening [m/s] is carried out; the byte never gives a faster one.
+
+        Raises:
+            TargetError: it is no number, not positive, or below 0.01 mm/s.
+        """
+        if not LEAST_SPEED <= speed < math.inf:
+            raise TargetError(f"speed: got {speed:g} m/s, expected {LEAST_SPEED:g} to {self.fastest:.3g} m/s")
+        if speed < self.slowest_direct:
+            return Pace(byte=SLOWEST_BYTE, speed=speed, stepped=True)
+        if speed > self.fastest:
+            note = f"speed {speed:g} m/s is more than the gripper can do: {self.fastest:.3g} m/s"
+            return Pace(byte=LARGEST_BYTE, speed=self.fastest, note=note)
+        byte = int((speed / self._opening_per_tick * (1.0 + 1e-9) - SLOWEST_TICKS) * LARGEST_BYTE / TICKS_SPAN) + 1
+        while self.speed_of(byte) > speed * (1.0 + 1e-9) or byte > LARGEST_BYTE:
+            byte -= 1
+        return Pace(byte=byte, speed=self.speed_of(byte))
+
+    def force_of(self, current: float) -> float:
+        """Return the grip force [N] of a current [A] by the maker's curve; both positive when driving closed."""
+        return self._force_per_current * current
+
+    def current_of(self, force: float) -> int:
+        """Return the current limit [mA] of a grip force [N] by the maker's curve.
+
+        Raises:
+            TargetError: it is no number, or outside the range of the current limit.
+        """
+        low, high = self.force_of(self._least_current), self.force_of(self._largest_current)
+        if not low - ROUNDING <= force <= high + ROUNDING:
+            raise TargetError(
+                f"force: got {force:g} N, expected {low:.3g} to {high:.3g} N, the range of the current limit; "
+                "a smaller force needs vision"
+            )
+        return round(1e3 * force / self._force_per_current)

@@ -1,0 +1,17 @@
+"""Two jaws on a robot's wrist: `ros2 launch finforce robot.launch.py object_mesh:=FILE arm:=true robot_ip:=ADDRESS`.
+
+`sim:=true` needs no hardware: `ros2 launch finforce robot.launch.py sim:=true`.
+"""
+
+from pathlib import Path
+
+from finforce_launch import describe_launch
+from finforce_options import RobotOptions
+from finforce_setups import robot_processes
+
+SHARE = Path(__file__).resolve().parents[1]
+
+
+def generate_launch_description():
+    """Return camera, detector, contacts, solvers, gripper, arm; with `config/robot.yaml` or `robot_sim.yaml`."""
+    return describe_launch(RobotOptions, robot_processes, SHARE)
