@@ -30,8 +30,10 @@ setup(
         "finforce_launch",
         "finforce_messages",
         "finforce_optional",
+        "finforce_options",
         "finforce_records",
         "finforce_ros",
+        "finforce_setups",
         "finforce_start",
     ],
     package_data={

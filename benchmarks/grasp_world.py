@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import count
-from threading import Event
 from typing import Protocol
 
 import numpy as np
@@ -34,14 +33,6 @@ CLEARANCE = 0.003  # [m] of the opening before first touch
 HOLDING = 10.0  # [s]
 # shares and times in the middle of what the twin draws for its fingers
 TERMS = (RelaxationTerm(share=0.065, time_constant=2.2), RelaxationTerm(share=0.065, time_constant=10.0))
-
-
-class SteppedClock(VirtualClock):
-    """A virtual clock that also passes the rests of time that rounding leaves: a loop would wait for them for ever."""
-
-    def wait(self, seconds: float, wake: Event | None = None) -> None:
-        """Let `seconds` [s] pass, a microsecond at least."""
-        super().wait(max(seconds, 1e-6), wake)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,7 +113,7 @@ class World:
     def __init__(self, case: Case, sensor: Sensor) -> None:
         self._case, self._sensor = case, sensor
         self.emulated = EmulatedGripper(case.variant, load=case.plant.force_at)
-        self.clock = SteppedClock()
+        self.clock = VirtualClock()
         self.bus = VirtualBus(EmulatedAdapter(self.emulated), self.clock)
         self.gripper = Gripper(self.bus, clock=self.clock)
         self._relaxation = Relaxation(case.plant.terms)

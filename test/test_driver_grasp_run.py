@@ -21,11 +21,6 @@ from finforce_driver.state import Phase
 STIFFNESS, WIDTH, LATENCY, NOISE = 1300.0, 0.025, 0.06, 0.05
 
 
-class PatientClock(VirtualClock):
-    def wait(self, seconds, wake=None):
-        super().wait(max(seconds, 1e-6), wake)
-
-
 def press(opening):
     return STIFFNESS * max(0.0, WIDTH - opening)
 
@@ -35,7 +30,7 @@ class Lab:
 
     def __init__(self, variant):
         self.emulated = EmulatedGripper(variant)
-        self.clock = PatientClock()
+        self.clock = VirtualClock()
         self.bus = VirtualBus(EmulatedAdapter(self.emulated), self.clock)
         self.gripper = Gripper(self.bus, clock=self.clock)
         self.gripper.wait(lambda state: state.phase is Phase.UNCALIBRATED, 5.0)
@@ -141,7 +136,7 @@ def test_error_of_the_source_leaves_the_jaws_holding(lab):
 
 
 def test_gripper_that_is_not_calibrated_is_not_moved():
-    emulated, clock = EmulatedGripper(), PatientClock()
+    emulated, clock = EmulatedGripper(), VirtualClock()
     gripper = Gripper(VirtualBus(EmulatedAdapter(emulated), clock), clock=clock)
     gripper.wait(lambda state: state.phase is Phase.UNCALIBRATED, 5.0)
     before = emulated.true_opening

@@ -130,3 +130,11 @@ def test_what_was_sent_is_kept_with_its_time(setup):
     assert setup.bus.counts["frames"] == 0
     setup.bus.receive(0.05)
     assert setup.bus.counts["frames"] == 1
+
+
+def test_a_wait_for_a_rest_of_rounding_ends():
+    clock = VirtualClock()
+    clock.wait(0.5)
+    before = clock.now()
+    clock.wait(1e-18)
+    assert before < clock.now() < before + 1e-5

@@ -11,11 +11,12 @@ import pytest
 import setuptools
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = sorted(path for path in ROOT.glob("finforce_*/*.py")) + sorted(ROOT.glob("finforce_*.py"))
+SOURCES = sorted(ROOT.glob("finforce_*/**/*.py")) + sorted(ROOT.glob("finforce_*.py"))
+SHARED = {"errors", "bounded", "records", "health", "optional", "ros"}  # modules at the root that know no jaw
 ROS = {"rclpy", "builtin_interfaces", "rcl_interfaces", "rosgraph_msgs", "std_srvs"}
 ROS |= {f"{name}_msgs" for name in ("diagnostic", "geometry", "sensor", "std", "visualization")}
-LAUNCH = {"launch", "launch_ros"}  # only where a full ROS 2 is
-MODULES = {"PIL": "pillow", "yaml": "pyyaml", "cv2": "opencv-contrib-python-headless"}
+LAUNCH = {"launch", "launch_ros", "ament_index_python"}  # only where a full ROS 2 is
+MODULES = {"PIL": "pillow", "serial": "pyserial", "yaml": "pyyaml", "cv2": "opencv-contrib-python-headless"}
 
 
 @pytest.fixture(scope="module")
@@ -87,9 +88,18 @@ def test_every_ros_package_that_is_imported_is_in_the_manifest(manifest):
 
 def test_every_module_is_installed(described):
     installed = set(described["packages"]) | set(described["py_modules"])
-    assert installed == {path.stem for path in ROOT.glob("finforce_*") if (path / "__init__.py").exists()} | {
-        path.stem for path in ROOT.glob("finforce_*.py")
+    packages = {".".join(path.parent.relative_to(ROOT).parts) for path in ROOT.glob("finforce_*/**/__init__.py")}
+    assert installed == packages | {path.stem for path in ROOT.glob("finforce_*.py")}
+
+
+def test_the_driver_imports_none_of_the_other_packages():
+    own = {"finforce_driver"} | {f"finforce_{name}" for name in SHARED}
+    strangers = {
+        path.name: {name for name in imported(path) if name.startswith("finforce_")} - own
+        for path in SOURCES
+        if "finforce_driver" in path.parts and not is_ros_file(path)
     }
+    assert not {name: found for name, found in strangers.items() if found}
 
 
 def test_executables_land_where_ros_looks_and_point_at_functions(described):
@@ -104,7 +114,7 @@ def test_executables_land_where_ros_looks_and_point_at_functions(described):
 
 def test_launch_configuration_and_marker_files_are_installed(described):
     files = {folder: set(names) for folder, names in described["data_files"]}
-    for folder in ("launch", "config", "rviz"):
+    for folder in ("launch", "config", "rviz", "urdf"):
         there = {str(path.relative_to(ROOT)) for path in (ROOT / folder).iterdir() if path.is_file()}
         assert {str(Path(name)) for name in files[f"share/finforce/{folder}"]} == there
     assert files["share/ament_index/resource_index/packages"] == {"resource/finforce"}

@@ -156,8 +156,9 @@ def test_images_of_a_gripper_are_stamped_as_those_of_a_script_and_never_alike(pr
     probe.wait_for(lambda: min(len(probe.got[topic]) for topic in (COLOR, DEPTH, INFO)) >= 8)
     stamps = [[ros.nanoseconds(message.header.stamp) for message in probe.got[topic][:8]] for topic in (COLOR, DEPTH)]
     assert stamps[0] == stamps[1] and (np.diff(stamps[0]) > 0).all()
-    pictures = [message.data.tobytes() for message in probe.got[COLOR]]
-    assert all(a != b for a, b in zip(pictures[:-1], pictures[1:], strict=True))
+    for topic in (COLOR, DEPTH):  # nor when some images between are lost
+        assert len({message.data.tobytes() for message in probe.got[topic]}) == len(probe.got[topic])
+    pictures = probe.got[COLOR]
     assert {message.header.frame_id for message in probe.got["/object_pose"]} == {"camera_color_optical_frame"}
     assert len(probe.got["/object_pose"]) < len(pictures) / 2
     probe.spinner.remove_node(node)

@@ -12,6 +12,7 @@ from finforce_driver.errors import LinkError
 from finforce_driver.slcan import SlcanParser, encode_frame
 
 _STEP = 0.001  # [s]
+_LEAST = 1e-6  # [s] that a wait takes: a rest of rounding would not move the clock, and be waited for for ever
 
 
 class Steppable(Protocol):
@@ -68,7 +69,7 @@ class VirtualClock:
 
     def wait(self, seconds: float, wake: Event | None = None) -> None:
         """Let `seconds` [s] pass, or less when `wake` is set meanwhile."""
-        left = seconds
+        left = max(seconds, _LEAST) if seconds > 0.0 else 0.0
         while left > 1e-9 and not (wake is not None and wake.is_set()):
             dt = min(left, self._step)
             self.tick(dt)
