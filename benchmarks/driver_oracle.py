@@ -106,6 +106,7 @@ class Oracle:
         self._scale = scale
         self.outcome = Outcome.NONE
         self._telemetry: dict[str, float] = {}
+        self._cut = False
 
     def check(self, state: GripperState, goal: float, stopped: bool, clearing: bool) -> list[str]:
         """Return the complaints about a new state.
@@ -117,9 +118,13 @@ class Oracle:
             clearing: it was, or its clearing was asked for and may fail.
         """
         outcome, self.outcome = self.outcome, state.outcome
+        # a calibration that was cut short leaves a flag that the driver does not trust
+        self._cut = state.phase is Phase.CALIBRATING or (self._cut and state.phase not in (Phase.READY, Phase.MOVING))
         if math.isnan(state.stamp):
             return self._check_ignorance(state)
         near = self.tape.last(state.stamp, WINDOW)
+        if not near:  # an old reply, whose state was checked when it came
+            return []
         complaints = [*self._check_flags(state, near, stopped, clearing), *self._check_values(state, near)]
         if state.outcome is not outcome:
             complaints += self._check_outcome(state, goal)
@@ -134,7 +139,7 @@ class Oracle:
         wrong = []
         if state.calibrated and not any(truth.calibrated for truth in near):
             wrong.append("calibrated")
-        if state.phase is Phase.UNCALIBRATED and "cut short" not in state.message and all(t.calibrated for t in near):
+        if state.phase is Phase.UNCALIBRATED and not self._cut and all(truth.calibrated for truth in near):
             wrong.append("uncalibrated")
         if not any(truth.echo[0] == state.activated for truth in near):
             wrong.append("activated")

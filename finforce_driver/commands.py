@@ -100,7 +100,7 @@ def hold(core: Core, now: float) -> None:
     core.note = ""
     if standing or not (core.known.driving or core.orders.pending):
         return
-    kept, place = core.orders.wanted, core.known.place_now(now)
+    kept, place = core.orders.wanted, core.place_now(now)
     if kept is not None and kept.drives and abs(kept.position - place) <= 1.0:
         return
     core.orders.want(core.order(position=core.place_for_order(now), flags=GO), urgent=True)

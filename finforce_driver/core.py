@@ -123,19 +123,24 @@ class Core:
             flags=flags,
         )
 
+    def place_now(self, now: float) -> float:
+        """Return where the jaws are by now [counts]; NaN unknown."""
+        order = self.orders.taken
+        return self.known.place_now(now, float(order.position) if order is not None and order.drives else None)
+
     def place_for_order(self, now: float) -> int:
         """Return the position that holds the jaws where they are [counts].
 
         The reply truncates: jaws that rest between two counts report the one on the open side.
         """
-        place = self.known.place_now(now)
+        place = self.place_now(now)
         if math.isnan(place):
             return 0
         return math.ceil(place) if self.known.history.speed() >= 0.0 else math.floor(place)
 
     def setpoint(self, now: float) -> float:
         """Return where the target or the jaws are now [counts], for a move that goes on from there."""
-        place, wanted = self.known.place_now(now), self.orders.wanted
+        place, wanted = self.place_now(now), self.orders.wanted
         if wanted is None or not wanted.flags & Flag.GO:
             return place
         ramp = self.job.steps.ramp(now) if self.job and self.job.steps else float(wanted.position)

@@ -110,6 +110,10 @@ class Exchange:
         command = MARKERS[self._marker]
         return Request(frame=encode_request(self._node, command), answer=command, node=self._node)
 
+    def rest(self) -> None:
+        """Note that so long a pause was made that nothing older can be on the way: the next reply puts us in step."""
+        self._tries = TRIES + 1
+
     def reset(self) -> None:
         """Begin anew on a link that was opened anew."""
         self.pending = None

@@ -9,7 +9,7 @@ from finforce_driver.protocol import Reply
 from finforce_driver.state import Outcome
 from finforce_driver.steps import Steps
 from finforce_driver.units import Pace
-from finforce_driver.verdict import GRACE, MoveWatch
+from finforce_driver.verdict import MoveWatch
 
 LOOSE_TIME = 0.1  # [s] without contact after which what was grasped is taken to be gone
 PRESSING = (Outcome.GRASPED, Outcome.BLOCKED)
@@ -53,7 +53,7 @@ class MoveJob:
         allowed = 2.0 / rate if self.steps else abs(goal.position - start) / rate
         closing = goal.position > start
         self.watch = MoveWatch(position=goal.position, closing=closing, allowed=allowed, now=now)
-        self._sent = self._pressed = now
+        self._pressed = now
 
     @property
     def position(self) -> int:
@@ -81,7 +81,6 @@ class MoveJob:
 
     def send(self, now: float) -> None:
         """Note that its order was sent."""
-        self._sent = now
         self.watch.send(now)
 
     def take(self, reply: Reply, now: float) -> None:
@@ -90,9 +89,8 @@ class MoveJob:
             final = self.steps is None or self.steps.done
             self.outcome = self.watch.take(reply, now, final)
             self._pressed = now
-        elif self.outcome in PRESSING and now - self._sent >= GRACE:
+        elif self.outcome in PRESSING:
             self._pressed = now if reply.contact else self._pressed
             if now - self._pressed > LOOSE_TIME:
                 self.outcome = Outcome.NONE
-                self.watch.push = 0
                 self.watch.delay(now)

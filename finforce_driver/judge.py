@@ -21,7 +21,7 @@ def judge_reply(core: Core, before: Reply | None, reply: Reply, now: float) -> N
         reply: the new one.
         now: when it came [s].
     """
-    if core.silent:
+    if core.silent or before is None:
         core.silent, core.note = False, ""
     core.stop.take(reply)
     _follow_recovery(core, reply, now)

@@ -10,6 +10,7 @@ from finforce_driver.reply_filter import Expectation, ReplyFilter, Sample
 from finforce_driver.telemetry import Telemetry
 
 FASTEST = 2000.0  # [counts/s] that anything can move the jaws with; 80000 ticks/s are 1932
+LONGEST_OUTLOOK = 0.1  # [s] for which the jaws are taken to go on as they did
 REACH_MARGIN = 1.5  # of the commanded speed
 
 
@@ -76,10 +77,16 @@ class Knowledge:
         """Return the best estimate of the last place [counts]; NaN unknown."""
         return self.history.last if self.calibrated else math.nan
 
-    def place_now(self, now: float) -> float:
-        """Return where the jaws are by now, at the speed of the last replies [counts]."""
-        ahead = self.place + self.history.speed() * max(0.0, now - self.stamp)
-        return min(max(ahead, 0.0), float(LARGEST_BYTE))
+    def place_now(self, now: float, target: float | None) -> float:
+        """Return where the jaws are by now [counts], at the speed of the last replies and not beyond their target."""
+        way = self.history.speed() * min(max(0.0, now - self.stamp), LONGEST_OUTLOOK)
+        bound = LARGEST_BYTE * (way > 0.0) if target is None else target
+        left = max(0.0, math.copysign(1.0, way) * (bound - self.place))
+        return self.place + math.copysign(min(abs(way), left), way)
+
+    def restart_contact(self) -> None:
+        """Forget a contact: the gripper has another order."""
+        self._contact_since = math.inf
 
     def take(self, reply: Reply, now: float, order: Move | None, speed: float) -> Reply | None:
         """Take a reply, and return what is believed after it; None: ask again.

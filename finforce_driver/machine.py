@@ -195,6 +195,7 @@ class GripperMachine:
             core.orders.take(request.move)
             core.echo.send(request.move, now)
             core.order_sent = now
+            core.known.restart_contact()
             if core.job is not None:
                 core.job.send(now)
 

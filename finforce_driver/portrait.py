@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from finforce_driver.advice import HALF_CALIBRATED, describe
 from finforce_driver.core import Core
 from finforce_driver.state import GripperState, Phase
-from finforce_driver.verdict import CLEAR_CURRENT, CONTACT_TIME
+from finforce_driver.verdict import CLEAR_CURRENT, CONTACT_TIME, push_direction
 
 DIRECTIONS = {1: "closing", -1: "opening", 0: ""}
 
@@ -56,13 +56,11 @@ def _target(core: Core) -> float:
 def _push(core: Core) -> int:
     """Return 1 or -1 for what the motor pushes against closing or opening, else 0."""
     reply = core.known.reply
-    if not core.known.driving or core.calibration is not None:
+    if not core.known.driving or core.calibration is not None or core.known.contact_time < CONTACT_TIME:
         return 0
     if core.job is not None:
-        return core.job.watch.push
-    if core.known.contact_time < CONTACT_TIME or abs(reply.current_mA) < CLEAR_CURRENT or not core.settled:
-        return 0
-    return 1 if reply.current_mA < 0 else -1
+        return push_direction(reply, core.job.watch.closing)
+    return 0 if abs(reply.current_mA) < CLEAR_CURRENT else push_direction(reply, True)
 
 
 def _sentence(core: Core, phase: Phase, faults: tuple[str, ...]) -> str:

@@ -1,4 +1,4 @@
-"""Decides which replies are believed: what goes on from the last one at once, anything else when it is repeated.
+"""Decides which replies are believed: what goes on from the last one at once, anything else when it repeats itself.
 
 A digit that fell over on the serial line makes a valid reply that is wrong; it must never become a state. Knows neither
 what the gripper was told nor what follows from its state.
@@ -10,10 +10,12 @@ from collections import deque
 from dataclasses import dataclass, replace
 from statistics import median_low
 
-from finforce_driver.protocol import Reply
+from finforce_driver.protocol import LARGEST_CURRENT_MA, Reply
 
 CURRENT_STEP = 100.0  # [mA] that the current may change by between two replies without being doubted
-CURRENT_RATE = 25_000.0  # [mA/s], of the greatest current limit within the 20 ms in which it settles, rounded
+CURRENT_RATE = 5_000.0  # [mA/s] beside that between two that confirm each other
+CONFIRMATIONS = 2  # replies in a row that have to agree with the one that was doubted
+MOST_DOUBTS = 8  # after which replies are taken to differ for good, as by a noisy current
 FLAGS = ("activated", "action", "overheated", "watchdog", "estopped", "calibrated", "error", "code")
 
 
@@ -48,7 +50,8 @@ class ReplyFilter:
     def __init__(self) -> None:
         self.doubted = 0
         self._believed: Sample | None = None
-        self._doubts: deque[Sample] = deque(maxlen=2)
+        self._doubts: deque[Sample] = deque(maxlen=CONFIRMATIONS)
+        self._unsettled = 0
 
     @property
     def doubtful(self) -> bool:
@@ -59,16 +62,21 @@ class ReplyFilter:
         """Begin anew: the next reply goes on from nothing."""
         self._believed = None
         self._doubts.clear()
+        self._unsettled = 0
 
     def take(self, sample: Sample, expected: Expectation) -> Reply | None:
-        """Return what to believe after a reply: it, the middle of three that disagree, or None for now."""
+        """Return what to believe after a reply: it, the middle of three where many disagree, or None for now."""
         if self._believed is not None and goes_on(self._believed, sample, expected):
             return self._believe(sample)
-        if any(_agree(doubt, sample, expected) for doubt in self._doubts):
-            return self._believe(sample)
         self.doubted += 1
-        if len(self._doubts) == 2:
-            return self._believe(Sample(reply=_middle([*self._doubts, sample]), time=sample.time))
+        if abs(sample.reply.current_mA) > LARGEST_CURRENT_MA:
+            return None
+        run = [*self._doubts, sample]
+        if len(run) > CONFIRMATIONS and all(_agree(*pair, expected) for pair in zip(run, run[1:], strict=False)):
+            return self._believe(sample)
+        self._unsettled += 1
+        if self._unsettled > MOST_DOUBTS:
+            return self._believe(Sample(reply=_middle(run), time=sample.time))
         self._doubts.append(sample)
         return None
 
@@ -76,6 +84,7 @@ class ReplyFilter:
         """Keep a sample and return its reply."""
         self._believed = sample
         self._doubts.clear()
+        self._unsettled = 0
         return sample.reply
 
 
@@ -107,7 +116,7 @@ def _flags(reply: Reply) -> tuple[int, ...]:
 
 
 def _middle(samples: list[Sample]) -> Reply:
-    """Return the reply of which every part is the middle one of three."""
+    """Return the reply of which every part is the middle one of some."""
     replies = [sample.reply for sample in samples]
     names = (*FLAGS, "position", "current_mA")
     return replace(replies[-1], **{name: median_low([getattr(reply, name) for reply in replies]) for name in names})

@@ -20,6 +20,7 @@ from finforce_driver.protocol import (
 )
 from finforce_driver.recovery import RecoveryStep
 
+LATEST_REPLY = 0.2  # [s] after which no reply is expected any more
 SEARCH_MISSES = 10  # requests without a reply after which other nodes are looked for
 
 
@@ -132,7 +133,7 @@ class RequestSource:
 
     def _poll(self, now: float) -> Request | None:
         """The empty command at the poll rate; while nothing answers, every other one looks for another node."""
-        if now < self._next_poll:
+        if now < self._next_poll or self._rests(now):
             return None
         period = 1.0 / self._core.settings.poll_rate
         # half a period late is made up for, more is left out
@@ -141,6 +142,16 @@ class RequestSource:
         if misses < SEARCH_MISSES or misses % 2 or self._core.calibration is not None:
             return self._poll_now()
         return self._search()
+
+    def _rests(self, now: float) -> bool:
+        """Whether a late reply is waited for: the way back into step during a calibration."""
+        exchange = self._core.exchange
+        if self._core.calibration is None or exchange.in_step:
+            return False
+        if now < exchange.sent + LATEST_REPLY:
+            return True
+        exchange.rest()
+        return False
 
     def _search(self) -> Request:
         """A ping to another node, which changes nothing there."""

@@ -38,19 +38,18 @@ class MoveWatch:
     """Judges one move.
 
     Attributes:
-        push: 1 or -1 while a contact lasts that is no longer than a blip, by its direction; else 0.
+        closing: whether the move closes.
 
     Args:
         position: where the move ends [counts].
-        closing: whether it closes.
+        closing: the same.
         allowed: its own time [s]; infinite for one that goes in steps, whose steps say how long it takes.
         now: time [s].
     """
 
     def __init__(self, *, position: int, closing: bool, allowed: float, now: float) -> None:
-        self.push = 0
+        self.closing = closing
         self._position = position
-        self._closing = closing
         self._allowed = max(allowed + EXTRA_TIME, LEAST_TIME)
         self._deadline = now + self._allowed
         self._sent = now
@@ -77,8 +76,9 @@ class MoveWatch:
         if now - self._sent < GRACE:
             return Outcome.NONE
         self._follow_contact(reply, now)
-        if self.push and self._contact and self._contact.replies >= CONTACT_REPLIES:
-            return self._judge_contact(reply.position)
+        contact = self._contact
+        if contact and now - contact.since >= CONTACT_TIME and contact.replies >= CONTACT_REPLIES:
+            return self._judge_contact(reply)
         there = reply.at_target and abs(reply.position - self._position) <= TOLERANCE
         self._arrivals = self._arrivals + 1 if there and final else 0
         if self._arrivals >= REACHED_REPLIES:
@@ -86,18 +86,17 @@ class MoveWatch:
         return Outcome.TIMED_OUT if now > self._deadline else Outcome.NONE
 
     def _follow_contact(self, reply: Reply, now: float) -> None:
-        """Keep how long a contact lasts, and its direction once it is no blip."""
+        """Keep how long a contact lasts at one place."""
         kept = self._contact
         if not reply.contact:
-            self._contact, self.push = None, 0
+            self._contact = None
             return
         if kept is None or abs(reply.position - kept.position) > 1:
             kept = _Contact(since=now, position=reply.position, replies=0)
         self._contact = _Contact(since=kept.since, position=kept.position, replies=kept.replies + 1)
-        self.push = push_direction(reply, self._closing) if now - kept.since >= CONTACT_TIME else 0
 
-    def _judge_contact(self, position: int) -> Outcome:
+    def _judge_contact(self, reply: Reply) -> Outcome:
         """Return what a lasting contact means."""
-        if self.push > 0:
-            return Outcome.CLOSED_EMPTY if position >= CLOSED else Outcome.GRASPED
-        return Outcome.REACHED if max(position, self._position) <= OPENED else Outcome.BLOCKED
+        if push_direction(reply, self.closing) > 0:
+            return Outcome.CLOSED_EMPTY if reply.position >= CLOSED else Outcome.GRASPED
+        return Outcome.REACHED if max(reply.position, self._position) <= OPENED else Outcome.BLOCKED

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from random import Random
 from time import monotonic
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
@@ -20,12 +20,13 @@ from finforce_contact.poses import pose_numbers
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_twin.coupled_gripper import CoupledGripper
 from finforce_twin.encoding import encode_depth, info_fields, sight_columns
+from finforce_twin.flicker import Flicker
 from finforce_twin.live import LiveScene, build_live_scene
 from finforce_twin.parameters import TwinParameters
 from finforce_twin.record import Footage, TwinFrame, build_footage, parse_size
 from finforce_twin.script import RATE
 
-FLICKERING = 2000  # numbers of an image that differ from the last one at the same opening
+PIXEL_TYPES = {"rgb8": np.uint8, "16UC1": np.uint16}
 TOLD_EVERY = 5.0  # s between two words on how far the rendering is
 Output = tuple[Any, Any]  # publisher and message
 
@@ -68,7 +69,7 @@ class TwinCameraNode(Node):
         self.is_over = False
         self._next, self._phase, self._told = 0, "", monotonic()
         self._outputs: dict[str, Any] = {}
-        self._rng = Random(parameters.seed)
+        self._flicker = Flicker(parameters.seed)
 
     def film(self) -> None:
         """Render all images into messages, and begin to play them."""
@@ -113,7 +114,7 @@ class TwinCameraNode(Node):
         moment = self.scene.take(self.gripper.opening, monotonic())
         for _, message in moment.picture:
             if isinstance(message, Image):
-                flicker(message, self._rng)
+                self._flicker.lay(np.frombuffer(message.data, PIXEL_TYPES[message.encoding]), id(message))
         return [*self._true(moment.wrenches, moment.T_camera_object), *moment.picture]
 
     def _tell(self, done: int, count: int) -> None:
@@ -155,13 +156,6 @@ class TwinCameraNode(Node):
         if topic not in self._outputs:
             self._outputs[topic] = self.create_publisher(kind, topic, ros.RESULT)
         return self._outputs[topic]
-
-
-def flicker(image: Image, rng: Random) -> None:
-    """Change some numbers of an image by one: a camera never gives the same twice, and a watch for frozen ones knows."""
-    stride = 1 if image.encoding == "rgb8" else 2  # of depths the lower byte
-    for place in rng.choices(range(0, len(image.data), stride), k=FLICKERING):
-        image.data[place] ^= 1 if image.data[place] else 0  # what has no depth gets none
 
 
 def camera_info(header: Header, camera: CameraIntrinsics) -> CameraInfo:
