@@ -215,7 +215,9 @@ class FaultRun:
         self._clearing &= state.estopped or self._stopped
         self.tally.wrong.update(complaints)
         if self._tracing and complaints:
-            print(f"{self.clock.now():.3f} {complaints} {state}\n   {self.tape.truths[-1]} {self.adapter.injected[-3:]}")
+            print(
+                f"{self.clock.now():.3f} {complaints} {state}\n   {self.tape.truths[-1]} {self.adapter.injected[-3:]}"
+            )
 
     def _watch_frame(self, frame: Frame) -> None:
         """Check a frame that leaves."""
@@ -257,7 +259,8 @@ class FaultRun:
         self._goal, self._allowed = 0.030 if self.emulated.true_opening < 0.02 else 0.010, True
         self.gripper.move(self._goal, 0.1)
         state = self.gripper.wait(lambda state: state.phase is not Phase.MOVING, 5.0)
-        return state.outcome is Outcome.REACHED and abs(self.tape.truths[-1].place - self.gripper.scale.counts_of(self._goal)) < 3.0
+        way = self.tape.truths[-1].place - self.gripper.scale.counts_of(self._goal)
+        return state.outcome is Outcome.REACHED and abs(way) < 3.0
 
 
 def choose_kinds(seed: int) -> tuple[FaultKind, ...]:
@@ -287,7 +290,7 @@ def print_tally(tally: Tally) -> None:
     print(f"hangs                    {tally.hangs:>8}")
     print(f"crashes                  {sum(tally.crashes.values()):>8}  {dict(tally.crashes)}")
     print(f"not back to work         {tally.unrecovered:>8}")
-    print(f"largest differences                {({name: round(value, 3) for name, value in tally.worst.items()})}")
+    print(f"largest differences                { ({name: round(value, 3) for name, value in tally.worst.items()}) }")
     print(f"against good practice              {dict(tally.violations)}")
 
 

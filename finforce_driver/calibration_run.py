@@ -13,6 +13,11 @@ STARTS = 3
 QUIET_CURRENT = 20  # [mA] that a motor at rest does not exceed
 IDLE_CURRENT, IDLE_REPLIES, LEAST_TIME = 100, 10, 0.7  # [mA], replies and [s] after which it is over
 OPENED, CLOSED = 3, 252  # [counts]
+END_TIME = 0.5  # [s] in which the position has to follow the flag
+NO_GRIPPER = (
+    "the calibration is done, but the position does not follow: configure the controller as a gripper "
+    "(#Gripper 1, #Save over UART)"
+)
 CALIBRATED_REPLIES = 2  # the first reply may carry a position of before
 
 
@@ -48,6 +53,7 @@ class CalibrationRun:
         self._place: int | None = None
         self._runs = self._opened = self._closed = False
         self._idle = self._calibrated = 0
+        self._ended: float | None = None
 
     @property
     def over(self) -> bool:
@@ -87,11 +93,13 @@ class CalibrationRun:
         self._runs |= abs(reply.current_mA) > QUIET_CURRENT or abs(reply.position - self._place) > 1
         if self._was_calibrated and not reply.calibrated:
             self.fail("the gripper gave the calibration up, or was restarted")
-        elif self._finished(reply, now):
-            self.step = CalibrationStep.DONE
-        elif not self._runs and now > self._begun + START_TIME:
+        elif self._was_calibrated:
+            self._look_for_end(reply, now)
+        elif reply.calibrated:
+            self._check_end(reply, now)
+        if self.step is CalibrationStep.WATCH and not self._runs and now > self._begun + START_TIME:
             self._start_again()
-        elif now > self._begun + TIME_LIMIT:
+        elif self.step is CalibrationStep.WATCH and now > self._begun + TIME_LIMIT:
             self.fail("no end stop was found in time: is something in the way, or the current too small?")
 
     def _start_again(self) -> None:
@@ -101,12 +109,19 @@ class CalibrationRun:
         else:
             self.fail("the calibration does not start: the motor draws no current; check its supply")
 
-    def _finished(self, reply: Reply, now: float) -> bool:
-        """Return whether the calibration is complete."""
-        if not self._was_calibrated:
-            self._calibrated = self._calibrated + 1 if reply.calibrated else 0
-            return self._calibrated >= CALIBRATED_REPLIES
+    def _look_for_end(self, reply: Reply, now: float) -> None:
+        """Look for the end where the flag, which was set before, does not tell."""
         self._opened |= reply.position <= OPENED
         self._closed |= self._opened and reply.position >= CLOSED
         self._idle = self._idle + 1 if self._closed and abs(reply.current_mA) < IDLE_CURRENT else 0
-        return self._idle >= IDLE_REPLIES and now > self._begun + LEAST_TIME
+        if self._idle >= IDLE_REPLIES and now > self._begun + LEAST_TIME:
+            self.step = CalibrationStep.DONE
+
+    def _check_end(self, reply: Reply, now: float) -> None:
+        """Check what the flag tells: the jaws end closed, and the position has to say so."""
+        self._ended = now if self._ended is None else self._ended
+        self._calibrated = self._calibrated + 1 if reply.position >= CLOSED else 0
+        if self._calibrated >= CALIBRATED_REPLIES:
+            self.step = CalibrationStep.DONE
+        elif now > self._ended + END_TIME:
+            self.fail(NO_GRIPPER)

@@ -84,7 +84,7 @@ def want_position(core: Core) -> None:
 
 
 def hold(core: Core, now: float) -> None:
-    """Stop in place and hold, or end a calibration, limp; a gripper that stands already stays as it is.
+    """Stop in place and hold, or end a calibration, limp; a gripper that stands or was let go stays as it is.
 
     Raises:
         GripperStateError: the jaws are limp, or unknown.
@@ -101,7 +101,7 @@ def hold(core: Core, now: float) -> None:
     if standing or not (core.known.driving or core.orders.pending):
         return
     kept, place = core.orders.wanted, core.place_now(now)
-    if kept is not None and kept.drives and abs(kept.position - place) <= 1.0:
+    if kept is not None and (not kept.drives or abs(kept.position - place) <= 1.0):
         return
     core.orders.want(core.order(position=core.place_for_order(now), flags=GO), urgent=True)
 

@@ -46,7 +46,7 @@ class Core:
     def __init__(self, settings: GripperSettings, salt: int) -> None:
         self.settings = settings
         self.scale = GripperScale(settings)
-        self.known = Knowledge(settings.telemetry_period)
+        self.known = Knowledge(settings)
         self.exchange = Exchange(settings.node_id)
         self.orders = Orders(salt)
         self.echo = EchoWatch()

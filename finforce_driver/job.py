@@ -53,7 +53,7 @@ class MoveJob:
         allowed = 2.0 / rate if self.steps else abs(goal.position - start) / rate
         closing = goal.position > start
         self.watch = MoveWatch(position=goal.position, closing=closing, allowed=allowed, now=now)
-        self._pressed = now
+        self._begun = self._pressed = now
 
     @property
     def position(self) -> int:
@@ -70,9 +70,15 @@ class MoveJob:
         """Whether the target may go on: under way, or pressing on something that may give way."""
         return self.outcome is Outcome.NONE or self.outcome in PRESSING
 
-    def advance(self, now: float, place: float) -> None:
-        """Let the target go on when it is due; `place` of the jaws [counts]."""
-        if self.steps is None or not self.stepping:
+    def advance(self, now: float, place: float, stamp: float) -> None:
+        """Let the target go on when it is due.
+
+        Args:
+            now: time [s].
+            place: of the jaws [counts].
+            stamp: when they were there [s].
+        """
+        if self.steps is None or not self.stepping or stamp <= self._begun:
             return
         before = self.steps.position
         self.steps.advance(now, place)

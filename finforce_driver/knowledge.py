@@ -7,10 +7,11 @@ import math
 from finforce_driver.history import History
 from finforce_driver.protocol import LARGEST_BYTE, Flag, Move, Reply
 from finforce_driver.reply_filter import Expectation, ReplyFilter, Sample
+from finforce_driver.settings import GripperSettings
 from finforce_driver.telemetry import Telemetry
 
 FASTEST = 2000.0  # [counts/s] that anything can move the jaws with; 80000 ticks/s are 1932
-LONGEST_OUTLOOK = 0.1  # [s] for which the jaws are taken to go on as they did
+LONGEST_OUTLOOK = 0.05  # [s] for which the jaws are taken to go on as they did
 REACH_MARGIN = 1.5  # of the commanded speed
 
 
@@ -26,13 +27,13 @@ class Knowledge:
         history: places over time [counts].
 
     Args:
-        telemetry_period: between two questions for telemetry [s].
+        settings: of the gripper.
     """
 
-    def __init__(self, telemetry_period: float) -> None:
+    def __init__(self, settings: GripperSettings) -> None:
         self.half_calibrated = False
-        self.telemetry = Telemetry(telemetry_period)
-        self.filter = ReplyFilter()
+        self.telemetry = Telemetry(settings.telemetry_period)
+        self.filter = ReplyFilter(settings.reply_timeout)
         self.history = History()
         self.reply: Reply | None = None
         self.stamp = math.nan

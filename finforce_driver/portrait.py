@@ -56,7 +56,8 @@ def _target(core: Core) -> float:
 def _push(core: Core) -> int:
     """Return 1 or -1 for what the motor pushes against closing or opening, else 0."""
     reply = core.known.reply
-    if not core.known.driving or core.calibration is not None or core.known.contact_time < CONTACT_TIME:
+    placed = core.known.driving and core.known.calibrated and core.calibration is None
+    if not placed or core.known.contact_time < CONTACT_TIME:
         return 0
     if core.job is not None:
         return push_direction(reply, core.job.watch.closing)

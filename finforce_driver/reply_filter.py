@@ -13,9 +13,11 @@ from statistics import median_low
 from finforce_driver.protocol import LARGEST_CURRENT_MA, Reply
 
 CURRENT_STEP = 100.0  # [mA] that the current may change by between two replies without being doubted
-CURRENT_RATE = 5_000.0  # [mA/s] beside that between two that confirm each other
+CONFIRMING_STEP, CONFIRMING_RATE = 60.0, 5_000.0  # [mA], [mA/s] between two that confirm each other
 CONFIRMATIONS = 2  # replies in a row that have to agree with the one that was doubted
-MOST_DOUBTS = 8  # after which replies are taken to differ for good, as by a noisy current
+MOST_DOUBTS = 16  # after which numbers are taken to differ for good, as by a noisy current
+FAST_WAY = 2.0  # [counts] between two replies, beyond which none is believed by itself: the jaws may have stopped
+LONGEST_GAP = 0.3  # [s] after which everything may be otherwise; a poll at 5 Hz takes 0.2 s
 FLAGS = ("activated", "action", "overheated", "watchdog", "estopped", "calibrated", "error", "code")
 
 
@@ -45,9 +47,13 @@ class ReplyFilter:
 
     Attributes:
         doubted: number of replies that were not believed at first.
+
+    Args:
+        longest_span: between two replies that can confirm each other [s].
     """
 
-    def __init__(self) -> None:
+    def __init__(self, longest_span: float) -> None:
+        self._longest_span = longest_span
         self.doubted = 0
         self._believed: Sample | None = None
         self._doubts: deque[Sample] = deque(maxlen=CONFIRMATIONS)
@@ -71,14 +77,26 @@ class ReplyFilter:
         self.doubted += 1
         if abs(sample.reply.current_mA) > LARGEST_CURRENT_MA:
             return None
-        run = [*self._doubts, sample]
-        if len(run) > CONFIRMATIONS and all(_agree(*pair, expected) for pair in zip(run, run[1:], strict=False)):
-            return self._believe(sample)
         self._unsettled += 1
-        if self._unsettled > MOST_DOUBTS:
-            return self._believe(Sample(reply=_middle(run), time=sample.time))
+        run = [*self._doubts, sample]
+        if len(run) > CONFIRMATIONS and len({_flags(item.reply) for item in run}) == 1:
+            if all(self._agree(*pair, expected) for pair in zip(run, run[1:], strict=False)):
+                return self._believe(sample)
+            if self._unsettled > MOST_DOUBTS:
+                return self._believe(Sample(reply=_middle(run), time=sample.time))
         self._doubts.append(sample)
         return None
+
+    def _agree(self, first: Sample, second: Sample, expected: Expectation) -> bool:
+        """Return whether the numbers of two replies can both be true."""
+        span = second.time - first.time
+        way = second.reply.position - first.reply.position
+        rise = second.reply.current_mA - first.reply.current_mA
+        return (
+            span <= self._longest_span
+            and abs(way) <= 1.0 + expected.reach * span
+            and abs(rise) <= CONFIRMING_STEP + CONFIRMING_RATE * span
+        )
 
     def _believe(self, sample: Sample) -> Reply:
         """Keep a sample and return its reply."""
@@ -90,7 +108,10 @@ class ReplyFilter:
 
 def goes_on(before: Sample, after: Sample, expected: Expectation) -> bool:
     """Return whether a reply needs no repetition: same flags, position as expected, hardly another current."""
-    way = expected.drift * (after.time - before.time)
+    span = after.time - before.time
+    way = expected.drift * span
+    if abs(way) > FAST_WAY or span > LONGEST_GAP:
+        return False
     # at rest nothing may change; in motion the truncation of both counts and of the speed adds up to some two
     tolerance = 1.0 + min(1.0, abs(way)) + 0.1 * abs(way) if expected.drift else 0.0
     return (
@@ -100,23 +121,13 @@ def goes_on(before: Sample, after: Sample, expected: Expectation) -> bool:
     )
 
 
-def _agree(first: Sample, second: Sample, expected: Expectation) -> bool:
-    """Return whether two replies can both be true."""
-    span = second.time - first.time
-    return (
-        _flags(first.reply) == _flags(second.reply)
-        and abs(second.reply.position - first.reply.position) <= 1.0 + expected.reach * span
-        and abs(second.reply.current_mA - first.reply.current_mA) <= CURRENT_STEP + CURRENT_RATE * span
-    )
-
-
 def _flags(reply: Reply) -> tuple[int, ...]:
     """Return what of a reply has to be equal."""
     return tuple(getattr(reply, name) for name in FLAGS)
 
 
 def _middle(samples: list[Sample]) -> Reply:
-    """Return the reply of which every part is the middle one of some."""
+    """Return the last reply with the middle ones of their numbers."""
     replies = [sample.reply for sample in samples]
-    names = (*FLAGS, "position", "current_mA")
+    names = ("position", "current_mA")
     return replace(replies[-1], **{name: median_low([getattr(reply, name) for reply in replies]) for name in names})

@@ -21,6 +21,7 @@ from finforce_driver.protocol import (
 from finforce_driver.recovery import RecoveryStep
 
 LATEST_REPLY = 0.2  # [s] after which no reply is expected any more
+SPACING = 0.001  # [s] before a reply is asked for again
 SEARCH_MISSES = 10  # requests without a reply after which other nodes are looked for
 
 
@@ -61,7 +62,8 @@ class RequestSource:
             return core.calibration.quiet_until(now)
         step = core.job.next_time if core.job is not None and core.may_drive else math.inf
         question = core.known.telemetry.next_time if self._may_ask() else math.inf
-        return min(self._next_poll, step, question)
+        repetition = core.exchange.sent + SPACING if core.known.filter.doubtful else math.inf
+        return min(self._next_poll, step, question, repetition)
 
     def begin_stop(self, now: float) -> Request | None:
         """Return the first frame of an emergency stop, an order with its flag; None when it is not due again."""
@@ -98,9 +100,11 @@ class RequestSource:
         """The way back into step; during a calibration only polls are sent."""
         return None if self._core.calibration else self._core.exchange.marker()
 
-    def _doubt(self, _: float) -> Request | None:
+    def _doubt(self, now: float) -> Request | None:
         """A reply that is not believed is asked for again."""
-        return self._poll_now() if self._core.known.filter.doubtful else None
+        core = self._core
+        doubtful = core.known.filter.doubtful and now >= core.exchange.sent + SPACING
+        return self._poll_now() if doubtful else None
 
     def _sequence(self, now: float) -> Request | None:
         """The next frame of a recovery or a calibration."""
@@ -125,7 +129,7 @@ class RequestSource:
         if core.stop.active or core.recovery is not None or core.calibration is not None:
             return None
         if job is not None and orders.wanted is not None and not orders.pending and core.may_drive:
-            job.advance(now, core.known.place)
+            job.advance(now, core.known.place, core.known.stamp)
             want_position(core)
         if not orders.pending or (orders.wanted.drives and not core.may_drive):
             return None
@@ -136,8 +140,8 @@ class RequestSource:
         if now < self._next_poll or self._rests(now):
             return None
         period = 1.0 / self._core.settings.poll_rate
-        # half a period late is made up for, more is left out
-        self._next_poll = max(self._next_poll + period, now + 0.5 * period)
+        # a late poll does not delay the next ones, unless it is so late that one is left out
+        self._next_poll = max(self._next_poll + period, now)
         misses = self._core.exchange.misses
         if misses < SEARCH_MISSES or misses % 2 or self._core.calibration is not None:
             return self._poll_now()

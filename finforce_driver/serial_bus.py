@@ -85,19 +85,19 @@ class SerialBus(Bus):
     def _join(self) -> None:
         """Take the adapter from any state onto the bus, and forget what it had received before."""
         # the empty line ends what an earlier program left half written: no move may come of it and a letter of ours
-        self._serial.write(END + b"C" + END)
+        write_all(self._serial, END + b"C" + END)
         sleep(_SETTLE)
         self._serial.reset_input_buffer()
         self._parser.discard()
         self._frames.clear()
-        self._serial.write(b"S%d\rO\r" % BIT_RATES[self._bit_rate])
+        write_all(self._serial, b"S%d\rO\r" % BIT_RATES[self._bit_rate])
 
     def close(self) -> None:
         """Leave the bus and close the port, also one that is gone; a `receive` under way ends first."""
         with self._reading, self._writing:
             if self._serial is not None:
                 try:
-                    self._serial.write(END + b"C" + END)
+                    write_all(self._serial, END + b"C" + END)
                 except _PORT_ERRORS:
                     # else the system waits up to 30 s for an adapter that hangs to take the rest
                     with suppress(*_PORT_ERRORS):
@@ -121,7 +121,7 @@ class SerialBus(Bus):
         with self._writing:
             port = self._opened()
             try:
-                port.write(self._torn + line)
+                write_all(port, self._torn + line)
             except _PORT_ERRORS as error:
                 self._torn = END
                 raise self._gone(error) from error
@@ -166,7 +166,7 @@ class SerialBus(Bus):
 
     def _gone(self, cause: Exception | str) -> LinkError:
         """Return the error of a port that fails while it is open."""
-        if isinstance(cause, _import_serial().SerialTimeoutException):
+        if isinstance(cause, TimeoutError):
             return LinkError(
                 f"{self._port} took nothing for {_WRITE_TIMEOUT:g} s: expected an adapter that reads; "
                 "unplug it and plug it in again"
@@ -192,6 +192,26 @@ class SerialBus(Bus):
                 f"{self._bit_rate:,} bit/s? its queue also fills when no gripper listens: check 24 V, CANH/CANL"
             )
         return ""
+
+
+def write_all(port: Any, data: bytes) -> None:
+    """Write bytes to an open port of pyserial, whole.
+
+    pyserial's own `write` fails on a machine that was busy for longer than the time-out, even if all bytes are out.
+
+    Raises:
+        TimeoutError: the port has not taken all of them in time.
+        OSError: it is gone.
+    """
+    end, descriptor = monotonic() + _WRITE_TIMEOUT, port.fileno()
+    room = select.poll()
+    room.register(descriptor, select.POLLOUT)
+    while data:
+        try:
+            data = data[os.write(descriptor, data) :]
+        except BlockingIOError:
+            if not room.poll(ceil(1e3 * max(0.0, end - monotonic()))):
+                raise TimeoutError("the port takes no more") from None
 
 
 def open_port(path: str, baud_rate: int) -> Any:

@@ -54,7 +54,10 @@ class Steps:
         """
         if self.done or now < self.next_time:
             return
-        self.waiting = self._way * (self.position - place) > LARGEST_LAG
+        lag = self._way * (self.position - place)
+        if lag < -LARGEST_LAG:  # the jaws are ahead: the ramp began at a place where they have not been
+            self.position = round(place)
+        self.waiting = lag > LARGEST_LAG
         if self.waiting:
             self.next_time = now + LAG_PAUSE
             return

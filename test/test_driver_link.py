@@ -1,5 +1,6 @@
 """Claims about the serial port: frames pass at once, and every way to fail says what would help."""
 
+import os
 import threading
 from time import sleep
 
@@ -197,25 +198,21 @@ def test_a_receive_under_way_ends_before_the_port_is_closed(bus):
         bus.send(POLL)
 
 
-def test_lines_of_two_threads_stay_whole(bus):
+def test_lines_of_two_threads_stay_whole(monkeypatch, bus):
     halves = []
 
-    class Slow:
-        def write(self, data):
-            halves.append(data[:3])
-            sleep(0.001)  # lets the other thread in
-            halves.append(data[3:])
+    def write_slowly(_, data):
+        halves.append(data[:3])
+        sleep(0.001)  # lets the other thread in
+        halves.append(data[3:])
 
-        def close(self):
-            pass
-
-    bus._serial.close()
-    bus._serial = Slow()
+    monkeypatch.setattr(serial_bus, "write_all", write_slowly)
     threads = [threading.Thread(target=lambda one=frame: [bus.send(one) for _ in range(10)]) for frame in (POLL, REPLY)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(LONG)
+    monkeypatch.undo()
     lines = b"".join(halves).split(b"\r")[:-1]
     assert sorted(lines) == 10 * [REPLY_LINE[:-1]] + 10 * [b"t07A0"]
 
@@ -237,25 +234,41 @@ def test_an_adapter_that_takes_nothing_is_told_from_one_that_is_gone(adapter, bu
             bus.send(POLL)
 
 
-def test_a_line_that_went_out_in_part_spoils_no_other(bus):
+def test_a_line_that_is_out_is_sent_however_busy_the_machine_was(monkeypatch, adapter, bus):
+    write = os.write
+
+    def write_and_be_away(descriptor, data):
+        count = write(descriptor, data)
+        sleep(0.15)  # longer than a port may take nothing
+        return count
+
+    monkeypatch.setattr(os, "write", write_and_be_away)
+    bus.send(POLL)
+    assert adapter.read() == b"t07A0\r"
+
+
+def test_a_line_that_is_taken_piece_by_piece_goes_out_whole(monkeypatch, adapter, bus):
+    write = os.write
+    monkeypatch.setattr(os, "write", lambda descriptor, data: write(descriptor, data[:2]))
+    bus.send(POLL)
+    assert adapter.read() == b"t07A0\r"
+
+
+def test_a_line_that_went_out_in_part_spoils_no_other(monkeypatch, bus):
     written = []
 
-    class Stuck:
-        def write(self, data):
-            written.append(data)
-            if len(written) == 1:
-                raise serial.SerialTimeoutException("Write timeout")
+    def write(_, data):
+        written.append(data)
+        if len(written) == 1:
+            raise TimeoutError("the port takes no more")
 
-        def close(self):
-            pass
-
-    bus._serial.close()
-    bus._serial = Stuck()
+    monkeypatch.setattr(serial_bus, "write_all", write)
     with pytest.raises(LinkError):
         bus.send(POLL)
     bus.send(POLL)
     bus.send(POLL)
     assert written == [b"t07A0\r", b"\rt07A0\r", b"t07A0\r"]
+    monkeypatch.undo()
 
 
 def test_garbage_alone_makes_the_adapter_suspect_until_a_frame_comes(adapter, bus):
