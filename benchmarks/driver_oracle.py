@@ -139,7 +139,8 @@ class Oracle:
         wrong = []
         if state.calibrated and not any(truth.calibrated for truth in near):
             wrong.append("calibrated")
-        if state.phase is Phase.UNCALIBRATED and not self._cut and all(truth.calibrated for truth in near):
+        cut = self._cut or "cut short" in state.message
+        if state.phase is Phase.UNCALIBRATED and not cut and all(truth.calibrated for truth in near):
             wrong.append("uncalibrated")
         if not any(truth.echo[0] == state.activated for truth in near):
             wrong.append("activated")

@@ -51,7 +51,7 @@ class CalibrationRun:
         self._starts = 0
         self._begun = self._booted = 0.0
         self._place: int | None = None
-        self._runs = self._opened = self._closed = False
+        self._runs = self._moved = self._opened = self._closed = False
         self._idle = self._calibrated = 0
         self._ended: float | None = None
 
@@ -72,7 +72,7 @@ class CalibrationRun:
         """Note that the calibration is sent."""
         self._starts += 1
         self._begun, self.step = now, CalibrationStep.WATCH
-        self._place, self._runs = None, False
+        self._place, self._runs, self._moved = None, False, False
 
     def fail(self, reason: str) -> None:
         """End it without success."""
@@ -90,7 +90,8 @@ class CalibrationRun:
     def _watch(self, reply: Reply, now: float) -> None:
         """Look for the start, the end, and the time limit."""
         self._place = reply.position if self._place is None else self._place
-        self._runs |= abs(reply.current_mA) > QUIET_CURRENT or abs(reply.position - self._place) > 1
+        self._moved |= abs(reply.position - self._place) > 1
+        self._runs |= self._moved or abs(reply.current_mA) > QUIET_CURRENT
         if self._was_calibrated and not reply.calibrated:
             self.fail("the gripper gave the calibration up, or was restarted")
         elif self._was_calibrated:
@@ -118,9 +119,12 @@ class CalibrationRun:
             self.step = CalibrationStep.DONE
 
     def _check_end(self, reply: Reply, now: float) -> None:
-        """Check what the flag tells: the jaws end closed, and the position has to say so."""
+        """Check what the flag tells: a controller that is no gripper moves, too, and keeps its position.
+
+        The jaws end closed, but limp: what is soft between them opens them again.
+        """
         self._ended = now if self._ended is None else self._ended
-        self._calibrated = self._calibrated + 1 if reply.position >= CLOSED else 0
+        self._calibrated = self._calibrated + 1 if self._moved or reply.position >= CLOSED else 0
         if self._calibrated >= CALIBRATED_REPLIES:
             self.step = CalibrationStep.DONE
         elif now > self._ended + END_TIME:

@@ -14,6 +14,7 @@ from finforce_driver.recovery import Recovery
 from finforce_driver.state import Outcome, Phase
 
 GO = Flag.ACTIVATE | Flag.GO
+OLD = 0.1  # [s] after which a reply does not tell where moving jaws are
 STANDING = 2.0  # [counts/s], below which an unknown order is taken to hold
 REFUSALS = {
     Phase.DISCONNECTED: "no gripper answers",
@@ -70,6 +71,7 @@ def move(core: Core, goal: Goal, now: float) -> None:
     if job is not None and job.goal == goal and job.outcome in (Outcome.NONE, Outcome.REACHED):
         return
     start = core.setpoint(now)
+    core.hold_wanted = False
     core.end_job(Outcome.REPLACED)
     core.note, core.outcome = goal.pace.note, Outcome.NONE
     core.job = MoveJob(goal, start=start, rate=goal.pace.speed / core.scale.resolution, now=now)
@@ -95,9 +97,14 @@ def hold(core: Core, now: float) -> None:
         core.orders.want(core.order(position=0, flags=Flag.ACTIVATE), urgent=True)
         return
     stepping = core.job is not None and core.job.steps is not None and core.job.stepping
-    standing = not core.moving and not stepping and abs(core.known.history.speed()) <= STANDING
+    # a hold that had to wait comes with the first reply after a gap, which tells no speed
+    still = abs(core.known.history.speed()) <= STANDING and not core.hold_wanted
+    standing = still and not core.moving and not stepping
     core.end_job(Outcome.REPLACED)
-    core.note = ""
+    core.note, core.hold_wanted = "", False
+    if now - core.known.stamp > OLD and (core.known.driving or core.orders.pending):
+        core.postpone_hold()
+        return
     if standing or not (core.known.driving or core.orders.pending):
         return
     kept, place = core.orders.wanted, core.place_now(now)
@@ -177,6 +184,7 @@ def release_power(core: Core, now: float) -> None:
 def _let_go(core: Core, flags: Flag, now: float) -> None:
     """Want an order that moves nothing and holds nothing."""
     core.end_job(Outcome.REPLACED)
+    core.hold_wanted = False
     core.orders.want(core.order(position=core.place_for_order(now), flags=flags), urgent=True)
 
 

@@ -36,6 +36,7 @@ class Core:
         job: the last move; None: none, or it was replaced by something else.
         outcome: of the last move without a job.
         enabled: moves are allowed: it was not switched off.
+        hold_wanted: the jaws are to be held where the next reply says that they are.
         joined: the link is open.
         silent: nothing answers for long.
         note: sentence that stays until the next command.
@@ -56,7 +57,7 @@ class Core:
         self.job: MoveJob | None = None
         self.outcome = Outcome.NONE
         self.enabled = True
-        self.joined = self.silent = False
+        self.joined = self.silent = self.hold_wanted = False
         self.note = ""
         self.order_sent = -math.inf
         self.counts: Counter[str] = Counter()
@@ -105,9 +106,16 @@ class Core:
     def abort(self, note: str = "") -> None:
         """Want nothing any more, after what the gripper may have been interrupted by."""
         self.end_job(Outcome.ABORTED)
+        self.hold_wanted = False
         self.orders.drop()
         self.echo.forget()
         self.note = note
+
+    def postpone_hold(self) -> None:
+        """Hold as soon as it is known where: at an old place, to hold would be to go back."""
+        self.orders.forget()
+        self.echo.forget()
+        self.hold_wanted = True
 
     def order(self, *, position: int, flags: int, speed: int | None = None, current_mA: int | None = None) -> Move:
         """Return an order; what is not given stays as it was last."""

@@ -19,19 +19,24 @@ class Echo(Enum):
 
 
 class EchoWatch:
-    """Looks whether the gripper does what it was told."""
+    """Looks whether the gripper does what it was told.
+
+    The gripper stays at its target, as it says, until it gets another order, whatever pulls at its jaws: leaving that
+    state, or taking itself to be at a target elsewhere, is the sign of an order that was not ours.
+    """
 
     def __init__(self) -> None:
         self._order: Move | None = None
         self._sent = 0.0
-        self._heard = False
+        self._heard = self._arrived = False
         self._odd = 0
 
     def send(self, order: Move, now: float) -> None:
         """Note an order that was answered."""
         if order != self._order:
             self._heard = False
-        self._order, self._sent, self._odd = order, now, 0
+        self._order, self._sent = order, now
+        self._odd, self._arrived = 0, False
 
     def forget(self) -> None:
         """Expect nothing."""
@@ -41,7 +46,7 @@ class EchoWatch:
         """Judge a believed reply."""
         if self._order is None or now - self._sent < GRACE:
             return Echo.FOLLOWS
-        if _fits(self._order, reply):
+        if self._fits(self._order, reply):
             self._heard, self._odd = True, 0
             return Echo.FOLLOWS
         self._odd += 1
@@ -50,11 +55,13 @@ class EchoWatch:
         self._odd = 0
         return Echo.OVERRULED if self._heard else Echo.UNHEARD
 
-
-def _fits(order: Move, reply: Reply) -> bool:
-    """Return whether a reply echoes an order's flags and is not at another target than the order's."""
-    told = bool(order.flags & Flag.ACTIVATE), bool(order.flags & Flag.GO)
-    if (reply.activated, reply.action) != told:
-        return False
-    elsewhere = abs(reply.position - order.position) > TOLERANCE + 1
-    return not (order.drives and reply.at_target and elsewhere)
+    def _fits(self, order: Move, reply: Reply) -> bool:
+        """Return whether a reply echoes an order's flags, and tells of its target and no other."""
+        told = bool(order.flags & Flag.ACTIVATE), bool(order.flags & Flag.GO)
+        if (reply.activated, reply.action) != told:
+            return False
+        near = abs(reply.position - order.position) <= TOLERANCE + 1
+        if not order.drives or self._arrived:
+            return reply.at_target or not order.drives
+        self._arrived = reply.at_target and near
+        return near or not reply.at_target

@@ -19,7 +19,7 @@ LENGTHS = {
 }
 # asked in turn, so that the late answer to one is not taken for the answer to the next
 MARKERS = (Command.PING, Command.CURRENT, Command.ENCODER, Command.ERRORS)
-TRIES = 2  # with markers: an adapter may know no remote frames
+TRIES = 2  # with markers before the first answer to one: an adapter may know no remote frames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +62,7 @@ class Exchange:
         self._node = node
         self._tries = 0
         self._marker = 0
+        self._marks = self._rested = False
 
     @property
     def in_step(self) -> bool:
@@ -89,9 +90,9 @@ class Exchange:
         self.latency = now - self.sent
         if request.counted and request.node == self._node:
             self.misses = 0
-        marked = request.answer is MARKERS[self._marker] or self._tries > TRIES
-        if marked and request.node == self._node:
-            self._tries = 0
+        self._marks |= request.frame.remote and request.node == self._node
+        if request.node == self._node and (request.answer is MARKERS[self._marker] or self._rested):
+            self._tries, self._rested = 0, False
         return request
 
     def miss(self) -> Request | None:
@@ -101,20 +102,22 @@ class Exchange:
             self.misses += 1
             self._tries += 1
             self._marker = (self._marker + 1) % len(MARKERS)
+            self._rested = False
         return request
 
     def marker(self) -> Request | None:
         """Return the request that gets us back into step; None when in step, or when that is not answered."""
-        if not 0 < self._tries <= TRIES:
+        if self.in_step or not (self._marks or self._tries <= TRIES):
             return None
         command = MARKERS[self._marker]
         return Request(frame=encode_request(self._node, command), answer=command, node=self._node)
 
     def rest(self) -> None:
         """Note that so long a pause was made that nothing older can be on the way: the next reply puts us in step."""
-        self._tries = TRIES + 1
+        self._rested = True
 
     def reset(self) -> None:
         """Begin anew on a link that was opened anew."""
         self.pending = None
         self.misses = self._tries = 0
+        self._marks = self._rested = False

@@ -53,7 +53,7 @@ class ForceGrasp:
         self._plan = GraspPlan(goal, self.settings, self._load, self._course, self._feed)
         self._pending: deque[ForceSample | TouchSample] = deque()
         self._phase, self._reason = GraspPhase.APPROACH, "waits for the first force"
-        self._began = self._held_at = self._saturated = self._now = math.nan
+        self._began = self._held_at = self._spare = self._saturated = math.nan
         self._content = 0
         self._asked_to_stop = ""
 
@@ -66,12 +66,15 @@ class ForceGrasp:
         self._pending.append(TouchSample(stamp=stamp, touching=touching))
 
     def change_force(self, force: float) -> None:
-        """Set another force [N], up or down, without letting go; the time limit begins anew.
+        """Set another force [N], up or down, without letting go; the time limit begins anew. The same changes nothing.
 
         Raises:
             TargetError: the force is no number, not above zero, or above the limit.
         """
-        self._set_force = self.settings.check_force(force)
+        force = self.settings.check_force(force)
+        if force == self._set_force:
+            return
+        self._set_force = force
         self._began = self._held_at = math.nan
         self._content = 0
         if self._phase is GraspPhase.HOLDING:
@@ -169,8 +172,7 @@ class ForceGrasp:
                 f"{got}: the jaws stay at {1e3 * state.opening:.1f} mm on their way to {1e3 * course.target:.1f} mm; "
                 f"is something in the way, or the motor's limit of {self._motor_force:g} N too low?"
             )
-        spare = self.settings.relaxation * self._set_force / self._load.model.stiffness
-        if self._held_at - course.target > spare + _SPARE_STEPS * course.resolution:
+        if self._held_at - course.target > self._spare:
             way = 1e3 * (self._held_at - course.target)
             raise GraspError(
                 f"{got} although the jaws closed by {way:.1f} mm while holding: the object slips or yields"
@@ -197,6 +199,9 @@ class ForceGrasp:
         self._content = self._content + 1 if held else 0
         if self._content >= _CONTENT and self._phase is not GraspPhase.HOLDING:
             self._phase, self._reason, self._held_at = GraspPhase.HOLDING, "holds the set force", target
+            # as it is now: a force that drifts while the jaws close looks like something that gets softer
+            yielded = self.settings.relaxation * self._set_force / self._load.model.stiffness
+            self._spare = yielded + _SPARE_STEPS * self._course.resolution
 
     def _pause(self, state: GripperState, now: float) -> GripperMove | None:
         """Return a move that keeps the jaws where they are until the next image says what to think of this one."""

@@ -36,7 +36,7 @@ class GraspSession:
         gripper: that grasps.
         goal: the first.
         settings: of all grasps.
-        ended: called when a grasp was ended from outside.
+        ended: called when a grasp has ended.
 
     Raises:
         TargetError: the force of the goal is above the limit of the settings.
@@ -71,8 +71,11 @@ class GraspSession:
             if self._grasp is not None:
                 self._grasp.change_force(goal.force)
 
-    def run(self) -> GraspStatus:
+    def run(self, begun: Callable[[], None] = lambda: None) -> GraspStatus:
         """Begin a grasp, if none runs, and wait; return how it is once the force is held, and go on holding it.
+
+        Args:
+            begun: called when a grasp has begun that the gripper does not refuse.
 
         Raises:
             GraspError: it was ended before; the gripper holds where it is.
@@ -80,6 +83,8 @@ class GraspSession:
         with self._changed:
             if self._grasp is None:
                 self._begin()
+                if self.runs:
+                    begun()
             if not self._changed.wait_for(self._is_settled, self.goal.time_limit + MARGIN):
                 self.stop("the gripper did not answer in time")
             if self.status.phase is GraspPhase.STOPPED:
@@ -110,6 +115,9 @@ class GraspSession:
                 return
             step = self._grasp.update(state, self._gripper.clock.now(), self._gripper.opening_at)
             self._tell(step.status)
+            if step.status.phase is GraspPhase.STOPPED:
+                self._grasp = None
+                self._ended()
             try:
                 self._act(step)
             except DriverError as error:
@@ -147,7 +155,6 @@ class GraspSession:
     def _act(self, step: GraspStep) -> None:
         """Do what a step asks for."""
         if step.stop:
-            self._grasp = None
             self._gripper.hold()
         elif step.move is not None:
             self._gripper.move(step.move.opening, step.move.speed, step.move.force)

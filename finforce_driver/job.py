@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from finforce_driver.protocol import Reply
 from finforce_driver.state import Outcome
-from finforce_driver.steps import Steps
+from finforce_driver.steps import LARGEST_LAG, Steps
 from finforce_driver.units import Pace
 from finforce_driver.verdict import MoveWatch
 
@@ -38,6 +38,7 @@ class MoveJob:
     Attributes:
         goal: what was asked for.
         outcome: what became of it; NONE while it is under way.
+        sent: an order of it has left.
 
     Args:
         goal: the same.
@@ -49,11 +50,13 @@ class MoveJob:
     def __init__(self, goal: Goal, *, start: float, rate: float, now: float) -> None:
         self.goal = goal
         self.outcome = Outcome.NONE
+        self._rate = rate
         self.steps = Steps(start=start, goal=goal.position, rate=rate, now=now) if goal.pace.stepped else None
         allowed = 2.0 / rate if self.steps else abs(goal.position - start) / rate
         closing = goal.position > start
         self.watch = MoveWatch(position=goal.position, closing=closing, allowed=allowed, now=now)
         self._begun = self._pressed = now
+        self.sent = False
 
     @property
     def position(self) -> int:
@@ -80,6 +83,9 @@ class MoveJob:
         """
         if self.steps is None or not self.stepping or stamp <= self._begun:
             return
+        if not self.sent and abs(self.steps.position - place) > LARGEST_LAG:
+            # the link failed meanwhile, and the jaws are not where they were thought to be
+            self.steps = Steps(start=place, goal=self.goal.position, rate=self._rate, now=now)
         before = self.steps.position
         self.steps.advance(now, place)
         if self.steps.position != before:
@@ -87,6 +93,7 @@ class MoveJob:
 
     def send(self, now: float) -> None:
         """Note that its order was sent."""
+        self.sent = True
         self.watch.send(now)
 
     def take(self, reply: Reply, now: float) -> None:

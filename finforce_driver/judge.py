@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from finforce_driver.advice import OTHER_MASTER, REBOOTED
 from finforce_driver.calibration_run import CalibrationStep
+from finforce_driver.commands import USABLE, hold
 from finforce_driver.core import Core
 from finforce_driver.echo import Echo
 from finforce_driver.protocol import Reply
 from finforce_driver.recovery import RecoveryStep
 from finforce_driver.state import Outcome
 from finforce_driver.stop import Stage
+
+NO_FAULTS = (False, False, False, False)
 
 
 def judge_reply(core: Core, before: Reply | None, reply: Reply, now: float) -> None:
@@ -33,6 +36,8 @@ def judge_reply(core: Core, before: Reply | None, reply: Reply, now: float) -> N
         core.known.half_calibrated = False
     elif not reply.error:
         _follow_orders(core, reply, now)
+    if core.hold_wanted and core.phase in USABLE:
+        hold(core, now)
 
 
 def overrule(core: Core, what: str) -> None:
@@ -73,11 +78,16 @@ def _follow_recovery(core: Core, reply: Reply, now: float) -> None:
 
 def _follow_fault(core: Core, before: Reply | None, reply: Reply, now: float) -> None:
     """End what a fault ends, and have its name asked for."""
-    if reply.error == (before is not None and before.error):
+    if _faults(reply) == (_faults(before) if before is not None else NO_FAULTS):
         return
     core.known.telemetry.ask_errors(now)
     if reply.error and core.recovery is None and core.stop.stage is not Stage.CLEARING:
         core.abort()
+
+
+def _faults(reply: Reply) -> tuple[bool, ...]:
+    """Return what a reply says of faults."""
+    return reply.error, reply.overheated, reply.watchdog, reply.estopped
 
 
 def _follow_calibration(core: Core, reply: Reply, now: float) -> None:

@@ -132,9 +132,9 @@ class GripperLoop:
             request = self._machine.next_request(now)
             if request is not None:
                 self._bus.send(request.frame)
+            left = self._machine.next_time(now) - now
         if request is None:
-            wait = min(self._machine.next_time(now) - now, longest)
-            self._clock.wait(max(wait, SHORTEST_WAIT), self._wake)
+            self._clock.wait(max(min(left, longest), SHORTEST_WAIT), self._wake)
         elif request.answer is not None:
             self._receive(request, now)
         if self._machine.must_reopen:

@@ -162,6 +162,8 @@ class GripperMachine:
         if request is None:
             return
         core.counts["lost replies"] += 1
+        if request.move is not None and core.orders.urgent and core.orders.wanted.drives:
+            core.postpone_hold()
         if not request.counted:
             core.known.telemetry.miss(now)
             return

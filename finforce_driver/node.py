@@ -23,13 +23,20 @@ from finforce_driver.grasp_settings import GraspSettings
 from finforce_driver.messages import goal_from_joint_state, move_from_joint_state
 from finforce_driver.outputs import DriverOutputs
 from finforce_driver.parameters import DriverParameters, build_gripper
-from finforce_driver.report import GripperHealth, describe_grasp, describe_state, gripper_alarms, news_of_state
+from finforce_driver.report import (
+    GripperHealth,
+    describe_grasp,
+    describe_state,
+    gripper_alarms,
+    news_of_state,
+    outcome_of_state,
+)
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState
 from finforce_driver.tasks import GripperTasks
 from finforce_driver.times import MessageTimes
 from finforce_errors import FinforceError, MissingDependencyError
-from finforce_health import Outcome, Report
+from finforce_health import Level, Outcome, Report
 from finforce_optional import import_library
 
 JAWS = ("left", "right")
@@ -118,8 +125,17 @@ class GripperDriverNode(Node):
                 with self._refusals("joint state"):
                     self.out.send_joints(self.times.to_stamp(state.stamp, self._now()), state)
             if self.health.is_news("gripper", text := news_of_state(state)):
-                self.get_logger().info(text)
+                self._log(outcome_of_state(state).level, text)
         self.out.send_grasp(self.session.status)
+
+    def _log(self, level: Level, text: str) -> None:
+        """Log a sentence at the level of a diagnosis."""
+        if level == Level.OK:
+            self.get_logger().info(text)
+        elif level == Level.WARN:
+            self.get_logger().warning(text)
+        else:
+            self.get_logger().error(text)
 
     def _on_command(self, message: JointState) -> None:
         """Move as a message says."""

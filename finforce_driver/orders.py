@@ -55,6 +55,11 @@ class Orders:
         self.urgent = False
         self._salt = self._salt + 1 & FREE_FLAGS
 
+    def forget(self) -> None:
+        """Want nothing, and do not know whether the last order was taken."""
+        self.wanted = self.taken = None
+        self.urgent = False
+
     def repeat(self) -> bool:
         """Send the wanted order again, since it has no effect; return whether that is still worth trying."""
         if self._repeats >= REPEATS:

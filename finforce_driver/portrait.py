@@ -59,9 +59,10 @@ def _push(core: Core) -> int:
     placed = core.known.driving and core.known.calibrated and core.calibration is None
     if not placed or core.known.contact_time < CONTACT_TIME:
         return 0
-    if core.job is not None:
-        return push_direction(reply, core.job.watch.closing)
-    return 0 if abs(reply.current_mA) < CLEAR_CURRENT else push_direction(reply, True)
+    order = core.orders.taken
+    if abs(reply.current_mA) < CLEAR_CURRENT and order is None:
+        return 0
+    return push_direction(reply, order is not None and order.position > reply.position)
 
 
 def _sentence(core: Core, phase: Phase, faults: tuple[str, ...]) -> str:

@@ -14,9 +14,9 @@ from finforce_driver.protocol import LARGEST_CURRENT_MA, Reply
 
 CURRENT_STEP = 100.0  # [mA] that the current may change by between two replies without being doubted
 CONFIRMING_STEP, CONFIRMING_RATE = 60.0, 5_000.0  # [mA], [mA/s] between two that confirm each other
-CONFIRMATIONS = 2  # replies in a row that have to agree with the one that was doubted
+CONFIRMATIONS = 3  # replies in a row that have to agree with the one that was doubted
 MOST_DOUBTS = 16  # after which numbers are taken to differ for good, as by a noisy current
-FAST_WAY = 2.0  # [counts] between two replies, beyond which none is believed by itself: the jaws may have stopped
+FAST_WAY = 3.0  # [counts] between two replies, beyond which none is believed by itself: the jaws may have stopped
 LONGEST_GAP = 0.3  # [s] after which everything may be otherwise; a poll at 5 Hz takes 0.2 s
 FLAGS = ("activated", "action", "overheated", "watchdog", "estopped", "calibrated", "error", "code")
 

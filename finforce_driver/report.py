@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from finforce_driver.advice import describe
 from finforce_driver.grasp_status import GraspPhase, GraspStatus
 from finforce_driver.state import GripperState, Phase
 from finforce_driver.state import Outcome as MoveOutcome
@@ -64,7 +65,9 @@ def _rename(figure: str) -> str:
 def outcome_of_state(state: GripperState) -> Outcome:
     """Return the level of a gripper's phase, a word for it and its sentence."""
     level = Level.ERROR if state.estopped or state.faults else LEVELS.get(state.phase, Level.WARN)
-    if level == Level.OK and state.outcome in FAILURES:
+    # what no phase says by itself is worth a look: another program's commands, or a speed that was cut
+    extraordinary = state.message not in ("", describe(state.phase, state.outcome, state.faults))
+    if level == Level.OK and (state.outcome in FAILURES or extraordinary):
         level = Level.WARN
     word = "estopped" if state.estopped else state.phase.value
     return Outcome(level=level, reason=word, text=state.message or word)

@@ -20,7 +20,7 @@ from finforce_driver.protocol import (
 )
 from finforce_driver.recovery import RecoveryStep
 
-LATEST_REPLY = 0.2  # [s] after which no reply is expected any more
+LATEST_REPLY = 0.5  # [s] after which no reply is expected any more
 SPACING = 0.001  # [s] before a reply is asked for again
 SEARCH_MISSES = 10  # requests without a reply after which other nodes are looked for
 
@@ -36,6 +36,8 @@ class RequestSource:
         self._core = core
         self._node = core.settings.node_id
         self._next_poll = -math.inf
+        # an order leaves on the word of a reply, not on that of an old one
+        self._freshness = 1.5 / core.settings.poll_rate + core.settings.reply_timeout
         self._searched = core.settings.node_id
         self._stop_rest: Request | None = None
         self._sources = (
@@ -62,8 +64,10 @@ class RequestSource:
             return core.calibration.quiet_until(now)
         step = core.job.next_time if core.job is not None and core.may_drive else math.inf
         question = core.known.telemetry.next_time if self._may_ask() else math.inf
-        repetition = core.exchange.sent + SPACING if core.known.filter.doubtful else math.inf
-        return min(self._next_poll, step, question, repetition)
+        wanted = core.known.filter.doubtful or core.hold_wanted
+        repetition = core.exchange.sent + SPACING if wanted else math.inf
+        poll = core.exchange.sent + LATEST_REPLY if self._resting() else self._next_poll
+        return min(poll, step, question, repetition)
 
     def begin_stop(self, now: float) -> Request | None:
         """Return the first frame of an emergency stop, an order with its flag; None when it is not due again."""
@@ -101,10 +105,10 @@ class RequestSource:
         return None if self._core.calibration else self._core.exchange.marker()
 
     def _doubt(self, now: float) -> Request | None:
-        """A reply that is not believed is asked for again."""
+        """A reply that is not believed is asked for again, and one that tells where to hold."""
         core = self._core
-        doubtful = core.known.filter.doubtful and now >= core.exchange.sent + SPACING
-        return self._poll_now() if doubtful else None
+        wanted = core.known.filter.doubtful or core.hold_wanted
+        return self._poll_now() if wanted and now >= core.exchange.sent + SPACING else None
 
     def _sequence(self, now: float) -> Request | None:
         """The next frame of a recovery or a calibration."""
@@ -128,10 +132,11 @@ class RequestSource:
         orders, job = core.orders, core.job
         if core.stop.active or core.recovery is not None or core.calibration is not None:
             return None
-        if job is not None and orders.wanted is not None and not orders.pending and core.may_drive:
+        may_drive = core.may_drive and now - core.known.stamp <= self._freshness
+        if job is not None and orders.wanted is not None and may_drive and not (job.sent and orders.pending):
             job.advance(now, core.known.place, core.known.stamp)
             want_position(core)
-        if not orders.pending or (orders.wanted.drives and not core.may_drive):
+        if not orders.pending or (orders.wanted.drives and not may_drive):
             return None
         return self._request_of(orders.wanted) if core.known.reply is not None else None
 
@@ -148,14 +153,18 @@ class RequestSource:
         return self._search()
 
     def _rests(self, now: float) -> bool:
-        """Whether a late reply is waited for: the way back into step during a calibration."""
-        exchange = self._core.exchange
-        if self._core.calibration is None or exchange.in_step:
+        """Whether a late reply is waited for: the way back into step without markers."""
+        if not self._resting():
             return False
-        if now < exchange.sent + LATEST_REPLY:
+        if now < self._core.exchange.sent + LATEST_REPLY:
             return True
-        exchange.rest()
+        self._core.exchange.rest()
         return False
+
+    def _resting(self) -> bool:
+        core, exchange = self._core, self._core.exchange
+        unmarked = core.calibration is not None or exchange.marker() is None
+        return unmarked and not exchange.in_step and core.known.reply is not None and not core.silent
 
     def _search(self) -> Request:
         """A ping to another node, which changes nothing there."""

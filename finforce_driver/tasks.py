@@ -53,8 +53,8 @@ class GripperTasks:
 
     def stop(self) -> str:
         """Hold in place."""
-        self._commands += 1
         self._session.stop("stopped by command")
+        self._count()
         return "the gripper holds in place"
 
     def estop(self) -> str:
@@ -85,8 +85,7 @@ class GripperTasks:
 
     def grasp(self) -> str:
         """Close until the set force is reached by vision; return while it is held."""
-        self._commands += 1
-        status = self._session.run()
+        status = self._session.run(self._count)
         return f"holds {status.force:.2f} N, set {status.goal:.2f} N: {status.reason}"
 
     def grasp_without_vision(self) -> str:
@@ -137,6 +136,10 @@ class GripperTasks:
     def _command(self, command: Callable[[], None], reason: str) -> None:
         """Give a command that ends whatever the gripper was about."""
         self._session.replace(command, reason)
+        self._count()
+
+    def _count(self) -> None:
+        """Note that there was another command, for those who wait for the end of an earlier one."""
         self._commands += 1
 
     def _await(self, condition: Callable[[GripperState], bool], timeout: float, own: int) -> GripperState:

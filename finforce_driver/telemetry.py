@@ -15,7 +15,7 @@ VALUES: dict[Command, tuple[str, Callable[[Frame], float | ErrorReport]]] = {
     Command.ERRORS: ("errors", decode_errors),
 }
 ORDER = tuple(VALUES)
-SILENCES = 3  # in a row after which an adapter or firmware is taken not to know these requests
+SILENCES = 3  # at the beginning, after which an adapter or firmware is taken not to know these requests
 PATIENCE = 60.0  # [s] until it is asked again
 
 
@@ -41,6 +41,7 @@ class Telemetry:
         self.errors: ErrorReport | None = None
         self._doubt: dict[Command, float | ErrorReport] = {}
         self._turn = self._silences = 0
+        self._answered = False
         self._next_time = -math.inf
 
     def ask_errors(self, now: float) -> None:
@@ -48,7 +49,7 @@ class Telemetry:
         self.errors = None
         self._doubt.pop(Command.ERRORS, None)
         self._turn = ORDER.index(Command.ERRORS)
-        if self._silences < SILENCES:
+        if self._answered or self._silences < SILENCES:
             self._next_time = now
 
     @property
@@ -63,11 +64,12 @@ class Telemetry:
     def miss(self, now: float) -> None:
         """Note that a question was not answered."""
         self._silences += 1
-        self._next_time = now + (PATIENCE if self._silences >= SILENCES else self._period)
+        unknown = self._silences >= SILENCES and not self._answered
+        self._next_time = now + (PATIENCE if unknown else self._period)
 
     def take(self, command: Command, frame: Frame, now: float) -> None:
         """Take an answer; one that is doubted is asked for again at once."""
-        self._silences = 0
+        self._silences, self._answered = 0, True
         if self._believe(command, frame):
             self._turn = (ORDER.index(command) + 1) % len(ORDER)
             self._next_time = now + self._period

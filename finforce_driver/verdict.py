@@ -43,7 +43,7 @@ class MoveWatch:
     Args:
         position: where the move ends [counts].
         closing: the same.
-        allowed: its own time [s]; infinite for one that goes in steps, whose steps say how long it takes.
+        allowed: its own time [s]; of one that goes in steps, that of two steps.
         now: time [s].
     """
 

@@ -133,6 +133,17 @@ def test_a_cut_short_recalibration_is_not_trusted_although_the_gripper_says_cali
 
 
 @both_variants
+@pytest.mark.parametrize("stiffness", [100.0, 1000.0])
+def test_something_soft_between_the_jaws_is_no_reason_to_doubt_the_gripper(rig, stiffness):
+    rig.emulated.jaws.load = lambda opening: stiffness * max(0.0, 0.025 - opening)
+    rig.gripper.calibrate()
+    assert rig.wait_for(Phase.READY, Phase.UNCALIBRATED).phase is Phase.READY
+    # limp, the jaws are pushed open; the stops were found all the same
+    assert rig.emulated.true_opening == pytest.approx(0.025, abs=2e-3)
+    assert rig.arrive(0.040).opening == pytest.approx(rig.emulated.true_opening, abs=2e-4)
+
+
+@both_variants
 def test_a_controller_that_is_no_gripper_is_found_out(rig):
     rig.emulated.configured = False
     rig.gripper.calibrate()

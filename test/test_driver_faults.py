@@ -3,8 +3,8 @@ import pytest
 from driver_faults import FaultRun, choose_kinds
 
 from finforce_driver.emulator.faults import FaultKind
+from finforce_driver.exchange import Exchange
 from finforce_driver.reply_filter import ReplyFilter
-from finforce_driver.requests import RequestSource
 
 
 def total(tally):
@@ -34,5 +34,5 @@ def test_a_driver_that_believes_every_reply_is_found_out(monkeypatch):
 
 
 def test_a_driver_that_does_not_get_back_into_step_is_found_out(monkeypatch):
-    monkeypatch.setattr(RequestSource, "_marker", lambda _self, _now: None)
+    monkeypatch.setattr(Exchange, "in_step", True)
     assert any(FaultRun(seed, 60, (FaultKind.LATE,)).run().wrong for seed in range(3))

@@ -138,6 +138,16 @@ def test_force_may_be_raised_and_lowered_while_holding():
     assert max(late) < 4.2
 
 
+def test_the_same_force_again_changes_nothing():
+    def repeat(bench, _):
+        bench.grasp.change_force(2.0)
+
+    course = grasp(2.0, seconds=12.0, on_step=repeat, force_at=spring(900.0))
+    reasons = [status.reason for status in course.statuses]
+    assert reasons[-1] == "holds the set force"
+    assert "goes to another force" not in reasons
+
+
 def test_grasp_that_begins_under_load_goes_to_the_set_force():
     jaws = Jaws(opening=126 * STEP)  # 23.7 mm about an object of 25 mm: 1.6 N
     for force in (1.0, 3.0):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grasp_fakes import Bench, Camera, Fingers, spring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -237,3 +238,15 @@ def test_settings_name_what_is_wrong():
         GraspGoal(force=1.0, speed=math.nan)
     with pytest.raises(TargetError, match="least_opening"):
         GraspGoal(force=1.0, least_opening=-0.001)
+
+
+@pytest.mark.parametrize(("stiffness", "force"), [(500.0, 2.0), (900.0, 2.0), (900.0, 4.0)])
+def test_a_force_that_drifts_away_while_it_is_held_squeezes_no_harder_than_relaxation_allows(stiffness, force):
+    def drift(sample):
+        return replace(sample, force=max(0.0, sample.force - 0.5 * max(0.0, sample.stamp - 8.0)))
+
+    fingers = Fingers(force_at=spring(stiffness))
+    course = Bench(goal=GraspGoal(force=force), fingers=fingers, camera=Camera(change=drift)).run(20.0)
+    assert "slips or yields" in course.status.reason
+    # 0.4 of the set force and three steps, and another two for the stiffness being learnt only
+    assert course.peak < 1.4 * force + 5 * STEP * stiffness

@@ -5,7 +5,6 @@ import threading
 from time import sleep
 
 import pytest
-import serial
 from link_fakes import FakeAdapter, receive_until
 
 from finforce_driver import serial_bus

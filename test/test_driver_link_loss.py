@@ -72,6 +72,7 @@ def test_an_unexpected_error_of_the_bus_does_not_end_the_driver():
 
 @both_variants
 def test_silence_is_told_within_a_third_of_a_second_and_the_port_opened_anew(rig):
+    rig.live(1.0)
     rig.adapter.adapter.grippers.clear()
     begin = rig.clock.now()
     state = rig.wait_for(Phase.DISCONNECTED)

@@ -122,7 +122,7 @@ def test_joints_that_are_not_two_are_refused(names):
     ],
 )
 def test_the_level_follows_from_phase_faults_and_outcome(changes, level):
-    assert outcome_of_state(replace(READY, **changes)).level == level
+    assert outcome_of_state(replace(READY, message="", **changes)).level == level
 
 
 def test_what_is_not_known_is_a_dash():

@@ -251,3 +251,18 @@ def test_a_late_reply_shifts_nothing(rig):
             rig.gripper.turn()
         age = rig.clock.now() - rig.state.stamp
         assert rig.state.opening - rig.emulated.true_opening < 0.05 * (age + 0.055) + COUNT
+
+
+@both_variants
+def test_hold_after_a_gap_does_not_bring_the_jaws_back(rig):
+    rig.arrive(0.045)
+    rig.gripper.move(0.0, 0.1)
+    rig.live(0.1)
+    rig.adapter.inject(FaultKind.LOST, 4)
+    rig.live(0.16)
+    place = rig.emulated.true_opening
+    rig.gripper.hold()
+    rig.live(0.5)
+    assert rig.emulated.true_opening < place + COUNT
+    assert rig.emulated.true_opening > 0.005
+    assert rig.state.phase is Phase.READY

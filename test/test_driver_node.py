@@ -163,7 +163,7 @@ def test_the_node_starts_the_gripper_and_closes_it_with_itself(probe):
 
 def test_temperature_voltage_and_events_are_in_the_diagnostics(probe):
     gripper, _ = driver(probe)
-    gripper.reply(counts={"lost replies": 3}, faults=(), message="holds")
+    gripper.reply(counts={"lost replies": 3}, faults=(), message="ready")
     state = gripper_state(probe, Level.OK)
     values = {entry.key: entry.value for entry in state.values}
     assert (values["temperature [deg C]"], values["voltage [V]"], values["events"]) == ("26", "24.0", "3 lost replies")

@@ -74,18 +74,8 @@ ERRORS = {
     "t03528000": (("motor not calibrated",), False),
     "t0352FE80": (("temperature", "encoder", "supply", "driver", "velocity", "current"), True),
 }
-REPLY_FIELDS = [
-    "position",
-    "current_mA",
-    "activated",
-    "action",
-    "code",
-    "overheated",
-    "watchdog",
-    "estopped",
-    "calibrated",
-    "error",
-]
+FLAG_FIELDS = ("overheated", "watchdog", "estopped", "calibrated", "error")
+REPLY_FIELDS = ("position", "current_mA", "activated", "action", "code", *FLAG_FIELDS)
 
 
 @pytest.mark.parametrize("line", MOVES)

@@ -17,8 +17,8 @@ SOON, POLL = 0.0015, 0.02  # [s]
 def settled(first, time=0.0):
     """A filter that believes a reply."""
     judge = ReplyFilter(0.05)
-    for index in range(3):
-        judge.take(Sample(reply=first, time=time - (2 - index) * SOON), REST)
+    for index in range(4):
+        judge.take(Sample(reply=first, time=time - (3 - index) * SOON), REST)
     return judge
 
 
@@ -26,9 +26,9 @@ def feed(judge, replies, start=POLL, step=SOON, expected=REST):
     return [judge.take(Sample(reply=item, time=start + index * step), expected) for index, item in enumerate(replies)]
 
 
-def test_the_first_reply_is_believed_when_two_others_repeat_it():
+def test_the_first_reply_is_believed_when_three_others_repeat_it():
     judge = ReplyFilter(0.05)
-    assert feed(judge, [reply()] * 3) == [None, None, reply()]
+    assert feed(judge, [reply()] * 4) == [None, None, None, reply()]
 
 
 def test_what_goes_on_is_believed_at_once():
@@ -72,9 +72,9 @@ def test_a_flipped_digit_never_becomes_a_state(position, current, status, error,
 @pytest.mark.parametrize(
     "change", [{"position": 90}, {"calibrated": False}, {"error": True}, {"code": 1}, {"current_mA": -500}]
 )
-def test_a_true_change_is_believed_two_replies_later(change):
+def test_a_true_change_is_believed_three_replies_later(change):
     after = reply(**change)
-    assert feed(settled(reply()), [after] * 3) == [None, None, after]
+    assert feed(settled(reply()), [after] * 4) == [None, None, None, after]
 
 
 def test_three_different_lies_are_not_believed():
@@ -90,12 +90,12 @@ def test_motion_at_the_known_speed_is_believed_at_once():
 
 def test_fast_motion_is_always_confirmed_since_the_jaws_may_have_stopped():
     fast = Expectation(drift=500.0, reach=750.0)
-    places = [reply(position=110 + index) for index in range(3)]
-    assert feed(settled(reply()), places, POLL, expected=fast) == [None, None, places[-1]]
+    places = [reply(position=110 + index) for index in range(4)]
+    assert feed(settled(reply()), places, POLL, expected=fast) == [None, None, None, places[-1]]
 
 
 def test_after_a_long_gap_even_the_same_reply_is_confirmed():
-    assert feed(settled(reply()), [reply()] * 3, 1.0) == [None, None, reply()]
+    assert feed(settled(reply()), [reply()] * 4, 1.0) == [None, None, None, reply()]
 
 
 def test_a_noisy_current_ends_with_its_middle():
@@ -111,4 +111,4 @@ def test_a_current_beyond_the_power_stage_is_never_believed():
 
 def test_two_replies_far_apart_do_not_confirm_each_other():
     after = reply(position=90)
-    assert feed(settled(reply()), [after] * 3, step=0.06) == [None] * 3
+    assert feed(settled(reply()), [after] * 4, step=0.06) == [None] * 4
