@@ -16,7 +16,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: F401 - for those who publish
 from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: F401 - for those who publish
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
@@ -54,6 +54,7 @@ from finforce_records import ParameterError, RecordT, bounds_of, check_value, co
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 STEADY = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
+REQUESTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # one that is passed over waits for ever
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TRANSPORT = Path(__file__).parent / "finforce_keypoints" / "transport" / "fastdds.xml"
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
@@ -222,17 +223,17 @@ def publish_diagnostics(
     node.create_timer(period, publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def serve_trigger(node: Node, name: str, action: Callable[[], str], *, aside: bool = False) -> None:
-    """Offer an action as a Trigger service, run `aside` if it takes long; what it refuses comes back as the message."""
-    _serve(node, Trigger, name, lambda _: action(), aside)
+def serve_trigger(node: Node, name: str, action: Callable[[], str], group: CallbackGroup | None = None) -> None:
+    """Offer an action as a Trigger service, aside in a group if it takes long; a refusal comes back as the message."""
+    _serve(node, Trigger, name, lambda _: action(), group)
 
 
 def serve_switch(node: Node, name: str, action: Callable[[bool], str]) -> None:
     """Offer an action that is told yes or no as a SetBool service; what it refuses comes back as the message."""
-    _serve(node, SetBool, name, lambda request: action(request.data), False)
+    _serve(node, SetBool, name, lambda request: action(request.data), None)
 
 
-def _serve(node: Node, kind: type, name: str, action: Callable[[Any], str], aside: bool) -> None:
+def _serve(node: Node, kind: type, name: str, action: Callable[[Any], str], group: CallbackGroup | None) -> None:
     def attempt(request: Any) -> tuple[bool, str]:
         try:
             return True, action(request)
@@ -240,11 +241,11 @@ def _serve(node: Node, kind: type, name: str, action: Callable[[Any], str], asid
             return False, str(error)
 
     async def answer(request: Any, response: Any) -> Any:
-        answered = await run_aside(node, partial(attempt, request)) if aside else attempt(request)
+        answered = await run_aside(node, partial(attempt, request)) if group else attempt(request)
         response.success, response.message = answered
         return response
 
-    node.create_service(kind, name, answer, callback_group=MutuallyExclusiveCallbackGroup() if aside else None)
+    node.create_service(kind, name, answer, callback_group=group, qos_profile=REQUESTS)
 
 
 async def run_aside(node: Node, action: Callable[[], Any]) -> Any:

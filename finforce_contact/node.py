@@ -60,8 +60,9 @@ class ContactEstimatorNode(Node):
     def _serve(self) -> None:
         """Offer services, whose long work holds up nothing else, and diagnostics."""
         session, period = self.session, self.parameters.diagnostics_period
-        ros.serve_trigger(self, "~/load_mesh", lambda: session.load_mesh(self._refreshed()), aside=True)
-        ros.serve_trigger(self, "~/reconstruct", lambda: session.reconstruct(self._refreshed()), aside=True)
+        one_by_one = MutuallyExclusiveCallbackGroup()
+        ros.serve_trigger(self, "~/load_mesh", lambda: session.load_mesh(self._refreshed()), one_by_one)
+        ros.serve_trigger(self, "~/reconstruct", lambda: session.reconstruct(self._refreshed()), one_by_one)
         ros.serve_trigger(self, "~/reset", session.reset)
         for side in self.parameters.sides:
             report = partial(self._report, side)

@@ -19,7 +19,7 @@ from finforce_driver.portrait import build_state
 from finforce_driver.protocol import Command, decode_reply, split_identifier
 from finforce_driver.requests import RequestSource
 from finforce_driver.settings import GripperSettings
-from finforce_driver.state import GripperState
+from finforce_driver.state import GripperState, Phase
 
 SHORT_SILENCE = 5  # requests in a row without a reply after which the gripper is taken to be absent
 PROBES = 20  # the same before the first reply: a second
@@ -97,7 +97,7 @@ class GripperMachine:
         core = self._core
         if core.phase in commands.CONNECTED and self.settings.release_on_stop:
             commands.activate(core, False, now)
-        elif core.phase in commands.USABLE:
+        elif core.phase in (*commands.USABLE, Phase.CALIBRATING):
             commands.hold(core, now)
 
     @property

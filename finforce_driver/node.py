@@ -12,6 +12,7 @@ from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
 from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, PointCloud2
 
@@ -82,7 +83,8 @@ class GripperDriverNode(Node):
         for name in ("estop", "stop"):
             ros.serve_trigger(self, f"~/{name}", getattr(tasks, name))
         for name in ("calibrate", "clear_errors", "grasp", "grasp_without_vision", "release"):
-            ros.serve_trigger(self, f"~/{name}", getattr(tasks, name), aside=True)
+            # what waits for an earlier call would move the jaws after a stop
+            ros.serve_trigger(self, f"~/{name}", getattr(tasks, name), ReentrantCallbackGroup())
         ros.serve_switch(self, "~/activate", tasks.activate)
         self.action = self._offer_action()
         ros.publish_diagnostics(self, self.qos, "finforce: gripper", self.parameters.diagnostics_period, self._report)

@@ -37,8 +37,9 @@ class EmergencyStop:
         return self.stage is not Stage.NONE
 
     def demand(self) -> None:
-        """Stop, whatever happened before."""
-        self.stage, self._next_time, self._tries = Stage.WANTED, 0.0, 0
+        """Stop, whatever happened before; what is on its way already is not sent anew."""
+        if self.stage is not Stage.WANTED:
+            self.stage, self._next_time, self._tries = Stage.WANTED, 0.0, 0
 
     def due(self, now: float) -> bool:
         """Return whether its frames are to be sent now, and count that as done."""

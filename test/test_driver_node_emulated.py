@@ -6,9 +6,10 @@ from time import time_ns
 
 import pytest
 from driver_bench_fakes import Bench, Fingers
+from driver_node_fakes import ask
 from node_fakes import ros_domain
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 import finforce_ros as ros
 from finforce_driver.bus import Frame
@@ -241,6 +242,30 @@ def test_release_opens_again(bench):
     answer = bench.call("release")
     assert answer.success, answer.message
     assert bench.gripper.true_opening == pytest.approx(0.045, abs=2 * STEP)
+
+
+def test_what_was_asked_for_before_a_stop_does_not_move_the_jaws_after_it(bench):
+    bench = bench(release_speed=0.01)
+    bench.wait_for_joints()
+    bench.move(0.04, velocity=[0.1])
+    bench.probe.wait_for(lambda: bench.gripper.true_opening < 0.041)
+    answers = [ask(bench.probe, Trigger, "release") for _ in range(3)]
+    bench.probe.wait_for(lambda: bench.gripper.true_opening > 0.0415)
+    assert bench.call("stop").success
+    left = bench.gripper.true_opening
+    bench.probe.wait_for(lambda: all(answer.done() for answer in answers))
+    bench.probe.spin(0.3)  # in which a waiting release would open by 3 mm
+    assert not any(answer.result().success for answer in answers)
+    assert bench.gripper.true_opening == pytest.approx(left, abs=2 * STEP)
+
+
+def test_a_driver_that_ends_while_the_gripper_calibrates_stops_it(bench):
+    bench = bench(calibrated=False)
+    bench.diagnosis(Level.WARN, "not calibrated")
+    ask(bench.probe, Trigger, "calibrate")
+    bench.probe.wait_for(lambda: bench.gripper.mode.name.lower() == "calibrate")
+    bench.node.destroy_node()
+    bench.probe.wait_for(lambda: bench.gripper.mode.name.lower() != "calibrate")
 
 
 def test_a_driver_that_ends_leaves_moving_jaws_where_they_are(bench):
