@@ -37,6 +37,7 @@ class Truth:
     place: float
     current: float
     calibrated: bool
+    configured: bool
     faults: frozenset[Fault]
     echo: tuple[bool, bool]
     mode: Mode
@@ -65,6 +66,7 @@ class Tape:
                 place=(jaws.encoder - ends.open) * 255.0 / span if span else math.nan,
                 current=1e-3 * gripper.reported_current,
                 calibrated=gripper.calibrated,
+                configured=gripper.configured,
                 faults=frozenset(gripper.faults),
                 echo=(gripper.order.activated, gripper.order.action),
                 mode=gripper.mode,
@@ -157,7 +159,8 @@ class Oracle:
 
     def _check_values(self, state: GripperState, near: list[Truth]) -> list[str]:
         wrong = []
-        if not math.isnan(state.opening):
+        # a controller that ceases to be a gripper freezes its position byte, which only a calibration finds out
+        if not math.isnan(state.opening) and all(truth.configured for truth in near):
             place = self._scale.counts_of(state.opening)
             # the reply tells a place between the stops
             error = min(abs(place - min(max(truth.place, 0.0), 255.0)) for truth in near)

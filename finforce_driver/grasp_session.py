@@ -39,13 +39,14 @@ class GraspSession:
         ended: called when a grasp has ended.
 
     Raises:
-        TargetError: the force of the goal is above the limit of the settings.
+        TargetError: the force of the goal is above the limit of the settings, or its opening beyond the stroke.
     """
 
     def __init__(
         self, gripper: Gripper, goal: GraspGoal, settings: GraspSettings, ended: Callable[[], None] = lambda: None
     ) -> None:
         settings.check_force(goal.force)
+        _check_opening(goal, gripper)
         self.goal = goal
         self.status: GraspStatus | None = None
         self._gripper, self._settings, self._ended = gripper, settings, ended
@@ -63,9 +64,10 @@ class GraspSession:
         """Take a goal for the next grasp; its force at once, too, for one that runs.
 
         Raises:
-            TargetError: the force is above the limit.
+            TargetError: the force is above the limit, or the least opening beyond the stroke.
         """
         self._settings.check_force(goal.force)
+        _check_opening(goal, self._gripper)
         with self._changed:
             self.goal = goal
             if self._grasp is not None:
@@ -173,3 +175,9 @@ class GraspSession:
 
     def _is_settled(self) -> bool:
         return self.status is not None and self.status.phase in SETTLED
+
+
+def _check_opening(goal: GraspGoal, gripper: Gripper) -> None:
+    """Refuse a least opening [m] that the jaws are never above; below the closed one it limits nothing."""
+    settings = gripper.settings
+    settings.check_opening("least opening", max(goal.least_opening, settings.closed_opening))

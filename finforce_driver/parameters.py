@@ -41,11 +41,14 @@ class DriverParameters(TimeParameters):
     release_speed: float = parameter(0.02, "of the opening while release opens", unit="m/s", min=1e-4, max=0.37)
 
     def __post_init__(self) -> None:
-        """Refuses joints that are not two.
+        """Refuses names that are none, and joints that are not two.
 
         Raises:
-            ParameterError: these are others.
+            ParameterError: these are.
         """
+        for name in ("port", "interface", "gripper_frame"):
+            if not getattr(self, name):
+                raise ParameterError(f"{name} is empty; expected a name, as {self.__dataclass_fields__[name].default}")
         if len(self.joint_names) != 2 or len(set(self.joint_names)) != 2:
             raise ParameterError(f"joint_names: got {self.joint_names!r}, expected two names, left and right")
 
@@ -60,11 +63,13 @@ def build_gripper(parameters: DriverParameters, settings: GripperSettings) -> Gr
     """Make the driver of the gripper that the parameters name; nothing is opened before it starts.
 
     Raises:
-        TargetError: a rate is none that ports or SLCAN know.
+        TargetError: a rate is none that ports or SLCAN know, or release_opening is beyond the stroke.
     """
     from finforce_driver.buses import build_bus
     from finforce_driver.gripper import Gripper
 
+    if not math.isnan(parameters.release_opening):
+        settings.check_opening("release_opening", parameters.release_opening)
     rates = {"baud_rate": parameters.baud_rate, "bit_rate": parameters.bit_rate}
     bus = build_bus(parameters.port, parameters.interface, **rates)
     return Gripper(bus, settings)

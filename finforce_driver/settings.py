@@ -27,6 +27,23 @@ class GripperSettings:
     telemetry_period: float = setting(1.0, "s", 0.05, 3600.0, "between two questions for temperature, supply or errors")
     release_on_stop: bool = setting(False, "", None, None, "let go when the driver ends; else it goes on holding")
 
+    @property
+    def open_opening(self) -> float:
+        """Opening at the open stop [m]."""
+        return self.closed_opening + self.stroke
+
+    def check_opening(self, name: str, opening: float) -> None:
+        """Refuses an opening [m] at which the jaws can never be.
+
+        Raises:
+            TargetError: it is no number, or outside the stroke.
+        """
+        if not self.closed_opening <= opening <= self.open_opening:
+            raise TargetError(
+                f"{name}: got {opening:g} m, expected {self.closed_opening:g} to {self.open_opening:g} m, what the "
+                "gripper can open"
+            )
+
     def __post_init__(self) -> None:
         """Refuses values out of bounds.
 

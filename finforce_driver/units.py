@@ -14,6 +14,7 @@ SLOWEST_TICKS = 40  # per second, at speed byte 0
 TICKS_SPAN = 79960  # per second, from speed byte 0 to 255
 SLOWEST_BYTE = 3  # below it the gripper mistakes slow motion for contact
 LEAST_SPEED = 1e-5  # [m/s] of the opening: a stroke in 80 minutes
+MOST_EXCESS = 2.0  # times the fastest speed; more is not cut but refused
 ROUNDING = 1e-9  # [m], [N]: what a value may lie out of bounds by arithmetic alone
 
 
@@ -96,9 +97,9 @@ class GripperScale:
         """Return how a speed of the opening [m/s] is carried out; the byte never gives a faster one.
 
         Raises:
-            TargetError: it is no number, not positive, or below 0.01 mm/s.
+            TargetError: it is no number, not positive, below 0.01 mm/s, or far beyond the gripper: another unit.
         """
-        if not LEAST_SPEED <= speed < math.inf:
+        if not LEAST_SPEED <= speed <= MOST_EXCESS * self.fastest:
             raise TargetError(f"speed: got {speed:g} m/s, expected {LEAST_SPEED:g} to {self.fastest:.3g} m/s")
         if speed < self.slowest_direct:
             return Pace(byte=SLOWEST_BYTE, speed=speed, stepped=True)

@@ -5,13 +5,15 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from driver_node_fakes import READY
+from driver_node_fakes import READY, FakeGripper
 
 from finforce_driver.errors import TargetError
-from finforce_driver.grasp_settings import GraspGoal
+from finforce_driver.grasp_session import GraspSession
+from finforce_driver.grasp_settings import GraspGoal, GraspSettings
 from finforce_driver.messages import goal_from_joint_state, move_from_gripper_command, move_from_joint_state
-from finforce_driver.parameters import DriverParameters
+from finforce_driver.parameters import DriverParameters, build_gripper
 from finforce_driver.report import describe_state, news_of_state, outcome_of_state
+from finforce_driver.settings import GripperSettings
 from finforce_driver.state import Outcome, Phase
 from finforce_driver.times import MessageTimes
 from finforce_health import NANOSECONDS, Level, StampError
@@ -99,6 +101,20 @@ def test_a_clock_that_does_not_go_yet_stamps_nothing():
     times = MessageTimes(SteppedClock(), (), max_age=0.2, restart_gap=1.0)
     with pytest.raises(StampError, match="use_sim_time without /clock"):
         times.to_stamp(99.9, 0)
+
+
+@pytest.mark.parametrize("name", ["port", "interface", "gripper_frame"])
+def test_a_name_that_is_empty_is_refused(name):
+    with pytest.raises(ParameterError, match=f"{name} is empty; expected a name"):
+        DriverParameters(**{name: ""})
+
+
+def test_openings_beyond_the_stroke_are_refused_at_the_start():
+    with pytest.raises(TargetError, match=r"release_opening: got 0.4 m, expected 0 to 0.048 m"):
+        build_gripper(DriverParameters(release_opening=0.4), GripperSettings())
+    with pytest.raises(TargetError, match=r"least opening: got 0.06 m, expected 0 to 0.048 m"):
+        GraspSession(FakeGripper(), GraspGoal(force=1.0, least_opening=0.06), GraspSettings())
+    GraspSession(FakeGripper(closed_opening=0.01), GraspGoal(force=1.0, least_opening=0.0), GraspSettings())
 
 
 @pytest.mark.parametrize("names", [(), ("a",), ("a", "a"), ("a", "b", "c")])

@@ -52,9 +52,14 @@ def test_slow_speeds_go_in_steps_at_the_slowest_byte():
 
 
 def test_a_speed_beyond_the_gripper_is_cut_with_a_note():
-    pace = SCALE.pace_of(1.0)
+    pace = SCALE.pace_of(0.5)
     assert (pace.byte, pace.speed) == (255, SCALE.fastest)
     assert "more than the gripper can do" in pace.note
+
+
+def test_a_speed_in_another_unit_is_refused():
+    with pytest.raises(TargetError, match=r"speed: got 20 m/s, expected 1e-05 to 0.368 m/s"):
+        SCALE.pace_of(20.0)
 
 
 def test_forces_follow_the_makers_curve():
