@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from finforce_driver.state import Outcome, Phase
 
 SILENT = (
-    "the gripper at node {node} does not answer: check its 24 V, CANH and CANL, the termination, 1 Mbit/s and node_id"
+    "the gripper at node {node} does not answer: check its 24 V, CANH and CANL, the termination, 1 Mbit/s, node_id and "
+    "the adapter's baud_rate"
 )
 OTHER_NODE = "no gripper answers at node {node}, but one does at node {other}: set node_id to {other}"
 OTHER_MASTER = "another program commands this gripper ({what}): stop it, then command again"

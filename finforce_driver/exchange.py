@@ -19,6 +19,7 @@ LENGTHS = {
 }
 # asked in turn, so that the late answer to one is not taken for the answer to the next
 MARKERS = (Command.PING, Command.CURRENT, Command.ENCODER, Command.ERRORS)
+UNANSWERED_PAUSE = 0.001  # [s] for the gripper to take a frame that it does not answer: it keeps three at most
 TRIES = 2  # with markers before the first answer to one: an adapter may know no remote frames
 
 
@@ -49,7 +50,8 @@ class Exchange:
 
     Attributes:
         pending: request whose reply is waited for.
-        sent: when it was sent [s].
+        sent: when the last request was sent [s].
+        free: from when the next one may be sent [s].
         misses: requests in a row without a reply.
         latency: from the last request to its reply [s]; NaN before the first.
     """
@@ -57,6 +59,7 @@ class Exchange:
     def __init__(self, node: int) -> None:
         self.pending: Request | None = None
         self.sent = math.nan
+        self.free = -math.inf
         self.misses = 0
         self.latency = math.nan
         self._node = node
@@ -73,6 +76,7 @@ class Exchange:
         """Note that a request is sent."""
         self.pending = request if request.answer is not None else None
         self.sent = now
+        self.free = now if request.answer is not None else now + UNANSWERED_PAUSE
 
     def answers(self, frame: Frame) -> bool:
         """Return whether a frame is the reply that is waited for."""

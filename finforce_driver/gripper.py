@@ -1,7 +1,7 @@
 """The gripper as a program uses it: commands that return at once, a state that is always there; knows no bytes.
 
     with Gripper(build_bus("/dev/ttyACM0")) as gripper:
-        gripper.wait(lambda state: state.phase is not Phase.PROBING, 3.0)
+        gripper.wait(lambda state: state.phase is Phase.UNCALIBRATED, 3.0)  # READY, if it is calibrated already
         gripper.calibrate()
         gripper.wait(lambda state: state.phase is Phase.READY, 40.0)
         gripper.move(0.010, speed=0.005, force=10.0)
@@ -171,9 +171,12 @@ class Gripper:
 
         Raises:
             GripperTimeoutError: none did within `timeout` [s].
+            GripperStateError: the gripper was closed meanwhile.
         """
         deadline = self.clock.now() + timeout
         while not condition(state := self.state):
+            if self._stop.is_set():
+                raise GripperStateError("wait: the driver of the gripper has ended; start it again")
             left = deadline - self.clock.now()
             if left <= 0.0:
                 raise GripperTimeoutError(

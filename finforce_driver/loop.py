@@ -162,7 +162,7 @@ class GripperLoop:
                     self._pause = FIRST_PAUSE
                     return
         with self._lock:
-            self._machine.on_silence(self._clock.now())
+            self._machine.on_silence(self._clock.now(), self._bus.suspicion)
 
     def _lose(self, reason: str) -> None:
         """Close a bus that failed, and open it later."""

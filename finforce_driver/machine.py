@@ -156,8 +156,8 @@ class GripperMachine:
             core.known.telemetry.take(request.answer, frame, now)
         return True
 
-    def on_silence(self, now: float) -> None:
-        """Note that the reply did not come in time."""
+    def on_silence(self, now: float, suspicion: str = "") -> None:
+        """Note that the reply did not come in time; `suspicion` is what the link has to say to that."""
         core, request = self._core, self._core.exchange.miss()
         if request is None:
             return
@@ -171,7 +171,7 @@ class GripperMachine:
             core.silent = True
             if core.orders.pending:
                 core.abort(LOST_ORDER)
-            core.note = core.note or SILENT.format(node=self.settings.node_id)
+            core.note = core.note or suspicion or SILENT.format(node=self.settings.node_id)
             self._refresh()
 
     def _take_reply(self, request: Request, frame: Frame, now: float) -> None:

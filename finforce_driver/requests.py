@@ -53,7 +53,7 @@ class RequestSource:
 
     def next_request(self, now: float) -> Request | None:
         """Return what to send at a time [s]; None when nothing is due."""
-        if self._quiet(now):
+        if self._quiet(now) or (now < self._core.exchange.free and not self._core.stop.active):
             return None
         return next((request for source in self._sources if (request := source(now)) is not None), None)
 
@@ -67,7 +67,7 @@ class RequestSource:
         wanted = core.known.filter.doubtful or core.hold_wanted
         repetition = core.exchange.sent + SPACING if wanted else math.inf
         poll = core.exchange.sent + LATEST_REPLY if self._resting() else self._next_poll
-        return min(poll, step, question, repetition)
+        return max(core.exchange.free, min(poll, step, question, repetition))
 
     def begin_stop(self, now: float) -> Request | None:
         """Return the first frame of an emergency stop, an order with its flag; None when it is not due again."""

@@ -133,7 +133,7 @@ def test_a_cut_short_recalibration_is_not_trusted_although_the_gripper_says_cali
 
 
 @both_variants
-@pytest.mark.parametrize("stiffness", [100.0, 1000.0])
+@pytest.mark.parametrize("stiffness", [100.0, 800.0])  # N/m; the older calibration presses with 21 N
 def test_something_soft_between_the_jaws_is_no_reason_to_doubt_the_gripper(rig, stiffness):
     rig.emulated.jaws.load = lambda opening: stiffness * max(0.0, 0.025 - opening)
     rig.gripper.calibrate()

@@ -170,3 +170,23 @@ def test_lost_replies_are_counted():
     rig.adapter.inject(FaultKind.LOST, 3)
     rig.live(1.0)
     assert rig.state.counts["lost replies"] == 3
+
+
+def test_what_the_link_suspects_goes_before_general_advice(monkeypatch):
+    rig = Rig(found=False)
+    rig.adapter.inject(FaultKind.LOST, count=10_000)
+    monkeypatch.setattr(type(rig.bus), "suspicion", "only garbage comes: wrong adapter speed?")
+    rig.live(3.0)
+    assert "wrong adapter speed?" in rig.state.message
+    monkeypatch.setattr(type(rig.bus), "suspicion", "")
+    other = Rig(found=False)
+    other.adapter.inject(FaultKind.LOST, count=10_000)
+    other.live(3.0)
+    assert "check its 24 V" in other.state.message and "baud_rate" in other.state.message
+
+
+def test_who_waits_for_a_gripper_that_was_closed_hears_of_it():
+    rig = Rig()
+    rig.gripper.close()
+    with pytest.raises(GripperStateError, match="has ended"):
+        rig.gripper.wait(lambda state: state.phase is Phase.MOVING, 5.0)
