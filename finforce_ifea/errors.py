@@ -33,4 +33,3 @@ class NotEnoughDataError(FinforceError, RuntimeError):
 
 class UnobservableError(NotEnoughDataError):
     """The key points that are seen do not tell what was asked."""
-

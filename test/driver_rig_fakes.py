@@ -19,6 +19,18 @@ COUNT = 0.048 / 255  # [m]
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))  # for the oracle
 
 
+class Later:
+    """Does something once when its time has come."""
+
+    def __init__(self, clock, time, action):
+        self._clock, self._time, self._action = clock, time, action
+
+    def step(self, _dt):
+        if self._clock.now() >= self._time:
+            self._time = float("inf")
+            self._action()
+
+
 class Rig:
     """A driver that has found its gripper; calibrated at once by the emulator's truth."""
 
@@ -43,6 +55,10 @@ class Rig:
         end = self.clock.now() + seconds
         while self.clock.now() < end - 1e-9:
             self.gripper.turn()
+
+    def at(self, time, action):
+        """Have something done at a time, whatever the driver is doing then."""
+        self.clock.attach(Later(self.clock, time, action))
 
     def wait_for(self, *phases, patience=45.0):
         return self.gripper.wait(lambda state: state.phase in phases, patience)

@@ -171,6 +171,6 @@ def test_no_order_leaves_after_a_stop_that_another_thread_demands_meanwhile(rig)
     loop.join()
     stop.join()
     driving = [index for index, frame in enumerate(slow.written) if len(frame.data) == 5 and frame.data[4] & 0x20 == 0]
-    stopping = [index for index, frame in enumerate(slow.written) if frame.id == 0x000]
+    stopping = [index for index, frame in enumerate(slow.written) if len(frame.data) == 5 and frame.data[4] & 0x20]
     assert len(driving) == 1
     assert driving[0] < min(stopping)
