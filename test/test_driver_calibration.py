@@ -1,3 +1,5 @@
+"""Claims about the calibration: its course, its end, what cuts it short."""
+
 import math
 
 import pytest

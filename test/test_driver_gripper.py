@@ -1,3 +1,5 @@
+"""Claims about the gripper as a program uses it."""
+
 import math
 import threading
 import time

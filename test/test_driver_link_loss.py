@@ -1,3 +1,5 @@
+"""Claims about silence, lost links and what is told of them."""
+
 import math
 
 import pytest

@@ -1,3 +1,5 @@
+"""Claims about other programs on the bus."""
+
 import pytest
 from driver_rig_fakes import VARIANTS, Rig
 

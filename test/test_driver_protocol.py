@@ -1,3 +1,5 @@
+"""Claims about the frames, to the byte."""
+
 import pytest
 from driver_rig_fakes import frame_of
 from hypothesis import given

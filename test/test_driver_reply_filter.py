@@ -1,3 +1,5 @@
+"""Claims about which replies are believed."""
+
 from dataclasses import replace
 
 import pytest

@@ -1,3 +1,5 @@
+"""Claims about slow motion by stepped targets."""
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st

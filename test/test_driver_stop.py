@@ -1,3 +1,5 @@
+"""Claims about the emergency stop and its end."""
+
 import pytest
 from driver_rig_fakes import VARIANTS, Rig
 

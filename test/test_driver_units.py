@@ -1,3 +1,5 @@
+"""Claims about openings, speeds and forces in the gripper's units."""
+
 import math
 
 import pytest
