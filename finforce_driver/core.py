@@ -85,7 +85,7 @@ class Core:
     @property
     def may_drive(self) -> bool:
         """Whether an order that moves the jaws may leave: everything that speaks against it is known and does not."""
-        return self.phase in (Phase.READY, Phase.MOVING) and self.exchange.in_step and not self.known.filter.doubtful
+        return self.phase in (Phase.READY, Phase.MOVING) and self.exchange.in_step and not self.known.filter.alarming
 
     @property
     def settled(self) -> bool:

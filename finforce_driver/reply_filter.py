@@ -64,6 +64,14 @@ class ReplyFilter:
         """Whether a further reply is wanted at once."""
         return bool(self._doubts)
 
+    @property
+    def alarming(self) -> bool:
+        """Whether a doubted reply, if it is true, changes what the gripper may be told."""
+        if self._believed is None:
+            return bool(self._doubts)
+        standing = _standing(self._believed.reply)
+        return any(_standing(doubt.reply) != standing for doubt in self._doubts)
+
     def forget(self) -> None:
         """Begin anew: the next reply goes on from nothing."""
         self._believed = None
@@ -124,6 +132,11 @@ def goes_on(before: Sample, after: Sample, expected: Expectation) -> bool:
 def _flags(reply: Reply) -> tuple[int, ...]:
     """Return what of a reply has to be equal."""
     return tuple(getattr(reply, name) for name in FLAGS)
+
+
+def _standing(reply: Reply) -> tuple[bool, ...]:
+    """Return what of a reply decides on what the gripper may be told."""
+    return reply.activated, reply.action, reply.calibrated, reply.error
 
 
 def _middle(samples: list[Sample]) -> Reply:

@@ -44,9 +44,9 @@ class RequestSource:
             self._stop,
             self._urgent_order,
             self._marker,
+            self._order,
             self._doubt,
             self._sequence,
-            self._order,
             self._poll,
             self._telemetry,
         )

@@ -33,6 +33,13 @@ def test_the_first_reply_is_believed_when_three_others_repeat_it():
     assert feed(judge, [reply()] * 4) == [None, None, None, reply()]
 
 
+@pytest.mark.parametrize("change, alarming", [({"position": 90}, False), ({"error": True}, True), ({"code": 0}, False)])
+def test_a_doubt_is_alarming_when_what_the_gripper_may_be_told_is_at_stake(change, alarming):
+    judge = settled(reply())
+    feed(judge, [reply(**change)])
+    assert (judge.doubtful, judge.alarming) == (True, alarming)
+
+
 def test_what_goes_on_is_believed_at_once():
     assert feed(settled(reply()), [reply(current_mA=-60)], POLL) == [reply(current_mA=-60)]
 
