@@ -105,18 +105,23 @@ class Gripper:
         """Return the opening [m] at a time of the last 5 s [s]; NaN where it is not known."""
         return self._loop.opening_at(time)
 
-    def move(self, opening: float, speed: float | None = None, force: float | None = None) -> None:
+    def move(
+        self, opening: float, speed: float | None = None, force: float | None = None, *, current: float | None = None
+    ) -> None:
         """Go to an opening, and stall with a force when something is in the way.
 
         Args:
             opening: to be reached [m].
             speed: of the opening [m/s], both jaws together; the default of the settings where None.
             force: grip force by the maker's curve [N]; the default current of the settings where None.
+            current: the motor's limit [A], in place of a force.
 
         Raises:
-            TargetError: a value is no number or out of bounds.
+            TargetError: a value is no number or out of bounds, or force and current are both given.
             GripperStateError: the gripper could not move: absent, faulty, not calibrated, calibrating, switched off.
         """
+        if current is not None:
+            force = self.scale.force_for(current, force)
         self._loop.command(lambda machine, now: machine.move(opening, speed, force, now))
 
     def hold(self) -> None:

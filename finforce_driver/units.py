@@ -115,6 +115,20 @@ class GripperScale:
         """Return the grip force [N] of a current [A] by the maker's curve; both positive when driving closed."""
         return self._force_per_current * current
 
+    def force_for(self, current: float, force: float | None) -> float:
+        """Return the grip force [N] that stands for a current limit [A].
+
+        Raises:
+            TargetError: the current is no number or out of range, or a force is given beside it.
+        """
+        if force is not None:
+            raise TargetError(f"force {force!r} N and current {current!r} A: expected one of them")
+        low, high = self._least_current, self._largest_current
+        is_number = isinstance(current, int | float) and not isinstance(current, bool)
+        if not (is_number and low - ROUNDING <= current <= high + ROUNDING):
+            raise TargetError(f"current: got {current!r} A, expected {low:g} to {high:g} A")
+        return self.force_of(current)
+
     def current_of(self, force: float) -> int:
         """Return the current limit [mA] of a grip force [N] by the maker's curve.
 
