@@ -9,6 +9,10 @@ from time import monotonic
 
 from finforce_driver.bus import Bus, Frame
 
+POLL = Frame(id=0x07A)
+REPLY = Frame(id=0x078, data=bytes.fromhex("800000C1"))
+REPLY_LINE = b"t0784800000C1\r"
+LONG = 5.0  # [s] far beyond what anything here takes; nothing is measured with it
 ENOUGH = 5.0  # [s] what was written on one side is there on the other at once; a machine under load may take its time
 
 

@@ -3,18 +3,13 @@
 from types import SimpleNamespace
 
 import pytest
-from link_fakes import FakeAdapter, receive_until
+from link_fakes import LONG, POLL, REPLY, REPLY_LINE, FakeAdapter, receive_until
 
 from finforce_driver import can_bus
 from finforce_driver.bus import Frame
 from finforce_driver.can_bus import PythonCanBus, check_version
 from finforce_driver.errors import LinkError
 from finforce_errors import MissingDependencyError
-
-POLL = Frame(id=0x07A)
-REPLY = Frame(id=0x078, data=bytes.fromhex("800000C1"))
-REPLY_LINE = b"t0784800000C1\r"
-LONG = 5.0  # [s] far beyond what anything here takes; nothing is measured with it
 
 
 @pytest.fixture
