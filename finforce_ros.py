@@ -20,7 +20,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
@@ -169,8 +169,7 @@ class QosWatch:
     def _mismatches(self, topic: str, writes: bool, qos: QoSProfile) -> list[str]:
         """Compare our end of a topic with every other end that stands against it."""
         node, sentences = self.node, []
-        look_up = node.get_subscriptions_info_by_topic if writes else node.get_publishers_info_by_topic
-        for end in look_up(topic):
+        for end in (node.get_subscriptions_info_by_topic if writes else node.get_publishers_info_by_topic)(topic):
             pair = (qos, end.qos_profile) if writes else (end.qos_profile, qos)
             verdict, why = qos_check_compatible(*pair)
             if verdict == QoSCompatibility.ERROR:
@@ -273,13 +272,14 @@ def take_newest(subscription: Subscription, message: Any) -> tuple[Any, int]:
 
 
 def run_node(
-    name: str,
-    build: Callable[[], Node],
-    args: Sequence[str] | None = None,
-    work: Callable[[Node, Executor], None] = rclpy.spin,
+    name: str, build: Callable[[], Node], args: Sequence[str] | None = None, work: Callable[..., None] = rclpy.spin
 ) -> int:
     """Build a node and let it work until it is done, Ctrl-C or SIGTERM; return 0, or 2 on our errors."""
-    rclpy.init(args=args)
+    try:
+        rclpy.init(args=args)
+    except RuntimeError as error:  # what stands after --ros-args is none of its words
+        print(f"{name}: {str(error).partition(', at ')[0]}", file=sys.stderr)
+        return 2
     # an executor that is made after a signal cannot be taken down quietly; a node takes long to build
     executor, node = SingleThreadedExecutor(), None
     try:

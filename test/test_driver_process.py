@@ -44,6 +44,7 @@ def test_a_signal_ends_a_node_that_has_no_port():
         ("gripper.node_id:=16", "gripper.node_id"),
         ("grasp_force:=9.0", "set force: got 9 N"),
         ("joint_names:=[a]", "joint_names: got"),
+        ("port", "parse parameter override rule: '-p port'"),
     ],
 )
 def test_what_cannot_be_set_up_ends_with_two_and_one_line(given, reason):
