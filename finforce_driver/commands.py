@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from finforce_driver.advice import HALF_CALIBRATED, OTHER_NODE
 from finforce_driver.calibration_run import CalibrationRun
 from finforce_driver.core import Core
@@ -12,6 +10,7 @@ from finforce_driver.job import Goal, MoveJob
 from finforce_driver.protocol import Flag
 from finforce_driver.recovery import Recovery
 from finforce_driver.state import Outcome, Phase
+from finforce_driver.units import is_number
 
 GO = Flag.ACTIVATE | Flag.GO
 OLD = 0.1  # [s] after which a reply does not tell where moving jaws are
@@ -35,7 +34,7 @@ def make_goal(core: Core, opening: float, speed: float | None, force: float | No
     """
     values = {"opening": opening, "speed": speed, "force": force}
     for name, value in values.items():
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value)):
+        if value is not None and not is_number(value):
             raise TargetError(f"{name}: got {value!r}, expected a number; the gripper stays as it was")
     settings = core.settings
     current = round(1e3 * settings.default_current) if force is None else core.scale.current_of(force)

@@ -28,7 +28,7 @@ class GripperSettings:
     release_on_stop: bool = setting(False, "", None, None, "let go when the driver ends; else it goes on holding")
 
     @property
-    def open_opening(self) -> float:
+    def largest_opening(self) -> float:
         """Opening at the open stop [m]."""
         return self.closed_opening + self.stroke
 
@@ -38,9 +38,9 @@ class GripperSettings:
         Raises:
             TargetError: it is no number, or outside the stroke.
         """
-        if not self.closed_opening <= opening <= self.open_opening:
+        if not self.closed_opening <= opening <= self.largest_opening:
             raise TargetError(
-                f"{name}: got {opening:g} m, expected {self.closed_opening:g} to {self.open_opening:g} m, what the "
+                f"{name}: got {opening:g} m, expected {self.closed_opening:g} to {self.largest_opening:g} m, what the "
                 "gripper can open"
             )
 

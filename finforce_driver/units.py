@@ -35,6 +35,11 @@ class Pace:
     note: str = ""
 
 
+def is_number(value: object) -> bool:
+    """Return whether a value is a number that is one: no truth value, no text, not NaN."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+
+
 class GripperScale:
     """Converts openings, speeds and forces into bytes and back.
 
@@ -43,6 +48,7 @@ class GripperScale:
     """
 
     def __init__(self, settings: GripperSettings) -> None:
+        self._settings = settings
         self._closed = settings.closed_opening
         self._stroke = settings.stroke
         self._force_per_current = settings.force_per_current
@@ -58,7 +64,7 @@ class GripperScale:
     @property
     def largest_opening(self) -> float:
         """Opening at the open stop [m]."""
-        return self._closed + self._stroke
+        return self._settings.largest_opening
 
     @property
     def slowest_direct(self) -> float:
@@ -86,7 +92,7 @@ class GripperScale:
         """
         low, high = self._closed, self.largest_opening
         if not low - ROUNDING <= opening <= high + ROUNDING:
-            raise TargetError(f"opening: got {opening:g} m, expected {low:g} to {high:g} m, what the gripper can open")
+            self._settings.check_opening("opening", opening)
         return round(min(max(self.counts_of(opening), 0.0), float(LARGEST_BYTE)))
 
     def speed_of(self, byte: int) -> float:
@@ -124,8 +130,7 @@ class GripperScale:
         if force is not None:
             raise TargetError(f"force {force!r} N and current {current!r} A: expected one of them")
         low, high = self._least_current, self._largest_current
-        is_number = isinstance(current, int | float) and not isinstance(current, bool)
-        if not (is_number and low - ROUNDING <= current <= high + ROUNDING):
+        if not (is_number(current) and low - ROUNDING <= current <= high + ROUNDING):
             raise TargetError(f"current: got {current!r} A, expected {low:g} to {high:g} A")
         return self.force_of(current)
 
