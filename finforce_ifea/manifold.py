@@ -1,0 +1,117 @@
+"""Equilibria of a jaw over depth and height of a pressing rod, each with its compliance; knows no object, no target.
+
+Between the stored equilibria of the manifold everything is interpolated. A load that differs from the manifold's own,
+as that of any other object does, moves the jaw by the compliance of the nearest equilibrium: with coordinates m (depth
+and height on the grid), loads lambda on the inner face, stored loads lambda_m, shapes u_m and compliances C_m,
+
+    u = u_m + C_m (lambda - lambda_m).
+
+In a linear jaw that is exact for every load; large rotations enter by m alone.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+_OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz"}}
+STENCIL = 4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Manifold:
+    """Stored equilibria on a grid of T depths (the first is zero) by Z heights of the rod that made them.
+
+    Loads and motions of the inner face belong to its n rows: x and z of each, interleaved (2 n,).
+
+    Attributes:
+        young_modulus: of the jaw that was pressed [Pa]; loads are in proportion to it.
+        heights: of the clamp and the rows (n + 1,) [m].
+        rods: heights of the rod (Z,) [m].
+        depths: largest depth of the rod at each height (Z,) [m]; the grid divides it evenly.
+        loads: (T, Z, 2 n) [N].
+        moves: of the rows (T, Z, 2 n) [m].
+        compliance: of the rows (T, Z, 2 n, 2 n) [m/N], in single precision.
+        shapes: of the whole jaw in the basis (T, Z, r) [m].
+        shape_compliance: (T, Z, r, 2 n) [m/N], in single precision.
+        basis: the unknowns of the full model per shape (size, r), orthonormal.
+    """
+
+    young_modulus: float
+    heights: NDArray
+    rods: NDArray
+    depths: NDArray
+    loads: NDArray
+    moves: NDArray
+    compliance: NDArray
+    shapes: NDArray
+    shape_compliance: NDArray
+    basis: NDArray
+
+
+@njit(**_OPTIONS)
+def weigh_cubic(x, count, weights, slopes):
+    """Writes the four weights of cubic Lagrange interpolation at x on 0 ... count - 1 and their derivatives.
+
+    Returns:
+        The first of the four nodes.
+    """
+    first = min(max(int(np.floor(x)) - 1, 0), count - STENCIL)
+    s = x - first
+    a, b, c = s - 1.0, s - 2.0, s - 3.0
+    weights[0], weights[1], weights[2], weights[3] = (
+        -a * b * c / 6.0,
+        s * b * c / 2.0,
+        -s * a * c / 2.0,
+        s * a * b / 6.0,
+    )
+    slopes[0] = -(b * c + a * c + a * b) / 6.0
+    slopes[1] = (b * c + s * c + s * b) / 2.0
+    slopes[2] = -(a * c + s * c + s * a) / 2.0
+    slopes[3] = (a * b + s * b + s * a) / 6.0
+    return first
+
+
+@njit(**_OPTIONS)
+def interpolate(table, m, out):
+    """Writes the values out (k,) of a table (T, Z, k) at grid coordinates m (2,)."""
+    wt, wz, slope = np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL)
+    t, z = weigh_cubic(m[0], table.shape[0], wt, slope), weigh_cubic(m[1], table.shape[1], wz, slope)
+    out[:] = 0.0
+    for i in range(STENCIL):
+        for j in range(STENCIL):
+            weight, row = wt[i] * wz[j], table[t + i, z + j]
+            for k in range(len(out)):
+                out[k] += weight * row[k]
+
+
+@njit(**_OPTIONS)
+def interpolate_slopes(table, m, step, out):
+    """Writes every `step`-th pair of derivatives out (2, k) of a table (T, Z, 2 n) by the grid coordinates m (2,)."""
+    wt, wz, dt, dz = np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL)
+    t, z = weigh_cubic(m[0], table.shape[0], wt, dt), weigh_cubic(m[1], table.shape[1], wz, dz)
+    out[:] = 0.0
+    for i in range(STENCIL):
+        for j in range(STENCIL):
+            along_t, along_z, row = dt[i] * wz[j], wt[i] * dz[j], table[t + i, z + j]
+            for k in range(out.shape[1] // 2):
+                for a in range(2):
+                    value = row[2 * step * k + a]
+                    out[0, 2 * k + a] += along_t * value
+                    out[1, 2 * k + a] += along_z * value
+
+
+@njit(**_OPTIONS)
+def blend(table, m, rows, first, last, out):
+    """Writes out (len(rows), last - first): rows and columns of a table (T, Z, p, q), linear between grid points."""
+    t = min(max(int(np.floor(m[0])), 0), table.shape[0] - 2)
+    z = min(max(int(np.floor(m[1])), 0), table.shape[1] - 2)
+    a, b = m[0] - t, m[1] - z
+    w00, w01, w10, w11 = (1.0 - a) * (1.0 - b), (1.0 - a) * b, a * (1.0 - b), a * b
+    for i in range(len(rows)):
+        c00, c01 = table[t, z, rows[i]], table[t, z + 1, rows[i]]
+        c10, c11 = table[t + 1, z, rows[i]], table[t + 1, z + 1, rows[i]]
+        for j in range(last - first):
+            k = first + j
+            out[i, j] = w00 * c00[k] + w01 * c01[k] + w10 * c10[k] + w11 * c11[k]

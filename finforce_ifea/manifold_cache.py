@@ -1,0 +1,98 @@
+"""Manifolds that were built before: found again by a hash of everything that they depend on; knows no mechanics.
+
+The folder is `$FINFORCE_CACHE`, else `finforce` in the user's cache folder. What cannot be read is built anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import fields
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.manifold import Manifold
+
+# To be raised when what is stored, or how it is found, changes.
+VERSION = 1
+_LOG = logging.getLogger(__name__)
+
+
+def hash_parts(*parts: NDArray | str | float) -> str:
+    """Returns a name (32 hexadecimal digits) for arrays, texts and numbers, to the last bit."""
+    digest = hashlib.sha256(f"manifold {VERSION}".encode())
+    for part in parts:
+        array = np.ascontiguousarray(part) if isinstance(part, np.ndarray) else None
+        digest.update(f"|{part!r}|".encode() if array is None else f"|{array.dtype}{array.shape}|".encode())
+        if array is not None:
+            digest.update(array.tobytes())
+    return digest.hexdigest()[:32]
+
+
+def cache_folder() -> Path:
+    """Returns the folder of the cache, which may not exist yet."""
+    named = os.environ.get("FINFORCE_CACHE")
+    if named:
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "finforce"
+
+
+def fetch_manifold(key: str, build: Callable[[], Manifold]) -> Manifold:
+    """Returns the stored manifold of a key, or builds and stores it; of two processes one builds.
+
+    A folder that cannot be written costs a warning and the time to build anew.
+    """
+    path = cache_folder() / f"{key}.npz"
+    found = _read(path)
+    if found is not None:
+        return found
+    with _locked(path):
+        found = _read(path)
+        if found is None:
+            found = build()
+            _write(path, found)
+    return found
+
+
+def _read(path: Path) -> Manifold | None:
+    """Returns a stored manifold, None when there is none that can be read."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            values = {field.name: stored[field.name] for field in fields(Manifold)}
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        _LOG.warning("the stored equilibria %s cannot be read (%s); they are built anew", path.name, error)
+        return None
+    values["young_modulus"] = float(values["young_modulus"])
+    return Manifold(**values)
+
+
+def _write(path: Path, manifold: Manifold) -> None:
+    """Stores a manifold, whole or not at all."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
+            np.savez(part, **{field.name: getattr(manifold, field.name) for field in fields(Manifold)})
+        os.replace(part.name, path)
+    except OSError as error:
+        _LOG.warning("the equilibria cannot be stored in %s (%s); the next start builds them anew", path.parent, error)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Keeps other processes from building the same; where locks cannot be had, both build."""
+    with ExitStack() as stack:
+        with suppress(ImportError, OSError):
+            import fcntl
+
+            path.parent.mkdir(parents=True, exist_ok=True)
+            fcntl.flock(stack.enter_context(path.with_suffix(".lock").open("w")), fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,122 @@
+"""The jaw by its stored equilibria: full geometric nonlinearity without an element; knows no key point targets.
+
+The unknowns q (2 n + 2,) are the loads on the n rows of the inner face (x and z interleaved) [N], whatever presses, and
+the grid coordinates of the stored equilibrium that is nearest in shape. See `finforce_ifea.manifold`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.factor import Factor
+from finforce_ifea.manifold import Manifold
+from finforce_ifea.model import LARGEST_MOVE, JawModel, Linearization
+from finforce_ifea.reduced_loops import find_grid_step, move_points, place_points, place_rows
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReducedProbe:
+    """Material points of a reduced jaw.
+
+    Attributes:
+        points: undeformed positions (p, 3) [m].
+        shapes: their motions at the stored equilibria (T, Z, 3 p) [m].
+        compliance: what loads on the rows do to them (T, Z, 3 p, 2 n) [m/N], in single precision.
+        rows: what share each row has in a point (p, n), for loads.
+    """
+
+    points: NDArray
+    shapes: NDArray
+    compliance: NDArray
+    rows: NDArray
+
+
+class _Identity:
+    """The factor of loads that are unknowns themselves."""
+
+    def solve(self, b: NDArray) -> NDArray:
+        """Returns b."""
+        return np.asarray(b)
+
+
+class ReducedModel:
+    """A jaw of stored equilibria; see `finforce_ifea.model.JawModel`. No springs can be added to its tangent.
+
+    Attributes:
+        size: number of unknowns.
+        reach: largest change of each unknown at once (size,).
+    """
+
+    rotations = None
+
+    def __init__(self, manifold: Manifold, full: JawModel, young_modulus: float) -> None:
+        """Scales a manifold to a modulus [Pa] of the jaw that `full` describes."""
+        factor = young_modulus / manifold.young_modulus
+        self.manifold, self._full = manifold, full
+        self.rows = manifold.loads.shape[2]
+        self.size = self.rows + 2
+        self.loads = manifold.loads * factor
+        self.compliance = manifold.compliance * np.float32(1.0 / factor)
+        self.shape_compliance = manifold.shape_compliance * np.float32(1.0 / factor)
+        stiffness = LARGEST_MOVE / np.abs(np.diagonal(self.compliance[0, 0]))
+        self.reach = np.r_[stiffness, np.inf, np.inf]
+
+    def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
+        """Returns the loads that q (size,) holds, and how far its grid coordinates are from the nearest equilibrium."""
+        moves = self.moves(q)
+        step = find_grid_step(self.manifold.moves, moves, q[-2:])
+        force = np.r_[q[:-2], -step]
+        return Linearization(force=force, energy=0.5 * float(moves @ q[:-2]), smallest_det=1.0, tangent=None)
+
+    def moves(self, q: NDArray) -> NDArray:
+        """Returns the motions of the rows (2 n,) [m], x and z interleaved."""
+        return place_rows(self.manifold.moves, self.compliance, self.loads, q)
+
+    def attach(self, points: NDArray, max_distance: float = 1e-3) -> ReducedProbe:
+        """Returns a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
+        points = np.array(points, float)
+        full, basis, zero = self._full, self.manifold.basis, np.zeros(self._full.size)
+        motion = full.project(full.attach(points, max_distance), zero, basis).reshape(3 * len(points), -1)
+        return ReducedProbe(
+            points=points,
+            shapes=self.manifold.shapes @ motion.T,
+            compliance=np.ascontiguousarray(motion.astype(np.float32) @ self.shape_compliance),
+            rows=share_rows(self.manifold.heights, points[:, 2]),
+        )
+
+    def positions(self, probe: ReducedProbe, q: NDArray) -> NDArray:
+        """Returns the deformed positions (p, 3) [m] of a probe."""
+        return place_points(probe.points, probe.shapes, probe.compliance, self.loads, q)
+
+    def project(self, probe: ReducedProbe, q: NDArray, modes: NDArray) -> NDArray:
+        """Returns the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the unknowns."""
+        return move_points(probe.compliance, q, np.ascontiguousarray(modes))
+
+    def load(self, probe: ReducedProbe, q: NDArray, forces: NDArray) -> NDArray:
+        """Returns the loads (size,) [N] at the rows of forces (p, 3) [N] at points of the inner face."""
+        return np.r_[(probe.rows.T @ forces[:, [0, 2]]).ravel(), 0.0, 0.0]
+
+    def factorise(self, tangent: None) -> Factor:
+        """Returns the factor of the unknowns, which are loads."""
+        return _Identity()
+
+    def vertices(self, q: NDArray) -> NDArray:
+        """Returns the deformed mesh vertices (v, 3) [m], in mesh order."""
+        still = np.zeros((self.manifold.basis.shape[1], 1))
+        shape = place_points(still, self.manifold.shapes, self.shape_compliance, self.loads, q)
+        return self._full.vertices(self.manifold.basis @ shape.ravel())
+
+
+def share_rows(heights: NDArray, places: NDArray) -> NDArray:
+    """Returns what share each row has in points at `places` (p,) [m] along the face, (p, n), linear between rows.
+
+    Args:
+        heights: of the clamp, where the jaw is held, and of the rows (n + 1,) [m].
+        places: of the points (p,) [m].
+    """
+    below = np.clip(np.searchsorted(heights, places) - 1, 0, len(heights) - 2)
+    upper = np.clip((places - heights[below]) / (heights[below + 1] - heights[below]), 0.0, 1.0)
+    shares, points = np.zeros((len(places), len(heights))), np.arange(len(places))
+    shares[points, below], shares[points, below + 1] = 1.0 - upper, upper
+    return shares[:, 1:]

@@ -1,0 +1,46 @@
+"""Work that a scene does not need: the rules by name, and how often each was applied; knows no ROS and no jaw."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+
+from finforce_errors import FinforceError
+
+ALL = "all"
+
+
+class SkippingError(FinforceError):
+    """A rule that is to be switched off does not exist."""
+
+
+class Skips:
+    """The rules of one node: which may be applied, and how often each was.
+
+    Args:
+        rules: names of the rules that the node has.
+        off: names of rules that are not to be applied; "all" for none of them.
+
+    Raises:
+        SkippingError: a name in `off` is no rule of the node.
+    """
+
+    def __init__(self, rules: Sequence[str], off: Collection[str] = ()) -> None:
+        unknown = sorted(set(off) - {*rules, ALL, ""})
+        if unknown:
+            raise SkippingError(f"skip_off: there is no rule {unknown[0]!r}; expected {', '.join(rules)} or {ALL}")
+        self._rules = tuple(rules)
+        self._off = frozenset(rules if ALL in off else off)
+        self._counts: Counter[str] = Counter()
+
+    def allows(self, rule: str) -> bool:
+        """Returns whether a rule may be applied."""
+        return rule not in self._off
+
+    def count(self, rule: str) -> None:
+        """Notes that a rule has saved its work once."""
+        self._counts[rule] += 1
+
+    def describe(self) -> dict[str, str]:
+        """Returns, for the diagnostics, how often each rule saved its work, or that it is off."""
+        return {f"skipped: {rule}": str(self._counts[rule]) if self.allows(rule) else "off" for rule in self._rules}
