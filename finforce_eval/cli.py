@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import NoReturn
 
-SOLVERS = ("default", "solid", "frame", "paper")
+SOLVERS = ("default", "reduced", "solid", "frame", "linear", "paper")
 MESHES = ("default", "coarse", "fine")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 CONTACT_HELP = (
@@ -42,6 +42,7 @@ def build_parser() -> Parser:
     _add_twin(commands)
     _add_demo(commands)
     _add_bench(commands)
+    _add_stress(commands)
     _add_steel(commands)
     _add_reconstruct(commands)
     version = commands.add_parser("version", help="print the version")
@@ -175,11 +176,30 @@ def _add_demo(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_bench(commands: argparse._SubParsersAction) -> None:
-    text = "measure the time of a solver step and the memory of a solver, single-threaded"
+    text = "measure run time against error of every solver tier and of what comes before it, and how cost grows"
     parser = commands.add_parser("bench", help=text, description=text)
+    text = "recordings of the bench finger to be solved, too; without it shapes of an independent program alone"
+    parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
+    text = "solvers, growth, localization, detection, chain, nodes, live; without it those that take minutes together"
+    parser.add_argument("--parts", metavar="A,B", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
-    parser.add_argument("--frames", type=int, default=1300, metavar="N", help="frames per solver (1300)")
+    text = "draw the first part, and every other beside it with its name added"
+    parser.add_argument("--figure", metavar="PNG", help=text)
+    parser.add_argument("--quick", action="store_true", help="fewer cases and no slow tier, to try it out")
     parser.set_defaults(run="finforce_eval.bench:run_bench")
+
+
+def _add_stress(commands: argparse._SubParsersAction) -> None:
+    text = "put numbers that no bench gives to the estimators: an answer is right within what it states, or not sure"
+    parser = commands.add_parser("stress", help=text, description=text)
+    parser.add_argument("--families", metavar="A,B", help="families of trials, all without; a wrong one lists them")
+    parser.add_argument("--count", type=int, metavar="N", help="trials per family; without, as many as each takes")
+    parser.add_argument("--seed", type=int, default=0, help="of everything that is drawn (0)")
+    parser.add_argument("--solver", default="default", choices=SOLVERS, help="model and objective")
+    parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
+    parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
+    parser.add_argument("--report", metavar="DIR", help="write a page with every family by level")
+    parser.set_defaults(run="finforce_eval.stress_command:run_stress")
 
 
 def _add_steel(commands: argparse._SubParsersAction) -> None:

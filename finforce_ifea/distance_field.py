@@ -46,7 +46,8 @@ def build_distance_field(polygons: tuple[NDArray, ...]) -> DistanceField:
     Raises:
         ContactError: The polygons span less than a cell of the grid.
     """
-    segments = np.concatenate([np.hstack([p, np.roll(p, -1, axis=0)]) for p in polygons])
+    # of one type, so that nothing is compiled anew while a jaw waits
+    segments = np.concatenate([np.hstack([p, np.roll(p, -1, axis=0)]) for p in polygons]).astype(float)
     low, high = segments[:, :2].min(0), segments[:, :2].max(0)
     if (high - low < CELL).any():
         raise ContactError(f"the outline spans {1e3 * (high - low)} mm, expected at least {1e3 * CELL:g} mm")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.away import AwayWatch
 from finforce_ifea.calibration import Calibration
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
 from finforce_ifea.gate import KeypointGate
@@ -17,27 +18,35 @@ from finforce_ifea.observation import (
     blank_solution,
     check_contact,
     check_observation,
+    sketch_contact,
 )
+from finforce_ifea.outline import ObjectOutline
 from finforce_ifea.point_tracking import PointTracker
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.taring import TareKeeper, TareReport
 from finforce_ifea.track import Track, compute_magnitude_stddev
 from finforce_ifea.tracking import PlaceTracker
+from finforce_ifea.verdict import find_doubt
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 
 _LONGEST_GAP = 1.0
 _BESIDE = 1e-3
 _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
-# Beyond these a force is not reported: misfit of the shape, stiffening, standard deviation [N], its share of the force.
-_LARGEST_MISFIT = 2.0
-_LARGEST_STIFFENING = 5.0
-_VAGUE_FORCE, _VAGUE_SHARE = 1.0, 0.25
+# Relative standard deviation of forces without a calibration.
+_UNCALIBRATED = 0.1
+# Share of a force that nobody has seen along z.
+_LEAN = 0.3
 
 
 class JawEstimator:
-    """Estimates the force on one jaw; deterministic, one thread."""
+    """Estimates the force on one jaw; deterministic, one thread.
+
+    Attributes:
+        spares: whether a jaw at rest is left alone while its object is out of reach.
+        spared: whether the last image was such a one.
+    """
 
     def __init__(
         self, jaw: Jaw, *, settings: EstimatorSettings | None = None, calibration: Calibration | None = None
@@ -52,32 +61,47 @@ class JawEstimator:
         self.jaw = calibration.apply(jaw) if calibration else jaw
         self.mechanics: Mechanics = build_mechanics(self.jaw, self.settings)
         self._rolling = PlaceTracker(self.mechanics.contact, self.jaw.keypoints, self.settings)
-        self._pointed = PointTracker(self.jaw, self.mechanics, self.settings)
+        self._pointed = PointTracker(self.jaw, self.mechanics, self.settings, self._rolling.response)
         self._tracker: PlaceTracker | PointTracker = self._rolling
         self._gate = KeypointGate(self.jaw, self.settings)
         self._relaxation = Relaxation(calibration.relaxation if calibration else ())
-        self._force_error = calibration.force_error if calibration else 0.1
+        solver = self.settings.solver
+        self._force_error = calibration.expect_error(self.jaw, solver) if calibration else _UNCALIBRATED
         self._taring = TareKeeper(
             self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
         )
+        self._away = AwayWatch(self.jaw.keypoints, self.jaw.inner_face_x, self._rolling.rest_modes)
+        self.spares, self.spared = True, False
         self.reset()
 
     def reset(self) -> None:
         """Forgets everything but the jaw: offsets, place, relaxation, stamps."""
         self._stamp: float | None = None
         self._contact: Contact | None = None
+        self._at_rest = False
         self._relaxed: float | None = None
         self._taring.reset()
         self._gate.reset()
+        self._away.reset()
         self._relaxation.reset()
         self._rolling.reset()
         self._pointed.reset()
 
     def warm_up(self) -> None:
         """Compiles what is compiled on first use, and leaves no trace."""
-        for tracker in (self._rolling, self._pointed):
+        for tracker in (self._rolling, self._pointed, self._rolling):
             tracker.update(self.jaw.keypoints.copy(), self._taring.tare, 0.03)
+            self._rolling.follow(self._imagine_contact())
+        self._rolling.follow(sketch_contact(self.jaw))
+        self._rolling.update(self.jaw.keypoints.copy(), self._taring.tare, 0.03)
         self.reset()
+
+    def _imagine_contact(self) -> Contact:
+        """Returns a contact with an outline, a block before the middle of the jaw."""
+        place = np.array([self.jaw.inner_face_x, float(np.median(self.jaw.candidates[:, 2]))])
+        block = 0.01 * np.array([[0.0, -1.0], [2.0, -1.0], [2.0, 1.0], [0.0, 1.0]])
+        outline = ObjectOutline(polygons=(block,), origin=place, tilt=0.0, stddev=np.full(3, 1e-3))
+        return replace(Contact.fixed(self.jaw, float(place[1])), outline=outline)
 
     @property
     def tared(self) -> bool:
@@ -117,7 +141,7 @@ class JawEstimator:
         self._stamp = observation.stamp
         points = self._gate.accept(observation)
         self._taring.add(points, observation.stddev, apart=contact is not None and contact.touching is False)
-        used = np.isfinite(points[:, 0])
+        used, self.spared = np.isfinite(points[:, 0]), False
         if used.sum() < self.settings.minimum_keypoints:
             seen = f"{int(used.sum())} of {len(used)} key points can be used"
             return self._fail("not_enough_points", seen, used)
@@ -126,6 +150,9 @@ class JawEstimator:
             return self._fail("waiting", waiting, used)
         if contact is None or not len(contact.points):
             return self._without_contact(points, used)
+        if self.spares and self.tared and self._away.is_idle(contact, points, self._taring.tare):
+            self.spared = True
+            return self._rest("the object is out of reach, the jaw is at rest", points)
         try:
             track = self._tracker.update(points, self._taring.tare, min(dt, _LONGEST_GAP), observation.stddev)
         except UnobservableError as error:
@@ -178,13 +205,26 @@ class JawEstimator:
     def _without_contact(self, points: NDArray, used: NDArray) -> Solution:
         """Says what can be said without an object: nothing presses, or it cannot be known where."""
         if self._taring.is_at_rest(points):
-            self._taring.note(quiet=True, loaded=False)
-            self._relax(np.zeros(3))
-            if self._tracker.q.any():  # the shape of a load that has gone
-                self._tracker.reset()
-            rest = blank_solution(self._stamp, "unloaded", "no object, the jaw is at rest", used)
-            return replace(rest, converged=True)
+            return self._rest("no object, the jaw is at rest", points)
         return self._fail("no_contact", "the jaw is bent but no contact is known", used)
+
+    def _rest(self, message: str, points: NDArray) -> Solution:
+        """Says that nothing presses, as far as the key points (K, 3) [m] tell it."""
+        self._taring.note(quiet=True, loaded=False)
+        self._relax(np.zeros(3))
+        if not self._at_rest:  # the shape of a load that has gone
+            self._tracker.reset()
+            self._contact, self._at_rest = None, True
+        response, used = self._rolling.response, np.isfinite(points[:, 0])
+        deviations = points - self.jaw.keypoints - self._taring.tare.offsets
+        stddev = response.bound_force(deviations, self.settings.offset_stddev)
+        return replace(
+            blank_solution(self._stamp, "unloaded", message, used),
+            converged=True,
+            force_stddev=stddev * np.array([1.0, 0.0, _LEAN]),
+            torque_stddev=np.array([0.0, stddev * response.heights[-1], 0.0]),
+            magnitude_stddev=stddev,
+        )
 
     def _fail(self, status: str, message: str, used: NDArray, iterations: int = 0) -> Solution:
         """Returns a solution without force."""
@@ -192,6 +232,7 @@ class JawEstimator:
 
     def _conclude(self, track: Track | None, used: NDArray) -> Solution:
         """Turns a track into a solution."""
+        self._at_rest = False
         if track is None:
             return self._fail("not_enough_points", "too few key points agree with the jaw's shape", used)
         used = track.weights > 0
@@ -199,30 +240,12 @@ class JawEstimator:
             self._tracker.reset()
             self._contact = None
             return self._fail("diverged", "the shape cannot be reached by the jaw", used, track.iterations)
-        doubt = self._doubt(track)
+        doubt = find_doubt(track, settles=self.settings.solver != "paper")
         if doubt:
             return self._fail("unobservable", doubt, used, track.iterations)
         self._taring.note(quiet=track.quiet, loaded=track.loaded)
         force = self._relax(track.force)
         return self._solution(track, force, used)
-
-    def _doubt(self, track: Track) -> str:
-        """Returns why a track must not be believed, empty when it may."""
-        if not track.converged and self.settings.solver != "paper":
-            return f"the shape has not settled within {track.iterations} iterations; is the contact's place right?"
-        if track.misfit > _LARGEST_MISFIT:
-            return (
-                f"the key points do not fit this contact ({track.misfit:.1f} standard deviations); is its place right?"
-            )
-        if track.stiffening > _LARGEST_STIFFENING:
-            return (
-                f"the jaw seems {track.stiffening:.0f} times as stiff as at the given height; is the contact elsewhere?"
-            )
-        magnitude = float(np.linalg.norm(track.force))
-        stddev = compute_magnitude_stddev(track.force, track.force_modes, track.covariance)
-        if not stddev <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
-            return f"the visible key points tell the force only within {stddev:.2g} N"
-        return ""
 
     def _relax(self, elastic: NDArray) -> NDArray:
         """Returns the force (3,) [N] that the material gives for an elastic force (3,) [N] now."""
@@ -230,16 +253,25 @@ class JawEstimator:
         self._relaxed = self._stamp
         return self._relaxation.update(elastic, dt)
 
+    @staticmethod
+    def _torque_stddev(track: Track, arm: NDArray, stddev: NDArray) -> float:
+        """Returns the standard deviation [N m] of the torque by those of the force (3,) [N] and of its height."""
+        by_force = np.hypot(arm[0] * stddev[2], arm[2] * stddev[0])
+        return float(np.hypot(by_force, track.force[0] * track.place_stddev))
+
     def _solution(self, track: Track, force: NDArray, used: NDArray) -> Solution:
         magnitude = float(np.linalg.norm(force))
         loaded = magnitude > 0.0
-        covariance = (
-            track.force_modes @ track.covariance @ track.force_modes.T + np.outer(force, force) * self._force_error**2
-        )
+        # the mechanics errs in the direction as in the magnitude
+        covariance = track.force_modes @ track.covariance @ track.force_modes.T
+        fit = compute_magnitude_stddev(track.force, track.force_modes, track.covariance)
+        share = np.hypot(self._force_error, track.place_error)
+        covariance += (share * magnitude) ** 2 * np.diag([1.0, 0.0, 1.0])
+        # a larger force leans more: where it is hardly known, its direction is not known either
+        covariance[2, 2] += (_LEAN * fit**2 / max(magnitude + fit, 1e-300)) ** 2
         stddev = np.sqrt(np.diag(covariance))
         arm = track.pressure_point * [1.0, 0.0, 1.0]
-        fit = compute_magnitude_stddev(track.force, track.force_modes, track.covariance)
-        total = np.hypot(fit, self._force_error * magnitude)
+        total = np.hypot(fit, share * magnitude)
         unknown = np.full(3, np.nan)
         return Solution(
             stamp=self._stamp,
@@ -248,7 +280,7 @@ class JawEstimator:
             force=force,
             torque=np.array([-arm[2] * force[1], arm[2] * force[0] - arm[0] * force[2], arm[0] * force[1]]),
             force_stddev=stddev,
-            torque_stddev=np.array([0.0, np.hypot(arm[0] * stddev[2], arm[2] * stddev[0]), 0.0]),
+            torque_stddev=np.array([0.0, self._torque_stddev(track, arm, stddev), 0.0]),
             magnitude_stddev=float(total),
             contact_point=arm if loaded else unknown,
             contact_place=track.pressure_place * [1.0, 0.0, 1.0] if loaded else unknown,
@@ -258,4 +290,5 @@ class JawEstimator:
             keypoints_used=used,
             iterations=track.iterations,
             converged=track.converged,
+            condition=track.condition,
         )

@@ -9,14 +9,18 @@ from numpy.typing import NDArray
 
 from finforce_ifea.errors import ContactError
 from finforce_ifea.model import JawModel
-from finforce_ifea.penalty import PenaltyContact, press_box, press_cylinder
+from finforce_ifea.penalty import PenaltyContact, measure_penalty_energy, press_box, press_cylinder
 from finforce_ifea.rolling import limit_step
 from finforce_ifea.surface import ContactSurface
 
-_TOLERANCE = 1e-8
+# Of the last Newton step: absolute [m], and as a share of the depth.
+_TOLERANCE, _FINE = 1e-8, 1e-6
 _ITERATIONS = 60
 _LONGEST_STEP = 0.5e-3
 _SHORTEST_STEP = 1e-6
+# A falling force that loses more than this share of the step's work, or any that gains as much, is a snap to another
+# shape; smooth limit points keep the balance within 3 %.
+_SNAP = 0.1
 
 
 class RigidObject(Protocol):
@@ -105,71 +109,86 @@ def press_jaw(
         depths: rising depths [m]; steps between them are cut to half a millimetre, and further where needed.
 
     Raises:
-        ContactError: No equilibrium is found; the message says at which depth.
+        ContactError: No stable equilibrium is found that is reached without a snap; the message says at which depth.
     """
-    q, reached, results = np.zeros(model.size), 0.0, []
+    setting = _Setting(model=model, surface=surface, face_x=face_x, rigid=rigid, height=height)
+    state, reached, results = _State(q=np.zeros(model.size), push=0.0, energy=0.0, iterations=0), 0.0, []
     for depth in depths:
         iterations, step = 0, _LONGEST_STEP
         while reached < depth - 1e-12:
             target = min(reached + step, depth)
-            trial = _find_equilibrium(model, surface, q, face_x, rigid, target, height)
-            if trial is not None:
-                q, reached, iterations = trial.q, target, iterations + trial.iterations
+            trial = _find_equilibrium(setting, state.q, target)
+            if trial is not None and not _snaps(state, trial, target - reached):
+                state, reached, iterations = trial, target, iterations + trial.iterations
                 continue
             step *= 0.5
             if step < _SHORTEST_STEP:
                 raise ContactError(
                     f"no equilibrium beyond a depth of {1e3 * reached:.3f} mm: the jaw buckles or slips off"
                 )
-        results.append(_describe(model, surface, q, face_x, rigid, depth, height, iterations))
+        results.append(_describe(setting, state.q, depth, iterations))
     return results
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Trial:
+class _Setting:
+    """What is pressed, and on what."""
+
+    model: JawModel
+    surface: ContactSurface
+    face_x: float
+    rigid: RigidObject
+    height: float
+
+    def press(self, points: NDArray, depth: float) -> PenaltyContact:
+        """Returns the contact with the surface's points (p, 3) [m] at a depth [m]."""
+        return self.rigid.press(points, self.surface.stiffness, self.face_x, depth, self.height)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _State:
+    """An equilibrium: unknowns, force against the object [N], energy of jaw and surface [J], Newton iterations."""
+
     q: NDArray
+    push: float
+    energy: float
     iterations: int
 
 
-def _find_equilibrium(
-    model: JawModel,
-    surface: ContactSurface,
-    q: NDArray,
-    face_x: float,
-    rigid: RigidObject,
-    depth: float,
-    height: float,
-) -> _Trial | None:
-    """Returns the equilibrium at `depth` by Newton's method, or None when it does not converge."""
+def _find_equilibrium(setting: _Setting, q: NDArray, depth: float) -> _State | None:
+    """Returns the stable equilibrium at `depth` by Newton's method, or None when it finds none."""
+    model, surface, tolerance = setting.model, setting.surface, min(_TOLERANCE, _FINE * depth)
     for iteration in range(1, _ITERATIONS + 1):
-        points = model.positions(surface.probe, q)
-        contact = rigid.press(points, surface.stiffness, face_x, depth, height)
+        contact = setting.press(model.positions(surface.probe, q), depth)
         state = model.linearize(q)
         if not state.smallest_det > 0:
             return None
         model.stiffen(state.tangent, surface.probe, q, contact.springs)
-        load = model.load(surface.probe, q, contact.forces)
-        step = limit_step(model, model.factorise(state.tangent).solve(load - state.force))
+        load, factor = model.load(surface.probe, q, contact.forces), model.factorise(state.tangent)
+        step = limit_step(model, factor.solve(load - state.force))
         q = q + step
         if not np.isfinite(q).all():
             return None
-        if np.abs(step).max() < _TOLERANCE:
-            return _Trial(q=q, iterations=iteration)
+        if np.abs(step).max() < tolerance:
+            energy = state.energy + measure_penalty_energy(contact.forces, surface.stiffness)
+            push = -float(contact.forces[:, 0].sum())
+            return _State(q=q, push=push, energy=energy, iterations=iteration) if factor.positive else None
     return None
 
 
-def _describe(
-    model: JawModel,
-    surface: ContactSurface,
-    q: NDArray,
-    face_x: float,
-    rigid: RigidObject,
-    depth: float,
-    height: float,
-    iterations: int,
-) -> Press:
+def _snaps(before: _State, after: _State, way: float) -> bool:
+    """Whether the jaw has jumped to another shape over a way [m] of the object, or has let go of it."""
+    if before.push > 0.0 and after.push == 0.0:
+        return True
+    work = 0.5 * way * (before.push + after.push)
+    lost = work - (after.energy - before.energy)
+    return lost < -_SNAP * abs(work) or (after.push < before.push and lost > _SNAP * abs(work))
+
+
+def _describe(setting: _Setting, q: NDArray, depth: float, iterations: int) -> Press:
+    model, surface = setting.model, setting.surface
     points = model.positions(surface.probe, q)
-    forces = rigid.press(points, surface.stiffness, face_x, depth, height).forces
+    forces = setting.press(points, depth).forces
     size = np.linalg.norm(forces, axis=1)
     share = size / size.sum() if size.any() else np.full(len(size), np.nan)
     in_plane = np.array([1.0, 0.0, 1.0])

@@ -23,7 +23,7 @@ from finforce_ifea.errors import MeshError
 from finforce_ifea.factor import Factor, SparseFactor, factorise_banded, sparse_from_banded
 from finforce_ifea.jaw_parts import Material
 from finforce_ifea.mesh import VolumeMesh
-from finforce_ifea.model import Linearization
+from finforce_ifea.model import LARGEST_MOVE, LARGEST_TURN, Linearization
 
 _SHEAR_CORRECTION = 5.0 / 6.0
 # At a stiff joint the band does not bend over a share of the rib's thickness, and the rib bends into the band
@@ -84,6 +84,7 @@ class FrameModel:
         dof = self.beams.dof.reshape(-1, 8)
         self.bandwidth = int(np.where(dof < self.size, dof - dof.min(1, keepdims=True), 0).max())
         self.rotations = np.isin(np.arange(self.size), self.beams.dof[:, :, 2:])
+        self.reach = np.where(self.rotations, LARGEST_TURN, LARGEST_MOVE)
         self._vertices = None if mesh is None else self.attach(mesh.nodes)
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:

@@ -5,6 +5,7 @@ logarithmic radius, of a known outline its tilt.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -131,6 +132,26 @@ class ExpectedObject:
     variance: NDArray
 
 
+class _Shape:
+    """Polygons (n, 2) [m] that know their equals, so that what was built from them can be found again."""
+
+    def __init__(self, polygons: tuple[NDArray, ...]) -> None:
+        self.polygons = polygons
+        self._key = tuple(np.asarray(polygon, float).tobytes() for polygon in polygons)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Shape) and self._key == other._key
+
+
+@lru_cache(maxsize=8)
+def _build_outline(shape: _Shape) -> OutlineIndenter:
+    """Returns the object of some polygons, the same one as before if they came lately."""
+    return OutlineIndenter(shape.polygons)
+
+
 def expect_object(contact: Contact, settings: EstimatorSettings, known: Indenter | None = None) -> ExpectedObject:
     """Returns the object of a contact: its outline, or a cylinder about the height of the points.
 
@@ -149,7 +170,7 @@ def expect_object(contact: Contact, settings: EstimatorSettings, known: Indenter
         own = np.array([settings.radius_log_stddev, settings.height_stddev])
         return ExpectedObject(indenter=RoundIndenter(), mean=mean, variance=own**2)
     same = isinstance(known, OutlineIndenter) and known.describes(outline)
-    indenter = known if same else OutlineIndenter(outline.polygons)
+    indenter = known if same else _build_outline(_Shape(outline.polygons))
     own = np.array([settings.tilt_stddev, settings.height_stddev])
     mean = np.array([outline.tilt, outline.origin[1]])
     return ExpectedObject(indenter=indenter, mean=mean, variance=outline.stddev[[2, 1]] ** 2 + own**2)

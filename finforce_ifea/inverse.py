@@ -12,17 +12,15 @@ E = eps (|Q| / |W_aa|) W_aa with Q = W_ea^T W_ea and the maximum norm over rows,
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
+from finforce_ifea.errors import ContactError, NotEnoughDataError
 from finforce_ifea.model import JawModel
-from finforce_ifea.rolling import limit_step
+from finforce_ifea.program import UNBOUNDED, solve_program
+from finforce_ifea.rolling import limit_step, measure_step
 
 EnergyForm = Literal["paper", "sofa"]
-_UNBOUNDED = 1e30
-_SINGULAR = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,29 +59,33 @@ class InverseResult:
         forces: (n, 3) [N] on the jaw at each contact.
         compliance: W_ea (3 K, m) [m/N] of the active key points, weighted, at the last state.
         covariance: of the multipliers (m, m) if each active key point has variance 1 / precision along every axis.
+        bias: of the multipliers (m,), what the energy term takes from them: Q^-1 E lambda.
         directions: total force per unit multiplier (3, m).
         residual: root mean square distance of active key points from their targets [m].
         kkt: largest violation of the program's optimality conditions, scaled by its largest term.
         condition: condition number of the program's matrix.
         iterations: Newton iterations.
         converged: whether the last one changed nothing that matters.
+        smallest_det: smallest det F of all elements [-]; at or below zero the mesh has turned inside out.
     """
 
     q: NDArray
     forces: NDArray
     compliance: NDArray
     covariance: NDArray
+    bias: NDArray
     directions: NDArray
     residual: float
     kkt: float
     condition: float
     iterations: int
     converged: bool
+    smallest_det: float
     multipliers: NDArray = field(repr=False)
 
 
 def solve_inverse(
-    model: JawModel, problem: Problem, q: NDArray, *, iterations: int = 20, tolerance: float = 1e-8
+    model: JawModel, problem: Problem, q: NDArray, *, iterations: int = 20, tolerance: float = 5e-6
 ) -> InverseResult:
     """Solves an inverse problem, starting from the state q (size,).
 
@@ -104,36 +106,53 @@ def solve_inverse(
         solution = solve_program(step.hessian, step.gradient, step.lower)
         change = limit_step(model, step.free + step.modes @ solution.multipliers)
         q = q + change
-        settled = bool(np.abs(change).max() < tolerance)
+        settled = measure_step(model, change) < tolerance
     multipliers = solution.multipliers
     forces = np.einsum("ncj,j->nc", step.directions, multipliers)
     miss = (model.positions(problem.effectors, q) - problem.targets)[active]
+    covariance = np.linalg.pinv(step.compliance.T @ step.compliance)
     return InverseResult(
         q=q,
         forces=forces,
         compliance=step.compliance,
-        covariance=np.linalg.pinv(step.compliance.T @ step.compliance),
+        covariance=covariance,
+        bias=covariance @ (step.energy @ multipliers),
         directions=step.directions.sum(0),
         residual=float(np.sqrt((miss**2).sum(1).mean())),
         kkt=solution.kkt,
         condition=float(np.linalg.cond(step.hessian)),
         iterations=iteration,
         converged=settled,
+        smallest_det=step.smallest_det,
         multipliers=multipliers,
     )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _LinearStep:
-    """The program of one state: free motion (size,), modes (size, m), matrix, gradient, bounds, force directions."""
+    """The program of one state.
+
+    Attributes:
+        free: motion towards equilibrium without forces (size,).
+        modes: motions by multipliers (size, m).
+        hessian: (m, m), its energy term included.
+        energy: that term (m, m).
+        gradient: (m,).
+        lower: bounds (m,).
+        directions: forces per multiplier (n, 3, m).
+        compliance: W_ea (3 K, m), weighted.
+        smallest_det: of all elements.
+    """
 
     free: NDArray
     modes: NDArray
     hessian: NDArray
+    energy: NDArray
     gradient: NDArray
     lower: NDArray
     directions: NDArray
     compliance: NDArray
+    smallest_det: float
 
 
 def _linear_step(model: JawModel, problem: Problem, q: NDArray, active: NDArray) -> _LinearStep:
@@ -150,15 +169,17 @@ def _linear_step(model: JawModel, problem: Problem, q: NDArray, active: NDArray)
     W_ea = moved[:, :, :-1].reshape(-1, len(lower))
     delta_free = miss.ravel() + moved[:, :, -1].ravel()
     Q, W_aa = W_ea.T @ W_ea, G.T @ modes
-    hessian = Q + problem.energy_weight * scale_energy(Q, 0.5 * (W_aa + W_aa.T), problem.energy_form)
+    energy = problem.energy_weight * scale_energy(Q, 0.5 * (W_aa + W_aa.T), problem.energy_form)
     return _LinearStep(
         free=free,
         modes=modes,
-        hessian=hessian,
+        hessian=Q + energy,
+        energy=energy,
         gradient=W_ea.T @ delta_free,
         lower=lower,
         directions=directions,
         compliance=W_ea,
+        smallest_det=state.smallest_det,
     )
 
 
@@ -179,7 +200,7 @@ def _force_directions(model: JawModel, problem: Problem, q: NDArray) -> tuple[ND
     else:
         tangent = np.stack([-normals[:, 2], np.zeros(count), normals[:, 0]], axis=1)
         across = np.broadcast_to([0.0, 1.0, 0.0], (count, 3))
-        basis, lower = np.stack([normals, tangent, across], axis=2), np.array([0.0, -_UNBOUNDED, -_UNBOUNDED])
+        basis, lower = np.stack([normals, tangent, across], axis=2), np.array([0.0, -UNBOUNDED, -UNBOUNDED])
     if problem.weights is not None:
         share = problem.weights / problem.weights.sum()
         return basis * share[:, None, None], lower
@@ -195,57 +216,3 @@ def surface_normals(model: JawModel, neighbours: Any, q: NDArray) -> NDArray:
     along = points[1::2] - points[::2]
     normal = np.stack([along[:, 2], np.zeros(len(along)), -along[:, 0]], axis=1)
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ProgramSolution:
-    """The solution of a quadratic program and its scaled KKT residual."""
-
-    multipliers: NDArray
-    kkt: float
-
-
-def solve_program(hessian: NDArray, gradient: NDArray, lower: NDArray) -> ProgramSolution:
-    """Minimises x^T H x / 2 + g^T x over x >= lower.
-
-    Args:
-        hessian: H (m, m), symmetric.
-        gradient: g (m,).
-        lower: (m,); -1e30 where there is no bound.
-
-    Raises:
-        UnobservableError: H is singular: the key points do not tell the forces apart.
-    """
-    scale = np.sqrt(np.diag(hessian))
-    if not (np.isfinite(hessian).all() and (scale > 0).all()):
-        raise UnobservableError(
-            "a force moves no active key point; more of them must be seen, or an energy weight given"
-        )
-    H, g = hessian / np.outer(scale, scale), gradient / scale
-    if np.linalg.eigvalsh(H)[0] < _SINGULAR:
-        raise UnobservableError(
-            "the active key points do not tell the forces apart; give an energy weight or fewer contacts"
-        )
-    bound = np.where(lower <= -_UNBOUNDED, -_UNBOUNDED, lower * scale)
-    m = len(g)
-    size = max(np.abs(g).max(), 1e-300)
-    x, _, flag, _ = daqp.solve(
-        np.ascontiguousarray(H),
-        np.ascontiguousarray(g / size),
-        np.zeros((0, m)),
-        np.full(m, _UNBOUNDED),
-        bound / size,
-        np.zeros(m, np.int32),
-    )
-    if flag < 1:
-        raise UnobservableError(f"the quadratic program has no solution (daqp exit flag {flag})")
-    x = np.asarray(x) * size
-    return ProgramSolution(multipliers=x / scale, kkt=compute_kkt_residual(H, g, bound, x))
-
-
-def compute_kkt_residual(H: NDArray, g: NDArray, lower: NDArray, x: NDArray) -> float:
-    """Returns the largest violation, over |g|, of the optimality conditions of min x^T H x / 2 + g^T x, x >= lower."""
-    slope = H @ x + g
-    bounded = lower > -_UNBOUNDED
-    violation = np.where(bounded, np.minimum(x - lower, slope), slope)
-    return float(np.abs(violation).max() / max(np.abs(g).max(), 1e-300))

@@ -103,15 +103,36 @@ def interpolate_slopes(table, m, step, out):
 
 
 @njit(**_OPTIONS)
-def blend(table, m, rows, first, last, out):
-    """Writes out (len(rows), last - first): rows and columns of a table (T, Z, p, q), linear between grid points."""
+def _find_cell(table, m):
+    """Returns the lower grid point of the cell at m (2,) and the weights of its corners 00, 01, 10, 11."""
     t = min(max(int(np.floor(m[0])), 0), table.shape[0] - 2)
     z = min(max(int(np.floor(m[1])), 0), table.shape[1] - 2)
     a, b = m[0] - t, m[1] - z
-    w00, w01, w10, w11 = (1.0 - a) * (1.0 - b), (1.0 - a) * b, a * (1.0 - b), a * b
-    for i in range(len(rows)):
-        c00, c01 = table[t, z, rows[i]], table[t, z + 1, rows[i]]
-        c10, c11 = table[t + 1, z, rows[i]], table[t + 1, z + 1, rows[i]]
+    return t, z, (1.0 - a) * (1.0 - b), (1.0 - a) * b, a * (1.0 - b), a * b
+
+
+@njit(**_OPTIONS)
+def blend(table, m, low, high, first, last, out):
+    """Writes rows low to high, columns first to last of a table (T, Z, p, q), linear between grid points, to out."""
+    t, z, w00, w01, w10, w11 = _find_cell(table, m)
+    for i in range(high - low):
+        c00, c01 = table[t, z, low + i], table[t, z + 1, low + i]
+        c10, c11 = table[t + 1, z, low + i], table[t + 1, z + 1, low + i]
         for j in range(last - first):
             k = first + j
             out[i, j] = w00 * c00[k] + w01 * c01[k] + w10 * c10[k] + w11 * c11[k]
+
+
+@njit(**_OPTIONS)
+def add_product(table, m, vector, first, last, out):
+    """Adds the product of a table (T, Z, p, q), linear between grid points, with a vector (q,) to out (p,).
+
+    The vector is zero outside first to last.
+    """
+    t, z, w00, w01, w10, w11 = _find_cell(table, m)
+    for i in range(len(out)):
+        c00, c01, c10, c11 = table[t, z, i], table[t, z + 1, i], table[t + 1, z, i], table[t + 1, z + 1, i]
+        total = 0.0
+        for k in range(first, last):
+            total += (w00 * c00[k] + w01 * c01[k] + w10 * c10[k] + w11 * c11[k]) * vector[k]
+        out[i] += total

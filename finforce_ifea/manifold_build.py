@@ -11,19 +11,22 @@ from finforce_ifea.indenter import RoundIndenter
 from finforce_ifea.manifold import STENCIL, Manifold
 from finforce_ifea.mechanics import Mechanics
 from finforce_ifea.rolling import PressedState, RollingContact, limit_step
+from finforce_ifea.solid import SolidModel
 
-DEPTHS, HEIGHTS, SHAPES = 12, 27, 40
-# As shares of the face: radius of the rod, largest depth, where the rod is first, how far from the top it is last, and
-# the spacing of rows where the mesh has too many of its own.
-_ROD, _DEEPEST, _LOWEST, _TOP, _FINEST = 0.07, 0.19, 0.11, 0.03, 1 / 80
+DEPTHS, HEIGHTS, SHAPES, ROWS = 12, 27, 40, 56
+# As shares of the face: radius of the rod, largest depth, where the rod is first, and how far from the top it is last.
+_ROD, _DEEPEST, _LOWEST, _TOP = 0.07, 0.19, 0.11, 0.03
 # The rod stops where it needs this many times the force that it needs half way up at full depth.
 _HARDEST = 12.0
 _LONGEST, _SHORTEST = 0.5e-3, 0.02e-3
 _ITERATIONS, _TOLERANCE = 30, 1e-9
 _LOADED_EVERY = 3
 _ON_FACE = 1e-4
+# Loads below this share of the largest are rounding errors.
+_NOTHING = 1e-7
+_FEWEST_ROWS, _MOST_ROWS = 12, 84
 # What the outcome depends on beside the jaw.
-GRID = (DEPTHS, HEIGHTS, SHAPES, _ROD, _DEEPEST, _LOWEST, _TOP, _FINEST, _HARDEST)
+GRID = (DEPTHS, HEIGHTS, SHAPES, ROWS, _ROD, _DEEPEST, _LOWEST, _TOP, _HARDEST)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,14 +76,14 @@ def build_rest(mechanics: Mechanics, young_modulus: float) -> Manifold:
 
 
 def _choose_rows(mechanics: Mechanics) -> NDArray:
-    """Returns the heights (n + 1,) [m] of the rows, the clamp's first: the mesh's own, if they are not too many."""
+    """Returns the heights (n + 1,) [m] of the rows, the clamp's first: a solid mesh's own, if they are not too many."""
     mesh, face_x = mechanics.mesh, mechanics.contact.face_x
     on_face = np.abs(mesh.nodes[:, 0] - face_x) < _ON_FACE
     held = np.isin(np.arange(len(mesh.nodes)), mesh.clamped)
     base = mesh.nodes[on_face & held, 2].max(initial=mechanics.contact.surface.low[1])
     own = np.unique(np.round(mesh.nodes[on_face & ~held, 2], 7))
-    if not 0.4 / _FINEST < len(own) < 1.0 / _FINEST:
-        own = np.linspace(base, mechanics.contact.surface.high[1], round(1.0 / _FINEST) + 1)[1:]
+    if not (isinstance(mechanics.model, SolidModel) and _FEWEST_ROWS <= len(own) <= _MOST_ROWS):
+        own = np.linspace(base, mechanics.contact.surface.high[1], ROWS + 1)[1:]
     return np.r_[base, own]
 
 
@@ -176,7 +179,8 @@ class _Face:
         at_rest = np.zeros(model.size)
         moved = model.positions(self._probe, q) - model.positions(self._probe, at_rest)
         # the load that holds the jaw in this shape, as far as loads at the rows can
-        load = np.linalg.solve(loads.T @ loads, loads.T @ state.force)
+        load = np.linalg.lstsq(loads, state.force)[0]
+        load[np.abs(load) < _NOTHING * np.abs(load).max()] = 0.0
         return _Tangent(
             load=load,
             move=self._average(moved[:, :, None]).reshape(count),

@@ -1,12 +1,13 @@
 """The mechanics of a jaw by name: mesh, model and contact surface; knows no key point."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw import Jaw
 from finforce_ifea.locking import warn_of_locking
 from finforce_ifea.mesh import VolumeMesh
 from finforce_ifea.model import JawModel
+from finforce_ifea.reduced_contact import ReducedContact
 from finforce_ifea.rolling import RollingContact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.solid import SolidModel
@@ -20,7 +21,7 @@ class Mechanics:
 
     mesh: VolumeMesh
     model: JawModel
-    contact: RollingContact
+    contact: RollingContact | ReducedContact
 
 
 def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
@@ -30,6 +31,8 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
         JawFileError: The jaw cannot be described by that model.
         MeshError: The mesh cannot be built.
     """
+    if settings.solver in ("reduced", "linear"):
+        return _reduce(jaw, settings)
     name = jaw.model if settings.solver == "default" else settings.solver
     mesh = jaw.build_mesh(settings.mesh if jaw.drawing is not None else None)
     if name == "paper":
@@ -50,3 +53,15 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
         across = "half" if model.symmetric else "both"
     surface = build_contact_surface(jaw, mesh, model, across=across)
     return Mechanics(mesh=mesh, model=model, contact=RollingContact(model, surface, jaw.inner_face_x))
+
+
+def _reduce(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
+    """Builds stored equilibria of what the jaw file recommends."""
+    from finforce_ifea.reduction import reduce_mechanics
+
+    if settings.force_axes != "normal":
+        raise JawFileError(
+            f"solver {settings.solver} knows forces in the jaw's plane alone; expected force_axes normal"
+        )
+    full = build_mechanics(jaw, replace(settings, solver="default"))
+    return reduce_mechanics(full, jaw, linear=settings.solver == "linear")

@@ -4,20 +4,19 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from finforce_ifea.errors import MeshError
-from finforce_ifea.shape_functions import shape_gradients
+from finforce_ifea.mesh_pieces import check_overlaps, check_pieces
+from finforce_ifea.shape_functions import EDGES_TET10, shape_gradients
 
 FACES_HEX = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
 FACES_TET = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-# A vertex of each kind of element, where its Jacobian is checked.
-_CORNERS_HEX = np.array(
-    [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]],
-    dtype=float,
-)
-_CORNERS_TET = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.25, 0.25, 0.25]], dtype=float)
+# Where the Jacobian of each kind of element is checked: corners, middles of edges and faces, centre.
+_PLACES_HEX = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+_CORNERS_TET = np.vstack([np.zeros(3), np.eye(3)])
+_PLACES_TET = np.concatenate([[*_CORNERS_TET], _CORNERS_TET[EDGES_TET10].mean(axis=1), [[0.25] * 3]])
 _MIRROR_HEX = [4, 5, 6, 7, 0, 1, 2, 3]
 _MIRROR_TET10 = [0, 2, 1, 3, 6, 5, 4, 7, 9, 8]
 
@@ -73,19 +72,20 @@ def build_volume_mesh(
         The mesh.
 
     Raises:
-        MeshError: No elements or two kinds of them, wrong shapes, indices out of range, NaN, millimetres for
-            metres, duplicate or unused nodes, inverted elements, no clamped nodes.
+        MeshError: No elements or two kinds of them, wrong shapes, indices out of range or not whole, NaN, millimetres
+            for metres, duplicate or unused nodes, inverted or repeated elements, no clamped nodes.
     """
     if (hexes is None) == (tets is None):
         raise MeshError("expected either hexahedra or tetrahedra, got both or neither")
     nodes = np.ascontiguousarray(nodes, dtype=float)
-    elements = np.ascontiguousarray(tets if hexes is None else hexes, dtype=np.int64)
-    clamped = np.unique(np.asarray(list(clamped), dtype=np.int64))
+    elements = _to_indices(tets if hexes is None else hexes, "elements")
+    clamped = np.unique(_to_indices(list(clamped), "clamped nodes"))
     _check_nodes(nodes)
     _check_elements(elements, len(nodes), (4, 10) if hexes is None else (8,))
     _check_numbering(nodes, elements)
     check_jacobians(nodes, elements)
     _check_clamped(clamped, len(nodes))
+    check_overlaps(elements, elements[:, _faces_of(elements)])
     return VolumeMesh(
         nodes=nodes,
         hexes=None if hexes is None else elements,
@@ -95,16 +95,31 @@ def build_volume_mesh(
     )
 
 
+def check_connection(mesh: VolumeMesh) -> None:
+    """Refuse a mesh that is not one piece, or of which a part can turn freely.
+
+    Raises:
+        MeshError: Parts share no node, or hang together by nodes on one line; or the clamped nodes lie on one.
+    """
+    elements = mesh.elements
+    check_pieces(mesh.nodes, elements, elements[:, _faces_of(elements)], mesh.clamped)
+
+
 def surface_triangles(elements: NDArray) -> NDArray:
     """Return the boundary triangles (t, 3) of elements (m, 4 | 8 | 10), outward normals.
 
     A face that belongs to one element only is boundary. Quadrilaterals are split along the diagonal from
     their smallest node index; of 10-node tetrahedra the corners are used.
     """
-    table = FACES_HEX if elements.shape[1] == 8 else FACES_TET
+    table = _faces_of(elements)
     faces = elements[:, table].reshape(-1, table.shape[1])
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return split_faces(faces[np.sort(first[count == 1])])
+
+
+def _faces_of(elements: NDArray) -> NDArray:
+    """Return which corners of elements (m, 4 | 8 | 10) make their faces."""
+    return FACES_HEX if elements.shape[1] == 8 else FACES_TET
 
 
 def split_faces(faces: NDArray) -> NDArray:
@@ -123,12 +138,12 @@ def compute_volume(mesh: VolumeMesh) -> float:
 
 
 def check_jacobians(nodes: NDArray, elements: NDArray) -> None:
-    """Refuse elements whose Jacobian is not positive at every corner and, of tetrahedra, at the centre.
+    """Refuse elements whose Jacobian is not positive at every corner, in the middle of edges and faces, and inside.
 
     Raises:
         MeshError: Elements are inverted; the message says how many and names the first.
     """
-    local = _CORNERS_HEX if elements.shape[1] == 8 else _CORNERS_TET
+    local = _PLACES_HEX if elements.shape[1] == 8 else _PLACES_TET
     gradients = shape_gradients(elements.shape[1], local)
     jacobians = np.einsum("mni,pnj->mpij", nodes[elements], gradients)
     smallest = np.linalg.det(jacobians).min(axis=1)
@@ -141,6 +156,16 @@ def check_jacobians(nodes: NDArray, elements: NDArray) -> None:
             f"at {centre} mm, Jacobian {smallest[inverted[0]]:.3g}); "
             "expected positive Jacobians with the nodes in the VTK order: repair or reorder these elements"
         )
+
+
+def _to_indices(numbers: ArrayLike, name: str) -> NDArray:
+    """Return node indices as integers after having refused what would be rounded or is a mask."""
+    given = np.asarray(numbers)
+    if given.dtype == bool or not np.issubdtype(given.dtype, np.number) and given.size:
+        raise MeshError(f"{name}: got {given.dtype}, expected node indices")
+    if given.size and not (np.isfinite(given).all() and (given == np.rint(given)).all()):
+        raise MeshError(f"{name}: got numbers that are not whole, expected node indices")
+    return np.ascontiguousarray(given, dtype=np.int64)
 
 
 def _check_nodes(nodes: NDArray) -> None:

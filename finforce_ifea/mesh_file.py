@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import MeshError, MissingDependencyError
-from finforce_ifea.mesh import VolumeMesh, build_volume_mesh
+from finforce_ifea.mesh import VolumeMesh, build_volume_mesh, check_connection
 from finforce_ifea.shape_functions import EDGES_TET10
 
 _VOLUME_CELLS = ("tetra", "tetra10", "hexahedron")
@@ -64,7 +64,7 @@ def read_volume_mesh(path: Path | str, *, scale: float = 1.0, clamp: ClampRule) 
 
     Raises:
         MeshError: The file is missing, cannot be read, has no volume elements, several or unsupported kinds
-            of them, or its mesh does not pass `build_volume_mesh`.
+            of them, its mesh does not pass `build_volume_mesh`, or is not one piece.
         MissingDependencyError: meshio is not installed.
     """
     path = Path(path)
@@ -77,9 +77,11 @@ def read_volume_mesh(path: Path | str, *, scale: float = 1.0, clamp: ClampRule) 
         elements = _order_middles(nodes, elements)
     parts = {"hexes": elements} if kind == "hexahedron" else {"tets": elements}
     try:
-        return build_volume_mesh(nodes=nodes, clamped=clamp.select(nodes), **parts)
+        mesh = build_volume_mesh(nodes=nodes, clamped=clamp.select(nodes), **parts)
+        check_connection(mesh)
     except MeshError as error:
         raise MeshError(f"{path.name}: {error}") from error
+    return mesh
 
 
 def _read_cells(path: Path) -> tuple[NDArray, list[tuple[str, NDArray]]]:

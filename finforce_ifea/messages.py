@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_health import NANOSECONDS
 from finforce_ifea.errors import ContactError, ObservationError
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.outline import ObjectOutline
 from finforce_ifea.outline_cloud import COLUMNS, outline_from_columns
 from finforce_ifea.pointcloud import decode_columns, decode_keypoints
+
+
+def read_stamp(data: bytes) -> int:
+    """Return the stamp [ns] of a message with a header from its CDR bytes, of which nothing else is read."""
+    seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    return NANOSECONDS * seconds + rest
 
 
 def check_frame(message: Any, frame: str, what: str) -> None:

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from finforce_ifea.factor import Factor
 
+LARGEST_MOVE, LARGEST_TURN = 2e-3, 0.3
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Linearization:
@@ -30,11 +32,13 @@ class JawModel(Protocol):
 
     Attributes:
         size: number of unknowns.
-        rotations: which unknowns are rotations (size,) bool; None when all are displacements.
+        rotations: which unknowns are rotations (size,) bool; None when all are of one kind.
+        reach: largest change of each unknown at once (size,), or of all: 2 mm, 0.3 rad.
     """
 
     size: int
     rotations: NDArray | None
+    reach: NDArray | float
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
         """Evaluates internal force, energy and, unless `tangent` is False, the tangent stiffness at q."""

@@ -10,18 +10,20 @@ from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 import finforce_ros as ros
-from finforce_health import Health, Outcome, Report, StampGate
+from finforce_health import Health, Idling, Outcome, Report, StampGate
 from finforce_ifea.errors import FinforceError
 from finforce_ifea.gripper import ForcePairing, single_jaw_grasp
-from finforce_ifea.messages import force_from_wrench, observation_from_cloud
+from finforce_ifea.messages import force_from_wrench, observation_from_cloud, read_stamp
 from finforce_ifea.observation import Solution
 from finforce_ifea.outputs import SolverOutputs
 from finforce_ifea.parameters import NodeParameters, build_contact_feed, build_estimator, load_parameter_jaw
 from finforce_ifea.report import describe_solution, outcome_of_solution, peer_alarms
 from finforce_ifea.settings import EstimatorSettings
+from finforce_skipping import AWAY, IDLE, LATE, SOLVER, Skips
 
 
 class IfeaSolverNode(Node):
@@ -40,15 +42,17 @@ class IfeaSolverNode(Node):
         self.parameters = parameters = ros.declare_record(self, NodeParameters)
         settings = ros.declare_record(self, EstimatorSettings, "estimator")
         ros.name_unknown_parameters(self)
+        self.skips = Skips(SOLVER, parameters.skip_off)
         jaw = load_parameter_jaw(parameters)
         self.contacts = build_contact_feed(jaw, parameters)
         self.estimator = build(jaw, parameters, settings)
+        self.estimator.spares = self.skips.allows(AWAY)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
         self.health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
-        self.pairing = ForcePairing(parameters.jaw_name)
+        self.pairing, self.idling = ForcePairing(parameters.jaw_name), Idling()
         self.last: Solution | None = None
         self.qos = ros.QosWatch(self)
-        self.out = SolverOutputs(self.qos, parameters)
+        self.out = SolverOutputs(self.qos, parameters, self.skips)
         self._serve(parameters.jaw_name)
         self._subscribe(parameters.jaw_name)
         source = "fixed" if self.contacts.is_fixed else "by topic"
@@ -69,13 +73,20 @@ class IfeaSolverNode(Node):
         if peer := self.parameters.peer:
             self.qos.subscription(WrenchStamped, f"{peer}/wrench", self._on_peer, ros.RESULT)
         topic = f"{side}/keypoints"
-        self.keypoints = self.qos.subscription(PointCloud2, topic, self._on_keypoints, ros.SENSOR)
+        # as bytes: of an image that is passed over no more than the stamp is read
+        self.keypoints = self.qos.subscription(PointCloud2, topic, self._on_keypoints, ros.SENSOR, raw=True)
 
-    def _on_keypoints(self, cloud: PointCloud2) -> None:
+    def _on_keypoints(self, data: bytes) -> None:
         """Solve the newest image and publish its wrench, if it can be trusted."""
-        began = perf_counter()
-        cloud, superseded = ros.take_newest(self.keypoints, cloud)
+        began, superseded = perf_counter(), 0
+        if self.skips.allows(LATE):
+            data, superseded = ros.take_newest(self.keypoints, data)
+            self.skips.count(LATE, superseded)
         self.health.arrive(superseded)
+        if self.idling.passes(read_stamp(data)):
+            self.skips.count(IDLE)
+            return
+        cloud = deserialize_message(data, PointCloud2)
         header, stamp = cloud.header, ros.nanoseconds(cloud.header.stamp)
         with self._refusals():
             observation = observation_from_cloud(cloud, self.parameters.frame)
@@ -83,6 +94,7 @@ class IfeaSolverNode(Node):
                 self._restart("the stamps went back: a new recording")
             self.last = solution = self.estimator.update(observation, self.contacts.at(stamp))
             self.gate.check_age(stamp, self._now())
+            self._note_idle(stamp)
             if not solution.trusted:
                 self._refuse(outcome_of_solution(solution))
                 return
@@ -95,6 +107,17 @@ class IfeaSolverNode(Node):
             age = (self._now() - stamp) / ros.NANOSECONDS
             self.health.publish(outcome_of_solution(solution), latency=perf_counter() - began, age=age)
             self.out.send_shape(header, observation, solution, self.estimator)
+
+    def _note_idle(self, stamp: int) -> None:
+        """Note whether the jaw was left alone in this image, and the next ones may be passed over."""
+        spared = bool(getattr(self.estimator, "spared", False))
+        if spared:
+            self.skips.count(AWAY)
+        self.idling.note(stamp, spared and self.skips.allows(IDLE))
+
+    def spare_time(self) -> float:
+        """Return for how long messages may wait [s]: while nothing happens, until the next image that is answered."""
+        return self.idling.spare_time(self._now())
 
     def _on_contact(self, cloud: PointCloud2) -> None:
         """Keep the newest contact."""
@@ -135,7 +158,8 @@ class IfeaSolverNode(Node):
         """Return how this node is doing."""
         limit = max(1.0, self.parameters.max_age)
         alarms = [*alarms, *peer_alarms(self.parameters.peer, self.pairing.silence, limit)]
-        return self.health.report(alarms, describe_solution(self.last) | {"tared": str(self.estimator.tared)})
+        tared = {"tared": str(self.estimator.tared)}
+        return self.health.report(alarms, describe_solution(self.last) | tared | self.skips.describe())
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds

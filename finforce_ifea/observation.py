@@ -85,6 +85,7 @@ class Solution:
         keypoints_used: (K,) bool.
         iterations: Newton iterations of this frame.
         converged: whether the last iteration changed nothing that matters.
+        condition: condition number of what was solved, its unknowns scaled; NaN where nothing was.
     """
 
     stamp: float
@@ -103,6 +104,7 @@ class Solution:
     keypoints_used: NDArray
     iterations: int
     converged: bool
+    condition: float = float("nan")
 
     @property
     def trusted(self) -> bool:
@@ -176,3 +178,11 @@ def check_contact(contact: Contact, jaw: Jaw) -> None:
         raise ContactError(f"contact points off the undeformed inner surface x = {jaw.inner_face_x:g} m")
     if len(weights) and not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
         raise ContactError(f"contact weights {weights}, expected non-negative numbers that are not all zero")
+
+
+def sketch_contact(jaw: Jaw) -> Contact:
+    """Returns a contact with the outline of a square that just touches the middle of a jaw, for a first try."""
+    middle = np.array([[jaw.inner_face_x, 0.0, float(np.median(jaw.candidates[:, 2]))]])
+    square = 0.01 * np.array([[0.0, -1.0], [2.0, -1.0], [2.0, 1.0], [0.0, 1.0]])
+    outline = ObjectOutline(polygons=(square,), origin=middle[0, ::2], tilt=0.0, stddev=np.array([1e-3, 1e-3, 0.1]))
+    return Contact(points=middle, weights=np.ones(1), outline=outline)

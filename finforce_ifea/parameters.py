@@ -40,6 +40,9 @@ class NodeParameters(TimeParameters):
     )
     completes_grasp: bool = parameter(False, "without a peer: publish this jaw's force as grasp_wrench")
     publish_surface: bool = parameter(True, "publish the deformed mesh vertices with every solved image")
+    skip_off: tuple[str, ...] = parameter(
+        ("",), "rules that are not applied, by their names in the diagnostics after `skipped:`, or all"
+    )
     marker_rate: float = parameter(
         10.0, "greatest rate of the markers, which are sent only to listeners", unit="Hz", min=0.1, max=60.0
     )

@@ -56,6 +56,19 @@ def _press_cylinder(points, stiffness, centre_x, centre_z, radius, smooth):
     return forces, springs, by_shape
 
 
+def measure_penalty_energy(forces: NDArray, stiffness: NDArray) -> float:
+    """Returns the energy [J] that the penalty stores where it pushes with forces (p, 3) [N].
+
+    With k = stiffness (p,) [N/m], s = 20 um and d the depth that belongs to a force it is k d^3 / (6 s) up to s, and
+    k (d^2 - s^2) / 2 - k s (d - s) / 2 more beyond.
+    """
+    push, smooth = np.linalg.norm(forces, axis=1) / stiffness, _SMOOTH_DEPTH
+    depth = np.where(push < 0.5 * smooth, np.sqrt(2.0 * smooth * push), push + 0.5 * smooth)
+    beyond = np.maximum(depth - smooth, 0.0)
+    cubic = np.minimum(depth, smooth) ** 3 / (6.0 * smooth)
+    return float((stiffness * (cubic + 0.5 * beyond * (depth + smooth) - 0.5 * smooth * beyond)).sum())
+
+
 def press_cylinder(
     points: NDArray, stiffness: NDArray, centre_x: float, centre_z: float, radius: float
 ) -> PenaltyContact:

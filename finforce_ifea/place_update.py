@@ -10,10 +10,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from finforce_ifea.place_doubt import PRIOR_REACH, doubt_height, invert_symmetric, measure_condition
+
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Depth has no prior; this share of one frame's information keeps the posterior regular while nothing was averaged.
 _DEPTH_SHARE = 1e-3
-_PRIOR_REACH = 4.0
 # Innovations beyond this many standard deviations are no chance: where the speed is known, and where it is not.
 _MANOEUVRE_SIGMA, _ONSET_SIGMA = 3.0, 2.5
 # Of a longer jump [m/s] the rest is taken for one of the place alone.
@@ -37,6 +38,23 @@ class Forecast(NamedTuple):
     unsure: float
 
 
+class Average(NamedTuple):
+    """Residuals averaged over the last frames.
+
+    A frame in which the finger was hardly pressed tells hardly anything of radius and height: what the average says of
+    them are its own averaged derivatives, not those of the last frame.
+
+    Attributes:
+        residuals: (K, 2) [m].
+        modes: derivatives by depth, log radius and height, averaged alike (K, 2, 3).
+        count: frames that they stand for (K,).
+    """
+
+    residuals: NDArray
+    modes: NDArray
+    count: NDArray
+
+
 class PlaceUpdate(NamedTuple):
     """The place after one frame.
 
@@ -45,42 +63,30 @@ class PlaceUpdate(NamedTuple):
         speed: of the depth [m/s].
         spread: covariance of depth and speed (2, 2).
         jumped: whether the depth changed beyond what was expected.
-        mean: averaged residuals about the new place (K, 2) [m].
-        count: frames that they stand for (K,).
+        average: of the residuals, about the new place.
         covariance: of the place (3, 3).
         depth_variance: of the depth, by this frame and what was before [m^2].
         kkt: what is left of the objective's gradient, relative to the gradient before.
         residual: weighted root mean square residual [m].
         misfit: root mean square of the averaged residuals over their standard deviations; about 1 where the model fits.
+        away: height that the key points alone ask for beyond the expected one [m].
+        mistaken: probability that the height is not the expected one at all.
+        condition: of the covariance, scaled to a unit diagonal.
     """
 
     place: NDArray
     speed: float
     spread: NDArray
     jumped: bool
-    mean: NDArray
-    count: NDArray
+    average: Average
     covariance: NDArray
     depth_variance: float
     kkt: float
     residual: float
     misfit: float
-
-
-@njit(**_OPTIONS)
-def _invert_symmetric(A):
-    """Returns the inverse of a symmetric 3 x 3 matrix."""
-    c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
-    c01 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
-    c02 = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
-    det = A[0, 0] * c00 + A[0, 1] * c01 + A[0, 2] * c02
-    out = np.empty((3, 3))
-    out[0, 0], out[0, 1], out[0, 2] = c00, c01, c02
-    out[1, 1] = A[0, 0] * A[2, 2] - A[0, 2] * A[0, 2]
-    out[1, 2] = A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2]
-    out[2, 2] = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
-    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
-    return out / det
+    away: float
+    mistaken: float
+    condition: float
 
 
 @njit(**_OPTIONS)
@@ -92,23 +98,24 @@ def _averaged_spread(data, count, k):
 
 
 @njit(**_OPTIONS)
-def _posterior(data, mean, count, offset, prior_variance, information):
+def _posterior(data, average, offset, prior_variance, information):
     """Returns Hessian and gradient of the log posterior of the place for averaged residuals."""
     hessian, gradient = np.zeros((3, 3)), np.zeros(3)
+    mean, modes, count = average
     for k in range(len(count)):
         if count[k] <= 0.5:
             continue
         s00, s11, s01 = _averaged_spread(data, count, k)
         det = s00 * s11 - s01 * s01
         for i in range(3):
-            a = (s11 * data.modes[k, 0, i] - s01 * data.modes[k, 1, i]) / det
-            b = (s00 * data.modes[k, 1, i] - s01 * data.modes[k, 0, i]) / det
+            a = (s11 * modes[k, 0, i] - s01 * modes[k, 1, i]) / det
+            b = (s00 * modes[k, 1, i] - s01 * modes[k, 0, i]) / det
             gradient[i] += a * mean[k, 0] + b * mean[k, 1]
             for j in range(3):
-                hessian[i, j] += a * data.modes[k, 0, j] + b * data.modes[k, 1, j]
+                hessian[i, j] += a * modes[k, 0, j] + b * modes[k, 1, j]
     for i in range(2):
         # far from its mean the prior lets go (Cauchy), for an object may touch first elsewhere than it was said to
-        variance = prior_variance[i] + (offset[i] / _PRIOR_REACH) ** 2
+        variance = prior_variance[i] + (offset[i] / PRIOR_REACH) ** 2
         hessian[i + 1, i + 1] += 1.0 / variance
         gradient[i + 1] -= offset[i] / variance
     hessian[0, 0] += _DEPTH_SHARE * information
@@ -143,34 +150,63 @@ def _weigh_depth(data, mean, count):
 
 
 @njit(**_OPTIONS)
-def _average(data, mean, count, deeper, memory):
-    """Returns the residuals averaged with this frame's, the depth changed by `deeper` [m], and what they count."""
+def _find_rift(data, deeper, information):
+    """Returns how far the depth would move if points that are half believed were not believed at all [m].
+
+    With w the weights, h the motions by depth, r what is left of the residuals and I the information,
+
+        rift = sum_k w_k (1 - w_k) h_k^T N_k^-1 r_k / I.
+
+    Chance cancels in it; points that are wrong together do not.
+
+    Args:
+        data: see `Residuals`.
+        deeper: change of the depth since the residuals [m].
+        information: on the depth [1/m^2].
+    """
+    rift = 0.0
+    for k in range(len(data.weights)):
+        n00, n11, n01 = data.noise[k, 0, 0], data.noise[k, 1, 1], data.noise[k, 0, 1]
+        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
+        r0, r1 = data.r[k, 0] - h0 * deeper, data.r[k, 1] - h1 * deeper
+        score = (h0 * (n11 * r0 - n01 * r1) + h1 * (n00 * r1 - n01 * r0)) / (n00 * n11 - n01 * n01)
+        rift += data.weights[k] * (1.0 - data.weights[k]) * score
+    return rift / information
+
+
+@njit(**_OPTIONS)
+def _extend(average, data, deeper, memory):
+    """Returns the average with this frame's residuals, its depth changed by `deeper` [m]."""
+    mean, modes, count = average
     n = len(count)
-    new_mean, new_count = np.empty((n, 2)), np.empty(n)
+    new_mean, new_modes, new_count = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty(n)
     for k in range(n):
         share = data.weights[k] / (min(count[k], memory) + 1.0)
         new_count[k] = min(count[k] * (1.0 - 1.0 / memory) + data.weights[k], memory)
         for a in range(2):
             new_mean[k, a] = mean[k, a] + share * (data.r[k, a] - data.modes[k, a, 0] * deeper - mean[k, a])
-    return new_mean, new_count
+            for i in range(3):
+                new_modes[k, a, i] = modes[k, a, i] + share * (data.modes[k, a, i] - modes[k, a, i])
+    return Average(new_mean, new_modes, new_count)
 
 
 @njit(**_OPTIONS)
-def _move_residuals(data, mean, moved, deeper):
+def _move_residuals(data, average, moved, deeper):
     """Takes averaged residuals to the new place and returns this frame's weighted root mean square there [m].
 
     The place has moved by `moved` (3,) since this frame's residuals, the depth by `deeper` [m] since the average.
     """
+    mean, modes, _ = average
     total, weight = 0.0, 0.0
     for k in range(len(mean)):
         weight += data.weights[k]
         for a in range(2):
             left = data.r[k, a]
-            mean[k, a] -= data.modes[k, a, 0] * deeper
+            mean[k, a] -= modes[k, a, 0] * deeper
             for i in range(3):
                 left -= data.modes[k, a, i] * moved[i]
                 if i > 0:
-                    mean[k, a] -= data.modes[k, a, i] * moved[i]
+                    mean[k, a] -= modes[k, a, i] * moved[i]
             total += data.weights[k] * left * left
     return np.sqrt(total / (2.0 * weight))
 
@@ -204,28 +240,28 @@ def _allow_for_manoeuvre(forecast, innovation, noise):
 
 
 @njit(**_OPTIONS)
-def update_place(data, mean, count, forecast, prior, prior_variance, memory, largest):
+def update_place(data, average, forecast, prior, prior_variance, memory, largest):
     """Returns the place after one frame; see `PlaceUpdate`.
 
     Args:
         data: residuals about the reference place.
-        mean: residuals averaged so far (K, 2) [m].
-        count: frames that they stand for (K,).
+        average: of the residuals so far.
         forecast: predicted depth and speed, last log radius and height.
         prior: of log radius and height (2,).
         prior_variance: (2,).
         memory: longest average [frames].
         largest: changes of log radius and height allowed at once (2,).
     """
-    information, innovation, pull = _weigh_depth(data, mean, count)
+    information, innovation, pull = _weigh_depth(data, average.residuals, average.count)
     innovation /= information
     reference, spread = forecast.place, _allow_for_manoeuvre(forecast, innovation, 1.0 / information)
     jumped = spread[0, 0] > forecast.spread[0, 0]
     gain = spread[0] / (1.0 / information + max(spread[0, 0], 0.0))
     depth = reference[0] + gain[0] * innovation
-    new_mean, new_count = _average(data, mean, count, depth - reference[0], memory)
-    hessian, gradient = _posterior(data, new_mean, new_count, reference[1:] - prior, prior_variance, information)
-    covariance = _invert_symmetric(hessian)
+    new = _extend(average, data, depth - reference[0], memory)
+    hessian, gradient = _posterior(data, new, reference[1:] - prior, prior_variance, information)
+    covariance = invert_symmetric(hessian)
+    away, mistaken, doubt = doubt_height(hessian, gradient, reference[2] - prior[1], prior_variance[1])
     shift = covariance @ gradient
     kkt = np.abs(hessian @ shift - gradient).max() / max(np.abs(gradient).max(), 1e-30)
     place = reference.copy()
@@ -235,12 +271,19 @@ def update_place(data, mean, count, forecast, prior, prior_variance, memory, lar
         place[i] += step
         # radius and height leave the depth that this frame's key points ask for
         place[0] -= pull[i] * step / information
-    residual = _move_residuals(data, new_mean, place - reference, place[0] - depth)
-    misfit = _compute_misfit(data, new_mean, new_count)
+    residual = _move_residuals(data, new, place - reference, place[0] - depth)
+    condition = measure_condition(covariance)
+    covariance[2, 2] += doubt
+    misfit = _compute_misfit(data, new.residuals, new.count)
     speed = forecast.speed + gain[1] * innovation
-    known = gain[0] / information
+    # what chance leaves of the innovation may be a motion that was not expected; the gain has followed a part of it
+    beyond = max(0.0, innovation**2 - 1.0 / information - max(forecast.spread[0, 0], 0.0))
+    known = gain[0] / information + (1.0 - gain[0]) ** 2 * beyond
+    known += _find_rift(data, depth - reference[0], information) ** 2
     spread = spread - np.outer(gain, spread[0])
-    return PlaceUpdate(place, speed, spread, jumped, new_mean, new_count, covariance, known, kkt, residual, misfit)
+    return PlaceUpdate(
+        place, speed, spread, jumped, new, covariance, known, kkt, residual, misfit, away, mistaken, condition
+    )
 
 
 @njit(**_OPTIONS)

@@ -11,13 +11,16 @@ from finforce_ifea.inverse import InverseResult, Problem, solve_inverse
 from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import Mechanics
 from finforce_ifea.observation import Contact
+from finforce_ifea.place_watch import PlaceWatch, blank_doubt
+from finforce_ifea.rest_response import RestResponse
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
 from finforce_ifea.track import Track, compute_magnitude_stddev, explain_offsets
 
 _NEIGHBOUR = 1e-3
 _QUIET_SIGMA = 3.0
-_SETTLED = 1e-5
+# Share of the model's reach in the last Newton step.
+_SETTLED = 5e-3
 _FARTHEST_MOVE = 0.2
 # The median of |miss|^2 / variance is this for a normal distribution in three axes.
 _MEDIAN_SQUARE = 2.4
@@ -33,8 +36,9 @@ class PointTracker:
     points are weighted by their agreement, and the state is brought to equilibrium.
     """
 
-    def __init__(self, jaw: Jaw, mechanics: Mechanics, settings: EstimatorSettings) -> None:
-        """Attaches the key points; raises MeshError when one is off the mesh."""
+    def __init__(self, jaw: Jaw, mechanics: Mechanics, settings: EstimatorSettings, response: RestResponse) -> None:
+        """Attaches the key points, `response` being that of the unloaded jaw; raises MeshError when one is off it."""
+        self._watch = PlaceWatch(response, settings)
         self.jaw, self.mechanics, self.settings = jaw, mechanics, settings
         self.paper = settings.solver == "paper"
         self.probe = mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
@@ -47,6 +51,7 @@ class PointTracker:
         """Starts anew, unloaded, with the middle candidate."""
         self.q = np.zeros(self.mechanics.model.size)
         self._misfit = 1.0
+        self._watch.reset()
         self._candidate = len(self.jaw.candidates) // 2
         self._heights = (float(self.jaw.candidates[self._candidate, 2]),)
         self._weights: NDArray | None = np.ones(1)
@@ -60,6 +65,7 @@ class PointTracker:
             self._heights, self._weights = (float(self.jaw.candidates[self._candidate, 2]),), np.ones(1)
             return
         self._heights = tuple(np.round(heights, 5).tolist())
+        self._watch.follow(float(np.average(heights, weights=contact.weights)))
         self._weights = np.asarray(contact.weights, float)
 
     def _build_load(self, height: float) -> tuple[NDArray, NDArray]:
@@ -153,9 +159,14 @@ class PointTracker:
         covariance = result.covariance
         if self.paper:
             covariance = covariance * float(np.mean(variance[np.isfinite(targets[:, 0])]))
+            covariance += np.outer(result.bias, result.bias)
         magnitude = float(np.linalg.norm(force))
         stddev = compute_magnitude_stddev(force, result.directions, covariance)
-        moves = result.q if self.mechanics.model.rotations is None else result.q[~self.mechanics.model.rotations]
+        moves = self.mechanics.model.positions(self.probe, result.q) - self._rest
+        doubt = blank_doubt()
+        if not self.paper:
+            miss = targets - self.mechanics.model.positions(self.probe, result.q)
+            doubt = self._watch.doubt(miss[:, ::2], weights / variance, magnitude)
         return Track(
             covariance=covariance,
             force=force,
@@ -166,11 +177,19 @@ class PointTracker:
             stiffening=1.0,
             residual=result.residual,
             misfit=self._misfit,
+            away=doubt.away,
+            mistaken=doubt.mistaken,
+            place_error=doubt.share,
+            place_stddev=doubt.stddev,
+            condition=result.condition,
             kkt=result.kkt,
             iterations=result.iterations,
             converged=result.converged,
             sound=bool(
-                np.isfinite(result.q).all() and np.isfinite(force).all() and np.abs(moves).max() < _FARTHEST_MOVE
+                np.isfinite(result.q).all()
+                and np.isfinite(force).all()
+                and result.smallest_det > 0
+                and np.abs(moves).max() < _FARTHEST_MOVE
             ),
             quiet=magnitude < _QUIET_SIGMA * stddev,
             loaded=magnitude > 2.0 * _QUIET_SIGMA * stddev,

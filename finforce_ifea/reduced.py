@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from finforce_ifea.factor import Factor
 from finforce_ifea.manifold import Manifold
 from finforce_ifea.model import LARGEST_MOVE, JawModel, Linearization
-from finforce_ifea.reduced_loops import find_grid_step, move_points, place_points, place_rows
+from finforce_ifea.reduced_loops import LARGEST_GRID_STEP, find_grid_step, follow, move_points, place_points
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,18 +60,18 @@ class ReducedModel:
         self.compliance = manifold.compliance * np.float32(1.0 / factor)
         self.shape_compliance = manifold.shape_compliance * np.float32(1.0 / factor)
         stiffness = LARGEST_MOVE / np.abs(np.diagonal(self.compliance[0, 0]))
-        self.reach = np.r_[stiffness, np.inf, np.inf]
+        self.reach = np.r_[stiffness, LARGEST_GRID_STEP, LARGEST_GRID_STEP]
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
         """Returns the loads that q (size,) holds, and how far its grid coordinates are from the nearest equilibrium."""
         moves = self.moves(q)
-        step = find_grid_step(self.manifold.moves, moves, q[-2:])
+        step = find_grid_step(self.manifold.moves, moves, q[-2:])[:2]
         force = np.r_[q[:-2], -step]
         return Linearization(force=force, energy=0.5 * float(moves @ q[:-2]), smallest_det=1.0, tangent=None)
 
     def moves(self, q: NDArray) -> NDArray:
         """Returns the motions of the rows (2 n,) [m], x and z interleaved."""
-        return place_rows(self.manifold.moves, self.compliance, self.loads, q)
+        return follow(self.manifold.moves, self.compliance, self.loads, q)
 
     def attach(self, points: NDArray, max_distance: float = 1e-3) -> ReducedProbe:
         """Returns a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""

@@ -5,13 +5,9 @@ from numpy.typing import NDArray
 
 from finforce_ifea.indenter import Indenter, RoundIndenter
 from finforce_ifea.reduced import ReducedModel, share_rows
-from finforce_ifea.reduced_loops import find_grid_step, place_contact, solve_contact
-from finforce_ifea.rolling import PressedState
+from finforce_ifea.reduced_loops import FaceRows, place_contact, step_contact
+from finforce_ifea.rolling import PressedState, find_share_that_meets
 from finforce_ifea.surface import ContactSurface
-
-_BISECTIONS, _TOUCH = 10, 2e-5
-# Below this grid coordinate of the depth a jaw is too little bent to tell the height by its shape.
-_SHALLOW = 0.5
 
 
 class ReducedContact:
@@ -23,52 +19,41 @@ class ReducedContact:
         self.indenter: Indenter = RoundIndenter()
         shares = share_rows(model.manifold.heights, surface.heights)
         upper = np.clip(np.searchsorted(model.manifold.heights, surface.heights) - 1, 0, shares.shape[1] - 1)
-        self._low, self._share = upper - 1, shares[np.arange(len(upper)), upper]
+        share = shares[np.arange(len(upper)), upper]
+        self._face = FaceRows(surface.points, upper - 1, share, model.manifold.rods)
+        self._tables = (model.manifold.moves, model.compliance)
+
+    def begin(self, height: float) -> NDArray:
+        """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
+        q, rods = np.zeros(self.model.size), self.model.manifold.rods
+        q[-1] = np.interp(height, rods, np.arange(len(rods)))
+        return q
 
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
         """Linearises the equilibrium with the object at a place (depth, shape, height); see `RollingContact`."""
-        model, count = self.model, self.model.rows
-        moves = model.moves(q)
-        points = place_contact(self.surface.points, self._low, self._share, moves)
+        moves = self.model.moves(q)
+        points = place_contact(self._face, moves)
         contact = self.indenter.press(points, self.surface.stiffness, self.face_x, place)
-        steps = solve_contact(
-            q, model.compliance, self._low, self._share, contact.forces, contact.springs, contact.by_shape
-        )
-        size = np.hypot(contact.forces[:, 0], contact.forces[:, 2])
-        total = size.sum()
-        share = size / total if total > 0 else np.full(len(size), np.nan)
-        pressure = share @ self.surface.points
-        correction = np.r_[steps[:, 0], self._turn_grid(q, moves, pressure[2])]
-        total_loads = np.zeros((3, 4))
-        total_loads[[0, 2]] = steps.reshape(-1, 2, 4).sum(0)
+        parts = (contact.forces, contact.springs, contact.by_shape)
+        step = step_contact(q, self._tables, self._face, moves, points, parts)
         return PressedState(
-            touches=bool(total > 0),
-            correction=correction,
-            modes=np.concatenate([steps[:, 1:], np.zeros((2, 3))]),
-            force=total_loads[:, 0] + [q[:count:2].sum(), 0.0, q[1:count:2].sum()],
-            force_modes=total_loads[:, 1:],
-            pressure_point=share @ points,
-            pressure_place=pressure,
+            touches=step.touches,
+            correction=step.correction,
+            modes=step.modes,
+            force=step.force,
+            force_modes=step.force_modes,
+            pressure_point=step.pressure_point,
+            pressure_place=step.pressure_place,
             smallest_det=1.0,
+            size=step.size,
+            away=step.away,
         )
-
-    def _turn_grid(self, q: NDArray, moves: NDArray, height: float) -> NDArray:
-        """Returns the step (2,) of the grid coordinates."""
-        m, rods = q[-2:], self.model.manifold.rods
-        step = find_grid_step(self.model.manifold.moves, moves, m)
-        if m[0] < _SHALLOW and np.isfinite(height):
-            step[1] = np.interp(height, rods, np.arange(len(rods))) - m[1]
-        return step
 
     def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
         """Returns the step of a jaw that has lost contact, cut where its surface meets the object again."""
-        low, high = 0.0, 1.0
-        for _ in range(_BISECTIONS):
-            share = 0.5 * (low + high)
-            moves = self.model.moves(q + share * step)
-            points = place_contact(self.surface.points, self._low, self._share, moves)
-            if self.indenter.find_gap(points, self.face_x, place) < -_TOUCH:
-                high = share
-            else:
-                low = share
-        return high * step
+
+        def find_gap(share: float) -> float:
+            points = place_contact(self._face, self.model.moves(q + share * step))
+            return self.indenter.find_gap(points, self.face_x, place)
+
+        return find_share_that_meets(find_gap) * step

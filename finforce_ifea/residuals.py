@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 _MODEL_FLOOR = 0.02e-3
 _LEAST_WEIGHT = 0.02
+# Median of a squared distance in three axes; what more is chance; and fewer points do not tell a level.
+_MEDIAN_SQUARE, _CHANCE, _FEWEST = 2.37, 1.5, 5
 
 
 class Uncertainty(NamedTuple):
@@ -42,7 +44,7 @@ class Residuals(NamedTuple):
         r: (K, 2) [m], zero where unused.
         modes: their derivatives by depth, log radius and height (K, 2, 3).
         weights: (K,) from 0 to 1, agreement times trust.
-        noise: of each point in a usual frame, in plane, (K, 2, 2) [m^2].
+        noise: of each point, in plane, in a frame as noisy as this one (K, 2, 2) [m^2].
         bias: variance that no averaging removes (K,) [m^2].
         used: number of points with a weight.
         known: number of points that were measured.
@@ -87,33 +89,61 @@ def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
     """
     noise, gain, width_variance, trust, offset_variance, depth_variance, model_error, gate = chance
     count, used, known = len(measured), 0, 0
-    r, modes = np.zeros((count, 2)), motions[:, ::2].copy()
+    r, modes, off = np.zeros((count, 2)), motions[:, ::2].copy(), np.zeros(count)
     weights, asked, say = np.zeros(count), np.zeros(count), np.zeros(count)
     way = ((positions - rest) ** 2).sum(axis=1)
     bias = _MODEL_FLOOR**2 + model_error**2 * way + offset_variance
     least = (noise[:, 0, 0] + noise[:, 1, 1]).min()
     for k in range(count):
         if not np.isfinite(measured[k, 0] + measured[k, 1] + measured[k, 2]):
+            off[k] = np.nan
             continue
-        off = measured[k, 1] - positions[k, 1]
-        r[k, 0] = measured[k, 0] - positions[k, 0] - gain[k, 0] * off - modes[k, 0, 0] * below
-        r[k, 1] = measured[k, 2] - positions[k, 2] - gain[k, 1] * off - modes[k, 1, 0] * below
-        r0, r1 = r[k, 0], r[k, 1]
-        r[k] += (modes[k] * moved).sum(axis=1)
+        off[k] = measured[k, 1] - positions[k, 1]
+        r[k, 0] = measured[k, 0] - positions[k, 0] - gain[k, 0] * off[k] - modes[k, 0, 0] * below
+        r[k, 1] = measured[k, 2] - positions[k, 2] - gain[k, 1] * off[k] - modes[k, 1, 0] * below
         h0, h1 = modes[k, 0, 0], modes[k, 1, 0]
-        square = off * off / (width_variance[k] + bias[k])
-        square += _square_distance(r0, r1, h0, h1, noise[k] / trust[k], bias[k], depth_variance)
         say[k] = h0 * h0 + h1 * h1
-        asked[k] = (h0 * r0 + h1 * r1) / max(say[k], 1e-12)
+        asked[k] = (h0 * r[k, 0] + h1 * r[k, 1]) / max(say[k], 1e-12)
         say[k] *= trust[k] * least / (noise[k, 0, 0] + noise[k, 1, 1])
         known += 1
+    jump = _weighted_median(asked, say)
+    level = _find_noise_level(r, off, modes, jump, chance, bias)
+    for k in range(count):
+        if np.isnan(off[k]):
+            continue
+        square = off[k] * off[k] / (level * width_variance[k] + bias[k])
+        spread = noise[k] * (level / trust[k])
+        h0, h1 = modes[k, 0, 0], modes[k, 1, 0]
+        square += _square_distance(r[k, 0], r[k, 1], h0, h1, spread, bias[k], depth_variance)
+        r[k] += (modes[k] * moved).sum(axis=1)
         weight = 1.0 / (1.0 + square / gate**2) ** 2
         if weight >= _LEAST_WEIGHT:
             weights[k] = weight * trust[k]
             used += 1
         else:
             r[k, 0] = r[k, 1] = 0.0
-    return Residuals(r, modes, weights, noise, bias, used, known, _weighted_median(asked, say))
+    return Residuals(r, modes, weights, noise * level, bias, used, known, jump)
+
+
+@njit(**_OPTIONS)
+def _find_noise_level(r, off, modes, jump, chance, bias):
+    """Returns the variance of this frame's residuals over what was expected of it, at least 1.
+
+    The depth is first moved by the median of what the points ask for, for a forecast may be wrong. The median of the
+    squared distances, 2.37 for three axes, is not moved by gross errors; half as much again is taken for chance.
+    """
+    squares, known = np.empty(len(r)), 0
+    for k in range(len(r)):
+        if np.isnan(off[k]):
+            continue
+        r0, r1 = r[k, 0] - modes[k, 0, 0] * jump, r[k, 1] - modes[k, 1, 0] * jump
+        spread = chance.noise[k] / chance.trust[k]
+        squares[known] = _square_distance(r0, r1, 0.0, 0.0, spread, bias[k], 0.0)
+        squares[known] += off[k] * off[k] / (chance.width_variance[k] + bias[k])
+        known += 1
+    if known < _FEWEST:
+        return 1.0
+    return max(1.0, np.median(squares[:known]) / (_MEDIAN_SQUARE * _CHANCE))
 
 
 @njit(**_OPTIONS)

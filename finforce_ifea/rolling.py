@@ -4,18 +4,21 @@ An unknown object is taken for a cylinder: its depth, radius and height are enou
 and spreads along the finger by itself as the finger bends.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.indenter import Indenter, RoundIndenter
+from finforce_ifea.jaw_stiffness import measure_stiffness
 from finforce_ifea.model import JawModel
 from finforce_ifea.surface import ContactSurface
 
-_LARGEST_STEP, _LARGEST_TURN = 2e-3, 0.3
 _BISECTIONS = 10
 _TOUCH = 2e-5
+# Stiffness [N/m] of the finger that the surface's penalty is meant for: the bench finger's, about that of strips too.
+_MEANT_STIFFNESS = 435.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,13 +27,15 @@ class PressedState:
 
     Attributes:
         touches: whether any surface point is in contact.
-        correction: Newton step of the unknowns towards equilibrium (size,).
+        correction: Newton step of the unknowns towards equilibrium (size,); with contact, within the model's reach.
         modes: motions of the unknowns by depth [per m], shape and height [per m], (size, 3).
         force: total contact force on the jaw after `correction` (3,) [N].
         force_modes: its derivatives (3, 3), columns as in modes.
         pressure_point: pressure centre on the deformed surface (3,) [m]; NaN without contact.
         pressure_place: the same on the undeformed surface (3,) [m]; NaN without contact.
         smallest_det: smallest det F of all elements [-].
+        size: of the whole Newton step, as a share of the model's reach.
+        away: distance of the shape from those that a model of stored shapes holds [m].
     """
 
     touches: bool
@@ -41,17 +46,29 @@ class PressedState:
     pressure_point: NDArray
     pressure_place: NDArray
     smallest_det: float
+    size: float
+    away: float = 0.0
 
 
 class RollingContact:
     """A model, its contact surface, and the object pressed into it."""
 
     def __init__(self, model: JawModel, surface: ContactSurface, face_x: float) -> None:
-        """Keeps the model, its contact surface and the plane x = face_x [m] of the undeformed surface."""
+        """Keeps the model, its contact surface and the plane x = face_x [m] of the undeformed surface.
+
+        The penalty goes with the jaw's own stiffness, so that forces scale with Young's modulus: a stiff jaw does not
+        vanish in the object, and a soft one does not meet a wall.
+        """
         self.model = model
-        self.surface = surface
+        self.surface = replace(
+            surface, stiffness=surface.stiffness * (measure_stiffness(model, surface) / _MEANT_STIFFNESS)
+        )
         self.face_x = face_x
         self.indenter: Indenter = RoundIndenter()
+
+    def begin(self, height: float) -> NDArray:
+        """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
+        return np.zeros(self.model.size)
 
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
         """Linearises the equilibrium f_int(q) = J^T p(J q, place) at unknowns q and place (depth, shape, height).
@@ -77,34 +94,47 @@ class RollingContact:
         force_modes[0] -= load_x @ modes
         force_modes[2] -= load_z @ modes
         relief = np.array([load_x @ steps[:, 0], 0.0, load_z @ steps[:, 0]])
+        reached = measure_step(model, steps[:, 0])
         return PressedState(
             touches=bool(total > 0),
-            correction=steps[:, 0],
+            correction=steps[:, 0] / max(reached, 1.0) if total > 0 else steps[:, 0],
             modes=modes,
             force=contact.forces.sum(0) - relief,
             force_modes=force_modes,
             pressure_point=share @ points,
             pressure_place=share @ self.surface.points,
             smallest_det=state.smallest_det,
+            size=reached,
         )
 
     def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
         """Returns the step of a jaw that has lost contact, cut where its surface meets the object again."""
-        low, high = 0.0, 1.0
-        for _ in range(_BISECTIONS):
-            share = 0.5 * (low + high)
+
+        def find_gap(share: float) -> float:
             points = self.model.positions(self.surface.probe, q + share * step)
-            if self.indenter.find_gap(points, self.face_x, place) < -_TOUCH:
-                high = share
-            else:
-                low = share
-        return high * step
+            return self.indenter.find_gap(points, self.face_x, place)
+
+        return find_share_that_meets(find_gap) * step
+
+
+def find_share_that_meets(find_gap: Callable[[float], float]) -> float:
+    """Returns the share from 0 to 1 of a step at which the gap [m] to an object closes, by bisection."""
+    low, high = 0.0, 1.0
+    for _ in range(_BISECTIONS):
+        share = 0.5 * (low + high)
+        if find_gap(share) < -_TOUCH:
+            high = share
+        else:
+            low = share
+    return high
+
+
+def measure_step(model: JawModel, step: NDArray) -> float:
+    """Returns the largest change in a step of the unknowns (size,), as a share of the model's reach."""
+    return float((np.abs(step) / model.reach).max(initial=0.0))
 
 
 def limit_step(model: JawModel, step: NDArray) -> NDArray:
-    """Returns a step of the unknowns shortened so that no node moves by more than 2 mm or turns by 0.3 rad at once."""
-    size = np.abs(step)
-    if model.rotations is not None:
-        size = np.where(model.rotations, size * (_LARGEST_STEP / _LARGEST_TURN), size)
-    largest = size.max(initial=0.0)
-    return step if largest <= _LARGEST_STEP else step * (_LARGEST_STEP / largest)
+    """Returns a step of the unknowns shortened so that none exceeds the model's reach."""
+    largest = measure_step(model, step)
+    return step if largest <= 1.0 else step / largest

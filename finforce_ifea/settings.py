@@ -5,14 +5,18 @@ from dataclasses import dataclass
 from finforce_bounded import check_bounds, choice, setting
 from finforce_ifea.errors import ObservationError
 
-SOLVERS = ("default", "solid", "frame", "paper")
+SOLVERS = ("default", "reduced", "solid", "frame", "linear", "paper")
+_SOLVER_MEANING = (
+    "mechanics: what the jaw file recommends (solid or frame), solid, frame, stored equilibria of what it recommends "
+    "(reduced), its compliance at rest alone (linear), or the paper's"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorSettings:
     """Settings of `JawEstimator`; each field's metadata says unit, bounds and meaning."""
 
-    solver: str = choice("default", SOLVERS, "mechanics: what the jaw file recommends, solid, frame, or the paper's")
+    solver: str = choice("default", SOLVERS, _SOLVER_MEANING)
     mesh: str = choice("default", ("coarse", "default", "fine"), "mesh density of a drawing")
     likelihood_threshold: float = setting(0.6, "1", 0.0, 1.0, "a key point below it is hidden")
     workspace_margin: float = setting(0.03, "m", 0.001, 1.0, "a key point farther from its place at rest is refused")

@@ -13,7 +13,7 @@ from finforce_ifea.elements import centre_gradient, elasticity_matrix, hex_stiff
 from finforce_ifea.factor import Factor, SparseFactor, factorise_banded, sparse_from_banded
 from finforce_ifea.jaw_parts import Material
 from finforce_ifea.mesh import VolumeMesh
-from finforce_ifea.model import Linearization
+from finforce_ifea.model import LARGEST_MOVE, Linearization
 from finforce_ifea.probes import (
     add_probe_springs,
     probe_loads,
@@ -58,7 +58,7 @@ class SolidModel:
             symmetric: halve the mesh where it mirrors itself in y = 0.
         """
         self.mesh = mesh
-        self.rotations = None
+        self.rotations, self.reach = None, LARGEST_MOVE
         mirror = find_mirror_nodes(mesh) if symmetric else None
         self.symmetric = mirror is not None
         elements = mesh.elements

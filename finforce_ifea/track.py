@@ -25,6 +25,11 @@ class Track:
         residual: weighted root mean square residual [m].
         stiffening: force over depth beside that of first touch [-]; large where the place has run to the base.
         misfit: averaged residuals over their standard deviations, about 1 where the model fits.
+        away: how far the key points alone would have the contact from where it was said to be [m].
+        mistaken: probability that it is not there.
+        place_error: relative standard deviation of the force that its place leaves, beside the covariance.
+        place_stddev: of the height of the pressure centre [m].
+        condition: of what was solved, its unknowns scaled.
         kkt: gradient of the objective that is left, relative to its parts.
         iterations: Newton iterations.
         converged: whether the last one changed nothing that matters.
@@ -48,6 +53,11 @@ class Track:
     sound: bool
     quiet: bool
     loaded: bool
+    away: float = 0.0
+    mistaken: float = 0.0
+    place_error: float = 0.0
+    place_stddev: float = 0.0
+    condition: float = 1.0
 
 
 def compute_magnitude_stddev(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
@@ -64,16 +74,29 @@ def compute_magnitude_stddev(force: NDArray, modes: NDArray, covariance: NDArray
     return float(np.sqrt(mode @ covariance @ mode))
 
 
-def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
-    """Returns by how many standard deviations one mode (K, 2) explains the offsets of a tare.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoadFit:
+    """Least squares of one mode: its gain (2 n,) on the offsets, and the standard deviation of what it finds."""
 
-    The rest is chance: of every key point [m], and of all together, as a wrong depth scale moves them alike.
+    gain: NDArray
+    stddev: float
+
+
+def fit_load(modes: NDArray, deviation: NDArray) -> LoadFit:
+    """Returns the fit of one mode (n, 2) to offsets of n key points, each off by chance by its deviation (n,) [m].
+
+    All together are off by chance, too, as a wrong depth scale moves them alike.
     """
-    seen = tare.counts > 0
-    deviation = np.sqrt(offset_stddev**2 + tare.offset_variance(0.0)[seen, None])
-    common = np.broadcast_to(np.eye(2), (int(seen.sum()), 2, 2))
-    design = np.concatenate([modes[seen][:, :, None], common], axis=2) / deviation[:, :, None]
+    common = np.broadcast_to(np.eye(2), (len(modes), 2, 2))
+    design = np.concatenate([modes[:, :, None], common], axis=2) / deviation[:, None, None]
     design = np.concatenate([design.reshape(-1, 3), np.diag([0.0, 1.0, 1.0]) / _COMMON_OFFSET])
-    target = np.append((tare.offsets[seen][:, [0, 2]] / deviation).ravel(), np.zeros(3))
     covariance = np.linalg.pinv(design.T @ design)
-    return float((covariance @ design.T @ target)[0] / np.sqrt(max(covariance[0, 0], 1e-300)))
+    gain = (covariance @ design.T)[0, :-3] / np.repeat(deviation, 2)
+    return LoadFit(gain=gain, stddev=float(np.sqrt(max(covariance[0, 0], 1e-300))))
+
+
+def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
+    """Returns by how many standard deviations one mode (K, 2) explains the offsets of a tare; see `fit_load`."""
+    seen = tare.counts > 0
+    fit = fit_load(modes[seen], np.sqrt(offset_stddev**2 + tare.offset_variance(0.0)[seen]))
+    return float(fit.gain @ tare.offsets[seen][:, [0, 2]].ravel() / fit.stddev)

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
-from finforce_ifea.place_update import Forecast, PlaceUpdate, update_place
+from finforce_ifea.place_update import Average, Forecast, PlaceUpdate, update_place
 from finforce_ifea.point_noise import PointNoise
 from finforce_ifea.residuals import Residuals, Uncertainty, weigh_residuals
+from finforce_ifea.rest_response import measure_rest
 from finforce_ifea.rolling import PressedState, RollingContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
@@ -28,7 +29,8 @@ _DEPTH_DRIFT = 0.01e-3
 _LARGEST_MOVE = 0.7e-3
 _LARGEST_SHIFT = 0.3e-3
 _SETTLED_MOVE = 1e-4
-_SETTLED_CORRECTION = 1e-4
+# Of the model's reach, 0.1 mm.
+_SETTLED_CORRECTION = 0.05
 _UNDECIDED = 0.2
 _FRAMES_RELEASED = 15
 _LOST_STDDEV = 1e-3
@@ -49,6 +51,8 @@ class PlaceTracker:
         self.probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
         self._stiffness: float | None = None
         self._rest = contact.model.positions(self.probe, np.zeros(contact.model.size))
+        self.response = measure_rest(contact, self.probe, len(keypoints))
+        self._outline: OutlineIndenter | None = None
         self._face = contact.surface.heights[[0, -1]]
         self.reset()
 
@@ -64,7 +68,7 @@ class PlaceTracker:
 
     def _begin(self) -> None:
         """Starts with the undeformed jaw and an object that just touches."""
-        self.q = np.zeros(self.contact.model.size)
+        self.q = self.contact.begin(self._prior[1])
         self._motion = np.array([self._find_touch(np.r_[0.0, self._prior]), 0.0])
         self._motion_covariance = np.diag([0.1e-3, 1e-3]) ** 2
         self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
@@ -73,8 +77,8 @@ class PlaceTracker:
 
     def _forget_place(self) -> None:
         self._slow = self._prior.copy()
-        self._mean = np.zeros((len(self._rest), 2))
-        self._count = np.zeros(len(self._rest))
+        count = len(self._rest)
+        self._average = Average(np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros(count))
 
     def update(self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None) -> Track | None:
         """Takes the key points (K, 3) [m], NaN where unused, dt [s] after the last; None when too few agree.
@@ -94,7 +98,7 @@ class PlaceTracker:
             if not state.touches:
                 q = q + self.contact.approach(q, state.correction, mechanical)
                 continue
-            q = q + limit_step(self.contact.model, state.correction)
+            q = q + state.correction
             data = self._weigh(q, state, measured, place - forecast.place, place, chance)
             if data.used < max(self.settings.minimum_keypoints, _LEAST_AGREEMENT * data.known):
                 place, q = self._leap(q, state, mechanical, place, data)
@@ -126,7 +130,7 @@ class PlaceTracker:
         """Whether the last iteration changed nothing that matters."""
         change = np.array([_SETTLED_MOVE, self.contact.indenter.shape_range.settled_change, _SETTLED_MOVE])
         small = (np.abs(moved) < change).all() and (np.abs(missing) < change).all()
-        return bool(small and np.abs(state.correction).max() < _SETTLED_CORRECTION)
+        return bool(small and state.size < _SETTLED_CORRECTION)
 
     def _find_touch(self, place: NDArray) -> float:
         """Returns the depth [m] at which the object of a place (3,) first touches the undeformed jaw."""
@@ -138,10 +142,13 @@ class PlaceTracker:
 
     def significance(self, tare: Tare, stddev: float) -> float:
         """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
+        return explain_offsets(self.rest_modes(), tare, stddev)
+
+    def rest_modes(self) -> NDArray:
+        """Returns how the key points of the undeformed jaw move in x and z by the depth (K, 2) [m/m]."""
         q = np.zeros(self.contact.model.size)
         state = self.contact.linearize(q, self._reachable(np.r_[-1.0, self._prior]))
-        modes = self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
-        return explain_offsets(modes, tare, stddev)
+        return self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
 
     def follow(self, contact: Contact) -> None:
         """Takes over where a contact's object is: its outline, or its height as that of first touch."""
@@ -151,17 +158,16 @@ class PlaceTracker:
         height = float(expect_object(contact, self.settings).mean[1])
         if self._given is None:
             self.reset(height)
-        if self._given != height or self._stiffness is None:
-            self._stiffness = self._touch_stiffness(height)
+        self._stiffness = self.response.stiffness_at(height)
         self._given = self._prior[1] = height
 
     def _follow_outline(self, contact: Contact) -> None:
         """Takes the outline's tilt and height as what is to be expected; an outline cut anew keeps the place."""
         before = self.contact.indenter
-        expected = expect_object(contact, self.settings, before)
+        expected = expect_object(contact, self.settings, self._outline)
         self._prior, self._prior_variance = expected.mean, expected.variance
-        self.contact.indenter = after = expected.indenter
-        self._given = self._stiffness = None
+        self.contact.indenter = self._outline = after = expected.indenter
+        self._given, self._stiffness = None, self.response.stiffness_at(float(expected.mean[1]))
         away = abs(self._slow[1] - expected.mean[1]) > _FARTHEST_HEIGHT * self.settings.height_stddev
         if away or not isinstance(before, OutlineIndenter) or not after.resembles(before):
             self._begin()
@@ -169,12 +175,6 @@ class PlaceTracker:
             change = after.field.front - before.field.front
             self._motion[0] += change
             self._reached[DEPTH] += change
-
-    def _touch_stiffness(self, height: float) -> float:
-        """Returns force over depth [N/m] of the undeformed jaw at `height` [m]."""
-        place = np.array([_LEAST_DEPTH, np.log(self.settings.radius), height])
-        state = self.contact.linearize(np.zeros(self.contact.model.size), place)
-        return float(np.linalg.norm(state.force_modes[:, DEPTH]))
 
     def _predict(self, dt: float) -> Forecast:
         """Returns the place dt [s] later: constant speed of the depth under white acceleration."""
@@ -214,8 +214,7 @@ class PlaceTracker:
         """Returns the place that the residuals ask for."""
         return update_place(
             data,
-            self._mean,
-            self._count,
+            self._average,
             forecast,
             self._prior,
             self._prior_variance,
@@ -243,7 +242,7 @@ class PlaceTracker:
         self._slow = place[1:].copy()
         self._motion = np.array([place[DEPTH], update.speed])
         self._motion_covariance, self._jumped = update.spread, update.jumped
-        self._mean, self._count = update.mean, update.count
+        self._average = update.average
         pressed = place[DEPTH] - self._find_touch(place)
         self._released = self._released + 1 if pressed < _TOUCH_DEPTH else 0
         if self._released >= _FRAMES_RELEASED:
@@ -282,10 +281,15 @@ class PlaceTracker:
             sound=bool(finite and state.smallest_det > 0),
             quiet=bool(pressed < _TOUCH_DEPTH),
             loaded=bool(pressed > _LOADED_DEPTH),
+            away=update.away,
+            mistaken=update.mistaken,
+            condition=update.condition,
+            place_stddev=float(np.sqrt(max(update.covariance[HEIGHT, HEIGHT], 0.0))),
         )
 
     def _stiffening(self, force: NDArray, place: NDArray) -> float:
         """Returns how much stiffer the pressed jaw is than at first touch; 1 until it is surely pressed."""
-        if self._stiffness is None or place[DEPTH] < _LOADED_DEPTH:
+        pressed = place[DEPTH] - self._find_touch(place)
+        if self._stiffness is None or pressed < _LOADED_DEPTH:
             return 1.0
-        return float(np.linalg.norm(force) / (self._stiffness * place[DEPTH]))
+        return float(np.linalg.norm(force) / (self._stiffness * pressed))

@@ -1,0 +1,152 @@
+"""Claims about the jaw of stored equilibria: it answers as the full mechanics does, wherever and whatever presses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimator_fakes import magnitudes, make_estimator, ramp, record, run
+from mechanics_fakes import BENCH, bench_mechanics
+from reduced_fakes import box, press, settle
+
+from finforce_ifea.errors import JawFileError
+from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
+from finforce_ifea.mechanics import build_mechanics
+from finforce_ifea.observation import Contact
+from finforce_ifea.rolling import limit_step
+from finforce_ifea.settings import EstimatorSettings
+
+DEPTHS = np.array([0.5, 2.0, 5.0, 10.0]) * 1e-3
+# Steps of depth [m], log radius and height [m] for central differences.
+STEPS = {DEPTH: 1e-6, SHAPE: 1e-4, HEIGHT: 1e-6}
+MODELS = ["solid", "frame"]
+
+
+def reduced(mesh="coarse"):
+    return bench_mechanics(mesh, "reduced")
+
+
+def keypoints(mechanics, q):
+    return mechanics.model.positions(mechanics.model.attach(BENCH.keypoints, 1e-3), q)
+
+
+def compare(indenter, shape, height, depths=DEPTHS, mechanics=None):
+    """Relative errors of force and errors of key points [m] at the depths, beside the full mechanics."""
+    full, other = bench_mechanics(), mechanics or reduced()
+    true, found = (press(each.contact, indenter(), shape, height, depths) for each in (full, other))
+    forces, others = (np.array([state.force for _, state in results]) for results in (true, found))
+    shapes = [
+        np.abs(keypoints(full, a) - keypoints(other, b)).max() for (a, _), (b, _) in zip(true, found, strict=True)
+    ]
+    return np.linalg.norm(others, axis=1) / np.linalg.norm(forces, axis=1) - 1.0, np.array(shapes)
+
+
+@pytest.mark.parametrize("height", [0.0205, 0.0333, 0.0418, 0.0571, 0.0689])
+@pytest.mark.parametrize("radius", [0.004, 0.0125, 0.0175])
+def test_forces_and_shapes_are_those_of_the_full_mechanics_between_the_stored_heights(radius, height):
+    force, shape = compare(RoundIndenter, np.log(radius), height)
+    assert np.abs(force).max() < 0.003
+    assert shape.max() < 0.02e-3
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.1, -0.3])
+def test_boxes_are_pressed_in_as_by_the_full_mechanics(tilt):
+    force, shape = compare(lambda: OutlineIndenter((box(0.02),)), tilt, 0.045)
+    assert np.abs(force).max() < 0.003
+    assert shape.max() < 0.06e-3
+
+
+def test_rest_stiffness_alone_is_right_for_small_loads_and_wrong_for_large_ones():
+    force, _ = compare(RoundIndenter, np.log(0.0125), 0.060, mechanics=bench_mechanics("coarse", "linear"))
+    assert abs(force[0]) < 0.01
+    assert abs(force[-1]) > 0.03
+
+
+def test_modes_are_the_derivatives_of_the_equilibrium_by_depth_radius_and_height():
+    contact = reduced().contact
+    place = np.array([0.004, np.log(0.0125), 0.031])
+    [(q, state)] = press(contact, RoundIndenter(), place[SHAPE], place[HEIGHT], [place[DEPTH]])
+    for which, size in STEPS.items():
+        step = size * np.eye(3)[which]
+        (_, above), (_, below) = (settle(contact, q, place + sign * step) for sign in (1, -1))
+        change = (above.force - below.force) / (2 * size)
+        # what the interpolated compliance changes on the way is left out
+        np.testing.assert_allclose(state.force_modes[:, which], change, atol=0.03 * np.linalg.norm(change))
+
+
+def test_equilibrium_is_found_again_from_another_place():
+    contact = reduced().contact
+    place = np.array([0.006, np.log(0.0125), 0.050])
+    [(q, state)] = press(contact, RoundIndenter(), place[SHAPE], place[HEIGHT], [place[DEPTH]])
+    [(other, _)] = press(contact, RoundIndenter(), place[SHAPE], place[HEIGHT] - 2e-3, [place[DEPTH] - 1e-3])
+    there, found = settle(contact, other, place)
+    np.testing.assert_allclose(found.force, state.force, atol=1e-5)
+    np.testing.assert_allclose(keypoints(reduced(), there), keypoints(reduced(), q), atol=1e-7)
+
+
+def test_jaw_that_has_lost_contact_comes_back_to_touch():
+    contact = reduced().contact
+    [(q, _)] = press(contact, RoundIndenter(), np.log(0.0125), 0.030, [0.004])
+    place = np.array([0.001, np.log(0.0125), 0.030])
+    state = contact.linearize(q, place)
+    assert not state.touches
+    back = q + contact.approach(q, state.correction, place)
+    assert contact.linearize(back, place).touches
+
+
+def test_forces_are_in_proportion_to_the_modulus():
+    stiff = replace(BENCH, material=replace(BENCH.material, young_modulus=7.0 * BENCH.material.young_modulus))
+    settings = EstimatorSettings(solver="reduced", mesh="coarse")
+    place = (np.log(0.0125), 0.040, [0.005])
+    [(_, soft)] = press(reduced().contact, RoundIndenter(), *place)
+    [(_, hard)] = press(build_mechanics(stiff, settings).contact, RoundIndenter(), *place)
+    np.testing.assert_allclose(hard.force, 7.0 * soft.force, rtol=1e-4)
+
+
+def test_deformed_surface_is_that_of_the_full_mechanics():
+    full, other = bench_mechanics(), reduced()
+    [(a, _)] = press(full.contact, RoundIndenter(), np.log(0.0125), 0.040, [0.008])
+    [(b, _)] = press(other.contact, RoundIndenter(), np.log(0.0125), 0.040, [0.008])
+    np.testing.assert_allclose(other.model.vertices(b), full.model.vertices(a), atol=0.05e-3)
+
+
+def test_shapes_that_are_far_from_the_stored_ones_are_known_as_such():
+    contact = reduced().contact
+    near = press(contact, RoundIndenter(), np.log(0.0125), 0.045, [0.008])[0][1].away
+    wide = press(contact, OutlineIndenter((box(0.04),)), 0.0, 0.045, [0.008])[0][1].away
+    assert near < 0.02e-3
+    assert wide > 0.3e-3
+
+
+@pytest.mark.parametrize("solver", MODELS)
+def test_force_of_key_points_is_that_of_the_full_solver(solver):
+    """The finger may recommend either model; the estimate of a press with noise is the same within 1 % of the force."""
+    jaw, recording = replace(BENCH, model=solver), record(ramp(3, 8, 2, 0))
+    full, other = (
+        magnitudes(run(recording, make_estimator(jaw, solver=name, mesh="coarse"))) for name in (solver, "reduced")
+    )
+    assert np.isfinite(other[60:]).all()
+    np.testing.assert_allclose(other[60:], full[60:], atol=0.01 * np.nanmax(full))
+
+
+def test_given_contact_gives_the_force_of_the_full_solver():
+    recording = record(ramp(3, 6), noise=0.2, offsets=0.0)
+    place = Contact(points=np.array([[BENCH.inner_face_x, 0.0, 0.040]]), weights=np.ones(1))
+    full, other = (
+        magnitudes(run(recording, contact=place, solver=name, mesh="coarse")) for name in ("solid", "reduced")
+    )
+    loaded = np.abs(full) > 0.3
+    assert loaded.sum() > 60
+    np.testing.assert_allclose(other[loaded], full[loaded], rtol=0.02)
+
+
+def test_forces_in_three_axes_are_refused():
+    with pytest.raises(JawFileError, match="expected force_axes normal"):
+        build_mechanics(BENCH, EstimatorSettings(solver="reduced", mesh="coarse", force_axes="three"))
+
+
+def test_steps_are_limited_by_the_reach_of_loads_and_grid_coordinates():
+    model = reduced().model
+    step = np.random.default_rng(0).normal(size=model.size)
+    limited = limit_step(model, 100.0 * step)
+    assert np.isclose((np.abs(limited) / model.reach).max(), 1.0)
+    np.testing.assert_array_equal(limit_step(model, 1e-6 * step), 1e-6 * step)
