@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import ContactError
+from finforce_ifea.face_tangents import Face, FaceTangent
 from finforce_ifea.indenter import RoundIndenter
 from finforce_ifea.manifold import STENCIL, Manifold
 from finforce_ifea.mechanics import Mechanics
@@ -16,17 +17,16 @@ from finforce_ifea.solid import SolidModel
 DEPTHS, HEIGHTS, SHAPES, ROWS = 12, 27, 40, 56
 # As shares of the face: radius of the rod, largest depth, where the rod is first, and how far from the top it is last.
 _ROD, _DEEPEST, _LOWEST, _TOP = 0.07, 0.19, 0.11, 0.03
+# By so much the rods stand denser at the base than in the middle: forces change fastest with height there.
+_DENSER = 0.5
 # The rod stops where it needs this many times the force that it needs half way up at full depth.
 _HARDEST = 12.0
 _LONGEST, _SHORTEST = 0.5e-3, 0.02e-3
 _ITERATIONS, _TOLERANCE = 30, 1e-9
-_LOADED_EVERY = 3
 _ON_FACE = 1e-4
-# Loads below this share of the largest are rounding errors.
-_NOTHING = 1e-7
 _FEWEST_ROWS, _MOST_ROWS = 12, 84
 # What the outcome depends on beside the jaw.
-GRID = (DEPTHS, HEIGHTS, SHAPES, ROWS, _ROD, _DEEPEST, _LOWEST, _TOP, _HARDEST)
+GRID = (DEPTHS, HEIGHTS, SHAPES, ROWS, _ROD, _DEEPEST, _LOWEST, _TOP, _DENSER, _HARDEST)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,9 +47,40 @@ def build_manifold(mechanics: Mechanics, young_modulus: float, progress: Callabl
     Raises:
         ContactError: the jaw cannot be pressed at enough heights.
     """
-    contact = mechanics.contact
+    grid = _press_everywhere(mechanics.contact, lambda share: progress(0.5 * share))
+    heights = _choose_rows(mechanics)
+    face, parts = Face(mechanics, heights[1:]), []
+    face.find_basis(grid.q.reshape(-1, grid.q.shape[-1]), SHAPES)
+    for number, row in enumerate(grid.q):
+        parts.append([face.describe(state) for state in row])
+        progress(0.5 + 0.5 * (number + 1) / len(grid.q))
+    return _store(young_modulus, grid, heights, parts, face)
+
+
+def build_rest(mechanics: Mechanics, young_modulus: float) -> Manifold:
+    """Stores the unloaded jaw alone, at all grid points; see `build_manifold`."""
+    heights, rest = _choose_rows(mechanics), np.zeros(mechanics.model.size)
+    face = Face(mechanics, heights[1:])
+    face.find_basis(rest[None], SHAPES)
+    grid = _Grid(rods=np.arange(STENCIL), depths=np.zeros(STENCIL), q=np.zeros((STENCIL, STENCIL, len(rest))))
+    return _store(young_modulus, grid, heights, [[face.describe(rest)] * STENCIL] * STENCIL, face)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Grid:
+    """Equilibria q (T, Z, size) under rods at heights (Z,) [m], pressed in evenly up to depths (Z,) [m]."""
+
+    rods: NDArray
+    depths: NDArray
+    q: NDArray
+
+
+def _press_everywhere(contact: RollingContact, progress: Callable[[float], None]) -> _Grid:
+    """Returns the equilibria under rods at all heights."""
     low, high = contact.surface.heights[[0, -1]]
-    heights = np.linspace(low + _LOWEST * (high - low), high - _TOP * (high - low), HEIGHTS)
+    share = np.linspace(0.0, 1.0, HEIGHTS)
+    share = (1.0 - _DENSER) * share + _DENSER * share**2
+    heights = low + (_LOWEST + (1.0 - _TOP - _LOWEST) * share) * (high - low)
     rods = [_Rod(contact, height) for height in heights]
     hardest = _HARDEST * float(np.linalg.norm(rods[HEIGHTS // 2].press(np.inf)[-1].state.force))
     depths, states = [], []
@@ -57,22 +88,8 @@ def build_manifold(mechanics: Mechanics, young_modulus: float, progress: Callabl
         course = rod.press(hardest)
         depths.append(course[-1].depth)
         states.append(rod.divide(course, DEPTHS))
-        progress(0.6 * (number + 1) / HEIGHTS)
-    q = np.array(states).transpose(1, 0, 2)
-    face, parts = _Face(mechanics, _choose_rows(mechanics)), []
-    for number, row in enumerate(q):
-        parts.append([face.describe(state) for state in row])
-        progress(0.6 + 0.4 * (number + 1) / len(q))
-    return _store(young_modulus, heights, np.array(depths), q, face, parts)
-
-
-def build_rest(mechanics: Mechanics, young_modulus: float) -> Manifold:
-    """Stores the unloaded jaw alone, at all grid points; see `build_manifold`."""
-    face = _Face(mechanics, _choose_rows(mechanics))
-    rest = np.zeros(mechanics.model.size)
-    part = face.describe(rest)
-    q = np.zeros((STENCIL, STENCIL, len(rest)))
-    return _store(young_modulus, np.arange(STENCIL), np.zeros(STENCIL), q, face, [[part] * STENCIL] * STENCIL)
+        progress((number + 1) / HEIGHTS)
+    return _Grid(rods=heights, depths=np.array(depths), q=np.array(states).transpose(1, 0, 2))
 
 
 def _choose_rows(mechanics: Mechanics) -> NDArray:
@@ -150,83 +167,21 @@ class _Rod:
         return None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Tangent:
-    """One equilibrium at the rows: load (2 n,) [N], move (2 n,) [m], compliance (2 n, 2 n), responses (size, 2 n)."""
+def _store(young_modulus: float, grid: _Grid, heights: NDArray, parts: list[list[FaceTangent]], face: Face) -> Manifold:
+    """Returns the manifold of a grid of equilibria and their tangents (T, Z)."""
 
-    load: NDArray
-    move: NDArray
-    compliance: NDArray
-    responses: NDArray
+    def collect(name: str, kind: type = np.float64) -> NDArray:
+        return np.array([[getattr(part, name) for part in row] for row in parts], kind)
 
-
-class _Face:
-    """The rows of the inner face as the full model moves them."""
-
-    def __init__(self, mechanics: Mechanics, rows: NDArray) -> None:
-        self.heights = rows
-        surface, self._model = mechanics.contact.surface, mechanics.model
-        across = surface.points[: surface.across, 1]
-        points = np.array([[mechanics.contact.face_x, y, z] for z in rows[1:] for y in across])
-        self._probe, self._across, self._count = self._model.attach(points, 1e-3), len(across), len(rows) - 1
-
-    def describe(self, q: NDArray) -> _Tangent:
-        """Returns the equilibrium of unknowns q and what unit loads at the rows do to it."""
-        model, count = self._model, 2 * self._count
-        state, loads = model.linearize(q), self._unit_loads(q)
-        responses = model.factorise(state.tangent).solve(loads)
-        moves = self._average(model.project(self._probe, q, responses)).transpose(0, 1, 2).reshape(count, count)
-        at_rest = np.zeros(model.size)
-        moved = model.positions(self._probe, q) - model.positions(self._probe, at_rest)
-        # the load that holds the jaw in this shape, as far as loads at the rows can
-        load = np.linalg.lstsq(loads, state.force)[0]
-        load[np.abs(load) < _NOTHING * np.abs(load).max()] = 0.0
-        return _Tangent(
-            load=load,
-            move=self._average(moved[:, :, None]).reshape(count),
-            compliance=0.5 * (moves + moves.T),
-            responses=responses,
-        )
-
-    def _average(self, moves: NDArray) -> NDArray:
-        """Returns x and z motions (n, 2, k) of the rows, the mean across the face, of those of points (p, 3, k)."""
-        return moves.reshape(self._count, self._across, 3, -1).mean(1)[:, [0, 2]]
-
-    def _unit_loads(self, q: NDArray) -> NDArray:
-        """Returns the loads (size, 2 n) of unit forces along x and z at each row."""
-        columns = np.zeros((len(q), 2 * self._count))
-        for row in range(self._count):
-            for number, axis in enumerate((0, 2)):
-                forces = np.zeros((self._count * self._across, 3))
-                forces[row * self._across : (row + 1) * self._across, axis] = 1.0 / self._across
-                columns[:, 2 * row + number] = self._model.load(self._probe, q, forces)
-        return columns
-
-
-def _store(
-    young_modulus: float, rods: NDArray, depths: NDArray, q: NDArray, face: _Face, parts: list[list[_Tangent]]
-) -> Manifold:
-    """Returns the manifold of equilibria q (T, Z, size) and their tangents."""
-    basis = _find_basis(q, parts)
     return Manifold(
         young_modulus=young_modulus,
-        heights=face.heights,
-        rods=rods,
-        depths=depths,
-        loads=np.array([[part.load for part in row] for row in parts]),
-        moves=np.array([[part.move for part in row] for row in parts]),
-        compliance=np.array([[part.compliance for part in row] for row in parts], np.float32),
-        shapes=q @ basis,
-        shape_compliance=np.array([[basis.T @ part.responses for part in row] for row in parts], np.float32),
-        basis=basis,
+        heights=heights,
+        rods=grid.rods,
+        depths=grid.depths,
+        loads=collect("load"),
+        moves=collect("move"),
+        compliance=collect("compliance", np.float32),
+        shapes=collect("shape"),
+        shape_compliance=collect("shape_compliance", np.float32),
+        basis=face.basis,
     )
-
-
-def _find_basis(q: NDArray, parts: list[list[_Tangent]]) -> NDArray:
-    """Returns orthonormal shapes (size, r) that span equilibria q (T, Z, size) and what loads do to them."""
-    states = q.reshape(-1, q.shape[-1])
-    some = [part.responses for row in parts[::_LOADED_EVERY] for part in row[::_LOADED_EVERY]]
-    responses = np.concatenate(some, axis=1).T
-    share = (np.abs(states).max() or 1.0) / np.abs(responses).max() / len(some)
-    vectors, values, _ = np.linalg.svd(np.concatenate([states, share * responses]).T, full_matrices=False)
-    return np.ascontiguousarray(vectors[:, : min(SHAPES, int((values > 0).sum()))])

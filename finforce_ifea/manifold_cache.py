@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from finforce_ifea.manifold import Manifold
 
 # To be raised when what is stored, or how it is found, changes.
-VERSION = 2
+VERSION = 3
 _LOG = logging.getLogger(__name__)
 
 
