@@ -18,10 +18,9 @@ from finforce_ifea.observation import (
     blank_solution,
     check_contact,
     check_observation,
-    sketch_contact,
 )
-from finforce_ifea.outline import ObjectOutline
 from finforce_ifea.point_tracking import PointTracker
+from finforce_ifea.rehearsal import rehearse
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.taring import TareKeeper, TareReport
@@ -36,6 +35,8 @@ _BESIDE = 1e-3
 _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
 # Relative standard deviation of forces without a calibration.
 _UNCALIBRATED = 0.1
+# Relative error of forces at the distance from stored shapes that those are good for.
+_EXTRAPOLATED = 0.015
 # Share of a force that nobody has seen along z.
 _LEAN = 0.3
 
@@ -89,19 +90,9 @@ class JawEstimator:
 
     def warm_up(self) -> None:
         """Compiles what is compiled on first use, and leaves no trace."""
-        for tracker in (self._rolling, self._pointed, self._rolling):
-            tracker.update(self.jaw.keypoints.copy(), self._taring.tare, 0.03)
-            self._rolling.follow(self._imagine_contact())
-        self._rolling.follow(sketch_contact(self.jaw))
-        self._rolling.update(self.jaw.keypoints.copy(), self._taring.tare, 0.03)
         self.reset()
-
-    def _imagine_contact(self) -> Contact:
-        """Returns a contact with an outline, a block before the middle of the jaw."""
-        place = np.array([self.jaw.inner_face_x, float(np.median(self.jaw.candidates[:, 2]))])
-        block = 0.01 * np.array([[0.0, -1.0], [2.0, -1.0], [2.0, 1.0], [0.0, 1.0]])
-        outline = ObjectOutline(polygons=(block,), origin=place, tilt=0.0, stddev=np.full(3, 1e-3))
-        return replace(Contact.fixed(self.jaw, float(place[1])), outline=outline)
+        rehearse(self.jaw, self.settings.tare_frames, self.update)
+        self.reset()
 
     @property
     def tared(self) -> bool:
@@ -265,7 +256,7 @@ class JawEstimator:
         # the mechanics errs in the direction as in the magnitude
         covariance = track.force_modes @ track.covariance @ track.force_modes.T
         fit = compute_magnitude_stddev(track.force, track.force_modes, track.covariance)
-        share = np.hypot(self._force_error, track.place_error)
+        share = np.hypot(np.hypot(self._force_error, track.place_error), _EXTRAPOLATED * track.extrapolation**2)
         covariance += (share * magnitude) ** 2 * np.diag([1.0, 0.0, 1.0])
         # a larger force leans more: where it is hardly known, its direction is not known either
         covariance[2, 2] += (_LEAN * fit**2 / max(magnitude + fit, 1e-300)) ** 2

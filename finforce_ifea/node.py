@@ -78,13 +78,14 @@ class IfeaSolverNode(Node):
 
     def _on_keypoints(self, data: bytes) -> None:
         """Solve the newest image and publish its wrench, if it can be trusted."""
-        began, superseded = perf_counter(), 0
+        began, overtaken = perf_counter(), 0
         if self.skips.allows(LATE):
-            data, superseded = ros.take_newest(self.keypoints, data)
-            self.skips.count(LATE, superseded)
-        self.health.arrive(superseded)
-        if self.idling.passes(read_stamp(data)):
-            self.skips.count(IDLE)
+            data, overtaken = ros.take_newest(self.keypoints, data)
+        passed = self.idling.passes(read_stamp(data))
+        # what waited while nothing happened was not late
+        self.skips.count(IDLE if self.idling.is_idle else LATE, overtaken + passed)
+        self.health.arrive(0 if self.idling.is_idle else overtaken)
+        if passed:
             return
         cloud = deserialize_message(data, PointCloud2)
         header, stamp = cloud.header, ros.nanoseconds(cloud.header.stamp)

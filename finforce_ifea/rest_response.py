@@ -50,9 +50,10 @@ class RestResponse:
         return (1.0 - share) * values[upper - 1] + share * values[upper]
 
     def bound_force(self, deviations: NDArray, offset_stddev: float) -> float:
-        """Returns the largest standard deviation [N] of a force that key points seen at rest leave room for.
+        """Returns the standard deviation [N] of a force that key points seen at rest leave room for, at any height.
 
-        At each height, the force that explains the deviations best and its own standard deviation are taken together.
+        At each height, the force that explains the deviations best and its own standard deviation are taken together;
+        all heights are alike.
 
         Args:
             deviations: of the key points from their places at rest (K, 3) [m], NaN where unseen.
@@ -61,7 +62,7 @@ class RestResponse:
         seen = np.isfinite(deviations[:, 0])
         fit = self._fit(seen.tobytes(), offset_stddev)
         loads = fit.gains @ deviations[seen][:, ::2].ravel()
-        return float(np.hypot(np.maximum(loads, 0.0), fit.stddevs).max())
+        return float(np.sqrt((np.maximum(loads, 0.0) ** 2 + fit.stddevs**2).mean()))
 
     def _fit(self, seen: bytes, offset_stddev: float) -> "_Fit":
         """Returns the fits for the key points that are seen, (K,) bool as bytes; kept, for they are mostly the same."""

@@ -35,7 +35,7 @@ class PressedState:
         pressure_place: the same on the undeformed surface (3,) [m]; NaN without contact.
         smallest_det: smallest det F of all elements [-].
         size: of the whole Newton step, as a share of the model's reach.
-        away: distance of the shape from those that a model of stored shapes holds [m].
+        extrapolation: distance of the shape from those that a model has stored, as a share of what it is good for.
     """
 
     touches: bool
@@ -47,7 +47,7 @@ class PressedState:
     pressure_place: NDArray
     smallest_det: float
     size: float
-    away: float = 0.0
+    extrapolation: float = 0.0
 
 
 class RollingContact:

@@ -25,6 +25,7 @@ class Track:
         residual: weighted root mean square residual [m].
         stiffening: force over depth beside that of first touch [-]; large where the place has run to the base.
         misfit: averaged residuals over their standard deviations, about 1 where the model fits.
+        extrapolation: distance of the shape from the stored ones, as a share of what the mechanics is good for.
         away: how far the key points alone would have the contact from where it was said to be [m].
         mistaken: probability that it is not there.
         place_error: relative standard deviation of the force that its place leaves, beside the covariance.
@@ -54,6 +55,7 @@ class Track:
     quiet: bool
     loaded: bool
     away: float = 0.0
+    extrapolation: float = 0.0
     mistaken: float = 0.0
     place_error: float = 0.0
     place_stddev: float = 0.0

@@ -158,6 +158,9 @@ class PlaceTracker:
         height = float(expect_object(contact, self.settings).mean[1])
         if self._given is None:
             self.reset(height)
+        if abs(height - self._given) > _FARTHEST_HEIGHT * self.settings.height_stddev:
+            self._prior[1] = height
+            self._forget_place()  # another object
         self._stiffness = self.response.stiffness_at(height)
         self._given = self._prior[1] = height
 
@@ -282,6 +285,7 @@ class PlaceTracker:
             quiet=bool(pressed < _TOUCH_DEPTH),
             loaded=bool(pressed > _LOADED_DEPTH),
             away=update.away,
+            extrapolation=state.extrapolation,
             mistaken=update.mistaken,
             condition=update.condition,
             place_stddev=float(np.sqrt(max(update.covariance[HEIGHT, HEIGHT], 0.0))),

@@ -8,6 +8,8 @@ from finforce_ifea.track import Track, compute_magnitude_stddev
 _LARGEST_MISFIT = 2.0
 _LARGEST_STIFFENING = 5.0
 _VAGUE_FORCE, _VAGUE_SHARE = 1.0, 0.25
+# Shapes so many times as far from the stored ones as they are good for.
+_STRANGEST = 2.0
 # A contact that is so surely another one, and at least so far from where it was said to be [m].
 _MISTAKEN, _LEAST_AWAY = 0.99, 4e-3
 
@@ -21,6 +23,8 @@ def find_doubt(track: Track, *, settles: bool) -> str:
     """
     if settles and not track.converged:
         return f"the shape has not settled within {track.iterations} iterations; is the contact's place right?"
+    if track.extrapolation > _STRANGEST:
+        return "the jaw's shape is too far from the stored ones; solver solid or frame knows any shape"
     if track.misfit > _LARGEST_MISFIT:
         return f"the key points do not fit this contact ({track.misfit:.1f} standard deviations); is its place right?"
     if track.stiffening > _LARGEST_STIFFENING:

@@ -45,7 +45,7 @@ def compare(indenter, shape, height, depths=DEPTHS, mechanics=None):
 def test_forces_and_shapes_are_those_of_the_full_mechanics_between_the_stored_heights(radius, height):
     force, shape = compare(RoundIndenter, np.log(radius), height)
     assert np.abs(force).max() < 0.003
-    assert shape.max() < 0.02e-3
+    assert shape.max() < 0.03e-3
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.1, -0.3])
@@ -111,10 +111,10 @@ def test_deformed_surface_is_that_of_the_full_mechanics():
 
 def test_shapes_that_are_far_from_the_stored_ones_are_known_as_such():
     contact = reduced().contact
-    near = press(contact, RoundIndenter(), np.log(0.0125), 0.045, [0.008])[0][1].away
-    wide = press(contact, OutlineIndenter((box(0.04),)), 0.0, 0.045, [0.008])[0][1].away
-    assert near < 0.02e-3
-    assert wide > 0.3e-3
+    near = press(contact, RoundIndenter(), np.log(0.0125), 0.045, [0.008])[0][1].extrapolation
+    wide = press(contact, OutlineIndenter((box(0.04),)), 0.0, 0.045, [0.008])[0][1].extrapolation
+    assert near < 0.05
+    assert wide > 0.9
 
 
 @pytest.mark.parametrize("solver", MODELS)
