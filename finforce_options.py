@@ -30,7 +30,7 @@ class SolverOptions:
     finder: str = option("", "what finds key points in images: network, frame (any DeepLabCut network) or dots")
     model: str = option("", "folder of a network and its pytorch_config.yaml; empty: the shipped network")
     T_gripper_camera: str = option("", "camera in the gripper's frame: x y z [m] qx qy qz qw")
-    solver: str = option("", "model and objective: default, solid, frame or paper")
+    solver: str = option("", "mechanics: default (reduced), reduced, solid, frame, linear or paper")
     mesh: str = option("", "mesh density: default, coarse or fine")
     parameter_file: str = option("", "YAML file with ROS parameters of the nodes")
     use_sim_time: bool = option(False, "take the time from /clock")

@@ -10,7 +10,7 @@ from finforce_ifea.calibration import Calibration
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
 from finforce_ifea.gate import KeypointGate
 from finforce_ifea.jaw import Jaw
-from finforce_ifea.mechanics import Mechanics, build_mechanics
+from finforce_ifea.mechanics import Mechanics, build_mechanics, choose_solver
 from finforce_ifea.observation import (
     Contact,
     Observation,
@@ -23,8 +23,9 @@ from finforce_ifea.point_tracking import PointTracker
 from finforce_ifea.rehearsal import rehearse
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.solution_numbers import find_numbers
 from finforce_ifea.taring import TareKeeper, TareReport
-from finforce_ifea.track import Track, compute_magnitude_stddev
+from finforce_ifea.track import Track
 from finforce_ifea.tracking import PlaceTracker
 from finforce_ifea.verdict import find_doubt
 
@@ -60,7 +61,7 @@ class JawEstimator:
         self.settings = settings or EstimatorSettings()
         self.calibration = calibration
         self.jaw = calibration.apply(jaw) if calibration else jaw
-        self.mechanics: Mechanics = build_mechanics(self.jaw, self.settings)
+        self.mechanics: Mechanics = build_mechanics(self.jaw, choose_solver(self.settings))
         self._rolling = PlaceTracker(self.mechanics.contact, self.jaw.keypoints, self.settings)
         self._pointed = PointTracker(self.jaw, self.mechanics, self.settings, self._rolling.response)
         self._tracker: PlaceTracker | PointTracker = self._rolling
@@ -90,9 +91,7 @@ class JawEstimator:
 
     def warm_up(self) -> None:
         """Compiles what is compiled on first use, and leaves no trace."""
-        self.reset()
-        rehearse(self.jaw, self.settings.tare_frames, self.update)
-        self.reset()
+        rehearse(self.jaw, self.settings.tare_frames, self.update, self.reset)
 
     @property
     def tared(self) -> bool:
@@ -244,38 +243,32 @@ class JawEstimator:
         self._relaxed = self._stamp
         return self._relaxation.update(elastic, dt)
 
-    @staticmethod
-    def _torque_stddev(track: Track, arm: NDArray, stddev: NDArray) -> float:
-        """Returns the standard deviation [N m] of the torque by those of the force (3,) [N] and of its height."""
-        by_force = np.hypot(arm[0] * stddev[2], arm[2] * stddev[0])
-        return float(np.hypot(by_force, track.force[0] * track.place_stddev))
-
     def _solution(self, track: Track, force: NDArray, used: NDArray) -> Solution:
-        magnitude = float(np.linalg.norm(force))
-        loaded = magnitude > 0.0
-        # the mechanics errs in the direction as in the magnitude
-        covariance = track.force_modes @ track.covariance @ track.force_modes.T
-        fit = compute_magnitude_stddev(track.force, track.force_modes, track.covariance)
-        share = np.hypot(np.hypot(self._force_error, track.place_error), _EXTRAPOLATED * track.extrapolation**2)
-        covariance += (share * magnitude) ** 2 * np.diag([1.0, 0.0, 1.0])
-        # a larger force leans more: where it is hardly known, its direction is not known either
-        covariance[2, 2] += (_LEAN * fit**2 / max(magnitude + fit, 1e-300)) ** 2
-        stddev = np.sqrt(np.diag(covariance))
-        arm = track.pressure_point * [1.0, 0.0, 1.0]
-        total = np.hypot(fit, share * magnitude)
-        unknown = np.full(3, np.nan)
+        extrapolated = _EXTRAPOLATED * track.extrapolation**2
+        share = float(np.sqrt(self._force_error**2 + track.place_error**2 + extrapolated**2))
+        numbers = find_numbers(
+            force,
+            track.force,
+            track.force_modes,
+            track.covariance,
+            track.pressure_point,
+            track.pressure_place,
+            track.place_stddev,
+            share,
+            _LEAN,
+        )
         return Solution(
             stamp=self._stamp,
-            status="ok" if loaded else "unloaded",
+            status="ok" if numbers.magnitude > 0.0 else "unloaded",
             message="" if self.tared else _UNTARED,
             force=force,
-            torque=np.array([-arm[2] * force[1], arm[2] * force[0] - arm[0] * force[2], arm[0] * force[1]]),
-            force_stddev=stddev,
-            torque_stddev=np.array([0.0, self._torque_stddev(track, arm, stddev), 0.0]),
-            magnitude_stddev=float(total),
-            contact_point=arm if loaded else unknown,
-            contact_place=track.pressure_place * [1.0, 0.0, 1.0] if loaded else unknown,
-            normal=force / magnitude if loaded else unknown,
+            torque=numbers.torque,
+            force_stddev=numbers.force_stddev,
+            torque_stddev=numbers.torque_stddev,
+            magnitude_stddev=numbers.magnitude_stddev,
+            contact_point=numbers.contact_point,
+            contact_place=numbers.contact_place,
+            normal=numbers.normal,
             residual=track.residual,
             kkt=track.kkt,
             keypoints_used=used,

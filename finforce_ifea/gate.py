@@ -1,6 +1,7 @@
 """Which key points of a frame may be used; knows no mechanics."""
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import ObservationError
@@ -42,12 +43,19 @@ class KeypointGate:
     def accept(self, observation: Observation) -> NDArray:
         """Returns the points (K, 3) [m] with NaN in the rows that must not be used."""
         points = np.array(observation.points, float)
-        likelihood = np.asarray(observation.likelihood)
-        visible = likelihood >= self._threshold
+        likelihood = np.asarray(observation.likelihood, float)
         if self._presence is None:
-            self._presence = visible.astype(float)
-        self._presence += _PRESENCE_GAIN * (visible - self._presence)
-        far = np.abs(points - self._rest).max(axis=1, initial=0.0)
-        usable = visible & (self._presence >= _LEAST_PRESENCE) & self._allowed & (far <= self._margin)
-        points[~usable] = np.nan
+            self._presence = (likelihood >= self._threshold).astype(float)
+        _close(points, likelihood, self._rest, self._allowed, self._presence, self._threshold, self._margin)
         return points
+
+
+@njit(cache=True)
+def _close(points, likelihood, rest, allowed, presence, threshold, margin):
+    """Updates the presence (K,) and makes the points (K, 3) [m] that must not be used NaN."""
+    for k in range(len(points)):
+        visible = likelihood[k] >= threshold
+        presence[k] += _PRESENCE_GAIN * ((1.0 if visible else 0.0) - presence[k])
+        far = np.abs(points[k] - rest[k]).max()
+        if not (visible and presence[k] >= _LEAST_PRESENCE and allowed[k] and far <= margin):
+            points[k] = np.nan

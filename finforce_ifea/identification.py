@@ -25,7 +25,7 @@ from finforce_ifea.course import (
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
 from finforce_ifea.indenter import DEPTH, ExpectedObject, expect_object
 from finforce_ifea.jaw import KEYPOINT_DISTANCE, Jaw
-from finforce_ifea.mechanics import Mechanics, build_mechanics
+from finforce_ifea.mechanics import Mechanics, build_mechanics, choose_full
 from finforce_ifea.plateaus import INSTANTS, CalibrationCase, Plateau, find_plateaus
 from finforce_ifea.relaxation import invert_relaxation
 from finforce_ifea.rolling import limit_step
@@ -205,7 +205,7 @@ class _Fit:
         """
         calibration = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus)
         try:
-            return build_mechanics(calibration.apply(self.jaw), self.settings)
+            return build_mechanics(calibration.apply(self.jaw), choose_full(self.settings))
         except (JawFileError, MeshError) as error:
             raise CalibrationError(
                 f"calibration: no shape of the jaw {self.jaw.name!r} comes near the key points ({error}); "

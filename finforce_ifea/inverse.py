@@ -85,7 +85,7 @@ class InverseResult:
 
 
 def solve_inverse(
-    model: JawModel, problem: Problem, q: NDArray, *, iterations: int = 20, tolerance: float = 5e-6
+    model: JawModel, problem: Problem, q: NDArray, *, iterations: int = 20, tolerance: float = 2e-7
 ) -> InverseResult:
     """Solves an inverse problem, starting from the state q (size,).
 

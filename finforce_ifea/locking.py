@@ -16,7 +16,7 @@ from finforce_ifea.tetrahedra import to_tet10
 # At this Poisson's ratio 10-node tetrahedra do not lock; the stiffness of bands at others follows from plane strain.
 _EASY_RATIO = 0.3
 # What is said, and where it is measured at all: 10-node tetrahedra above a ratio, hexahedra below a scaled Jacobian.
-_TOLERATED = 1.05
+_TOLERATED = {"distorted hexahedra": 1.05, "4-node tetrahedra": 1.1, "10-node tetrahedra": 1.1}
 _HARD_RATIO, _DISTORTED = 0.4, 0.8
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
@@ -65,7 +65,7 @@ def warn_of_locking(jaw: Jaw, mesh: VolumeMesh) -> None:
     else:
         suspect, kind = jaw.material.poisson_ratio > _HARD_RATIO, "10-node tetrahedra"
     factor = measure_locking(jaw, mesh) if suspect else 1.0
-    if factor > _TOLERATED:
+    if factor > _TOLERATED[kind]:
         advice = {
             "distorted hexahedra": "Use hexahedra nearer to boxes, more of them, or 10-node tetrahedra",
             "4-node tetrahedra": "Use 10-node tetrahedra or hexahedra",

@@ -88,18 +88,20 @@ def interpolate(table, m, out):
 
 @njit(**_OPTIONS)
 def interpolate_slopes(table, m, step, out):
-    """Writes every `step`-th pair of derivatives out (2, k) of a table (T, Z, 2 n) by the grid coordinates m (2,)."""
+    """Writes every `step`-th pair of a table (T, Z, 2 n) at grid coordinates m (2,), and derivatives, out (3, k)."""
     wt, wz, dt, dz = np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL)
     t, z = weigh_cubic(m[0], table.shape[0], wt, dt), weigh_cubic(m[1], table.shape[1], wz, dz)
     out[:] = 0.0
     for i in range(STENCIL):
         for j in range(STENCIL):
-            along_t, along_z, row = dt[i] * wz[j], wt[i] * dz[j], table[t + i, z + j]
+            weight, along_t, along_z = wt[i] * wz[j], dt[i] * wz[j], wt[i] * dz[j]
+            row = table[t + i, z + j]
             for k in range(out.shape[1] // 2):
                 for a in range(2):
                     value = row[2 * step * k + a]
-                    out[0, 2 * k + a] += along_t * value
-                    out[1, 2 * k + a] += along_z * value
+                    out[0, 2 * k + a] += weight * value
+                    out[1, 2 * k + a] += along_t * value
+                    out[2, 2 * k + a] += along_z * value
 
 
 @njit(**_OPTIONS)
@@ -124,13 +126,15 @@ def blend(table, m, low, high, first, last, out):
 
 
 @njit(**_OPTIONS)
-def add_product(table, m, vector, first, last, out):
+def add_product(table, m, vector, first, last, step, out):
     """Adds the product of a table (T, Z, p, q), linear between grid points, with a vector (q,) to out (p,).
 
-    The vector is zero outside first to last.
+    The vector is zero outside first to last; every `step`-th pair of rows is added to.
     """
     t, z, w00, w01, w10, w11 = _find_cell(table, m)
     for i in range(len(out)):
+        if (i // 2) % step != 0:
+            continue
         c00, c01, c10, c11 = table[t, z, i], table[t, z + 1, i], table[t + 1, z, i], table[t + 1, z + 1, i]
         total = 0.0
         for k in range(first, last):

@@ -16,7 +16,7 @@ from finforce_ifea.solid import SolidModel
 
 DEPTHS, HEIGHTS, SHAPES, ROWS = 12, 27, 40, 56
 # As shares of the face: radius of the rod, largest depth, where the rod is first, and how far from the top it is last.
-_ROD, _DEEPEST, _LOWEST, _TOP = 0.07, 0.19, 0.11, 0.03
+_ROD, _DEEPEST, _LOWEST, _TOP = 0.2, 0.19, 0.11, 0.03
 # By so much the rods stand denser at the base than in the middle: forces change fastest with height there.
 _DENSER = 0.5
 # The rod stops where it needs this many times the force that it needs half way up at full depth.

@@ -14,6 +14,8 @@ from finforce_ifea.solid import SolidModel
 from finforce_ifea.surface import Across, build_contact_surface
 from finforce_ifea.tetrahedra import to_tet4
 
+_REDUCED = ("reduced", "linear")
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mechanics:
@@ -25,13 +27,13 @@ class Mechanics:
 
 
 def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
-    """Builds the mechanics that the settings name.
+    """Builds the mechanics that the settings name; "default" is the full one that the jaw file recommends.
 
     Raises:
         JawFileError: The jaw cannot be described by that model.
         MeshError: The mesh cannot be built.
     """
-    if settings.solver in ("reduced", "linear"):
+    if settings.solver in _REDUCED:
         return _reduce(jaw, settings)
     name = jaw.model if settings.solver == "default" else settings.solver
     mesh = jaw.build_mesh(settings.mesh if jaw.drawing is not None else None)
@@ -55,6 +57,18 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
     return Mechanics(mesh=mesh, model=model, contact=RollingContact(model, surface, jaw.inner_face_x))
 
 
+def choose_solver(settings: EstimatorSettings) -> EstimatorSettings:
+    """Returns settings in which "default" has become "reduced", unless forces in three axes are asked for."""
+    if settings.solver == "default" and settings.force_axes == "normal":
+        return replace(settings, solver="reduced")
+    return settings
+
+
+def choose_full(settings: EstimatorSettings) -> EstimatorSettings:
+    """Returns settings with the full mechanics behind the solver that they name."""
+    return replace(settings, solver="default") if settings.solver in _REDUCED else settings
+
+
 def _reduce(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
     """Builds stored equilibria of what the jaw file recommends."""
     from finforce_ifea.reduction import reduce_mechanics
@@ -63,5 +77,5 @@ def _reduce(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
         raise JawFileError(
             f"solver {settings.solver} knows forces in the jaw's plane alone; expected force_axes normal"
         )
-    full = build_mechanics(jaw, replace(settings, solver="default"))
+    full = build_mechanics(jaw, choose_full(settings))
     return reduce_mechanics(full, jaw, linear=settings.solver == "linear")

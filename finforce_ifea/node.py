@@ -114,7 +114,7 @@ class IfeaSolverNode(Node):
         spared = bool(getattr(self.estimator, "spared", False))
         if spared:
             self.skips.count(AWAY)
-        self.idling.note(stamp, spared and self.skips.allows(IDLE))
+        self.idling.note(stamp, spared and self.skips.allows(IDLE), self._now())
 
     def spare_time(self) -> float:
         """Return for how long messages may wait [s]: while nothing happens, until the next image that is answered."""

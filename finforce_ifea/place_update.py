@@ -240,6 +240,28 @@ def _allow_for_manoeuvre(forecast, innovation, noise):
 
 
 @njit(**_OPTIONS)
+def forecast_place(motion, covariance, slow, dt, acceleration, drift, sudden):
+    """Returns the place dt [s] later: constant speed of the depth under white acceleration; see `Forecast`.
+
+    Args:
+        motion: depth [m] and speed [m/s] (2,).
+        covariance: of both (2, 2).
+        slow: log radius and height [m] (2,).
+        dt: [s].
+        acceleration: standard deviation [m/s^2].
+        drift: standard deviation of the depth beside that [m].
+        sudden: whether the last frame did not show the speed.
+    """
+    a, b, c, power = covariance[0, 0], covariance[0, 1], covariance[1, 1], acceleration**2
+    mixed = b + dt * c + power * dt**3 / 2.0
+    spread = np.array(
+        [[a + 2.0 * dt * b + dt**2 * c + power * dt**4 / 4.0 + drift**2, mixed], [mixed, c + power * dt**2]]
+    )
+    place = np.array([motion[0] + dt * motion[1], slow[0], slow[1]])
+    return Forecast(place, motion[1], spread, dt if sudden else 0.0)
+
+
+@njit(**_OPTIONS)
 def update_place(data, average, forecast, prior, prior_variance, memory, largest):
     """Returns the place after one frame; see `PlaceUpdate`.
 

@@ -54,18 +54,23 @@ class PlaceWatch:
         self._response = response
         self._prior_variance = settings.height_stddev**2
         self._memory = float(settings.memory)
-        self._height = float(np.median(response.heights))
+        self._height, self._spread = float(np.median(response.heights)), 0.0
         self.reset()
 
     def reset(self) -> None:
         """Forgets where the key points had the load."""
         self._away, self._information = 0.0, 0.0
 
-    def follow(self, height: float) -> None:
-        """Takes the height [m] of a load over; another one is another load."""
+    def follow(self, heights: NDArray, weights: NDArray) -> None:
+        """Takes a load's heights (n,) [m] and their weights (n,) over; another mean height is another load.
+
+        Shares of a spread load are hardly better known than that it is somewhere there.
+        """
+        height = float(np.average(heights, weights=weights))
         if abs(height - self._height) > _SUREST:
             self.reset()
         self._height = height
+        self._spread = float(np.average((heights - height) ** 2, weights=weights))
 
     def doubt(self, residuals: NDArray, precision: NDArray, force: float) -> PlaceDoubt:
         """Returns what one frame and those before say of the place.
@@ -85,7 +90,7 @@ class PlaceWatch:
         asked = force * float((weights * beside * left).sum()) / max(information, 1e-300)
         self._average(asked, information)
         depth = force / self._response.stiffness_at(self._height)
-        given = self._prior_variance + (_TRAVEL * depth) ** 2
+        given = self._prior_variance + self._spread + (_TRAVEL * depth) ** 2
         spread = 1.0 / max(self._information, 1e-9) + _SUREST**2
         mistaken, beyond = doubt_place(self._away, spread, given, 0.0)
         stddev = float(np.sqrt(given + beyond))

@@ -18,6 +18,7 @@ from finforce_ifea.tare import Tare
 from finforce_ifea.track import Track, compute_magnitude_stddev, explain_offsets
 
 _NEIGHBOUR = 1e-3
+_KNOWN_LOADS = 32
 _QUIET_SIGMA = 3.0
 # Share of the model's reach in the last Newton step.
 _SETTLED = 5e-3
@@ -44,6 +45,7 @@ class PointTracker:
         self.probe = mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
         self._rest = mechanics.model.positions(self.probe, np.zeros(mechanics.model.size))
         self._energy_weights = parse_energy_weights(settings, len(jaw.candidates))
+        self._known: dict[tuple[float, ...], tuple[Any, Any]] = {}
         self._load = lru_cache(maxsize=256)(self._build_load)
         self.reset()
 
@@ -65,7 +67,7 @@ class PointTracker:
             self._heights, self._weights = (float(self.jaw.candidates[self._candidate, 2]),), np.ones(1)
             return
         self._heights = tuple(np.round(heights, 5).tolist())
-        self._watch.follow(float(np.average(heights, weights=contact.weights)))
+        self._watch.follow(heights, contact.weights)
         self._weights = np.asarray(contact.weights, float)
 
     def _build_load(self, height: float) -> tuple[NDArray, NDArray]:
@@ -102,12 +104,13 @@ class PointTracker:
         )
 
     def _probes(self, key: tuple[float, ...], points: NDArray, neighbours: NDArray) -> tuple[Any, Any]:
-        if getattr(self, "_probe_key", None) != key:
+        """Returns the probes of a load's points and neighbours; those of the last loads are kept."""
+        if key not in self._known:
+            if len(self._known) >= _KNOWN_LOADS:
+                del self._known[next(iter(self._known))]
             model = self.mechanics.model
-            self._probe_key, self._probe_pair = (
-                key,
-                (model.attach(points, 1e-3), model.attach(neighbours, 1e-3)),
-            )
+            self._known[key] = (model.attach(points, 1e-3), model.attach(neighbours, 1e-3))
+        self._probe_pair = self._known[key]
         return self._probe_pair
 
     def update(self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None) -> Track | None:
@@ -164,7 +167,7 @@ class PointTracker:
         stddev = compute_magnitude_stddev(force, result.directions, covariance)
         moves = self.mechanics.model.positions(self.probe, result.q) - self._rest
         doubt = blank_doubt()
-        if not self.paper:
+        if result.converged and not self.paper:
             miss = targets - self.mechanics.model.positions(self.probe, result.q)
             doubt = self._watch.doubt(miss[:, ::2], weights / variance, magnitude)
         return Track(

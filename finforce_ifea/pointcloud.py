@@ -162,19 +162,26 @@ def encode_cloud(columns: Mapping[str, ArrayLike]) -> EncodedCloud:
     if len(lengths) > 1:
         sizes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
         raise ObservationError(f"the columns of a cloud differ in length: {sizes}")
-    fields, point_step = [], 0
-    for name, array in arrays.items():
-        code = _CODES.get(array.dtype.newbyteorder("="))
-        if code is None or array.ndim not in (1, 2):
-            raise ObservationError(f"column '{name}' of type {array.dtype}, shape {array.shape} is no field")
-        count = 1 if array.ndim == 1 else array.shape[1]
-        fields.append(PointField(name, point_step, code, count))
-        point_step += array.dtype.itemsize * count
-    entries = tuple((field.name, field.offset, field.datatype, field.count) for field in fields)
-    table = np.zeros(lengths.pop() if lengths else (0,), dtype=_layout(entries, point_step, False))
+    fields, layout = _plan(tuple((name, array.dtype, array.shape[1:]) for name, array in arrays.items()))
+    table = np.zeros(lengths.pop() if lengths else (0,), dtype=layout)
     for name, array in arrays.items():
         table[name] = array.reshape(table[name].shape)
-    return EncodedCloud(tuple(fields), point_step, table.tobytes())
+    return EncodedCloud(fields, layout.itemsize, table.tobytes())
+
+
+@lru_cache(maxsize=64)
+def _plan(columns: tuple[tuple[str, np.dtype, tuple[int, ...]], ...]) -> tuple[tuple[PointField, ...], np.dtype]:
+    """Return fields and layout of a point with columns (name, type, shape without the first axis)."""
+    fields, point_step = [], 0
+    for name, kind, shape in columns:
+        code = _CODES.get(kind.newbyteorder("="))
+        if code is None or len(shape) > 1:
+            raise ObservationError(f"column '{name}' of type {kind}, shape (n, *{shape}) is no field")
+        count = shape[0] if shape else 1
+        fields.append(PointField(name, point_step, code, count))
+        point_step += kind.itemsize * count
+    entries = tuple((field.name, field.offset, field.datatype, field.count) for field in fields)
+    return tuple(fields), _layout(entries, point_step, False)
 
 
 def decode_columns(cloud: Any, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray]:

@@ -4,7 +4,7 @@ The unknowns q (2 n + 2,) are the loads on the n rows of the inner face (x and z
 the grid coordinates of the stored equilibrium that is nearest in shape. See `finforce_ifea.manifold`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,12 +53,11 @@ class ReducedModel:
     def __init__(self, manifold: Manifold, full: JawModel, young_modulus: float) -> None:
         """Scales a manifold to a modulus [Pa] of the jaw that `full` describes."""
         factor = young_modulus / manifold.young_modulus
-        self.manifold, self._full = manifold, full
+        self.manifold, self._full = scale_manifold(manifold, factor), full
         self.rows = manifold.loads.shape[2]
         self.size = self.rows + 2
-        self.loads = manifold.loads * factor
-        self.compliance = manifold.compliance * np.float32(1.0 / factor)
-        self.shape_compliance = manifold.shape_compliance * np.float32(1.0 / factor)
+        self.loads, self.compliance = self.manifold.loads, self.manifold.compliance
+        self.shape_compliance = self.manifold.shape_compliance
         stiffness = LARGEST_MOVE / np.abs(np.diagonal(self.compliance[0, 0]))
         self.reach = np.r_[stiffness, LARGEST_GRID_STEP, LARGEST_GRID_STEP]
 
@@ -106,6 +105,20 @@ class ReducedModel:
         still = np.zeros((self.manifold.basis.shape[1], 1))
         shape = place_points(still, self.manifold.shapes, self.shape_compliance, self.loads, q)
         return self._full.vertices(self.manifold.basis @ shape.ravel())
+
+
+def scale_manifold(manifold: Manifold, factor: float) -> Manifold:
+    """Returns the manifold of a jaw whose modulus is `factor` times as large."""
+    if factor == 1.0:
+        return manifold
+    soft = np.float32(1.0 / factor)
+    return replace(
+        manifold,
+        young_modulus=manifold.young_modulus * factor,
+        loads=manifold.loads * factor,
+        compliance=manifold.compliance * soft,
+        shape_compliance=manifold.shape_compliance * soft,
+    )
 
 
 def share_rows(heights: NDArray, places: NDArray) -> NDArray:

@@ -89,7 +89,7 @@ def follow(moves, compliance, loads, q):
         extra[k] = q[k] - extra[k]
     interpolate(moves, m, out)
     first, last = _find_ends(extra)
-    add_product(compliance, m, extra, first, last, out)
+    add_product(compliance, m, extra, first, last, 1, out)
     return out
 
 
@@ -128,14 +128,13 @@ def find_grid_step(moves, now, m):
     number is the root mean square distance at m [m].
     """
     count = (moves.shape[2] // 2 + _WATCHED - 1) // _WATCHED
-    at, slopes = np.empty(moves.shape[2]), np.empty((2, 2 * count))
-    interpolate(moves, m, at)
-    interpolate_slopes(moves, m, _WATCHED, slopes)
+    at = np.empty((3, 2 * count))
+    interpolate_slopes(moves, m, _WATCHED, at)
     a = b = c = u = v = square = 0.0
     for k in range(count):
         for axis in range(2):
-            miss = now[2 * _WATCHED * k + axis] - at[2 * _WATCHED * k + axis]
-            by_depth, by_height = slopes[0, 2 * k + axis], slopes[1, 2 * k + axis]
+            miss = now[2 * _WATCHED * k + axis] - at[0, 2 * k + axis]
+            by_depth, by_height = at[1, 2 * k + axis], at[2, 2 * k + axis]
             a, b, c = a + by_depth * by_depth, b + by_depth * by_height, c + by_height * by_height
             u, v, square = u + by_depth * miss, v + by_height * miss, square + miss * miss
     damping = _DAMPING * max(a, c) + _DAMPING_FLOOR
@@ -264,7 +263,7 @@ def step_contact(q, tables, face, moves, points, contact):
     correction[:count], modes[:count] = steps[:, 0], steps[:, 1:]
     after = moves.copy()
     first, last = _find_ends(correction[:count])
-    add_product(tables[1], q[count:], correction[:count], first, last, after)
+    add_product(tables[1], q[count:], correction[:count], first, last, _WATCHED, after)
     nearest = find_grid_step(tables[0], after, q[count:])
     correction[count:] = nearest[:2]
     if q[count] < _SHALLOW and total > 0.0:

@@ -13,23 +13,27 @@ from finforce_ifea.observation import Contact, Observation, sketch_contact
 
 _STDDEV = 0.3e-3
 _NOISE = 0.05e-3
-_AFTER_TARE = 3
+_EACH = 3
+Update = Callable[[Observation, Contact], object]
 
 
-def rehearse(jaw: Jaw, tare_frames: int, update: Callable[[Observation, Contact], object]) -> None:
+def rehearse(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None]) -> None:
     """Gives an estimator images with each kind of contact, with stated standard deviations and without.
 
     Args:
         jaw: the jaw.
         tare_frames: that are taken before the first force.
-        update: of an estimator that is reset before and after; stamps rise.
+        update: of the estimator.
+        reset: of the same, left reset in the end.
     """
-    random, stamp = np.random.default_rng(0), 0.0
+    random = np.random.default_rng(0)
     for stddev in (None, np.full(jaw.keypoints.shape, _STDDEV)):
-        for contact in _imagine_contacts(jaw):
-            for _ in range(tare_frames + _AFTER_TARE):
-                stamp += 1.0 / 30.0
-                update(_imagine_image(jaw, stamp, stddev, random), contact)
+        reset()
+        contacts = list(_imagine_contacts(jaw))
+        course = [contacts[0]] * tare_frames + [contact for contact in contacts for _ in range(_EACH)]
+        for count, contact in enumerate(course):
+            update(_imagine_image(jaw, count / 30.0, stddev, random), contact)
+    reset()
 
 
 def _imagine_contacts(jaw: Jaw) -> Iterator[Contact]:

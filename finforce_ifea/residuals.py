@@ -11,6 +11,8 @@ _MODEL_FLOOR = 0.02e-3
 _LEAST_WEIGHT = 0.02
 # Median of a squared distance in three axes; what more is chance; and fewer points do not tell a level.
 _MEDIAN_SQUARE, _CHANCE, _FEWEST = 2.37, 1.5, 5
+# Beyond this level key points are not noisy but something else than key points.
+_LOUDEST = 20.0
 
 
 class Uncertainty(NamedTuple):
@@ -127,7 +129,7 @@ def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
 
 @njit(**_OPTIONS)
 def _find_noise_level(r, off, modes, jump, chance, bias):
-    """Returns the variance of this frame's residuals over what was expected of it, at least 1.
+    """Returns the variance of this frame's residuals over what was expected of it, at least 1; 1 where it is garbage.
 
     The depth is first moved by the median of what the points ask for, for a forecast may be wrong. The median of the
     squared distances, 2.37 for three axes, is not moved by gross errors; half as much again is taken for chance.
@@ -143,7 +145,8 @@ def _find_noise_level(r, off, modes, jump, chance, bias):
         known += 1
     if known < _FEWEST:
         return 1.0
-    return max(1.0, np.median(squares[:known]) / (_MEDIAN_SQUARE * _CHANCE))
+    level = max(1.0, np.median(squares[:known]) / (_MEDIAN_SQUARE * _CHANCE))
+    return level if level < _LOUDEST else 1.0
 
 
 @njit(**_OPTIONS)

@@ -7,8 +7,8 @@ from finforce_ifea.errors import ObservationError
 
 SOLVERS = ("default", "reduced", "solid", "frame", "linear", "paper")
 _SOLVER_MEANING = (
-    "mechanics: what the jaw file recommends (solid or frame), solid, frame, stored equilibria of what it recommends "
-    "(reduced), its compliance at rest alone (linear), or the paper's"
+    "mechanics: default is reduced, the stored equilibria of what the jaw file recommends (solid or frame); these in "
+    "full, the compliance at rest alone (linear), or the paper's"
 )
 
 

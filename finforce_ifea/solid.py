@@ -23,7 +23,7 @@ from finforce_ifea.probes import (
 )
 
 # Above this many multiplications a sparse factorisation with a fill-reducing order beats the band.
-_BANDED_COST_LIMIT = 4e8
+_BANDED_COST_LIMIT = 1e10
 _ON_PLANE = 1e-9
 
 

@@ -28,7 +28,7 @@ class ContactSurface:
         heights: the distinct heights (h,) [m].
         across: points per height.
         stiffness: penalty of each point (p,) [N/m].
-        probe: the model's probe of the points.
+        probe: the model's probe of the points; None where the model moves them by itself.
         low: least y and z of the inner face (2,) [m].
         high: largest y and z (2,) [m].
     """

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,19 +32,30 @@ class Tare:
 
     def offset_variance(self, unseen: float) -> NDArray:
         """Returns the variance (K,) [m^2] of each offset; `unseen` is the standard deviation without a tare [m]."""
+        return np.where(self.counts > 0, self._seen_variance, unseen**2)
+
+    @cached_property
+    def _seen_variance(self) -> NDArray:
         noise = self.noise if self.stated is None else self.stated.covariance
-        seen = np.trace(noise, axis1=-2, axis2=-1) / 3.0 / np.maximum(self.counts, 1)
-        return np.where(self.counts > 0, seen, unseen**2)
+        return np.trace(noise, axis1=-2, axis2=-1) / 3.0 / np.maximum(self.counts, 1)
 
     def point_noise(self, stddev: NDArray | None) -> PointNoise:
         """Returns the noise of the key points of an image that states `stddev` (K, 3) [m], or nothing.
 
         A tare without stated deviations stands for key points that all state its pooled noise.
         """
+        return self._silent_noise if stddev is None else compute_point_noise(self._usual, stddev)
+
+    @cached_property
+    def _usual(self) -> StatedNoise:
         count = len(self.counts)
         pooled = np.broadcast_to(np.sqrt(np.diag(self.noise)), (count, 3))
-        usual = self.stated or StatedNoise(np.broadcast_to(self.noise, (count, 3, 3)), pooled)
-        return compute_point_noise(usual, stddev)
+        return self.stated or StatedNoise(np.broadcast_to(self.noise, (count, 3, 3)), pooled)
+
+    @cached_property
+    def _silent_noise(self) -> PointNoise:
+        """Of an image that states nothing."""
+        return compute_point_noise(self._usual, None)
 
 
 def blank_tare(count: int, noise: float) -> Tare:

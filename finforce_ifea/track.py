@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.solution_numbers import measure_along
 from finforce_ifea.tare import Tare
 
 # Standard deviation of an offset that all key points share [m]: a depth scale wrong by 1 % at 0.15 m.
@@ -70,10 +71,8 @@ def compute_magnitude_stddev(force: NDArray, modes: NDArray, covariance: NDArray
         modes: derivative of the force by what was estimated (3, m).
         covariance: of what was estimated (m, m).
     """
-    magnitude = float(np.linalg.norm(force))
-    direction = force / magnitude if magnitude > 0 else np.array([-1.0, 0.0, 0.0])
-    mode = direction @ modes
-    return float(np.sqrt(mode @ covariance @ mode))
+    modes, covariance = np.ascontiguousarray(modes), np.ascontiguousarray(covariance)
+    return float(measure_along(np.ascontiguousarray(force), modes, covariance))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

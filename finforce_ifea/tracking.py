@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
-from finforce_ifea.place_update import Average, Forecast, PlaceUpdate, update_place
+from finforce_ifea.place_update import Average, Forecast, PlaceUpdate, forecast_place, update_place
 from finforce_ifea.point_noise import PointNoise
 from finforce_ifea.residuals import Residuals, Uncertainty, weigh_residuals
 from finforce_ifea.rest_response import measure_rest
@@ -27,6 +27,8 @@ _TOUCH_DEPTH = 0.15e-3
 _LOADED_DEPTH = 0.5e-3
 _DEPTH_DRIFT = 0.01e-3
 _LARGEST_MOVE = 0.7e-3
+# A leap only has to come near. One that leaves the points as far as they were by all but this is in vain [m].
+_LARGEST_LEAP, _LEAST_APPROACH = 2e-3, 0.1e-3
 _LARGEST_SHIFT = 0.3e-3
 _SETTLED_MOVE = 1e-4
 # Of the model's reach, 0.1 mm.
@@ -91,7 +93,8 @@ class PlaceTracker:
         measured, unseen = points - tare.offsets, self.settings.offset_stddev
         chance = self._expect_errors(noise, tare.offset_variance(unseen) + noise.standing, forecast)
         update, settled, iteration, share, last = None, False, 0, 1.0, np.zeros(3)
-        while not settled and iteration < self.settings.iterations:
+        far, in_vain = np.inf, 0
+        while not settled and iteration < self.settings.iterations and in_vain < 2:
             iteration += 1
             mechanical = self._reachable(place)
             state = self.contact.linearize(q, mechanical)
@@ -102,6 +105,8 @@ class PlaceTracker:
             data = self._weigh(q, state, measured, place - forecast.place, place, chance)
             if data.used < max(self.settings.minimum_keypoints, _LEAST_AGREEMENT * data.known):
                 place, q = self._leap(q, state, mechanical, place, data)
+                in_vain = in_vain + 1 if abs(data.jump) > far - _LEAST_APPROACH else 0
+                far = abs(data.jump)
                 continue
             update = self._update_place(data, forecast)
             aim = self._bound(update.place, place, share)
@@ -181,14 +186,10 @@ class PlaceTracker:
 
     def _predict(self, dt: float) -> Forecast:
         """Returns the place dt [s] later: constant speed of the depth under white acceleration."""
-        depth, speed = self._motion
-        (a, b), (_, c) = self._motion_covariance
-        power = self.settings.acceleration**2
-        spread = np.array([[a + 2 * dt * b + dt**2 * c, b + dt * c], [b + dt * c, c]])
-        spread += power * np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]])
-        spread[0, 0] += _DEPTH_DRIFT**2
-        place = np.array([depth + dt * speed, *self._slow])
-        return Forecast(place, float(speed), spread, float(dt) if self._released or self._jumped else 0.0)
+        sudden = bool(self._released or self._jumped)
+        return forecast_place(
+            self._motion, self._motion_covariance, self._slow, dt, self.settings.acceleration, _DEPTH_DRIFT, sudden
+        )
 
     def _expect_errors(self, noise: PointNoise, offset_variance: NDArray, forecast: Forecast) -> Uncertainty:
         """Returns what is known of the errors of this frame's key points."""
@@ -229,7 +230,7 @@ class PlaceTracker:
         self, q: NDArray, state: PressedState, mechanical: NDArray, place: NDArray, data: Residuals
     ) -> tuple[NDArray, NDArray]:
         """Returns place and unknowns moved towards the median depth when the points disagree with the forecast."""
-        jump = float(np.clip(data.jump, -_LARGEST_MOVE, _LARGEST_MOVE))
+        jump = float(np.clip(data.jump, -_LARGEST_LEAP, _LARGEST_LEAP))
         place = place + np.array([jump, 0.0, 0.0])
         step = state.modes[:, DEPTH] * (self._reachable(place)[DEPTH] - mechanical[DEPTH])
         return place, q + limit_step(self.contact.model, step)
@@ -265,11 +266,11 @@ class PlaceTracker:
         pressed = place[DEPTH] - self._find_touch(place)
         if pressed < _LEAST_DEPTH:
             force = force * max(0.0, pressed / _LEAST_DEPTH)
-        covariance = update.covariance.copy()
-        covariance[DEPTH, DEPTH] += update.depth_variance
-        finite = np.isfinite(force).all() and np.isfinite(update.covariance).all() and np.isfinite(self.q).all()
+        covariance = update.covariance * max(1.0, update.misfit**2)
+        covariance[DEPTH, DEPTH] += update.depth_variance * max(1.0, update.misfit**2)
+        finite = np.isfinite(force.sum() + update.covariance.sum() + self.q.sum())
         return Track(
-            covariance=covariance * max(1.0, update.misfit**2),
+            covariance=covariance,
             force=force,
             force_modes=state.force_modes,
             pressure_point=state.pressure_point,
