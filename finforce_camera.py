@@ -196,9 +196,11 @@ def decode_depth(
     image = np.asarray(data)
     if image.ndim != 2:
         raise ImageError(f"depth image: shape {image.shape}; expected (height, width)")
-    depth = image.astype(np.float32)
     if encoding != "32FC1":
-        depth = depth * np.float32(scale)
+        depth = np.multiply(image, np.float32(scale), dtype=np.float32)
+        depth[image == 0] = np.nan
+        return depth
+    depth = image.astype(np.float32)
     depth[~(np.isfinite(depth) & (depth > 0.0))] = np.nan
     return depth
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import array
 import math
+import struct
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3, Wrench, WrenchStamped
 from numpy.typing import ArrayLike, NDArray
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
@@ -35,6 +38,23 @@ def stamp_message(stamp: int) -> Time:
     return Time(sec=seconds, nanosec=rest)
 
 
+class KeptMessage:
+    """A message with a header in its serialised form, which can be sent again under other stamps.
+
+    Args:
+        message: of any type that begins with a std_msgs/Header.
+    """
+
+    def __init__(self, message: Any) -> None:
+        self._data = bytearray(serialize_message(message))
+        self._numbers = "<iI" if self._data[1] & 1 else ">iI"
+
+    def at(self, stamp: int) -> bytes:
+        """Return the message with a stamp [ns]."""
+        struct.pack_into(self._numbers, self._data, 4, *divmod(stamp, NANOSECONDS))
+        return bytes(self._data)
+
+
 def cloud_message(header: Header, columns: Mapping[str, ArrayLike]) -> PointCloud2:
     """Return a cloud of height 1 with one field per column (n,), in their order and type."""
     encoded = encode_cloud(columns)
@@ -42,12 +62,18 @@ def cloud_message(header: Header, columns: Mapping[str, ArrayLike]) -> PointClou
         header=header,
         height=1,
         width=len(encoded.data) // encoded.point_step,
-        fields=[PointField(**vars(entry)) for entry in encoded.fields],
+        fields=_point_fields(encoded.fields),
         point_step=encoded.point_step,
         row_step=len(encoded.data),
         data=array.array("B", encoded.data),  # an ndarray would be checked byte by byte
         is_dense=all(bool(np.isfinite(values).all()) for values in columns.values()),
     )
+
+
+@lru_cache(maxsize=64)
+def _point_fields(entries: Sequence[Any]) -> list[PointField]:
+    """Return a cloud's fields as messages, which all clouds with these fields share."""
+    return [PointField(**vars(entry)) for entry in entries]
 
 
 def xyz_columns(points: ArrayLike) -> dict[str, NDArray[np.float32]]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import Field, fields
 from functools import partial
-from pathlib import Path
 from threading import Thread
 from typing import Any
 
@@ -20,7 +18,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
@@ -34,8 +32,10 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who publish
 
 from finforce_errors import FinforceError
+from finforce_executor import KeepingExecutor, is_wanted  # noqa: F401 - for those who publish
 from finforce_health import NANOSECONDS, Level, Outcome, Report  # noqa: F401 - for those with stamps
 from finforce_messages import (  # noqa: F401 - for those who publish
+    KeptMessage,
     cloud_message,
     grasp_force,
     image_message,
@@ -50,22 +50,13 @@ from finforce_messages import (  # noqa: F401 - for those who publish
     xyz_columns,
 )
 from finforce_records import ParameterError, RecordT, bounds_of, check_value, constraints, describe
+from finforce_transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
 
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 STEADY = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
 REQUESTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # one that is passed over waits for ever
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-TRANSPORT = Path(__file__).parent / "finforce_keypoints" / "transport" / "fastdds.xml"
-PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
-CHOICES = (PROFILES, "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
-
-
-def provide_transport() -> None:
-    """Have Fast DDS carry images, which its default loses, unless somebody has chosen how it works already."""
-    if TRANSPORT.is_file() and not any(os.environ.get(name) for name in CHOICES):
-        os.environ[PROFILES] = str(TRANSPORT)
-
 
 provide_transport()  # read when the first context is made, whoever makes it
 
@@ -281,9 +272,10 @@ def run_node(
         print(f"{name}: {str(error).partition(', at ')[0]}", file=sys.stderr)
         return 2
     # an executor that is made after a signal cannot be taken down quietly; a node takes long to build
-    executor, node = SingleThreadedExecutor(), None
+    executor, node = KeepingExecutor(), None
     try:
         node = build()
+        executor.obey(node)
         work(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a launch sends it again after the terminal

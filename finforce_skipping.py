@@ -9,6 +9,21 @@ from finforce_errors import FinforceError
 
 ALL = "all"
 
+# of every node
+UNCHANGED = "wait set unchanged"
+LATE = "frame late"
+UNHEARD = "nobody subscribes"
+EVERYWHERE = (UNCHANGED, LATE, UNHEARD)
+# of a solver
+AWAY = "no object near"
+IDLE = "idle image"
+SOLVER = (AWAY, IDLE)
+# of a contact estimator, which has AWAY and IDLE, too
+STILL = "nothing moved"
+RESTING = "grasp rests"
+UNNEEDED = "jaw not needed"
+CONTACT = (AWAY, IDLE, STILL, RESTING, UNNEEDED)
+
 
 class SkippingError(FinforceError):
     """A rule that is to be switched off does not exist."""
@@ -18,7 +33,7 @@ class Skips:
     """The rules of one node: which may be applied, and how often each was.
 
     Args:
-        rules: names of the rules that the node has.
+        rules: names of the rules that the node has beside those that every node has.
         off: names of rules that are not to be applied; "all" for none of them.
 
     Raises:
@@ -26,10 +41,11 @@ class Skips:
     """
 
     def __init__(self, rules: Sequence[str], off: Collection[str] = ()) -> None:
+        rules = tuple(dict.fromkeys((*EVERYWHERE, *rules)))
         unknown = sorted(set(off) - {*rules, ALL, ""})
         if unknown:
             raise SkippingError(f"skip_off: there is no rule {unknown[0]!r}; expected {', '.join(rules)} or {ALL}")
-        self._rules = tuple(rules)
+        self._rules = rules
         self._off = frozenset(rules if ALL in off else off)
         self._counts: Counter[str] = Counter()
 
@@ -37,9 +53,9 @@ class Skips:
         """Returns whether a rule may be applied."""
         return rule not in self._off
 
-    def count(self, rule: str) -> None:
-        """Notes that a rule has saved its work once."""
-        self._counts[rule] += 1
+    def count(self, rule: str, times: int = 1) -> None:
+        """Notes that a rule has saved its work."""
+        self._counts[rule] += times
 
     def describe(self) -> dict[str, str]:
         """Returns, for the diagnostics, how often each rule saved its work, or that it is off."""

@@ -9,7 +9,6 @@ a product of two matrices of 512 x 512 beside them says what that is.
 
 import argparse
 import json
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,24 +16,12 @@ from typing import Any
 import numpy as np
 
 from finforce_eval.bench import write_figures
+from finforce_eval.bench_detection import time_product
+from finforce_eval.bench_scenes import FIRST_SEED, UNSEEN, record_unseen
 from finforce_eval.cli import main as finforce
 from finforce_ifea.errors import FinforceError
 
-# Name of the case: scene, and what is changed in it; no object is one of the shapes trained on.
-CASES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "cylinder": ("grasp_cylinder", ()),
-    "cube": ("grasp_cube", ()),
-    "asymmetric": ("grasp_asymmetric", ()),
-    "bottle": ("grasp_cylinder", ("--object", "bottle", "--set", "scale=0.45", "--set", "turn_x=1.5708")),
-    "shifting": ("shifting", ()),
-    "fast close": ("fast_close", ()),
-    "bench middle": ("bench_cylinder", ()),
-    "bench lower": ("bench_cylinder_lower", ()),
-    "weight": ("weight_turn", ()),
-    "weight, dim": ("weight_turn_dim", ()),
-}
 SOURCES = ("images", "truth")
-FIRST_SEED = 101
 COLUMNS = (
     ("px p50", "pixel_median_px"),
     ("px p95", "pixel_p95_px"),
@@ -43,19 +30,6 @@ COLUMNS = (
     ("hidden+ %", "hidden_accepted_pct"),
     ("visible- %", "visible_lost_pct"),
 )
-
-
-def record(name: str, seed: int, folder: Path) -> Path:
-    """Record one case with a seed, unless that was done before; return where.
-
-    Raises:
-        FinforceError: the scene could not be recorded.
-    """
-    scene, changes = CASES[name]
-    bag = folder / f"{name.replace(',', '').replace(' ', '_')}_{seed}"
-    if not bag.exists() and finforce(["twin", "record", scene, "-o", str(bag), "--seed", str(seed), *changes]) != 0:
-        raise FinforceError(f"{name}: the scene could not be recorded")
-    return bag
 
 
 def evaluate(bag: Path, source: str, options: Sequence[str]) -> dict[str, Any]:
@@ -74,7 +48,7 @@ def evaluate(bag: Path, source: str, options: Sequence[str]) -> dict[str, Any]:
 
 def measure(name: str, seed: int, folder: Path, options: Sequence[str]) -> dict[str, Any]:
     """Return the figures of one case and seed."""
-    bag = record(name, seed, folder)
+    bag = record_unseen(name, seed, folder)
     found = {source: evaluate(bag, source, options if source == "images" else ()) for source in SOURCES}
     return {
         "case": name,
@@ -88,17 +62,6 @@ def measure(name: str, seed: int, folder: Path, options: Sequence[str]) -> dict[
         "detector_ms": found["images"]["detector_ms"],
         "delay": found["images"].get("delay"),
     }
-
-
-def time_yardstick() -> float:
-    """Return the median time [ms] of a product of two matrices of 512 x 512 in single precision."""
-    matrix = np.random.default_rng(0).standard_normal((512, 512)).astype(np.float32)
-    times = []
-    for _ in range(25):
-        began = time.perf_counter()
-        matrix @ matrix
-        times.append(time.perf_counter() - began)
-    return 1e3 * float(np.median(times))
 
 
 def format_row(label: str, figures: Mapping[str, Any]) -> str:
@@ -140,7 +103,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of the recordings")
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     parser.add_argument("--seeds", type=int, default=1, help="recordings per case (1)")
-    parser.add_argument("--scenes", nargs="+", default=list(CASES), choices=list(CASES), help="cases (all)")
+    parser.add_argument("--scenes", nargs="+", default=list(UNSEEN), choices=list(UNSEEN), help="cases (all)")
     parser.add_argument("--model", help="folder of another network than the shipped one")
     options = parser.parse_args()
     words = ["--detector", f"model={options.model}"] if options.model else []
@@ -149,7 +112,7 @@ def main() -> None:
         for seed in range(FIRST_SEED, FIRST_SEED + options.seeds):
             rows.append(measure(name, seed, options.folder, words))
             print_table(rows[-1:])
-    yardstick = time_yardstick()
+    yardstick = 1e3 * float(np.median([time_product() for _ in range(25)]))
     print_table(rows)
     print(f"Product of two matrices of 512 x 512: {yardstick:.2f} ms. {summarise(rows)}")
     if options.json:

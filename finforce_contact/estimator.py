@@ -26,6 +26,7 @@ from finforce_contact.touch import SURELY_BENT, TouchBelief, describe_conflict
 from finforce_ifea.errors import ObservationError
 from finforce_ifea.jaw import Jaw
 from finforce_ifea.outline import ObjectOutline
+from finforce_skipping import AWAY, CONTACT, STILL, Skips
 
 __all__ = ["ContactEstimate", "ContactEstimator"]
 
@@ -40,6 +41,7 @@ _SURROUNDED = 0.5
 _STILL_FORCE = 0.01
 # An object with its origin farther off [m] is in nobody's reach.
 _NOWHERE = 1.0
+_RULES = {"apart": AWAY, "still": STILL}
 _REASONS = ("solved", "apart", "still", "no_object", "no_pose", "surrounded", "beside", "late pose", "odd pose")
 
 
@@ -59,6 +61,7 @@ class ContactEstimator:
         jaw: with the calibration applied that the solver has.
         settings: of this estimator.
         face: the inner surface of the jaw's mesh.
+        skips: rules of what need not be done; all are applied unless others are put here.
         counts: images and poses by what was done with them, or why nothing was.
     """
 
@@ -72,9 +75,8 @@ class ContactEstimator:
         self.face = build_inner_face(jaw, self.settings.mesh)
         self._rest_line = self.face.deform(self.face.mesh.nodes)
         self._samples = np.unique(np.linspace(0, len(self.face.mesh.nodes) - 1, _JAW_SAMPLES).astype(int))
-        self._poses = PoseFilter(self.settings)
-        self._belief = TouchBelief(self.settings)
-        self._rest = RestWatch(self.settings)
+        self._poses, self._belief = PoseFilter(self.settings), TouchBelief(self.settings)
+        self._rest, self.skips = RestWatch(self.settings), Skips(CONTACT)
         self._counts: Counter[str] = Counter(dict.fromkeys(_REASONS, 0))
         self.set_object(mesh)
 
@@ -186,7 +188,8 @@ class ContactEstimator:
     def _follow(self, stamp: float, pose: FilteredPose, scene: Scene) -> ContactEstimate:
         """Finds the place in a scene, or keeps the last one, and says whether the object touches."""
         skipped = self._find_reason_to_skip(scene)
-        if not skipped:
+        if not (skipped and self.skips.allows(_RULES[skipped])):
+            skipped = ""
             if self._surrounds_jaw(scene):
                 message = f"this pose puts {self._mesh.name} around the jaw: check its pose, mesh and unit"
                 return self._give_up(stamp, "no_pose", message, "surrounded")
@@ -196,6 +199,7 @@ class ContactEstimator:
                 return self._give_up(stamp, "apart", message, "beside")
             self._rows = _points_of(self._place, self.jaw)
         self._counts[skipped or "solved"] += 1
+        self.skips.count(_RULES.get(skipped, ""))
         message = "" if skipped == "apart" else self._judge_touch(pose, scene)
         if skipped == "apart":
             self._belief.set(False)

@@ -11,8 +11,10 @@ import finforce_ros as ros
 from finforce_contact.parameters import ContactParameters
 from finforce_contact.session import ContactSession
 from finforce_ifea.errors import MissingDependencyError
+from finforce_skipping import LATE, Skips
 
 CAMERA = "/camera/camera"
+WAITING = ros.QoSProfile(depth=20, reliability=ros.ReliabilityPolicy.BEST_EFFORT)  # a tenth of a second, and more
 
 
 class Handlers(Protocol):
@@ -20,9 +22,11 @@ class Handlers(Protocol):
 
     Attributes:
         camera_group: callback group of the images, which wait for each other.
+        skips: rules of what need not be done.
     """
 
     camera_group: Any
+    skips: Skips
 
     def on_object(self, message: Any) -> None:
         """Use the object's pose that a message holds."""
@@ -30,15 +34,55 @@ class Handlers(Protocol):
     async def on_image(self, take: Callable[[Any], Any], image: Any) -> None:
         """Use the object's pose that `take` finds with an image."""
 
-    def on_jaw_pose(self, side: str, message: Any) -> None:
-        """Use the pose of a jaw."""
+    def on_jaw_pose(self, side: str, data: bytes) -> None:
+        """Use the pose of a jaw, a message that was not read yet."""
 
-    def on_jaw(self, side: str, take: Callable[[str, Any], list[Any]], message: Any) -> None:
-        """Use what `take` makes of a message of a jaw's solver."""
+    def on_jaw(self, side: str, kind: type, take: Callable[[str, Any], list[Any]], data: bytes) -> None:
+        """Use what `take` makes of a message of a jaw's solver, which was not read yet."""
 
 
-def subscribe(qos: ros.QosWatch, parameters: ContactParameters, session: ContactSession, handlers: Handlers) -> None:
-    """Subscribe to all that the parameters ask for.
+class JawInputs:
+    """The subscriptions to what a jaw's solver says, which come and go.
+
+    Args:
+        qos: makes subscriptions and watches them.
+        side: of the jaw.
+        session: takes the messages.
+        handlers: guards that.
+    """
+
+    def __init__(self, qos: ros.QosWatch, side: str, session: ContactSession, handlers: Handlers) -> None:
+        self._qos = qos
+        self._topics = [
+            (kind, f"{side}/{name}", partial(handlers.on_jaw, side, kind, take))
+            for kind, name, take in (
+                (ros.WrenchStamped, "wrench", session.take_wrench),
+                (ros.PointCloud2, "surface", session.take_surface),
+            )
+        ]
+        self._made: list[Any] = []
+
+    @property
+    def are_open(self) -> bool:
+        """Whether the jaw's solver is listened to."""
+        return bool(self._made)
+
+    def open(self) -> None:
+        """Listen to the jaw's solver from now on."""
+        if not self._made:
+            # as bytes: of an image that is passed over no more than the stamp is read
+            self._made = [self._qos.subscription(*topic, ros.SENSOR, raw=True) for topic in self._topics]
+
+    def close(self) -> None:
+        """Listen no more."""
+        while self._made:
+            self._qos.node.destroy_subscription(self._made.pop())
+
+
+def subscribe(
+    qos: ros.QosWatch, parameters: ContactParameters, session: ContactSession, handlers: Handlers
+) -> dict[str, JawInputs]:
+    """Subscribe to all that the parameters ask for; return what comes of the jaws' solvers, by side.
 
     Raises:
         MissingDependencyError: a message type is not installed.
@@ -49,13 +93,11 @@ def subscribe(qos: ros.QosWatch, parameters: ContactParameters, session: Contact
         qos.subscription(ros.PoseStamped, "object_pose", handlers.on_object, ros.SENSOR)
     else:
         qos.subscription(detections_type(), "object_detections", handlers.on_object, ros.SENSOR)
-    for side in parameters.sides:
-        for kind, name, take in (
-            (ros.WrenchStamped, "wrench", partial(handlers.on_jaw, side, session.take_wrench)),
-            (ros.PointCloud2, "surface", partial(handlers.on_jaw, side, session.take_surface)),
-            (ros.PoseStamped, "jaw_pose", partial(handlers.on_jaw_pose, side)),
-        ):
-            qos.subscription(kind, f"{side}/{name}", take, ros.SENSOR)
+    jaws = {side: JawInputs(qos, side, session, handlers) for side in parameters.sides}
+    for side, inputs in jaws.items():
+        inputs.open()
+        qos.subscription(ros.PoseStamped, f"{side}/jaw_pose", partial(handlers.on_jaw_pose, side), WAITING, raw=True)
+    return jaws
 
 
 def _subscribe_camera(qos: ros.QosWatch, session: ContactSession, handlers: Handlers) -> None:
@@ -66,16 +108,22 @@ def _subscribe_camera(qos: ros.QosWatch, session: ContactSession, handlers: Hand
         ("object_mask", session.take_mask),
         (f"{CAMERA}/aligned_depth_to_color/image_raw", session.take_depth),
     ):
-        _subscribe_newest(qos, topic, partial(handlers.on_image, take), group)
+        _subscribe_newest(qos, topic, partial(handlers.on_image, take), handlers)
 
 
-def _subscribe_newest(qos: ros.QosWatch, topic: str, take: Callable[[Any], Awaitable[None]], group: Any) -> None:
+def _subscribe_newest(
+    qos: ros.QosWatch, topic: str, take: Callable[[Any], Awaitable[None]], handlers: Handlers
+) -> None:
     """Subscribe to the newest of the images on a topic."""
+    skips = handlers.skips
 
     async def on_image(message: Any) -> None:
-        await take(ros.take_newest(images.current, message)[0])
+        if skips.allows(LATE):
+            message, late = ros.take_newest(images.current, message)
+            skips.count(LATE, late)
+        await take(message)
 
-    images = ros.LargeSubscription(qos, ros.Image, topic, on_image, callback_group=group)
+    images = ros.LargeSubscription(qos, ros.Image, topic, on_image, callback_group=handlers.camera_group)
 
 
 def detections_type() -> type:

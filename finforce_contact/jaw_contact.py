@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import NamedTuple, TypeVar
 
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.object_mesh import ObjectMesh
-from finforce_contact.pairing import PosePairing, Step
+from finforce_contact.pairing import DEPTH, PosePairing, Step
+from finforce_ifea.away import is_away
 from finforce_ifea.errors import FinforceError
 
 SECOND = 1e-9  # s/ns
+AWAY_FOR = 10  # images in a row, after which the object is taken to stay away: a second, of the ten that are looked at
 ValueT = TypeVar("ValueT")
 
 
@@ -23,6 +26,13 @@ class TimedEstimate(NamedTuple):
 
     stamp: int
     estimate: ContactEstimate
+
+
+class PassedImage(NamedTuple):
+    """An image without a contact: its stamp [ns], and what gives the jaw's pose (4, 4) in it."""
+
+    stamp: int
+    read: Callable[[], NDArray]
 
 
 class JawContact:
@@ -52,6 +62,9 @@ class JawContact:
         self._surface: tuple[int, NDArray] | None = None
         self._wrench: tuple[int, tuple[NDArray, NDArray]] | None = None
         self._posed: int | None = None
+        self._passed: deque[PassedImage] = deque(maxlen=DEPTH)
+        self._over: deque[int] = deque(maxlen=DEPTH)
+        self._away, self._is_driven = 0, False
 
     def set_object(self, mesh: ObjectMesh | None) -> None:
         """Take another object; its pose is not known yet.
@@ -63,7 +76,23 @@ class JawContact:
         if mesh is not None:
             self._warm_up()
         self._pairing.reset()
+        self._passed.clear()
         self._posed = None
+
+    @property
+    def is_away(self) -> bool:
+        """Whether the object stood out of the jaw's reach in the last image."""
+        return self._away > 0
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing happens: the object is out of reach, or held still."""
+        return self.is_away or self.estimator.resting
+
+    @property
+    def needs_surface(self) -> bool:
+        """Whether surface and wrench are of use: unless it was away for a while, or where images are due with them."""
+        return self._is_driven or self._away < AWAY_FOR
 
     def _warm_up(self) -> None:
         """Let what is compiled on first use be compiled before the first image waits for it."""
@@ -82,8 +111,10 @@ class JawContact:
             MeshError: the surface is not that of the jaw's mesh.
         """
         self._surface = stamp, surface
-        known = self._posed is not None and not self._pairing.is_waiting(stamp)
-        return self._update(stamp) if known else []
+        known = self._posed is not None and not self._pairing.is_waiting(stamp) and stamp not in self._over
+        estimates = self._update(stamp) if known else []
+        self._is_driven |= bool(estimates)
+        return estimates
 
     def take_wrench(self, stamp: int, wrench: tuple[NDArray, NDArray]) -> None:
         """Keep force (3,) [N] and torque (3,) [N m] of an image [ns]."""
@@ -102,7 +133,23 @@ class JawContact:
         self, stamp: int, T_camera_object: NDArray, covariance: NDArray | None = None
     ) -> list[TimedEstimate]:
         """Take the object's pose (4, 4) in an image [ns], with its covariance (6, 6); as `take_jaw_pose`."""
-        return self._follow(self._pairing.add_object(stamp, T_camera_object, covariance))
+        estimates = self._follow(self._pairing.add_object(stamp, T_camera_object, covariance))
+        self._catch_up(stamp)
+        return estimates
+
+    def pass_over(self, stamp: int, read: Callable[[], NDArray]) -> None:
+        """Leave an image [ns] without a contact; `read` gives the jaw's pose (4, 4), should the object's pose come."""
+        self._over.append(stamp)
+        if self._pairing.has_object(stamp):
+            self._follow(self._pairing.add_late(stamp, read()))
+        else:
+            self._passed.append(PassedImage(stamp, read))
+
+    def _catch_up(self, stamp: int) -> None:
+        """Use the object's pose in an image [ns] that was passed over."""
+        for image in [image for image in self._passed if self._pairing.belong(image.stamp, stamp)]:
+            self._passed.remove(image)
+            self._follow(self._pairing.add_late(image.stamp, image.read()))
 
     def _follow(self, steps: Iterable[Step]) -> list[TimedEstimate]:
         """Hand poses on and update for the images that are due."""
@@ -122,6 +169,9 @@ class JawContact:
             return []
         surface, wrench = self._fresh(self._surface, stamp), self._fresh(self._wrench, stamp)
         self.last = TimedEstimate(stamp, self.estimator.update(SECOND * stamp, surface, wrench))
+        contact = self.last.estimate.contact
+        away = contact is not None and is_away(contact, self.estimator.jaw.inner_face_x)
+        self._away = self._away + 1 if away else 0
         return [self.last]
 
     def _fresh(self, kept: tuple[int, ValueT] | None, stamp: int) -> ValueT | None:

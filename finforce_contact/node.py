@@ -12,6 +12,7 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 
 import finforce_ros as ros
 from finforce_contact.camera_feed import StampedPose
@@ -23,9 +24,11 @@ from finforce_contact.pose_settings import TrackerSettings
 from finforce_contact.report import describe, object_alarms, outcome_of_estimate
 from finforce_contact.session import ContactSession
 from finforce_contact.settings import ContactSettings
-from finforce_health import Health, Outcome, Report, StampGate
+from finforce_health import Health, Idling, Outcome, Report, StampGate
 from finforce_ifea.errors import FinforceError
+from finforce_ifea.messages import read_stamp
 from finforce_records import refresh_record
+from finforce_skipping import CONTACT, IDLE, UNNEEDED, Skips
 
 
 class ContactEstimatorNode(Node):
@@ -45,16 +48,19 @@ class ContactEstimatorNode(Node):
         tracker = ros.declare_record(self, TrackerSettings, "tracker")
         ros.name_unknown_parameters(self)
         sides, age = parameters.sides, parameters.max_age
-        self.session = ContactSession(parameters, contact, tracker)
+        self.skips = Skips(CONTACT, parameters.skip_off)
+        self.session = ContactSession(parameters, contact, tracker, self.skips)
         self.gates = {side: StampGate(max_age=age, restart_gap=parameters.restart_gap) for side in sides}
         self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in sides}
         self.qos = ros.QosWatch(self)
-        self.out = ContactOutputs(self.qos, parameters)
+        self.out = ContactOutputs(self.qos, parameters, self.skips)
         with self._refusals(sides):
             self.get_logger().info(self.session.load_mesh(parameters))
         self._serve()
         self.camera_group = MutuallyExclusiveCallbackGroup()
-        subscribe(self.qos, parameters, self.session, self)
+        self.idling = {side: Idling() for side in sides}
+        self.unread: dict[str, dict[type, Callable[[], None]]] = {side: {} for side in sides}
+        self.inputs = subscribe(self.qos, parameters, self.session, self)
         self.get_logger().info(f"jaws: {parameters.jaws}, ready, object poses by {parameters.pose_source}")
 
     def _serve(self) -> None:
@@ -72,20 +78,55 @@ class ContactEstimatorNode(Node):
         """Return the parameters with the present values of those that may be set at run time."""
         return refresh_record(self.parameters, lambda name: self.get_parameter(name).value)
 
-    def on_jaw_pose(self, side: str, message: PoseStamped) -> None:
-        """Find the contact of an image."""
-        began = perf_counter()
+    def on_jaw_pose(self, side: str, data: bytes) -> None:
+        """Find the contact of an image, unless it may be passed over."""
+        began, stamp = perf_counter(), read_stamp(data)
         self.health[side].arrive()
         with self._refusals((side,)):
-            if self.gates[side].enter(ros.nanoseconds(message.header.stamp), self._now()):
+            if self.idling[side].passes(stamp):
+                self.skips.count(IDLE)
+                self.session.pass_over(side, stamp, partial(deserialize_message, data, PoseStamped))
+                return
+            if self.gates[side].enter(stamp, self._now()):
                 self.session.restart(side)
                 self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
+            message = deserialize_message(data, PoseStamped)
+            self._read_late(side)
             self._send(side, began, self.session.take_jaw_pose(side, message))
+            self._rest(side, stamp)
 
-    def on_jaw(self, side: str, take: Callable[[str, Any], list[TimedEstimate]], message: Any) -> None:
-        """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own."""
-        began = perf_counter()
+    def _read_late(self, side: str) -> None:
+        """Read what a jaw's solver said while images were passed over."""
+        self.idling[side].end()
+        for read in list(self.unread[side].values()):
+            read()
+
+    def spare_time(self) -> float:
+        """Return for how long messages may wait [s]: while nothing happens, until the next image that is answered."""
+        return min(idling.spare_time(self._now()) for idling in self.idling.values())
+
+    def _rest(self, side: str, stamp: int) -> None:
+        """Do less for a jaw out of whose reach the object stood in an image [ns], or that holds it still."""
+        jaw = self.session.jaws[side]
+        self.idling[side].note(stamp, jaw.is_idle and self.skips.allows(IDLE), self._now())
+        if jaw.needs_surface or not self.skips.allows(UNNEEDED):
+            self.inputs[side].open()
+            return
+        self.skips.count(UNNEEDED)
+        self.inputs[side].close()
+
+    def on_jaw(self, side: str, kind: type, take: Callable[[str, Any], list[TimedEstimate]], data: bytes) -> None:
+        """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own.
+
+        Of an image that is passed over it is read when the next contact is looked for, if nothing newer came.
+        """
+        began, stamp = perf_counter(), read_stamp(data)
+        if self.idling[side].passes(stamp):
+            self.unread[side][kind] = partial(self.on_jaw, side, kind, take, data)
+            return
+        self.unread[side].pop(kind, None)
         with self._refusals((side,)):
+            message = deserialize_message(data, kind)
             self._check_ahead(message)
             self._send(side, began, take(side, message))
 
@@ -144,7 +185,8 @@ class ContactEstimatorNode(Node):
 
     def _report(self, side: str, alarms: list[Outcome]) -> Report:
         """Return how one jaw's contact is doing."""
-        return self.health[side].report([*alarms, *object_alarms(self.session)], describe(self.session, side))
+        values = describe(self.session, side) | self.skips.describe()
+        return self.health[side].report([*alarms, *object_alarms(self.session)], values)
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds

@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finforce_contact.checks import to_floats
+from finforce_contact.crossings import crosses_itself
 from finforce_contact.decimation import decimate
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.mesh_repair import repair
-from finforce_contact.optional import import_open3d, import_trimesh
+from finforce_contact.optional import import_trimesh
 from finforce_contact.triangles import ObjectMesh, compute_areas
 
 __all__ = ["FORMATS", "UNITS", "ObjectMesh", "load_object_mesh", "prepare_object_mesh", "read_triangles"]
@@ -22,7 +23,7 @@ THINNEST = 1e-4  # [m], a mesh that is thinner is a sheet, and has no inside
 FARTHEST = 1.0  # [m], of a vertex from the origin of its frame; poses are of that origin, and turn about it
 TRIANGLE_BOUND = 2_000_000  # a closed mesh of so many takes some ten seconds, an open one a minute
 FILE_BOUND = 1 << 30  # [byte], more than any format needs for as many triangles
-_CROSSING_LIMIT = 30_000  # triangles; open3d compares all pairs, in a second for so many
+_CROSSING_LIMIT = 30_000  # triangles, whose pairs are compared in a fraction of a second
 _COMMON = 0.1  # [m], the size that tells which unit is the likely one
 
 
@@ -184,11 +185,7 @@ def _note_crossings(mesh: ObjectMesh) -> ObjectMesh:
     """Return the mesh, with a note if its surface crosses itself; not looked for in open or very fine ones."""
     if not mesh.watertight or len(mesh.triangles) > _CROSSING_LIMIT:
         return mesh
-    open3d = import_open3d()
-    geometry = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.triangles)
-    )
-    if not geometry.is_self_intersecting():
+    if not crosses_itself(mesh.vertices, mesh.triangles):
         return mesh
     note = "The surface crosses itself; what is inside twice counts as inside."
     return replace(mesh, notes=(*mesh.notes, note))

@@ -61,7 +61,7 @@ class PosePairing:
         overdue = [self._step(*self._jaws[-1], None)] if self._waiting else []
         self._in_step &= not self._waiting
         self._jaws.append((stamp, invert_pose(T_camera_jaw)))
-        found = next((pose for pose in reversed(self._objects) if self._belong(pose.stamp, stamp)), None)
+        found = next((pose for pose in reversed(self._objects) if self.belong(pose.stamp, stamp)), None)
         self._waiting = found is None and self._in_step
         return overdue if self._waiting else [*overdue, self._step(*self._jaws[-1], found)]
 
@@ -69,7 +69,7 @@ class PosePairing:
         """Take the pose (4, 4) of the object in an image [ns]; return what is to be done now."""
         pose = _ObjectPose(stamp, T_camera_object, covariance)
         self._objects.append(pose)
-        jaw = next((jaw for jaw in reversed(self._jaws) if self._belong(jaw[0], stamp)), None)
+        jaw = next((jaw for jaw in reversed(self._jaws) if self.belong(jaw[0], stamp)), None)
         if jaw is None:
             return []
         is_newest = jaw is self._jaws[-1]
@@ -78,11 +78,21 @@ class PosePairing:
         self._waiting &= not is_newest
         return [self._step(*jaw, pose, is_due=is_due)]
 
+    def has_object(self, stamp: int) -> bool:
+        """Say whether the object's pose in an image [ns] is known."""
+        return any(self.belong(pose.stamp, stamp) for pose in self._objects)
+
+    def add_late(self, stamp: int, T_camera_jaw: NDArray) -> list[Step]:
+        """Take the pose (4, 4) of the jaw in an image [ns] that is not due any more; return what is to be done now."""
+        found = next((pose for pose in reversed(self._objects) if self.belong(pose.stamp, stamp)), None)
+        return [self._step(stamp, invert_pose(T_camera_jaw), found, is_due=False)] if found else []
+
     def is_waiting(self, stamp: int) -> bool:
         """Say whether an image [ns] waits for its object pose."""
-        return self._waiting and self._belong(self._jaws[-1][0], stamp)
+        return self._waiting and self.belong(self._jaws[-1][0], stamp)
 
-    def _belong(self, one: int, other: int) -> bool:
+    def belong(self, one: int, other: int) -> bool:
+        """Say whether two stamps [ns] are those of one image."""
         return abs(one - other) <= self._tolerance
 
     def _step(self, stamp: int, T_jaw_camera: NDArray, pose: _ObjectPose | None, *, is_due: bool = True) -> Step:

@@ -57,6 +57,10 @@ class ContactParameters(TimeParameters):
         1.0, "metres per unit of the generated mesh, as far as it is known", unit="m", min=1e-6, max=1e6, settable=True
     )
 
+    skip_off: tuple[str, ...] = parameter(
+        ("",), "rules that are not applied, by their names in the diagnostics after `skipped:`, or all"
+    )
+
     @property
     def sides(self) -> tuple[str, ...]:
         """The jaws by name."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from threading import RLock
 from typing import Any
 
@@ -20,6 +21,7 @@ from finforce_contact.pose_source import ExternalPoseSource, ObjectPose
 from finforce_contact.report import describe_mesh
 from finforce_contact.settings import ContactSettings
 from finforce_ifea.errors import FinforceError
+from finforce_skipping import CONTACT, RESTING, Skips
 
 
 class ContactSession:
@@ -34,17 +36,27 @@ class ContactSession:
         parameters: of the node.
         contact: settings of the contact estimators.
         tracker: settings of the pose tracker.
+        skips: rules of what need not be done; all of them when absent.
 
     Raises:
         FinforceError: the jaw cannot be used.
     """
 
-    def __init__(self, parameters: ContactParameters, contact: ContactSettings, tracker: TrackerSettings) -> None:
+    def __init__(
+        self,
+        parameters: ContactParameters,
+        contact: ContactSettings,
+        tracker: TrackerSettings,
+        skips: Skips | None = None,
+    ) -> None:
+        self._skips = skips or Skips(CONTACT)
         tolerance, max_age = round(parameters.pose_tolerance / SECOND), round(parameters.max_age / SECOND)
         self.jaws = {
             side: JawContact(ContactEstimator(jaw, settings=contact), tolerance=tolerance, max_age=max_age)
             for side, jaw in load_jaws(parameters).items()
         }
+        for jaw_contact in self.jaws.values():
+            jaw_contact.estimator.skips = self._skips
         self.mesh: ObjectMesh | None = None
         self.trouble = ""
         self._frame = parameters.camera_frame
@@ -164,6 +176,12 @@ class ContactSession:
             self.jaws[side].take_wrench(stamp_of(message), wrench)
         return []
 
+    def pass_over(self, side: str, stamp: int, read: Callable[[], Any]) -> None:
+        """Leave an image [ns] without a contact on a jaw; `read` gives the jaw's PoseStamped when it is needed."""
+        what = f"the pose of the {side} jaw"
+        with self._lock:
+            self.jaws[side].pass_over(stamp, lambda: pose_from_message(read(), self._frame, what))
+
     def read_pose(self, message: Any) -> StampedPose | None:
         """Return the object's pose of a PoseStamped or a Detection3DArray, None when nothing was detected.
 
@@ -182,7 +200,9 @@ class ContactSession:
 
     def take_depth(self, image: Any) -> StampedPose | None:
         """Return the object's pose in a depth image, None while every grasp rests; see `CameraFeed`."""
-        rests = all(jaw.estimator.resting for jaw in self.jaws.values())
+        rests = self._skips.allows(RESTING) and all(jaw.estimator.resting for jaw in self.jaws.values())
+        if rests:
+            self._skips.count(RESTING)
         with self._camera_lock:
             return self._camera.take_depth(image, rests=rests)
 

@@ -1,4 +1,7 @@
-"""Times of a solver step and memory of a solver, single-threaded, beside a yardstick of the machine."""
+"""The `finforce bench` command: parts measured one after the other, each with a table, figures and a picture.
+
+Knows of no part what it measures: each is a module with `measure(quick)`, `format_table`, `as_json` and `draw`.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,10 @@ import argparse
 import os
 import platform
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import perf_counter
@@ -18,26 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.bench_live import measure_live
-from finforce_eval.commands import write_json
-from finforce_eval.contacts import ContactChoice
 from finforce_eval.errors import OptionError
-from finforce_eval.recording import read_recording
-from finforce_eval.tracks import Recording
-from finforce_ifea.errors import MissingDependencyError
-from finforce_ifea.estimator import Contact, JawEstimator
-from finforce_ifea.jaw import Jaw, load_jaw
-from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.solid import SolidModel
+from finforce_ifea.errors import FinforceError
 
-RECORDING = Path(__file__).parent / "data" / "bench_cyl25_middle"
-SOLVERS = (
-    ("solid, 522 vertices", "solid", "coarse"),
-    ("solid, default mesh", "solid", "default"),
-    ("frame", "frame", "default"),
-    ("paper's setting", "paper", "default"),
-)
-FACTORISATIONS = 50
 LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh", "small_gicp", "coal")
 
 
@@ -54,12 +40,51 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Figures:
-    """Everything that a benchmark measured: times, memory [MB] by name, and what could not be measured."""
+class Part:
+    """One part of the benchmark.
 
-    rows: Sequence[Row]
-    memory: Mapping[str, float]
-    notes: Sequence[str]
+    Attributes:
+        name: on the command line and in the JSON.
+        module: that measures it.
+        title: above its table.
+        usual: whether it is measured when no parts are named.
+        takes_folder: whether it measures recordings, too.
+    """
+
+    name: str
+    module: str
+    title: str
+    usual: bool = True
+    takes_folder: bool = False
+
+
+PARTS = (
+    Part(
+        name="solvers",
+        module="finforce_eval.bench_solvers",
+        title="Run time against force error of the solver tiers",
+        takes_folder=True,
+    ),
+    Part(name="growth", module="finforce_eval.bench_growth", title="How cost grows"),
+    Part(
+        name="localization",
+        module="finforce_eval.bench_localization",
+        title="Run time against place error of the contact",
+    ),
+    Part(
+        name="detection",
+        module="finforce_eval.bench_detection",
+        title="Run time against pixel error of the key points",
+    ),
+    Part(name="chain", module="finforce_eval.bench_chain", title="Latency against force error of the whole chain"),
+    Part(name="nodes", module="finforce_eval.bench_nodes", title="Share of a core that each node takes", usual=False),
+    Part(
+        name="live",
+        module="finforce_eval.bench_live",
+        title="Key points out to wrench in, one solver node per jaw",
+        usual=False,
+    ),
+)
 
 
 def row_from_times(name: str, times: Sequence[float] | NDArray[np.float64]) -> Row:
@@ -68,67 +93,14 @@ def row_from_times(name: str, times: Sequence[float] | NDArray[np.float64]) -> R
     return Row(name=name, n=len(times), p50=p50, p95=p95, p99=p99, max=longest)
 
 
-def measure_steps(recording: Recording, jaw: Jaw, solver: str, mesh: str, frames: int) -> NDArray[np.float64]:
-    """Return the times of the solved steps (n,) [s], the first run, which compiles, left out.
-
-    Args:
-        recording: frames from an unloaded jaw to a loaded one.
-        jaw: the jaw.
-        solver: name of the solver.
-        mesh: name of the mesh density.
-        frames: frames to be timed.
-    """
-    contact = Contact.fixed(jaw, ContactChoice().height(recording))
-    settings = EstimatorSettings(solver=solver, mesh=mesh)
-    track = recording.jaw(jaw.side).keypoints
-    seen = [track.observation(index) for index in range(len(track.stamps))]
-    warm_up = JawEstimator(jaw, settings=settings)
-    for observation in seen[:200]:
-        warm_up.update(observation, contact)
-    estimator = JawEstimator(jaw, settings=settings)
+def time_calls(call: Callable[[], Any], count: int, clock: Callable[[], float] = perf_counter) -> list[float]:
+    """Return the durations of `count` calls [s] by a clock."""
     times = []
-    for observation in seen[:frames]:
-        begin = perf_counter()
-        solution = estimator.update(observation, contact)
-        # an unloaded or unsolved frame may be cheaper: it is not what a user waits for
-        if solution.status == "ok":
-            times.append(perf_counter() - begin)
-    return np.array(times)
-
-
-def measure_factorisation(jaw: Jaw, mesh: str) -> NDArray[np.float64]:
-    """Return the times (n,) [s] of a SuperLU factorisation of the whole jaw's stiffness matrix."""
-    from scipy.sparse.linalg import splu
-
-    model = SolidModel(jaw.build_mesh(mesh), jaw.material, symmetric=False)
-    stiffness = model.sparse_tangent(model.linearize(np.zeros(model.size)).tangent).tocsc()
-    options = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
-    return np.array([_time_call(lambda: splu(stiffness, **options)) for _ in range(FACTORISATIONS)])
-
-
-def _time_call(call: Callable[[], Any]) -> float:
-    """Return the duration of a call [s]."""
-    begin = perf_counter()
-    call()
-    return perf_counter() - begin
-
-
-MEMORY_PROBE = """
-import sys
-from finforce_eval.bench import RECORDING, measure_steps
-from finforce_eval.memory import resident_bytes
-from finforce_eval.recording import read_recording
-from finforce_ifea.jaw import load_jaw
-measure_steps(read_recording(RECORDING), load_jaw("bench"), sys.argv[1], sys.argv[2], 300)
-print(resident_bytes())
-"""
-
-
-def measure_memory(solver: str, mesh: str) -> float:
-    """Return the resident memory of a fresh process that runs an estimator [MB]."""
-    command = [sys.executable, "-c", MEMORY_PROBE, solver, mesh]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return int(done.stdout.split()[-1]) / 1e6
+    for _ in range(count):
+        begin = clock()
+        call()
+        times.append(clock() - begin)
+    return times
 
 
 def describe_machine() -> dict[str, Any]:
@@ -145,6 +117,8 @@ def describe_machine() -> dict[str, Any]:
 
 def write_figures(path: Path | str, figures: Mapping[str, Any]) -> None:
     """Write figures as JSON with the machine, versions and commit that they are of; what is not finite becomes null."""
+    from finforce_eval.commands import write_json  # loads the estimators, which many a benchmark does not need
+
     write_json(path, {"machine": describe_machine(), **_without_nan(figures)})
 
 
@@ -193,42 +167,60 @@ def format_rows(rows: Sequence[Row]) -> str:
     return "\n".join([head, "-" * len(head), *lines])
 
 
-def measure_all(frames: int) -> Figures:
-    """Measure everything, under a progress bar; without ROS 2 a note says what was left out."""
-    from tqdm import tqdm
+def select_parts(names: str | None) -> tuple[Part, ...]:
+    """Return the parts of a comma-separated list; without one those that `make bench` measures.
 
-    jaw, recording = load_jaw("bench"), read_recording(RECORDING)
-    rows, memory, notes = [], {}, []
-    with tqdm(total=2 * len(SOLVERS) + 3, disable=None, leave=False) as bar:
-        for mesh, name in (("coarse", "522 vertices"), ("default", "default mesh")):
-            rows.append(row_from_times(f"SuperLU, {name}", measure_factorisation(jaw, mesh)))
-            bar.update()
-        for name, solver, mesh in SOLVERS:
-            bar.set_description(name)
-            rows.append(row_from_times(f"step: {name}", measure_steps(recording, jaw, solver, mesh, frames)))
-            bar.update()
-            memory[name] = measure_memory(solver, mesh)
-            bar.update()
-        bar.set_description("both jaws live")
-        try:
-            live = measure_live(RECORDING)
-            rows.append(row_from_times("key points to wrench, both jaws live", live.latency))
-            memory["solver node"] = live.memory / 1e6
-        except MissingDependencyError as error:
-            notes.append(f"both jaws live: not measured: {error}")
-    return Figures(rows=rows, memory=memory, notes=notes)
+    Raises:
+        OptionError: a name is none of a part.
+    """
+    if not names:
+        return tuple(part for part in PARTS if part.usual)
+    known = {part.name: part for part in PARTS}
+    wanted = [name.strip() for name in names.split(",") if name.strip()]
+    for name in wanted:
+        if name not in known:
+            raise OptionError(f"--parts: there is no part {name!r}, expected some of {', '.join(known)}")
+    return tuple(known[name] for name in dict.fromkeys(wanted))
 
 
 def run_bench(options: argparse.Namespace) -> None:
-    """Measure, print the table, write the JSON."""
-    if options.frames < 1:
-        raise OptionError(f"--frames {options.frames}: expected at least 1")
-    figures, machine = measure_all(options.frames), describe_machine()
-    print(format_rows(figures.rows))
-    print("\nresident memory of a process with one solver:")
-    print("\n".join(f"  {name}: {megabytes:.0f} MB" for name, megabytes in figures.memory.items()))
-    print("\n".join(figures.notes))
-    print(f"{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
-    if options.json:
-        rows = [asdict(row) for row in figures.rows]
-        write_figures(options.json, {"times_ms": rows, "memory_MB": figures.memory})
+    """Measure the parts, print each one's table, write the JSON and the pictures."""
+    parts, machine = select_parts(options.parts), describe_machine()
+    if options.folder and not any(part.takes_folder for part in parts):
+        raise OptionError(f"{options.folder}: none of the parts {', '.join(p.name for p in parts)} takes recordings")
+    content: dict[str, Any] = {}
+    for number, part in enumerate(parts):
+        begin = perf_counter()
+        try:
+            figures = _run_part(part, options, _picture_name(options.figure, part, first=number == 0))
+        except OptionError:
+            raise
+        except FinforceError as error:
+            print(f"not measured: {error}")
+            figures = {"not_measured": str(error)}
+        content[part.name] = {**figures, "took_s": round(perf_counter() - begin, 1)}
+        if options.json:
+            write_figures(options.json, content)
+    print(f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
+
+
+def _run_part(part: Part, options: argparse.Namespace, picture: Path | None) -> dict[str, Any]:
+    """Measure one part, print and draw it, and return it as plain values."""
+    module = import_module(part.module)
+    print(f"\n{part.title}\n")
+    taken = {"folder": options.folder} if part.takes_folder else {}
+    figures = module.measure(options.quick, **taken)
+    table = module.format_table(figures)
+    print(table)
+    if picture is not None:
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        module.draw(figures, picture)
+        print(f"\nPicture: {picture}")
+    return {**module.as_json(figures), "table": table}
+
+
+def _picture_name(path: str | None, part: Part, *, first: bool) -> Path | None:
+    """Return the picture's name as given for the first part, with the part's name added for the others."""
+    if not path:
+        return None
+    return Path(path) if first else Path(path).with_stem(f"{Path(path).stem}_{part.name}")

@@ -7,14 +7,17 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from os import getpid
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_eval.bench import Row, format_rows, row_from_times
 from finforce_eval.commands import make_setup
+from finforce_eval.demo import RECORDING
 from finforce_eval.memory import child_processes, resident_bytes
 from finforce_eval.recording import read_recording
 from finforce_eval.replay import replay
@@ -75,12 +78,11 @@ def _watched() -> Iterator[_Watch]:
         thread.join()
 
 
-def measure_live(source: Path, seconds: float = 20.0) -> LiveFigures:
-    """Play a recording through one solver node per jaw.
+def measure(quick: bool) -> LiveFigures:
+    """Play the shipped recording through one solver node per jaw.
 
     Args:
-        source: recording of the left bench jaw.
-        seconds: how much of it.
+        quick: ten seconds of it instead of twenty.
 
     Raises:
         MissingDependencyError: ROS 2 is not installed.
@@ -88,7 +90,35 @@ def measure_live(source: Path, seconds: float = 20.0) -> LiveFigures:
     """
     names = argparse.Namespace(jaw="bench", solver="default", mesh="default", contact=[], calibration=None)
     with tempfile.TemporaryDirectory() as folder, _watched() as watch:
-        path = write_recording(with_both_jaws(read_recording(source), seconds), Path(folder) / "both")
+        both = with_both_jaws(read_recording(RECORDING), 10.0 if quick else 20.0)
+        path = write_recording(both, Path(folder) / "both")
         result = replay(read_recording(path), make_setup(names))
     times = np.concatenate([case.step_ms for case in result.evaluation.results.values()])
     return LiveFigures(latency=1e-3 * times[np.isfinite(times)], memory=watch.largest)
+
+
+def format_table(figures: LiveFigures) -> str:
+    """Return the latency [ms] and the memory as text."""
+    return f"{format_rows([_row(figures)])}\n\nlargest solver node: {1e-6 * figures.memory:.0f} MB"
+
+
+def as_json(figures: LiveFigures) -> dict[str, Any]:
+    """Return the figures as plain values."""
+    return {"latency_ms": asdict(_row(figures)), "node_MB": 1e-6 * figures.memory}
+
+
+def draw(figures: LiveFigures, path: Path | str) -> None:
+    """Draw the distribution of the latency and write it."""
+    from finforce_eval.figures import BLUE, new_figure, style_axes
+
+    figure = new_figure(7.0, 3.6)
+    axes = figure.subplots()
+    style_axes(axes)
+    times = 1e3 * np.sort(figures.latency)
+    axes.plot(times, np.arange(1, len(times) + 1) / len(times), color=BLUE)
+    axes.set(xlabel="key points out to wrench in [ms]", ylabel="share of the images", xscale="log", ylim=(0, 1))
+    figure.savefig(path)
+
+
+def _row(figures: LiveFigures) -> Row:
+    return row_from_times("key points to wrench, both jaws live", figures.latency)

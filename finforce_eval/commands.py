@@ -22,7 +22,7 @@ from finforce_eval.recording import read_recording
 from finforce_eval.results import CaseResult
 from finforce_eval.tables import evaluation_json, format_table
 from finforce_eval.tracks import Recording
-from finforce_ifea.calibration import Calibration, load_calibration, save_calibration
+from finforce_ifea.calibration import Calibration, load_calibration, name_mechanics, save_calibration
 from finforce_ifea.errors import FinforceError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw import Jaw, load_jaw
@@ -255,5 +255,6 @@ def run_calibrate(options: argparse.Namespace) -> None:
     Path(options.output).parent.mkdir(parents=True, exist_ok=True)
     fit = calibrate(cases, jaw, setup.settings)
     print(format_fit(fit, cases))
-    save_calibration(fit.calibration, options.output, uncertainty=fit.uncertainty)
+    named = replace(fit.calibration, solver=name_mechanics(jaw, setup.settings.solver))
+    save_calibration(named, options.output, uncertainty=fit.uncertainty)
     print(f"Calibration: {options.output}")

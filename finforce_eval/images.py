@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,20 @@ from finforce_eval.bags import BagReader, check_types, open_bag, read_stamp
 from finforce_eval.errors import RecordingError
 from finforce_eval.image_messages import CAMERA_INFO, COMPRESSED, IMAGE, color_from_message, depth_from_message
 from finforce_ifea.errors import ObservationError
-from finforce_keypoints.images import RgbdImage, StampedImage, check_image
+from finforce_keypoints.images import RgbdImage, check_image
 
 # the ends of topics by which the images are found, whatever the camera is called; the first that is there counts
 COLOR_ENDS = tuple(f"color/{name}{end}" for end in ("", "/compressed") for name in ("image_raw", "image_rect_raw"))
 DEPTH_ENDS = tuple(f"aligned_depth_to_color/image_raw{end}" for end in ("", "/compressedDepth", "/compressed"))
 INFO_ENDS = ("color/camera_info",)
 PAIRED = 8_000_000  # as the detector node takes colour and depth for one image: distance of their stamps [ns]
+
+
+class StampedImage(NamedTuple):
+    """A whole image and its exact stamp [ns]."""
+
+    stamp: int
+    image: RgbdImage
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

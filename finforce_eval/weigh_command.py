@@ -13,7 +13,7 @@ from finforce_eval.commands import make_setup, read_keypoints
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluate import check_keypoint_count
 from finforce_eval.weighing import estimate_pressing, find_holds, format_weighing, weigh
-from finforce_ifea.calibration import Calibration, save_calibration
+from finforce_ifea.calibration import Calibration, name_mechanics, save_calibration
 
 
 def run_weigh(options: argparse.Namespace) -> None:
@@ -39,6 +39,7 @@ def run_weigh(options: argparse.Namespace) -> None:
     base = setup.calibration or Calibration(young_modulus=setup.jaw.material.young_modulus, jaw=setup.jaw.name)
     scaled = replace(
         base,
+        solver=name_mechanics(setup.jaw, setup.settings.solver),
         young_modulus=base.young_modulus * weighing.factor,
         force_error=float(np.clip(max(weighing.misfit, base.force_error), 0.005, 0.5)),
     )

@@ -11,6 +11,7 @@ _MODEL_FLOOR = 0.02e-3
 _LEAST_WEIGHT = 0.02
 # Median of a squared distance in three axes; what more is chance; and fewer points do not tell a level.
 _MEDIAN_SQUARE, _CHANCE, _FEWEST = 2.37, 1.5, 5
+_BELIEVED = 0.25
 # Beyond this level key points are not noisy but something else than key points.
 _LOUDEST = 20.0
 
@@ -51,6 +52,7 @@ class Residuals(NamedTuple):
         used: number of points with a weight.
         known: number of points that were measured.
         jump: median of the depths that the points ask for one by one, about the model's own place [m].
+        agreed: number of points that have at least the weight of a residual at the gate.
     """
 
     r: NDArray
@@ -61,6 +63,7 @@ class Residuals(NamedTuple):
     used: int
     known: int
     jump: float
+    agreed: int
 
 
 @njit(**_OPTIONS)
@@ -124,7 +127,8 @@ def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
             used += 1
         else:
             r[k, 0] = r[k, 1] = 0.0
-    return Residuals(r, modes, weights, noise * level, bias, used, known, jump)
+    agreed = int((weights >= _BELIEVED * trust).sum())
+    return Residuals(r, modes, weights, noise * level, bias, used, known, jump, agreed)
 
 
 @njit(**_OPTIONS)

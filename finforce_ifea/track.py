@@ -29,6 +29,7 @@ class Track:
         extrapolation: distance of the shape from the stored ones, as a share of what the mechanics is good for.
         away: how far the key points alone would have the contact from where it was said to be [m].
         mistaken: probability that it is not there.
+        agreement: share of the measured key points that agree with the shape.
         place_error: relative standard deviation of the force that its place leaves, beside the covariance.
         place_stddev: of the height of the pressure centre [m].
         condition: of what was solved, its unknowns scaled.
@@ -58,6 +59,7 @@ class Track:
     away: float = 0.0
     extrapolation: float = 0.0
     mistaken: float = 0.0
+    agreement: float = 1.0
     place_error: float = 0.0
     place_stddev: float = 0.0
     condition: float = 1.0

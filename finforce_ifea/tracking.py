@@ -288,6 +288,7 @@ class PlaceTracker:
             away=update.away,
             extrapolation=state.extrapolation,
             mistaken=update.mistaken,
+            agreement=data.agreed / data.known,
             condition=update.condition,
             place_stddev=float(np.sqrt(max(update.covariance[HEIGHT, HEIGHT], 0.0))),
         )

@@ -10,6 +10,8 @@ _LARGEST_STIFFENING = 5.0
 _VAGUE_FORCE, _VAGUE_SHARE = 1.0, 0.25
 # Shapes so many times as far from the stored ones as they are good for.
 _STRANGEST = 2.0
+# Share of the key points: what no majority says is not believed.
+_MAJORITY = 0.5
 # A contact that is so surely another one, and at least so far from where it was said to be [m].
 _MISTAKEN, _LEAST_AWAY = 0.99, 4e-3
 
@@ -29,6 +31,8 @@ def find_doubt(track: Track, *, settles: bool) -> str:
         return f"the key points do not fit this contact ({track.misfit:.1f} standard deviations); is its place right?"
     if track.stiffening > _LARGEST_STIFFENING:
         return f"the jaw seems {track.stiffening:.0f} times as stiff as at the given height; is the contact elsewhere?"
+    if track.agreement <= _MAJORITY:
+        return f"only {100 * track.agreement:.0f} % of the key points agree with the jaw's shape"
     if track.mistaken > _MISTAKEN and abs(track.away) > _LEAST_AWAY:
         return f"the contact is not where it was said to be: the key points have it {1e3 * track.away:+.0f} mm away"
     magnitude = float(np.linalg.norm(track.force))

@@ -14,7 +14,7 @@ from finforce_camera import CameraIntrinsics, ImageError, ImageLayout
 from finforce_contact.messages import camera_from_info, depth_from_image, same_camera, stamp_of
 from finforce_ifea.messages import check_frame
 from finforce_keypoints.errors import SyncError
-from finforce_keypoints.images import ImageWatch, RgbdImage, StampedImage, check_image, decode_color
+from finforce_keypoints.images import ImagePair, ImageWatch, RgbdImage, check_image, decode_color
 from finforce_keypoints.parameters import DetectorParameters
 
 SECOND = 1e-9  # s/ns
@@ -82,13 +82,11 @@ class CameraFeed:
             self._heard = now
         return self.topic == topic
 
-    def take_color(self, topic: str, message: Any) -> StampedImage | None:
+    def take_color(self, topic: str, message: Any) -> ImagePair | None:
         """Take a colour image and return it with its depth; None while that has not come, or of another topic.
 
         Raises:
             SyncError: no depth image came for an earlier image.
-            ObservationError: the frame is another one.
-            ImageError: the images cannot be used, or the intrinsics are not known yet.
         """
         if not self.listens(topic):
             return None
@@ -98,12 +96,12 @@ class CameraFeed:
             raise self._missing_depth(stamp_of(self._colors.popleft()))
         return found
 
-    def take_depth(self, message: Any) -> StampedImage | None:
-        """Take a depth image and return it with its colour; None while that has not come; raises as `take_color`."""
+    def take_depth(self, message: Any) -> ImagePair | None:
+        """Take a depth image and return it with its colour; None while that has not come."""
         self._depths.append(message)
         return self._match()
 
-    def _match(self) -> StampedImage | None:
+    def _match(self) -> ImagePair | None:
         """Return the newest colour image that has its depth, and pass the older ones over."""
         for place in reversed(range(len(self._colors))):
             color = self._colors[place]
@@ -112,18 +110,37 @@ class CameraFeed:
                 self.passed += place
                 for _ in range(place + 1):
                     self._colors.popleft()
-                return StampedImage(stamp_of(color), self._decode(color, depth))
+                return ImagePair(stamp_of(color), color, depth)
         return None
 
-    def _decode(self, color: Any, depth: Any) -> RgbdImage:
-        """Return the whole image after having refused what cannot be one."""
+    def pass_over(self) -> None:
+        """Forget the colour images that wait: one after them has been answered."""
+        self.passed += len(self._colors)
+        self._colors.clear()
+
+    def read_color(self, message: Any) -> NDArray[np.uint8]:
+        """Return the colours (h, w, 3) of a colour image.
+
+        Raises:
+            ObservationError: the frame is another one.
+            ImageError: the image cannot be used, or the intrinsics are not known yet.
+        """
         if self.camera is None:
             raise ImageError(f"images came, but no camera_info on {self._parameters.info_topic} yet")
-        check_frame(color, self._parameters.camera_frame, "the colour image")
+        check_frame(message, self._parameters.camera_frame, "the colour image")
+        return color_from_image(message)
+
+    def decode(self, pair: ImagePair) -> RgbdImage:
+        """Return the whole image of a pair after having refused what cannot be one.
+
+        Raises:
+            ObservationError: a frame is another one.
+            ImageError: the images cannot be used, or the intrinsics are not known yet.
+        """
         image = RgbdImage(
-            stamp=SECOND * stamp_of(color),
-            color=color_from_image(color),
-            depth=depth_from_image(depth, self._parameters.camera_frame, self._parameters.depth_scale),
+            stamp=SECOND * pair.stamp,
+            color=self.read_color(pair.color),
+            depth=depth_from_image(pair.depth, self._parameters.camera_frame, self._parameters.depth_scale),
             camera=self.camera,
         )
         check_image(image)

@@ -19,7 +19,10 @@ from finforce_keypoints.images import RgbdImage, check_image
 from finforce_keypoints.jaw_localizer import JawKeypoints, JawLocalizer
 from finforce_keypoints.localization import DepthScale
 from finforce_keypoints.plane_picture import find_side
+from finforce_keypoints.rules import LOOK_EVERY, RULES, SEARCH_EVERY, SEARCHED, STILL, UNSEEN
 from finforce_keypoints.settings import DetectorSettings
+from finforce_keypoints.stillness import StillWatch
+from finforce_skipping import ALL, Skips
 
 __all__ = ["JawKeypoints", "KeypointDetector"]
 
@@ -46,9 +49,11 @@ class KeypointDetector:
         jaws: Mapping[str, Jaw],
         T_gripper_camera: NDArray,
         settings: DetectorSettings | None = None,
+        skips: Skips | None = None,
     ) -> None:
-        """Prepare to look at jaws, side -> jaw, with a camera at T_gripper_camera (4, 4)."""
+        """Prepare to look at jaws, side -> jaw, with a camera at T_gripper_camera (4, 4); every image without skips."""
         self.settings = settings or DetectorSettings()
+        self._skips = skips or Skips(RULES, (ALL,))
         wrong = [side for side, jaw in jaws.items() if jaw.side != side]
         if wrong or not jaws:
             raise GeometryError(f"jaws {sorted(jaws)}, wrong side: {wrong}; expected left, right or both")
@@ -65,6 +70,9 @@ class KeypointDetector:
         for jaw in self._jaws.values():
             jaw.reset()
         self._stamp: float | None = None
+        self._looked = -np.inf
+        self._missed = dict.fromkeys(self._jaws, 0)
+        self._watch = StillWatch()
         self._scale = DepthScale(error=0.0, stddev=self.settings.scale_stddev)
         self.counts: Counter[str] = Counter()
 
@@ -95,6 +103,29 @@ class KeypointDetector:
                 jaw.locate(later, jaw.imagine(image.camera), self._scale)
         self.reset()
 
+    def confirm(self, stamp: float, color: NDArray, camera: CameraIntrinsics) -> Mapping[str, JawKeypoints] | None:
+        """Return the key points of an image in which nothing has moved, None where it has to be looked at in full.
+
+        They are the means of the images since when nothing has moved; "confirmed" in `counts` counts them. A motion of
+        more than `stillness.LARGEST_SHIFT` is seen at once; all that cannot be seen so, after `LOOK_EVERY` at most.
+
+        Args:
+            stamp: of the image [s].
+            color: (h, w, 3) uint8.
+            camera: its intrinsics.
+        """
+        is_due = self._stamp is None or not self._stamp < stamp <= self._looked + LOOK_EVERY
+        if is_due or not self._skips.allows(STILL) or not all(jaw.is_settled for jaw in self._jaws.values()):
+            return None
+        found = self._watch.confirm(stamp, color, camera)
+        if found is not None:
+            self._drift(stamp)
+            for jaw in self._jaws.values():
+                jaw.rest(stamp)
+            self._skips.count(STILL)
+            self.counts["confirmed"] += 1
+        return found
+
     def detect(self, image: RgbdImage) -> Mapping[str, JawKeypoints]:
         """Return the key points of the jaws in an image; a jaw that is not found is absent.
 
@@ -113,9 +144,24 @@ class KeypointDetector:
                 "reset for a new recording"
             )
         self._drift(image.stamp)
-        findings = self._finder.find(image, {side: jaw.expect(image.stamp) for side, jaw in self._jaws.items()})
+        self._looked = image.stamp
+        expected = {side: jaw.expect(image.stamp) for side, jaw in self._jaws.items() if self._is_wanted(side)}
+        findings = self._finder.find(image, expected) if expected else {}
         self.counts["images"] += 1
-        return self._locate(image, findings)
+        found = self._locate(image, findings)
+        self._missed = {side: 0 if side in found else missed + 1 for side, missed in self._missed.items()}
+        if not self._skips.allows(STILL):
+            return found
+        return self._watch.take(found if len(found) == len(self._jaws) else {}, image.color, image.camera) or found
+
+    def _is_wanted(self, side: str) -> bool:
+        """Say whether a jaw is looked for in the next image; one that has long been lost is so in every few only."""
+        beyond = self._missed[side] - SEARCHED
+        is_due = beyond < 0 or beyond % SEARCH_EVERY == SEARCH_EVERY - 1
+        if is_due or not self._jaws[side].is_lost or not self._skips.allows(UNSEEN):
+            return True
+        self._skips.count(UNSEEN)
+        return False
 
     def _locate(self, image: RgbdImage, findings: Mapping[str, PixelFinding]) -> dict[str, JawKeypoints]:
         """Return the key points of the jaws that are found."""

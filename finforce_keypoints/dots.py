@@ -93,7 +93,7 @@ class DotFinder:
 
     def find(self, image: RgbdImage, expected: Mapping[str, NDArray | None]) -> Mapping[str, PixelFinding]:
         """Return the dots of every jaw; see `PixelFinder`."""
-        candidates = {side: self._place(side, expected.get(side), image.camera) for side in self._points}
+        candidates = {side: self._place(side, pose, image.camera) for side, pose in expected.items()}
         dots = self._see(np.asarray(image.color), [pattern for some in candidates.values() for pattern in some])
         chosen, matches = {}, {}
         for side, patterns in candidates.items():

@@ -37,7 +37,8 @@ class PixelFinder(Protocol):
 
         Args:
             image: colour, depth and camera.
-            expected: side -> T_camera_jaw (4, 4) where the jaw should be; None where it was lost: look everywhere.
+            expected: side -> T_camera_jaw (4, 4) where the jaw should be; None where it was lost: look everywhere; a
+                side that is absent is not looked for.
 
         Returns:
             side -> finding; a side that cannot be seen at all is absent.

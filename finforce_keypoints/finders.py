@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from finforce_keypoints.model import KeypointModel
     from finforce_keypoints.parameters import DetectorParameters
     from finforce_keypoints.settings import DetectorSettings
+    from finforce_skipping import Skips
 
 SHIPPED = Path(__file__).parent / "models" / "plane"
 ANSWERS = {"auto": None, "yes": True, "no": False}
@@ -47,8 +48,9 @@ def build_detector(
     parameters: DetectorParameters,
     settings: DetectorSettings | None = None,
     dots: DotSettings | None = None,
+    skips: Skips | None = None,
 ) -> BuiltDetector:
-    """Return the detector of the jaws (by side) that the parameters ask for.
+    """Return the detector of the jaws (by side) that the parameters ask for; it leaves out nothing without `skips`.
 
     Raises:
         PoseError: the camera's pose is none.
@@ -61,7 +63,7 @@ def build_detector(
     T_gripper_camera = parameters.camera_pose
     settings = settings or DetectorSettings()
     finder, card = build_finder(jaws, parameters, settings, dots)
-    return BuiltDetector(KeypointDetector(finder, jaws, T_gripper_camera, settings), card)
+    return BuiltDetector(KeypointDetector(finder, jaws, T_gripper_camera, settings, skips), card)
 
 
 def build_finder(

@@ -123,13 +123,13 @@ class FrameFinder:
     def _plan(self, camera: CameraIntrinsics, expected: Mapping[str, NDArray | None]) -> list[_View]:
         """Return what the network is shown."""
         whole = Box(x=0, y=0, width=camera.width, height=camera.height)
-        boxes = {side: self._expect(camera, side, expected.get(side)) for side in self._points}
+        boxes = {side: self._expect(camera, side, pose) for side, pose in expected.items()}
         if not self._names.is_of_one_jaw:
             known = [box for box in boxes.values() if box is not None]
             is_whole = self._is_frozen or len(known) < len(boxes)
             canvas = whole if is_whole else _join(known, whole)
             return [_View(sides=tuple(boxes), canvas=canvas, window=canvas)]
-        rest = {side: whole if len(boxes) == 1 else _half(whole, side) for side in boxes}
+        rest = {side: whole if len(self._points) == 1 else _half(whole, side) for side in boxes}
         windows = [boxes[side] or rest[side] for side in boxes]
         canvases = [whole] * len(windows) if self._is_frozen else _equalize(windows, whole)
         return [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +38,12 @@ class RgbdImage:
     camera: CameraIntrinsics
 
 
-class StampedImage(NamedTuple):
-    """A whole image and its exact stamp [ns]."""
+class ImagePair(NamedTuple):
+    """A colour image and its depth image, both as they came, and the exact stamp of the first [ns]."""
 
     stamp: int
-    image: RgbdImage
+    color: Any
+    depth: Any
 
 
 def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | None = None) -> NDArray:

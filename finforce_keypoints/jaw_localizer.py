@@ -127,6 +127,15 @@ class JawLocalizer:
         return self._track.is_lost
 
     @property
+    def is_settled(self) -> bool:
+        """Whether the jaw's place is no longer learnt, so that images in a row tell the same."""
+        return self._patch.is_learnt
+
+    def rest(self, stamp: float) -> None:
+        """Take it that the jaw has not moved from the last image to one of `stamp` [s]."""
+        self._track.rest(stamp)
+
+    @property
     def middle(self) -> NDArray:
         """T_camera_jaw (4, 4) in the middle of the opening range."""
         return self._origin.place(self._origin.middle)

@@ -155,6 +155,11 @@ class OriginTrack:
         self._P = P - np.outer(gain, P[0])
         return self._estimate()
 
+    def rest(self, stamp: float) -> None:
+        """Take it that the jaw has not moved since the last image."""
+        if self._stamp is not None:
+            self._stamp, self._state[1] = stamp, 0.0
+
     def _begin(self, stamp: float, origin: Origin, speed: float = 0.0) -> Origin:
         """Start the course at an origin."""
         self._stamp, self._state = stamp, np.array([origin.x, speed])

@@ -6,27 +6,44 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from time import perf_counter
+from time import monotonic, perf_counter
 from typing import TYPE_CHECKING, Any
 
+from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
 import finforce_ros as ros
-from finforce_health import Health, Outcome, Report, StampGate
+from finforce_contact.messages import stamp_of
+from finforce_health import Health, Idling, Outcome, Report, StampGate
+from finforce_heap import keep_heap
 from finforce_ifea.errors import FinforceError
-from finforce_keypoints.camera_feed import CameraFeed
+from finforce_keypoints.camera_feed import SECOND, CameraFeed
 from finforce_keypoints.dot_image import DotSettings
 from finforce_keypoints.finders import BuiltDetector, build_detector
-from finforce_keypoints.images import StampedImage
+from finforce_keypoints.images import ImagePair
 from finforce_keypoints.outputs import DetectorOutputs
 from finforce_keypoints.parameters import DetectorParameters, load_jaws
-from finforce_keypoints.report import describe, outcome_of_keypoints
+from finforce_keypoints.report import describe, outcome_of_keypoints, report_of_rest
+from finforce_keypoints.rules import RULES
 from finforce_keypoints.settings import DetectorSettings
+from finforce_raw_image import read_image
+from finforce_skipping import IDLE, LATE, UNHEARD, Skips
 
 if TYPE_CHECKING:
     from finforce_keypoints.detector import JawKeypoints
+
+
+class DoorGroup(MutuallyExclusiveCallbackGroup):
+    """Callbacks that are called while it is open; messages that come meanwhile wait, unread."""
+
+    is_open = True
+
+    def can_execute(self, entity: Any) -> bool:
+        """Say whether one may be called now."""
+        return self.is_open and super().can_execute(entity)
 
 
 class KeypointDetectorNode(Node):
@@ -50,14 +67,16 @@ class KeypointDetectorNode(Node):
         said = ParameterDescriptor(description="what the rows of the clouds are", read_only=True)
         self.declare_parameter("keypoint_names", list(names), said, ignore_override=True)
         ros.name_unknown_parameters(self)
-        self.detector, self.card = build(jaws, parameters, settings, dots)
+        self.skips = Skips(RULES, parameters.skip_off)
+        self.detector, self.card = build(jaws, parameters, settings, dots, self.skips)
         self.feed = CameraFeed(parameters)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
         source, age = self.feed.source, parameters.max_age
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}
+        self.rested, self.idling = float("-inf"), Idling()
         self.qos = ros.QosWatch(self)
-        self.out = DetectorOutputs(self.qos, parameters, names, self.card)
+        self.out = DetectorOutputs(self.qos, parameters, names, self.card, self.skips)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
         self._subscribe()
@@ -72,50 +91,98 @@ class KeypointDetectorNode(Node):
 
     def _subscribe(self) -> None:
         """Create the subscriptions; images that a newer one overtook are passed over."""
-        parameters, feed = self.parameters, self.feed
-        self.qos.subscription(CameraInfo, parameters.info_topic, partial(self._take, feed.take_info), ros.SENSOR)
+        parameters = self.parameters
+        self.qos.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR)
+        # as bytes: of an image that nobody looks at no more than the header is read
+        self.depth_group = DoorGroup()
         self.depths = ros.LargeSubscription(
-            self.qos, Image, parameters.depth_topic, partial(self._take, feed.take_depth)
+            self.qos, Image, parameters.depth_topic, self._on_depth, raw=True, callback_group=self.depth_group
         )
         self.colors = {
-            topic: ros.LargeSubscription(self.qos, Image, topic, partial(self._on_color, topic))
+            topic: ros.LargeSubscription(self.qos, Image, topic, partial(self._on_color, topic), raw=True)
             for topic in parameters.color_topics
         }
 
-    def _on_color(self, topic: str, message: Image) -> None:
+    def _on_info(self, message: CameraInfo) -> None:
+        """Keep the camera's intrinsics."""
+        with self._refusals():
+            self.feed.take_info(message)
+
+    def _on_color(self, topic: str, data: bytes) -> None:
         """Take the newest colour image of the camera's topic."""
-        message, superseded = ros.take_newest(self.colors[topic].current, message)
+        began, superseded = perf_counter(), 0
+        if self.skips.allows(LATE):
+            data, superseded = ros.take_newest(self.colors[topic].current, data)
+            self.skips.count(LATE, superseded)
         if not self.feed.listens(topic):
             return
         for health in self.health.values():
             health.source = self.feed.source
             health.arrive(superseded)
-        self._take(partial(self.feed.take_color, topic), message)
-
-    def _take(self, take: Callable[[Any], StampedImage | None], message: Any) -> None:
-        """Hand a message to the feed, and find the key points in an image that is whole with it."""
-        began = perf_counter()
         with self._refusals():
-            taken = take(message)
-            if taken is not None:
-                self._detect(taken, began)
+            message = read_image(data)
+            if not (self._rest() or self._confirm(message, began)):
+                self.depth_group.is_open = True  # what came meanwhile is read now
+                self._answer(self.feed.take_color(topic, message), began)
 
-    def _detect(self, taken: StampedImage, began: float) -> None:
-        """Find the key points of all jaws and publish them while they are fresh."""
-        if self.gate.enter(taken.stamp, self._now()):
+    def _on_depth(self, data: bytes) -> None:
+        """Take a depth image."""
+        with self._refusals():
+            self._answer(self.feed.take_depth(read_image(data)), perf_counter())
+
+    def _rest(self) -> bool:
+        """Say whether nobody listens, so that there is nothing to do."""
+        if not self.skips.allows(UNHEARD) or self.out.are_heard:
+            return False
+        self.depth_group.is_open = False
+        self.rested = monotonic()
+        self.skips.count(UNHEARD)
+        return True
+
+    def _confirm(self, message: Any, began: float) -> bool:
+        """Publish the last key points again if a colour image shows that nothing has moved; say whether it did."""
+        if self.feed.camera is None:
+            return False
+        stamp, color = stamp_of(message), self.feed.read_color(message)
+        found = self.detector.confirm(SECOND * stamp, color, self.feed.camera)
+        if found is None:
+            return False
+        self.depth_group.is_open = False
+        self.feed.pass_over()
+        self.gate.enter(stamp, self._now())
+        if self.skips.allows(IDLE) and self.idling.passes(stamp):
+            self.skips.count(IDLE)
+            return True
+        self.found = found
+        self._publish(stamp, color, began)
+        self.idling.note(stamp, True)
+        return True
+
+    def _answer(self, pair: ImagePair | None, began: float) -> None:
+        """Find the key points of all jaws in an image that is whole."""
+        if pair is None:
+            return
+        image = self.feed.decode(pair)
+        if self.gate.enter(pair.stamp, self._now()):
             self._restart("the stamps went back: a new recording")
         self.found = {}  # until they are found again
-        self.found = found = self.detector.detect(taken.image)
-        self.gate.check_age(taken.stamp, self._now())
+        self.found = self.detector.detect(image)
+        self._publish(pair.stamp, image.color, began)
+        self.idling.note(pair.stamp, False)
+
+    def _publish(self, stamp: int, color: NDArray, began: float) -> None:
+        """Publish the key points of an image, (h, w, 3), while they are fresh."""
+        found = self.found
+        self.gate.check_age(stamp, self._now())
         for side, health in self.health.items():
             outcome = outcome_of_keypoints(found.get(side), side, self.detector.warnings.get(side, ""))
             if side not in found:
                 self._refuse(outcome, (side,))
                 continue
-            self.out.send_jaw(side, taken.stamp, found[side])
-            age = (self._now() - taken.stamp) / ros.NANOSECONDS
+            self.out.send_jaw(side, stamp, found[side])
+            age = (self._now() - stamp) / ros.NANOSECONDS
             health.publish(outcome, latency=perf_counter() - began, age=age)
-        self.out.send_annotated(taken, found)
+        self.out.send_annotated(stamp, color, found)
 
     def _restart(self, reason: str) -> str:
         self.detector.reset()
@@ -139,7 +206,11 @@ class KeypointDetectorNode(Node):
 
     def _report(self, side: str, alarms: list[Outcome]) -> Report:
         """Return how one jaw is seen."""
-        return self.health[side].report(alarms, describe(self.feed, self.card, self.found.get(side)))
+        known = describe(self.feed, self.card, self.found.get(side)) | self.skips.describe()
+        report = self.health[side].report(alarms, known)
+        if monotonic() - self.rested > self.parameters.max_age:
+            return report
+        return report_of_rest(alarms, report.values)
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds
@@ -147,6 +218,7 @@ class KeypointDetectorNode(Node):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until Ctrl-C."""
+    keep_heap()
     return ros.run_node("keypoint_detector", KeypointDetectorNode, args)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,11 +15,21 @@ from finforce_keypoints.jaw_localizer import REASONS
 from finforce_keypoints.overlay import draw_keypoints
 from finforce_keypoints.parameters import DetectorParameters
 from finforce_keypoints.report import build_skeleton, describe_names
+from finforce_keypoints.rules import ANNOTATED
 
 if TYPE_CHECKING:
     from finforce_keypoints.detector import JawKeypoints
     from finforce_keypoints.finders import FinderCard
-    from finforce_keypoints.images import StampedImage
+    from finforce_skipping import Skips
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Kept:
+    """The messages of one jaw, and the key points that they were made of."""
+
+    points: NDArray
+    pose: ros.KeptMessage
+    cloud: ros.KeptMessage
 
 
 class DetectorOutputs:
@@ -29,35 +40,52 @@ class DetectorOutputs:
         parameters: which jaws, and the camera's frame.
         names: of the rows of the clouds; sent once, and kept for whoever comes later.
         card: of the finder.
+        skips: what may be left out.
     """
 
     def __init__(
-        self, qos: ros.QosWatch, parameters: DetectorParameters, names: Sequence[str], card: FinderCard
+        self, qos: ros.QosWatch, parameters: DetectorParameters, names: Sequence[str], card: FinderCard, skips: Skips
     ) -> None:
-        sides = parameters.sides
+        sides, self._skips = parameters.sides, skips
         self._frame, self._skeleton = parameters.camera_frame, build_skeleton(names)
         self.keypoints = {side: qos.publisher(ros.PointCloud2, f"{side}/keypoints", ros.RESULT) for side in sides}
         self.pose = {side: qos.publisher(ros.PoseStamped, f"{side}/jaw_pose", ros.RESULT) for side in sides}
         self.annotated = qos.publisher(ros.Image, "~/annotated", ros.RESULT)
         self.names = qos.publisher(ros.String, "~/keypoint_names", ros.LATCHED)
+        self._kept: dict[str, _Kept] = {}
         self.names.publish(ros.String(data=describe_names(names, card)))
 
-    def send_jaw(self, side: str, stamp: int, found: JawKeypoints) -> None:
-        """Send the key points of a jaw and its pose, of the image at `stamp` [ns]."""
-        time = ros.stamp_message(stamp)
-        # the pose goes first: the contact estimator and the solver work at the same time then
-        pose = ros.pose_message(ros.Header(stamp=time, frame_id=self._frame), pose_numbers(found.T_camera_jaw))
-        self.pose[side].publish(pose)
-        header = ros.Header(stamp=time, frame_id=f"{side}_jaw")
-        self.keypoints[side].publish(ros.cloud_message(header, keypoint_columns(found)))
+    @property
+    def are_heard(self) -> bool:
+        """Whether anybody subscribes to what is made of images."""
+        outputs = (*self.keypoints.values(), *self.pose.values(), self.annotated)
+        return any(output.get_subscription_count() for output in outputs)
 
-    def send_annotated(self, taken: StampedImage, found: Mapping[str, JawKeypoints]) -> None:
-        """Send the image with what was found in it, while someone subscribes."""
-        if self.annotated.get_subscription_count():
-            header = ros.Header(stamp=ros.stamp_message(taken.stamp), frame_id=self._frame)
-            self.annotated.publish(
-                ros.image_message(header, draw_keypoints(taken.image.color, found.values(), self._skeleton))
-            )
+    def send_jaw(self, side: str, stamp: int, found: JawKeypoints) -> None:
+        """Send the key points of a jaw and its pose, of the image at `stamp` [ns].
+
+        What was sent before is not put together again.
+        """
+        kept = self._kept.get(side)
+        if kept is None or kept.points is not found.points:
+            kept = self._kept[side] = self._build(side, found)
+        # the pose goes first: the contact estimator and the solver work at the same time then
+        self.pose[side].publish(kept.pose.at(stamp))
+        self.keypoints[side].publish(kept.cloud.at(stamp))
+
+    def _build(self, side: str, found: JawKeypoints) -> _Kept:
+        """Return the messages of a jaw, without a stamp."""
+        pose = ros.pose_message(ros.Header(frame_id=self._frame), pose_numbers(found.T_camera_jaw))
+        cloud = ros.cloud_message(ros.Header(frame_id=f"{side}_jaw"), keypoint_columns(found))
+        return _Kept(points=found.points, pose=ros.KeptMessage(pose), cloud=ros.KeptMessage(cloud))
+
+    def send_annotated(self, stamp: int, color: NDArray, found: Mapping[str, JawKeypoints]) -> None:
+        """Send the image at `stamp` [ns], (h, w, 3), with what was found in it, while someone subscribes."""
+        if self._skips.allows(ANNOTATED) and not self.annotated.get_subscription_count():
+            self._skips.count(ANNOTATED)
+            return
+        header = ros.Header(stamp=ros.stamp_message(stamp), frame_id=self._frame)
+        self.annotated.publish(ros.image_message(header, draw_keypoints(color, found.values(), self._skeleton)))
 
 
 def keypoint_columns(found: JawKeypoints) -> dict[str, NDArray]:

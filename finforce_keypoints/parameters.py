@@ -75,6 +75,9 @@ class DetectorParameters(TimeParameters):
         min=0.0,
         max=0.1,
     )
+    skip_off: tuple[str, ...] = parameter(
+        ("",), "rules that are not applied, by their names in the diagnostics after `skipped:`, or all"
+    )
     frozen_after: int = parameter(
         2, "repetitions of a picture, to the bit, after which the camera counts as frozen", unit="1", min=1, max=1000
     )

@@ -28,6 +28,7 @@ SETTLED = 0.02  # [px] that a last iteration may move
 FARTHEST = 2.0e-3  # [m] between the network's place and the registered one
 LEAST_LIKENESS = 0.75  # correlation with the template, below which something else is seen
 STDDEV = 0.04e-3  # [m] of a registered slide
+_INNER = (slice(3, -3), slice(3, -3))  # the border's gradients are one-sided
 FORGOTTEN_AFTER = 15  # images in a row without likeness: the light or the thing itself has changed
 
 
@@ -61,7 +62,13 @@ class ReferencePatch:
     def reset(self) -> None:
         """Forget the template."""
         self._template: NDArray | None = None
+        self._matcher: PatchMatcher | None = None
         self._count, self._anchor, self._unlike = 0, 0.0, 0
+
+    @property
+    def is_learnt(self) -> bool:
+        """Whether the template is one of enough images, so that it changes no more."""
+        return self._count >= TEMPLATE_IMAGES
 
     def refine(
         self, color: NDArray, camera: CameraIntrinsics, measured: Origin, place: Callable[[Origin], NDArray]
@@ -94,14 +101,16 @@ class ReferencePatch:
         self._template += share * (patch - self._template)
         self._anchor += share * (off - self._anchor)
         self._count += 1
+        self._matcher = None
 
     def _register(
         self, color: NDArray, camera: CameraIntrinsics, measured: Origin, place: Callable[[Origin], NDArray]
     ) -> Origin | None:
         """Return the origin, without the anchor, at which the patch is the template; None when it is nowhere near."""
         x = measured.x - self._anchor
+        self._matcher = self._matcher or build_matcher(self._template)
         for _ in range(ITERATIONS):
-            slide = match_patch(self._take(color, camera, place(Origin(x=x, stddev=0.0))), self._template)
+            slide = self._matcher.match(self._take(color, camera, place(Origin(x=x, stddev=0.0))))
             step = self._sign * slide.x * SCALE
             x += step
             if abs(x + self._anchor - measured.x) > FARTHEST or not np.isfinite(x):
@@ -117,19 +126,36 @@ class ReferencePatch:
         return import_cv2().GaussianBlur(grey, (0, 0), BLUR).astype(np.float64)
 
 
-def match_patch(patch: NDArray, template: NDArray) -> Slide:
-    """Return by how much a patch has slid against a template, both (h, w).
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PatchMatcher:
+    """Tells by how much patches have slid against one template, by least squares to first order in the slide s.
 
-    Least squares of patch = a template - a (s_x d_x + s_z d_z) template + b, to first order in the slide s.
+    patch = a template - a (s_x d_x + s_z d_z) template + b
+
+    Attributes:
+        columns: (n, 4) d_x template, d_z template, template and 1 of the inner pixels.
+        inverse: (4, n) that gives -a s_x, -a s_z, a and b of a patch.
     """
-    inner = (slice(3, -3), slice(3, -3))  # the border's gradients are one-sided
+
+    columns: NDArray
+    inverse: NDArray
+
+    def match(self, patch: NDArray) -> Slide:
+        """Return by how much a patch (h, w) has slid."""
+        values = patch[_INNER].ravel()
+        slope_x, _, gain, _ = self.inverse @ values
+        if not gain > 0.0:
+            return Slide(x=0.0, likeness=0.0)
+        template = self.columns[:, 2]
+        seen, known = values - values.mean(), template - template.mean()
+        likeness = float(seen @ known / max(np.linalg.norm(seen) * np.linalg.norm(known), 1e-9))
+        return Slide(x=float(-slope_x / gain), likeness=likeness)
+
+
+def build_matcher(template: NDArray) -> PatchMatcher:
+    """Return what compares patches with a template (h, w)."""
     by_z, by_x = np.gradient(template)
-    values, one = patch[inner].ravel(), np.ones(patch[inner].size)
-    columns = np.column_stack([by_x[inner].ravel(), by_z[inner].ravel(), template[inner].ravel(), one])
+    values = template[_INNER].ravel()
+    columns = np.column_stack([by_x[_INNER].ravel(), by_z[_INNER].ravel(), values, np.ones(values.size)])
     normal = columns.T @ columns + 1e-6 * np.eye(4)
-    slope_x, _, gain, _ = np.linalg.solve(normal, columns.T @ values)
-    if not gain > 0.0:
-        return Slide(x=0.0, likeness=0.0)
-    seen, known = values - values.mean(), columns[:, 2] - columns[:, 2].mean()
-    likeness = float(seen @ known / max(np.linalg.norm(seen) * np.linalg.norm(known), 1e-9))
-    return Slide(x=float(-slope_x / gain), likeness=likeness)
+    return PatchMatcher(columns=columns, inverse=np.linalg.solve(normal, columns.T))

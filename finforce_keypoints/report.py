@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from finforce_health import Level, Outcome
+from finforce_health import Level, Outcome, Report
 
 if TYPE_CHECKING:
     from finforce_keypoints.camera_feed import CameraFeed
@@ -30,6 +30,13 @@ def outcome_of_keypoints(found: JawKeypoints | None, side: str, warning: str = "
     enough = visible >= LEAST_VISIBLE
     level = Level.OK if enough and not warning else Level.WARN
     return Outcome(level=level, reason="visible" if enough else "hidden", text=text)
+
+
+def report_of_rest(alarms: Sequence[Outcome], values: Mapping[str, str]) -> Report:
+    """Return the state of a node that nobody listens to: standing faults, and values."""
+    level = max((alarm.level for alarm in alarms), default=Level.OK)
+    said = [alarm.text for alarm in alarms]
+    return Report(level=level, message="; ".join([*said, "rests: nobody subscribes to the key points"]), values=values)
 
 
 def describe(feed: CameraFeed, card: FinderCard, found: JawKeypoints | None) -> dict[str, str]:

@@ -46,7 +46,7 @@ class FakeDetector:
     def __init__(self, sides):
         self.answer = {side: FakeKeypoints() for side in sides}
         self.images, self.resets, self.error, self.delay = [], 0, None, 0.0
-        self.warnings, self.warmed = {}, False
+        self.warnings, self.warmed, self.is_still = {}, False, False
 
     def detect(self, image):
         self.images.append(image)
@@ -54,6 +54,9 @@ class FakeDetector:
         if self.error is not None:
             raise self.error
         return self.answer
+
+    def confirm(self, stamp, color, camera):
+        return self.answer if self.is_still else None
 
     def reset(self):
         self.resets += 1
@@ -123,12 +126,14 @@ def image_of(stamp, picture, encoding, frame=FRAME):
 class CameraBench:
     """A camera before a detector node, and what the node says."""
 
-    def __init__(self, probe, *, color_topic=COLOR, info=True, start=start_detector, qos=ros.RESULT, **parameters):
+    def __init__(
+        self, probe, *, color_topic=COLOR, info=True, heard=True, start=start_detector, qos=ros.RESULT, **parameters
+    ):
         self.probe = probe
         self.rng = np.random.default_rng(7)
         self.node = start(probe, **parameters)
         sides = self.node.parameters.sides
-        for side in sides:
+        for side in sides if heard else ():
             probe.hear(f"{side}/keypoints", PointCloud2)
             probe.hear(f"{side}/jaw_pose", PoseStamped)
         self.color_out = probe.speak(color_topic, Image, qos)
@@ -137,7 +142,7 @@ class CameraBench:
         for publisher in (self.color_out, self.depth_out, self.info_out):
             probe.connected(publisher)
         outputs = [*self.node.out.keypoints.values(), *self.node.out.pose.values()]
-        probe.wait_for(lambda: all(output.get_subscription_count() == 1 for output in outputs))
+        probe.wait_for(lambda: all(output.get_subscription_count() == heard for output in outputs))
         if info:
             self.send_info()
 

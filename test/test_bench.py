@@ -1,26 +1,56 @@
-"""Claims about the benchmark and the recording that it and the demo run on."""
+"""Claims about the benchmark command and the recording that it and the demo run on."""
 
 import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from finforce_eval.bench import RECORDING, format_rows, measure_steps, row_from_times, write_figures
+from finforce_eval import bench, bench_live
+from finforce_eval.bench import PARTS, Part, format_rows, row_from_times, select_parts, time_calls, write_figures
 from finforce_eval.bench_live import MIRROR_MOMENT, LiveFigures, with_both_jaws
 from finforce_eval.cli import main
+from finforce_eval.demo import RECORDING
+from finforce_eval.errors import OptionError
 from finforce_eval.memory import child_processes, resident_bytes
 from finforce_eval.recording import read_recording
 from finforce_ifea.errors import MissingDependencyError
 from finforce_ifea.jaw import load_jaw
 
+ROOT = Path(__file__).parents[1]
+
 
 @pytest.fixture(scope="module")
 def recording():
     return read_recording(RECORDING)
+
+
+@pytest.fixture
+def two_parts(monkeypatch):
+    """Replaces the parts by two that measure nothing; returns what they were asked for."""
+    asked = []
+
+    def make(name, **options):
+        def measure(quick, folder=None):
+            asked.append((name, quick, folder))
+            return name
+
+        module = SimpleNamespace(
+            measure=measure,
+            format_table=lambda figures: f"table of {figures}",
+            as_json=lambda figures: {"measured": figures},
+            draw=lambda figures, path: path.write_text(figures),
+        )
+        monkeypatch.setitem(sys.modules, f"part_{name}", module)
+        return Part(name=name, module=f"part_{name}", title=f"Title of {name}", **options)
+
+    parts = (make("first", takes_folder=True), make("second"), make("third", usual=False))
+    monkeypatch.setattr(bench, "PARTS", parts)
+    return asked
 
 
 def test_shipped_recording_is_small_and_one_cycle_that_begins_unloaded(recording):
@@ -42,17 +72,11 @@ def test_times_become_percentiles_in_milliseconds():
     assert format_rows([row]).splitlines()[-1].split() == ["step", "50.00", "95.00", "99.00", "100.00", "101"]
 
 
-def test_only_loaded_solved_steps_are_timed(recording, monkeypatch):
-    class Estimator:
-        def __init__(self, *_, **__):
-            self.steps = 0
-
-        def update(self, observation, contact):
-            self.steps += 1
-            return SimpleNamespace(status="ok" if self.steps % 4 == 0 else "unloaded")
-
-    monkeypatch.setattr("finforce_eval.bench.JawEstimator", Estimator)
-    assert len(measure_steps(recording, load_jaw("bench"), "solid", "coarse", 100)) == 25
+def test_every_call_is_timed_once():
+    calls = []
+    times = time_calls(lambda: calls.append(1), 4)
+    assert len(times) == len(calls) == 4
+    assert min(times) >= 0
 
 
 def test_process_takes_memory_and_knows_its_children():
@@ -76,23 +100,51 @@ def test_right_jaw_is_the_mirror_image_of_the_left(recording):
     np.testing.assert_allclose(mirrored, np.cross(arm, force) * MIRROR_MOMENT)
 
 
-def test_bench_prints_a_table_and_writes_json(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("finforce_eval.bench.measure_memory", lambda solver, mesh: 123.0)
-    monkeypatch.setattr("finforce_eval.bench.measure_steps", lambda *_: np.full(9, 2e-3))
-    live = LiveFigures(latency=np.full(9, 5e-3), memory=150_000_000)
-    monkeypatch.setattr("finforce_eval.bench.measure_live", lambda source: live)
-    out = tmp_path / "new" / "bench.json"
-    assert main(["bench", "--json", str(out)]) == 0
+def test_usual_parts_are_measured_unless_others_are_named(two_parts):
+    assert [part.name for part in select_parts(None)] == ["first", "second"]
+    assert [part.name for part in select_parts("third, first,third")] == ["third", "first"]
+    with pytest.raises(OptionError, match="no part 'fourth', expected some of first, second, third"):
+        select_parts("fourth")
+
+
+def test_every_listed_part_keeps_the_contract():
+    for part in PARTS:
+        module = __import__(part.module, fromlist=["measure"])
+        assert all(callable(getattr(module, name)) for name in ("measure", "format_table", "as_json", "draw")), part
+
+
+def test_command_prints_tables_and_writes_json_and_a_picture_for_each_part(two_parts, tmp_path, capsys):
+    out, picture = tmp_path / "new" / "bench.json", tmp_path / "new" / "p.png"
+    assert main(["bench", str(tmp_path), "--quick", "--json", str(out), "--figure", str(picture)]) == 0
+    assert two_parts == [("first", True, str(tmp_path)), ("second", True, None)]
     content = json.loads(out.read_text())
-    assert {"machine", "times_ms", "memory_MB"} <= content.keys()
     assert {"processor", "python", "commit"} <= content["machine"].keys()
-    names = [row["name"] for row in content["times_ms"]]
-    assert names[0] == "SuperLU, 522 vertices"
-    assert "step: frame" in names
-    assert all(row.keys() == {"name", "n", "p50", "p95", "p99", "max"} for row in content["times_ms"])
-    assert names[-1] == "key points to wrench, both jaws live"
-    assert content["memory_MB"]["solver node"] == 150.0
-    assert "123 MB" in capsys.readouterr().out
+    assert [content[name]["measured"] for name in ("first", "second")] == ["first", "second"]
+    assert (picture.read_text(), picture.with_name("p_second.png").read_text()) == ("first", "second")
+    printed = capsys.readouterr().out
+    assert "Title of first" in printed and "table of second" in printed
+
+
+def test_part_that_cannot_be_measured_is_said_and_the_others_are_measured(two_parts, tmp_path, monkeypatch, capsys):
+    def refuse(quick, folder=None):
+        raise MissingDependencyError("needs ROS 2")
+
+    monkeypatch.setattr(sys.modules["part_first"], "measure", refuse)
+    assert main(["bench", "--json", str(tmp_path / "bench.json")]) == 0
+    content = json.loads((tmp_path / "bench.json").read_text())
+    assert content["first"]["not_measured"] == "needs ROS 2"
+    assert content["second"]["measured"] == "second"
+    assert "not measured: needs ROS 2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["--parts", "none"], ["FOLDER", "--parts", "second"], ["--frames", "9"]])
+def test_options_that_mean_nothing_are_refused_with_one_line(two_parts, words, capsys):
+    try:
+        code = main(["bench", *words])
+    except SystemExit as end:
+        code = end.code
+    assert code == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_figures_are_written_with_where_they_are_from_and_null_for_what_is_not_finite(tmp_path):
@@ -103,17 +155,34 @@ def test_figures_are_written_with_where_they_are_from_and_null_for_what_is_not_f
     assert {"processor", "cores", "python", "commit"} <= set(content["machine"])
 
 
-def test_bench_without_ros_says_what_it_left_out(monkeypatch, capsys):
-    def refuse(source):
-        raise MissingDependencyError("needs ROS 2")
-
-    monkeypatch.setattr("finforce_eval.bench.measure_memory", lambda solver, mesh: 123.0)
-    monkeypatch.setattr("finforce_eval.bench.measure_steps", lambda *_: np.full(9, 2e-3))
-    monkeypatch.setattr("finforce_eval.bench.measure_live", refuse)
-    assert main(["bench"]) == 0
-    assert "both jaws live: not measured: needs ROS 2" in capsys.readouterr().out
+def test_latency_of_live_jaws_becomes_a_row_and_a_picture(tmp_path):
+    figures = LiveFigures(latency=np.linspace(4e-3, 6e-3, 11), memory=150_000_000)
+    assert bench_live.as_json(figures)["latency_ms"]["p50"] == pytest.approx(5.0)
+    assert bench_live.as_json(figures)["node_MB"] == 150.0
+    assert "150 MB" in bench_live.format_table(figures)
+    bench_live.draw(figures, tmp_path / "live.png")
+    assert (tmp_path / "live.png").stat().st_size > 1000
 
 
-def test_bench_without_frames_is_refused(capsys):
-    assert main(["bench", "--frames", "0"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+def test_page_takes_its_tables_from_the_figures_and_keeps_what_they_do_not_hold(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    page = __import__("speed_page")
+    blocks = page.list_blocks(
+        {
+            "machine": {"commit": "abc", "processor": "P", "cores": 2, "python": "3"},
+            "solvers": {"table": "| a |\n|---|\nnote", "tables": {"tiers": "| t |"}},
+            "chain": {"not_measured": "no ROS"},
+        }
+    )
+    text = "x\n<!-- begin solvers -->\nold\n<!-- end solvers -->\n<!-- begin nodes -->\nkept\n<!-- end nodes -->\n"
+    filled = page.fill_page(text, blocks)
+    assert filled == text.replace("old", "| a |\n|---|\n\nnote")
+    assert page.fill_page(filled, blocks) == filled
+    assert blocks["solvers.tiers"] == "| t |" and "no ROS" in blocks["chain"] and "abc" in blocks["machine"]
+
+
+def test_page_asks_for_tables_that_the_benchmark_has(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    asked = __import__("speed_page").name_places((ROOT / "docs" / "speed.md").read_text(encoding="utf-8"))
+    assert "solvers.tiers" in asked
+    assert {name.split(".")[0] for name in asked} <= {"machine", *(part.name for part in PARTS)}

@@ -31,7 +31,8 @@ class Camera:
         if picture is None:
             picture = self.rng.integers(90, 160, (HEIGHT, WIDTH, 3), dtype=np.uint8)
         self.feed.take_depth(image_of(stamp, np.full((HEIGHT, WIDTH), 120, dtype=np.uint16), "16UC1"))
-        return self.feed.take_color(topic, image_of(stamp, picture, "rgb8")) is not None
+        pair = self.feed.take_color(topic, image_of(stamp, picture, "rgb8"))
+        return pair is not None and self.feed.decode(pair).stamp > 0.0
 
 
 def test_a_camera_that_comes_back_under_the_other_name_is_taken_after_a_silence():

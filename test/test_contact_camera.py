@@ -166,6 +166,7 @@ def test_the_tracker_rests_while_the_grasp_does(probe, camera, scene):
     bench.see(scene, masked=False)
     probe.spin(0.3)
     assert len(bench.poses) == 1
+    assert bench.node.skips.describe()["skipped: grasp rests"] == "1"
     jaw.estimator.resting = False
     bench.see(scene, masked=False)
     probe.wait_for(lambda: len(bench.poses) == 2)

@@ -58,10 +58,10 @@ def test_gross_errors_of_high_likelihood_do_not_move_the_force(change, height, b
     assert np.nanmax(np.abs(moved)) < bound
 
 
-def test_without_the_robust_weights_the_same_gross_errors_do_move_it():
+def test_without_the_robust_weights_the_same_gross_errors_do_move_it_or_leave_no_answer():
     spoilt = pressed(20).changed(range(REST, len(STEPS)), misidentify(3))
     moved = magnitudes(run(spoilt, solver="frame", gate=100.0)) - magnitudes(solved(20))
-    assert np.nanmax(np.abs(moved)) > 0.3
+    assert np.nan_to_num(np.abs(moved[REST + 15 :]), nan=np.inf).max() > 0.3
 
 
 def test_gross_errors_are_not_reported_as_used():

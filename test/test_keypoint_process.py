@@ -26,6 +26,7 @@ def test_a_signal_ends_the_node_cleanly(number):
         ("T_gripper_camera:=[0.0, 0.0, 0.1]", "quaternion of shape"),
         ("T_gripper_camera:=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0]", "norm"),
         ("detector.likelihood:=2.0", "detector.likelihood"),
+        ("skip_off:=[nonsense]", "there is no rule 'nonsense'"),
         ("color_topics:=[]", "color_topics: got (), expected at least one topic"),
         ("input_size:=[]", "input_size: got (), expected height and width"),
         ("T_gripper_camera:=[]", "quaternion of shape"),

@@ -51,7 +51,7 @@ def imported(path):
 
 
 def is_ros_file(path):
-    return path.name in ("node.py", "finforce_ros.py", "finforce_messages.py")
+    return path.name in ("node.py", "finforce_ros.py", "finforce_messages.py", "finforce_executor.py")
 
 
 def test_only_nodes_and_their_shared_module_import_ros():

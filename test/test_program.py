@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
 from finforce_ifea.errors import UnobservableError
-from finforce_ifea.inverse import compute_kkt_residual, solve_program
+from finforce_ifea.program import compute_kkt_residual, solve_program
 
 UNBOUNDED = -1e30
 

@@ -7,7 +7,7 @@ from finforce_keypoints import reference_patch
 from finforce_keypoints.gripper_geometry import ROBOT_CAMERA, jaw_in_camera
 from finforce_keypoints.jaw_pose import Origin
 from finforce_keypoints.plane_picture import intersect_plane
-from finforce_keypoints.reference_patch import TEMPLATE_IMAGES, ReferencePatch, match_patch
+from finforce_keypoints.reference_patch import TEMPLATE_IMAGES, ReferencePatch, build_matcher
 from finforce_twin.depth_camera import build_d405_vga
 
 CAMERA = build_d405_vga()
@@ -90,6 +90,6 @@ def test_a_slide_by_half_a_pixel_is_read_off_to_a_hundredth():
     def spot(x):
         return 200.0 * np.exp(-((columns - 20.0 - x) ** 2 + (rows - 20.0) ** 2) / 50.0)
 
-    assert match_patch(spot(0.5), spot(0.0)).x == pytest.approx(0.5, abs=0.01)
-    assert match_patch(spot(-0.5), spot(0.0)).x == pytest.approx(-0.5, abs=0.01)
-    assert match_patch(200.0 - spot(0.0), spot(0.0)).likeness == 0.0
+    assert build_matcher(spot(0.0)).match(spot(0.5)).x == pytest.approx(0.5, abs=0.01)
+    assert build_matcher(spot(0.0)).match(spot(-0.5)).x == pytest.approx(-0.5, abs=0.01)
+    assert build_matcher(spot(0.0)).match(200.0 - spot(0.0)).likeness == 0.0

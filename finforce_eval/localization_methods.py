@@ -1,4 +1,4 @@
-"""The ways to find a contact place that `localization.py` compares."""
+"""The ways to find a contact place that a benchmark compares; knows neither recordings nor truth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,14 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_contact.closest import ClosestLocalizer
+from finforce_contact.estimator import ContactEstimator
 from finforce_contact.inner_face import build_inner_face
 from finforce_contact.intersection import NearSolid, intersect
 from finforce_contact.localization import Localizer, OutlineLocalizer, Scene
 from finforce_contact.object_mesh import ObjectMesh
 from finforce_contact.section import SectionKeeper
 from finforce_contact.settings import ContactSettings
-from finforce_ifea.errors import MissingDependencyError
 from finforce_ifea.jaw import Jaw
+from finforce_optional import import_library
 
 Wrench = tuple[NDArray, NDArray] | None
 Method = Callable[[NDArray, NDArray, Wrench], float | None]
@@ -81,10 +82,7 @@ def by_triangle_pairs(setup: Setup) -> Method:
     Raises:
         MissingDependencyError: coal is not installed.
     """
-    try:
-        import coal
-    except ImportError as error:
-        raise MissingDependencyError("the test of triangle pairs needs coal: pip install coal") from error
+    coal = import_library("coal", "the test of triangle pairs")
     jaw = setup.jaw.build_mesh(ContactSettings().mesh)
     thing = _build_tree(coal, setup.mesh.vertices, setup.mesh.triangles)
     request, still = coal.CollisionRequest(), coal.Transform3s()
@@ -118,6 +116,19 @@ def _height_of(centre: NDArray, surface: NDArray, nodes: NDArray) -> float:
     return float(nodes[((surface - centre) ** 2).sum(axis=1).argmin(), 2])
 
 
+def by_whole_estimator(setup: Setup) -> Method:
+    """Return the estimator with its pose filter and its outline as a way to find a place."""
+    estimator, stamps = ContactEstimator(setup.jaw, mesh=setup.mesh, settings=ContactSettings()), iter(range(10**9))
+
+    def locate(T: NDArray, surface: NDArray, wrench: Wrench) -> float | None:
+        stamp = next(stamps) / 30.0
+        estimator.take_pose(stamp, T)
+        estimate = estimator.update(stamp, surface, wrench)
+        return float(estimate.points[:, 2] @ estimate.weights) if len(estimate.points) else None
+
+    return locate
+
+
 METHODS: dict[str, Callable[[Setup], Method]] = {
     "outline and line of action": lambda setup: by_outline(setup, with_wrench=True),
     "outline alone": lambda setup: by_outline(setup, with_wrench=False),
@@ -125,4 +136,5 @@ METHODS: dict[str, Callable[[Setup], Method]] = {
     "manifold3d, cut to the jaw": lambda setup: by_intersection(setup, cut_down=True),
     "triangle pairs (coal)": by_triangle_pairs,
     "closest point, undeformed": by_closest,
+    "the whole estimator": by_whole_estimator,
 }
