@@ -24,7 +24,7 @@ WRONG = (
     "outline and height in turn",
     "of the object before",
 )
-RIGHT = ("height", "outline", "fixed", "regions", "three axes")
+RIGHT = ("height", "outline", "fixed", "regions")
 OUTLINE_STDDEV = np.array([1e-4, 3e-4, 3e-3])
 CORNERS = 90
 FARTHEST = 0.045
@@ -67,13 +67,25 @@ def run_wrong(plan: Plan) -> Iterator[Trial]:
 
 def run_right(plan: Plan) -> Iterator[Trial]:
     """Yields presses whose contact is told in every form there is, and is right."""
-    usual, three = Bench(plan), _build_three(plan)
-    kinds = [kind for kind in RIGHT if kind != "three axes" or three is not None]
-    for seed in range(plan.share(12 * len(kinds))):
+    bench = Bench(plan)
+    for seed in range(plan.share(12 * len(RIGHT))):
         random = plan.random("right", seed)
-        kind = kinds[seed % len(kinds)]
-        session = open_session(three if three and kind == "three axes" else usual, random, level=kind)
-        contact = _contact_of("fixed" if kind == "three axes" else kind, session, random)
+        kind = RIGHT[seed % len(RIGHT)]
+        session = open_session(bench, random, level=kind)
+        contact = _contact_of(kind, session, random)
+        yield from session.play(seed, [replace(step, contact=contact) for step in session.press()])
+
+
+def run_axes(plan: Plan) -> Iterator[Trial]:
+    """Yields presses whose force at a given place has three axes; one refusal where a model is planar."""
+    bench = _build_three(plan)
+    if bench is None:
+        yield Trial(level="planar model", outcome="refused", note="forces in three axes need a solid")
+        return
+    for seed in range(plan.share(12)):
+        random = plan.random("axes", seed)
+        session = open_session(bench, random, level="three axes")
+        contact = _contact_of("fixed", session, random)
         yield from session.play(seed, [replace(step, contact=contact) for step in session.press()])
 
 
@@ -136,4 +148,5 @@ FAMILIES = (
     Family(name="contacts", what="another contact in every image", run=run_contacts),
     Family(name="wrong", what="contacts said to be where they are not", run=run_wrong),
     Family(name="right", what="contacts in every form there is", run=run_right),
+    Family(name="axes", what="forces in three axes at a given place", run=run_axes),
 )

@@ -22,7 +22,7 @@ FORCE_ERROR = 0.01
 COURSE_STEPS = 16
 # The penalty of the contact rises quadratically over this depth [m].
 SMOOTH_DEPTH = 2e-5
-OWN_MECHANICS = ("default", "solid", "frame")
+OWN_MECHANICS = ("solid", "frame")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,8 +62,8 @@ class Bench:
         self.estimator = JawEstimator(jaw, settings=chosen, calibration=calibration)
         self.estimator.warm_up()
         self.jaw = self.estimator.jaw
-        own = plan.solver in OWN_MECHANICS
-        self.mechanics = self.estimator.mechanics if own else build_mechanics(self.jaw, replace(chosen, solver="solid"))
+        own, full = plan.solver in OWN_MECHANICS, replace(chosen, solver=self.jaw.model)
+        self.mechanics = self.estimator.mechanics if own else build_mechanics(self.jaw, full)
 
     def press(self, random: np.random.Generator, *, depth: float | None = None) -> Course:
         """Returns a press by a drawn cylinder at a drawn height, `depth` [m] deep or drawn too.

@@ -13,6 +13,8 @@ from finforce_ifea.mechanics import Mechanics
 # Loads below this share of the largest are rounding errors; rows that the mesh cannot tell apart share a load.
 _NOTHING, _RIDGE = 1e-7, 1e-9
 _EVERY = 3
+# Of the responses of one equilibrium so many combinations say nearly all.
+_LEADING = 12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,11 +67,14 @@ class Face:
 
     def find_basis(self, states: NDArray, count: int) -> None:
         """Sets the basis to the `count` shapes that say most of equilibria (m, size) and of what loads do to them."""
-        responses = np.concatenate([self._respond(q)[:, ::_EVERY] for q in states[:: _EVERY**2]], axis=1).T
-        share = (np.abs(states).max() or 1.0) / np.abs(responses).max() / len(states)
-        samples = np.concatenate([states, share * responses])
-        count, size = min(count, *samples.shape), samples.shape[1]
-        self.basis = np.ascontiguousarray(eigh(samples.T @ samples, subset_by_index=(size - count, size - 1))[1])
+        parts, largest = [], 0.0
+        for q in states[:: _EVERY**2]:
+            responses = self._respond(q)[:, ::_EVERY]
+            largest = max(largest, np.abs(responses).max())
+            parts.append(_condense(responses, _LEADING))
+        share = (np.abs(states).max() or 1.0) / largest / len(states)
+        samples = np.concatenate([states.T, share * np.concatenate(parts, axis=1)], axis=1)
+        self.basis = np.linalg.qr(_condense(samples, min(count, *samples.shape)))[0]
 
     def _respond(self, q: NDArray) -> NDArray:
         """Returns the changes (size, 2 n) of the unknowns by unit loads at the rows."""
@@ -98,3 +103,12 @@ class Face:
                 forces[row * self._across : (row + 1) * self._across, axis] = 1.0 / self._across
                 columns[:, 2 * row + number] = self._model.load(self._probe, q, forces)
         return columns
+
+
+def _condense(samples: NDArray, count: int) -> NDArray:
+    """Returns the `count` orthogonal combinations (size, count) that say most of samples (size, m).
+
+    Their scalar products (m, m) take the place of the unknowns' (size, size), which a large mesh could not store.
+    """
+    m = samples.shape[1]
+    return samples @ eigh(samples.T @ samples, subset_by_index=(max(m - count, 0), m - 1))[1]

@@ -1,4 +1,4 @@
-"""How sure a place is: its covariance's condition, and whether the contact is another one; knows no key point."""
+"""How sure a place is: its covariance's condition, another contact, points that err together; knows no mechanics."""
 
 import numpy as np
 from numba import njit
@@ -88,3 +88,28 @@ def doubt_height(hessian, gradient, offset, prior_variance):
     away, spread = offset + (covariance[2] * slope).sum(), max(covariance[2, 2], 0.0)
     mistaken, variance = doubt_place(away, spread, prior_variance, offset)
     return away, mistaken, variance
+
+
+@njit(**_OPTIONS)
+def find_rift(data, deeper, information):
+    """Returns how far the depth would move if points that are half believed were not believed at all [m].
+
+    With w the weights, h the motions by depth, r what is left of the residuals and I the information,
+
+        rift = sum_k w_k (1 - w_k) h_k^T N_k^-1 r_k / I.
+
+    Chance cancels in it; points that are wrong together do not.
+
+    Args:
+        data: see `Residuals`.
+        deeper: change of the depth since the residuals [m].
+        information: on the depth [1/m^2].
+    """
+    rift = 0.0
+    for k in range(len(data.weights)):
+        n00, n11, n01 = data.noise[k, 0, 0], data.noise[k, 1, 1], data.noise[k, 0, 1]
+        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
+        r0, r1 = data.r[k, 0] - h0 * deeper, data.r[k, 1] - h1 * deeper
+        score = (h0 * (n11 * r0 - n01 * r1) + h1 * (n00 * r1 - n01 * r0)) / (n00 * n11 - n01 * n01)
+        rift += data.weights[k] * (1.0 - data.weights[k]) * score
+    return rift / information

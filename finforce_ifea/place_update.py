@@ -10,13 +10,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.place_doubt import PRIOR_REACH, doubt_height, invert_symmetric, measure_condition
+from finforce_ifea.place_doubt import PRIOR_REACH, doubt_height, find_rift, invert_symmetric, measure_condition
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Depth has no prior; this share of one frame's information keeps the posterior regular while nothing was averaged.
 _DEPTH_SHARE = 1e-3
 # Innovations beyond this many standard deviations are no chance: where the speed is known, and where it is not.
 _MANOEUVRE_SIGMA, _ONSET_SIGMA = 3.0, 2.5
+# No speed is believed for longer than this [s].
+_LONGEST_SIGHT = 0.2
 # Of a longer jump [m/s] the rest is taken for one of the place alone.
 _FASTEST = 0.05
 
@@ -150,31 +152,6 @@ def _weigh_depth(data, mean, count):
 
 
 @njit(**_OPTIONS)
-def _find_rift(data, deeper, information):
-    """Returns how far the depth would move if points that are half believed were not believed at all [m].
-
-    With w the weights, h the motions by depth, r what is left of the residuals and I the information,
-
-        rift = sum_k w_k (1 - w_k) h_k^T N_k^-1 r_k / I.
-
-    Chance cancels in it; points that are wrong together do not.
-
-    Args:
-        data: see `Residuals`.
-        deeper: change of the depth since the residuals [m].
-        information: on the depth [1/m^2].
-    """
-    rift = 0.0
-    for k in range(len(data.weights)):
-        n00, n11, n01 = data.noise[k, 0, 0], data.noise[k, 1, 1], data.noise[k, 0, 1]
-        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
-        r0, r1 = data.r[k, 0] - h0 * deeper, data.r[k, 1] - h1 * deeper
-        score = (h0 * (n11 * r0 - n01 * r1) + h1 * (n00 * r1 - n01 * r0)) / (n00 * n11 - n01 * n01)
-        rift += data.weights[k] * (1.0 - data.weights[k]) * score
-    return rift / information
-
-
-@njit(**_OPTIONS)
 def _extend(average, data, deeper, memory):
     """Returns the average with this frame's residuals, its depth changed by `deeper` [m]."""
     mean, modes, count = average
@@ -257,7 +234,7 @@ def forecast_place(motion, covariance, slow, dt, acceleration, drift, sudden):
     spread = np.array(
         [[a + 2.0 * dt * b + dt**2 * c + power * dt**4 / 4.0 + drift**2, mixed], [mixed, c + power * dt**2]]
     )
-    place = np.array([motion[0] + dt * motion[1], slow[0], slow[1]])
+    place = np.array([motion[0] + min(dt, _LONGEST_SIGHT) * motion[1], slow[0], slow[1]])
     return Forecast(place, motion[1], spread, dt if sudden else 0.0)
 
 
@@ -301,7 +278,7 @@ def update_place(data, average, forecast, prior, prior_variance, memory, largest
     # what chance leaves of the innovation may be a motion that was not expected; the gain has followed a part of it
     beyond = max(0.0, innovation**2 - 1.0 / information - max(forecast.spread[0, 0], 0.0))
     known = gain[0] / information + (1.0 - gain[0]) ** 2 * beyond
-    known += _find_rift(data, depth - reference[0], information) ** 2
+    known += find_rift(data, depth - reference[0], information) ** 2
     spread = spread - np.outer(gain, spread[0])
     return PlaceUpdate(
         place, speed, spread, jumped, new, covariance, known, kkt, residual, misfit, away, mistaken, condition

@@ -25,7 +25,7 @@ class ReducedContact:
         share = shares[np.arange(len(upper)), upper]
         self._face = FaceRows(surface.points, upper - 1, share, model.manifold.rods)
         self._farthest = _FARTHEST_SHAPE * (surface.heights[-1] - surface.heights[0])
-        self._tables = (model.manifold.moves, model.compliance)
+        self._tables = (model.manifold.moves, model.compliance, model.loads)
 
     def begin(self, height: float) -> NDArray:
         """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""

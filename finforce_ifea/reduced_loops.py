@@ -18,6 +18,9 @@ _DAMPING, _DAMPING_FLOOR = 1e-6, 1e-12
 # The grid coordinates wait until a correction is below this share of what is allowed: a shape far from equilibrium says
 # little of the nearest one.
 _CALM = 0.15
+# A step of the grid coordinates that leads away from the stored equilibria is halved so often, then left out; by so much
+# it may, as a share and in metres.
+_HALVINGS, _SLACK, _SLACK_FLOOR = 4, 1e-2, 1e-8
 # Below this grid coordinate of the depth a jaw is too little bent to tell the height by its shape.
 _SHALLOW = 0.5
 
@@ -154,6 +157,33 @@ def _bound_grid_step(step, m, moves):
 
 
 @njit(**_OPTIONS)
+def _measure_miss(tables, loads, m):
+    """Returns the root mean square distance [m] of a jaw under loads (2 n,) [N] from the equilibrium stored at m."""
+    count = len(loads)
+    extra, miss = np.empty(count), np.zeros(count)
+    interpolate(tables[2], m, extra)
+    for k in range(count):
+        extra[k] = loads[k] - extra[k]
+    first, last = _find_ends(extra)
+    add_product(tables[1], m, extra, first, last, _WATCHED, miss)
+    return np.sqrt((miss**2).sum() / ((count // 2 + _WATCHED - 1) // _WATCHED))
+
+
+@njit(**_OPTIONS)
+def _approach_grid(tables, loads, m, step):
+    """Shortens a step (3,) of grid coordinates m (2,), see `find_grid_step`, until it leads nearer to the stored ones.
+
+    The step takes the jaw to stay as it is, which it does not where compliances change fast, as at the base.
+    """
+    largest = (1.0 + _SLACK) * step[2] + _SLACK_FLOOR
+    for _ in range(_HALVINGS):
+        if _measure_miss(tables, loads, m + step[:2]) <= largest:
+            return
+        step[:2] *= 0.5
+    step[:2] = 0.0
+
+
+@njit(**_OPTIONS)
 def place_contact(face, moves):
     """Returns the contact points (p, 3) [m], moved by the rows beside them, whose motions are (2 n,) [m]."""
     points = face.points.copy()
@@ -238,7 +268,8 @@ def step_contact(q, tables, face, moves, points, contact):
 
     Args:
         q: unknowns (2 n + 2,).
-        tables: motions of the rows at the stored equilibria (T, Z, 2 n) [m] and their compliance (T, Z, 2 n, 2 n).
+        tables: motions of the rows at the stored equilibria (T, Z, 2 n) [m], their compliance (T, Z, 2 n, 2 n) and
+            their loads (T, Z, 2 n) [N].
         face: the contact points on the rows.
         moves: of the rows now (2 n,) [m].
         points: contact points now (p, 3) [m].
@@ -265,6 +296,8 @@ def step_contact(q, tables, face, moves, points, contact):
     first, last = _find_ends(correction[:count])
     add_product(tables[1], q[count:], correction[:count], first, last, _WATCHED, after)
     nearest = find_grid_step(tables[0], after, q[count:])
+    if size <= _CALM:
+        _approach_grid(tables, q[:count] + correction[:count], q[count:], nearest)
     correction[count:] = nearest[:2]
     if q[count] < _SHALLOW and total > 0.0:
         step = np.array([correction[count], np.interp(place[2], face.rods, np.arange(len(face.rods))) - q[count + 1]])

@@ -1,9 +1,8 @@
 """Depth, shape and height of the pressing object from key points, frame after frame, on the deformed jaw.
 
 The shape of an unknown object is its radius, that of a known outline its tilt. Depth changes fast and is tracked by a
-Kalman filter with constant velocity. Shape and height change slowly: they are
-the maximum a posteriori for the residuals averaged over the last frames, so that their priors count once and errors
-of the mechanics are not mistaken for information.
+Kalman filter with constant velocity. Shape and height change slowly: the maximum a posteriori for the residuals
+averaged over the last frames, so that their priors count once and errors of the mechanics are no information.
 """
 
 import numpy as np
@@ -126,16 +125,17 @@ class PlaceTracker:
         """Returns the place asked for, within a share of where the linearisation about the present one holds."""
         bounds, reach = self.contact.indenter.shape_range, _FARTHEST_HEIGHT * self.settings.height_stddev
         change = np.array([_LARGEST_MOVE, share * bounds.largest_change, share * _LARGEST_SHIFT])
-        aim = np.clip(asked, place - change, place + change)
+        aim = np.minimum(np.maximum(asked, place - change), place + change)
         aim[SHAPE] = min(max(aim[SHAPE], bounds.low), bounds.high)
         aim[HEIGHT] = min(max(aim[HEIGHT], self._prior[1] - reach), self._prior[1] + reach)
         return aim
 
     def _is_settled(self, state: PressedState, moved: NDArray, missing: NDArray) -> bool:
         """Whether the last iteration changed nothing that matters."""
-        change = np.array([_SETTLED_MOVE, self.contact.indenter.shape_range.settled_change, _SETTLED_MOVE])
-        small = (np.abs(moved) < change).all() and (np.abs(missing) < change).all()
-        return bool(small and state.size < _SETTLED_CORRECTION)
+        if state.size >= _SETTLED_CORRECTION:
+            return False
+        change = (_SETTLED_MOVE, self.contact.indenter.shape_range.settled_change, _SETTLED_MOVE)
+        return all(max(abs(m), abs(k)) < c for m, k, c in zip(moved, missing, change, strict=True))
 
     def _find_touch(self, place: NDArray) -> float:
         """Returns the depth [m] at which the object of a place (3,) first touches the undeformed jaw."""

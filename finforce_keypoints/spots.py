@@ -23,10 +23,9 @@ if TYPE_CHECKING:
     from finforce_keypoints.jaw_localizer import JawKeypoints
 
 LEAST_POINTS = 8  # valid key points that a jaw needs
-HALF = 5  # [px] of the patch around a key point; its gradients need one more
+HALVES = (5, 10)  # [px] of the patch around a key point, larger where little is to be seen; gradients need one more
 INNER = (slice(None), slice(1, -1), slice(1, -1))  # of patches (n, s, s), without what the gradients need
 _LENGTH = 1e-3  # [m] in which shifts are solved for
-_STEPS = np.stack(np.meshgrid(np.arange(-HALF - 1, HALF + 2), np.arange(-HALF - 1, HALF + 2)), axis=-1)
 _ALIKE = 1.7  # by which shifts err more than from noise that no neighbours share; seen on twin images
 _RIDGE = 1e-3  # keeps a picture without any contrast regular
 
@@ -47,6 +46,10 @@ class JawSpots:
     along_z: NDArray
     powers: NDArray
 
+    def reach(self, shifts: NDArray) -> NDArray:
+        """Return how far shifts (4,) [m] move the key points along x, (n,), and all of them along z: (n + 1,) [m]."""
+        return np.abs(np.append(self.powers @ shifts[:3], shifts[3]))
+
     def solve(self, mean: NDArray, square: NDArray) -> SpotModel:
         """Return what answers for the differences from a mean picture.
 
@@ -64,13 +67,14 @@ class JawSpots:
         columns = (inner / 100.0, np.ones_like(inner), *np.moveaxis(shifts, -1, 0), -slope_z)
         design = np.stack(columns, axis=-1).reshape(-1, len(columns))
         covariance = np.linalg.inv(design.T @ design + _RIDGE * np.eye(len(columns)))
-        spread = np.einsum("ij,jk,ik->i", self.powers, covariance[2:5, 2:5], self.powers)
+        along_x = np.einsum("ij,jk,ik->i", self.powers, covariance[2:5, 2:5], self.powers)
+        spread = np.append(along_x, covariance[5, 5])
         return SpotModel(
             mean=inner.ravel(),
             design=design,
             inverse=covariance @ design.T,
             square=square,
-            error=_LENGTH * _ALIKE * float(np.sqrt(spread.max() * square.mean())),
+            errors=_LENGTH * _ALIKE * np.sqrt(spread * square.mean()),
         )
 
 
@@ -83,14 +87,14 @@ class SpotModel:
         design: (N, 6) of gain, brightness, three shifts along x and one along z.
         inverse: (6, N) c = inverse @ d.
         square: (n,) mean square of what is left around each key point while nothing moves.
-        error: largest standard deviation of a key point's shift [m].
+        errors: (n + 1,) standard deviations of the key points' shifts along x, then of the one along z [m].
     """
 
     mean: NDArray
     design: NDArray
     inverse: NDArray
     square: NDArray
-    error: float
+    errors: NDArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,11 +113,17 @@ def look_at(values: NDArray, model: SpotModel) -> Look:
     return Look(shifts=_LENGTH * answer[2:], left=np.square(left).reshape(len(model.square), -1).mean(axis=1))
 
 
-def place_spots(found: JawKeypoints, camera: CameraIntrinsics) -> JawSpots | None:
-    """Return where a jaw is watched, None where too few of its key points are seen well inside the image."""
+def place_spots(found: JawKeypoints, camera: CameraIntrinsics, half: int = HALVES[0]) -> JawSpots | None:
+    """Return where a jaw is watched, None where too few of its key points are seen well inside the image.
+
+    Args:
+        found: its key points.
+        camera: that saw them.
+        half: of the patches' width and height [px].
+    """
     size = np.array([camera.width, camera.height])
     with np.errstate(invalid="ignore"):
-        inside = ((found.pixels > HALF + 1) & (found.pixels < size - HALF - 2)).all(axis=1)
+        inside = ((found.pixels > half + 1) & (found.pixels < size - half - 2)).all(axis=1)
     kept = found.valid & inside
     if kept.sum() < LEAST_POINTS:
         return None
@@ -122,7 +132,9 @@ def place_spots(found: JawKeypoints, camera: CameraIntrinsics) -> JawSpots | Non
         project((points + step) @ T[:3, :3].T + T[:3, 3], camera)
         for step in np.array([[0.0, 0.0, 0.0], [_LENGTH, 0.0, 0.0], [0.0, 0.0, _LENGTH]])
     )
-    places = np.rint(found.pixels[kept]).astype(np.intp)[:, None, None] + _STEPS
+    steps = np.arange(-half - 1, half + 2)
+    around = np.stack(np.meshgrid(steps, steps), axis=-1)
+    places = np.rint(found.pixels[kept]).astype(np.intp)[:, None, None] + around
     height = points[:, 2] / points[:, 2].max()
     return JawSpots(
         pixels=places[..., 1] * camera.width + places[..., 0],

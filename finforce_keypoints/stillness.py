@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_keypoints.spots import INNER, JawSpots, Look, look_at, place_spots
+from finforce_keypoints.spots import HALVES, INNER, JawSpots, Look, look_at, place_spots
 
 if TYPE_CHECKING:
     from finforce_camera import CameraIntrinsics
@@ -21,6 +21,7 @@ AVERAGED = 10  # images, over which a creep is averaged
 SIGMA = 4.0  # standard deviations of a shift that noise explains, where that is more
 LARGEST_ERROR = 0.02e-3  # [m] standard deviation of a shift, above which nobody can tell
 STRANGEST = 3.0  # mean square of what is left around one key point by that of still images: more is another thing
+JUDGED = 8  # images after which it shows whether the patches are large enough
 LEAST_IMAGES = 15  # over which the mean is taken before it stands for anything
 MOST_IMAGES = 60  # of which it is the mean at most; older ones fade
 MOVED = 0.3e-3  # [m] of a jaw from one image to the next, which needs no look at its picture
@@ -43,12 +44,17 @@ class JawWatch:
     @property
     def is_sure(self) -> bool:
         """Whether the mean is one of enough images, and shows a shift well enough."""
-        return self._count >= LEAST_IMAGES and self._model.error <= LARGEST_ERROR
+        return self._count >= LEAST_IMAGES and self._model.errors.max() <= LARGEST_ERROR
 
     @property
-    def limit(self) -> float:
-        """Shift [m] of a key point in one image, up to which it has not moved: noise explains it."""
-        return max(LARGEST_SHIFT, SIGMA * self._model.error)
+    def is_vague(self) -> bool:
+        """Whether the patches show too little for ever telling."""
+        return self._count >= JUDGED and self._model.errors.max() > LARGEST_ERROR
+
+    @property
+    def limits(self) -> NDArray:
+        """Shifts (n + 1,) [m] of the key points in one image, as `JawSpots.reach`, up to which noise explains them."""
+        return np.maximum(LARGEST_SHIFT, SIGMA * self._model.errors)
 
     def add(self, found: JawKeypoints, patches: NDArray) -> None:
         """Average with one more image its key points and its patches (n, s, s)."""
@@ -78,14 +84,10 @@ class JawWatch:
         """Say whether the jaw stands where it stood, by the inner grey values (N,) of a picture."""
         seen = self.look(values)
         is_strange = (seen.left > STRANGEST * self._square).any()  # of the first image nothing is known: NaN
-        if is_strange or self._reach(seen.shifts) > self.limit:
+        if is_strange or (self.spots.reach(seen.shifts) > self.limits).any():
             return False
         self._creep += (seen.shifts - self._creep) / AVERAGED
-        return self._reach(self._creep) <= LARGEST_CREEP
-
-    def _reach(self, shifts: NDArray) -> float:
-        """Return how far [m] shifts (4,) move the key point that they move most."""
-        return float(max(np.abs(self.spots.powers @ shifts[:3]).max(), abs(shifts[3])))
+        return bool(self.spots.reach(self._creep).max() <= LARGEST_CREEP)
 
     def tell(self, stamp: float) -> JawKeypoints:
         """Return the key points of an image of `stamp` [s] in which nothing has moved: the means."""
@@ -118,6 +120,7 @@ class StillWatch:
         self._values = np.empty(0)
         self._verdict: bool | None = None
         self._doubted = False
+        self._half = HALVES[0]
 
     def confirm(self, stamp: float, color: NDArray, camera: CameraIntrinsics) -> Mapping[str, JawKeypoints] | None:
         """Return the key points by side of a picture (h, w, 3) uint8 in which nothing has moved, else None.
@@ -158,6 +161,8 @@ class StillWatch:
         elif camera is not self._camera or not self._jaws:
             self._begin(found, color, camera)
         elif self._add(found, color, verdict):
+            if self._half < HALVES[-1] and any(jaw.is_vague for jaw in self._jaws.values()):
+                self._begin(found, color, camera, HALVES[-1])
             return self._tell(next(iter(found.values())).stamp) if self._is_sure else found
         elif self._doubted or not self._is_sure:
             self._begin(found, color, camera)
@@ -177,10 +182,13 @@ class StillWatch:
                 jaw.add(found[side], part)
         return verdict
 
-    def _begin(self, found: Mapping[str, JawKeypoints], color: NDArray, camera: CameraIntrinsics) -> None:
-        """Begin new means with a picture, unless too little of a jaw is seen in it."""
+    def _begin(
+        self, found: Mapping[str, JawKeypoints], color: NDArray, camera: CameraIntrinsics, half: int = HALVES[0]
+    ) -> None:
+        """Begin new means with a picture and patches of a size [px], unless too little of a jaw is seen in it."""
         self._forget()
-        spots = {side: place_spots(jaw, camera) for side, jaw in found.items()}
+        self._half = half
+        spots = {side: place_spots(jaw, camera, half) for side, jaw in found.items()}
         if any(jaw is None for jaw in spots.values()):
             return
         self._camera = camera

@@ -25,6 +25,7 @@ from finforce_ifea.errors import CalibrationError, ContactError, JawFileError, O
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.forward import Cylinder, press_jaw
 from finforce_ifea.jaw import KEYPOINT_DISTANCE, load_jaw
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.settings import EstimatorSettings
 
@@ -239,8 +240,7 @@ def test_steel_finger_is_no_solid():
 def test_steel_finger_works_with_the_same_estimator():
     """Key points that the model itself has at 12 mm of depth, with a little noise: 3.5 N to a tenth."""
     jaw = load_jaw("steel")
-    maker = JawEstimator(jaw)
-    mechanics = maker.mechanics
+    maker, mechanics = JawEstimator(jaw), build_mechanics(jaw, EstimatorSettings())
     results = press_jaw(
         mechanics.model,
         mechanics.contact.surface,

@@ -89,6 +89,9 @@ def test_what_comes_later_is_heard_and_what_went_is_not(probe, working):
     worker, _ = working
     plain, late = (probe.speak(topic, String) for topic in ("plain", "late"))
     work(probe, working, plain.get_subscription_count)
+    plain.publish(String(data="first"))
+    work(probe, working, lambda: worker.heard)
+    worker.heard.clear()
     worker.destroy_subscription(worker.plain)
     worker.create_subscription(String, "late", lambda message: worker.heard.append(message.data), 10)
     work(probe, working, lambda: late.get_subscription_count() and not plain.get_subscription_count())

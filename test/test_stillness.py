@@ -58,8 +58,8 @@ def test_a_motion_is_seen_on_the_very_picture_that_shows_it(seen, move, side):
 @pytest.mark.parametrize("shape", [move_all, bend])
 def test_no_shift_beyond_the_bound_is_let_pass(side, shape):
     watch = watch_of()
-    error = max(jaw._model.error for jaw in watch._jaws.values())
-    bound = max(jaw.limit for jaw in watch._jaws.values()) + 3.0 * error
+    error = max(jaw._model.errors.max() for jaw in watch._jaws.values())
+    bound = max(jaw.limits.max() for jaw in watch._jaws.values()) + 3.0 * error
     # the tip lies above the highest key point that is watched, by a tenth of the height at most
     ways = np.linspace(1.25, 4.0, 8) * bound
     assert bound < 2.5 * LARGEST_SHIFT
