@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from time import sleep
 from typing import Any, NamedTuple
 
-from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
@@ -35,6 +34,10 @@ def is_wanted(publisher: Any, skips: Skips) -> bool:
     return wanted
 
 
+class _UnknownRclpyError(Exception):
+    """What the executor reads of rclpy's inside is not there, or something else."""
+
+
 class KeepingExecutor(SingleThreadedExecutor):
     """Answers as its base does, for half of the time or less.
 
@@ -42,6 +45,8 @@ class KeepingExecutor(SingleThreadedExecutor):
     node says that something came or went, and messages go to plain callbacks at once. Whatever else is ready, as a
     timer, a service or a coroutine under way, is left to the base, and so is a node with actions. A connection that
     does not come about is noticed with the next timer. While a node has time to spare, all of that waits.
+
+    It reads what rclpy promises nobody. Where a release of rclpy has that otherwise, it says so once and is its base.
 
     Args:
         context: of rclpy.
@@ -51,33 +56,69 @@ class KeepingExecutor(SingleThreadedExecutor):
         super().__init__(context=context)
         self._skips, self._spare_time = Skips(()), lambda: 0.0
         self._kept: _Kept | None = None
+        self._is_strange = False
 
     def obey(self, node: Any) -> None:
-        """Ask a node's `skips` whether the wait set may be kept, and its `spare_time` [s] how long messages may wait."""
+        """Ask a node's `skips` whether the wait set may be kept, its `spare_time` [s] how long messages may wait."""
         self._skips = getattr(node, "skips", self._skips)
         self._spare_time = getattr(node, "spare_time", self._spare_time)
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait for work and do it; with a time limit [s] as the base does."""
-        if timeout_sec is not None or self._is_busy() or not self._skips.allows(UNCHANGED):
+        if timeout_sec is not None or self._is_strange or not self._skips.allows(UNCHANGED):
             super().spin_once(timeout_sec)
             return
-        kept = self._kept = self._kept or _Kept(self.get_nodes(), self.context)
-        if kept.is_foreign:
+        try:
+            self._spin_kept()
+        except _UnknownRclpyError as error:
+            self._be_base(error)
+
+    def _spin_kept(self) -> None:
+        """Wait with the kept wait set and do what is ready."""
+        with self._own_work():
+            is_foreign = self._is_busy() or self._keep().is_foreign
+        if is_foreign:
             super().spin_once()
             return
         if (spare := self._spare_time()) > LEAST_SLEEP:
             sleep(spare)  # what comes meanwhile is taken at once
-        ready = kept.wait((self._guard.handle, self._sigint_gc.handle), self.can_execute)
+        with self._own_work():
+            ready = self._keep().wait((self._guard.handle, self._sigint_gc.handle), self.can_execute)
+            is_changed = self._guard.handle.pointer in ready.guards
         if not self.context.ok():
             raise ExternalShutdownException
-        if self._guard.handle.pointer in ready.guards:
+        if is_changed:
             self._release()  # something came or went
         for subscription in ready.messages:
             if self.can_execute(subscription):
                 self._hand_over(subscription)
         if ready.has_more:
             super().spin_once(0.0)
+
+    @contextmanager
+    def _own_work(self) -> Iterator[None]:
+        """Mark what is done with rclpy's inside: an error there is none of a node's, unless rclpy ends."""
+        try:
+            yield
+        except InvalidHandle:
+            raise  # it was taken away meanwhile
+        except Exception as error:
+            if not self.context.ok():
+                raise
+            raise _UnknownRclpyError(f"{type(error).__name__}: {error}") from error
+
+    def _be_base(self, error: _UnknownRclpyError) -> None:
+        """Say why nothing is kept, and keep nothing from now on."""
+        self._is_strange = True
+        with suppress(Exception):
+            self._release()
+        self._kept = None
+        get_logger("finforce").warning(f"this rclpy is another one than expected, '{UNCHANGED}' is off: {error}")
+
+    def _keep(self) -> _Kept:
+        """Return the wait set, made now if there is none."""
+        self._kept = self._kept or _Kept(self.get_nodes(), self.context)
+        return self._kept
 
     def _is_busy(self) -> bool:
         """Say whether a coroutine is under way, and forget those that are done."""
@@ -89,7 +130,8 @@ class KeepingExecutor(SingleThreadedExecutor):
         """Call back with all messages that wait, until the subscription is gone or its group busy."""
         with suppress(InvalidHandle), (handle := subscription.handle):
             for _ in range(MOST_AT_ONCE):
-                taken = handle.take_message(subscription.msg_type, subscription.raw)
+                with self._own_work():
+                    taken = handle.take_message(subscription.msg_type, subscription.raw)
                 if taken is None:
                     return
                 self._skips.count(UNCHANGED)
@@ -129,6 +171,9 @@ class _Kept:
     """
 
     def __init__(self, nodes: Sequence[Node], context: Any) -> None:
+        from rclpy.event_handler import EventHandler  # not all releases have them
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+
         waitables = [item for node in nodes for item in node.waitables]
         foreign = [item for item in waitables if not isinstance(item, EventHandler)]
         self.is_foreign = bool(foreign) or any(True for node in nodes for _ in node.guards)

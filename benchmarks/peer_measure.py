@@ -177,12 +177,14 @@ class FirstAnswers:
         seconds: median over the processes [s].
         processes: that were started.
         memory: resident after the last image [MB].
+        caches: compiled code and stored equilibria that are there at the end [MB].
     """
 
     cached: str
     seconds: float
     processes: int
     memory: float
+    caches: float
 
 
 def measure_starts(solver: str, progress: Callable[[], object] = lambda: None) -> list[FirstAnswers]:
@@ -207,11 +209,13 @@ def _summarise_starts(name: str, starts: Sequence[Mapping[str, float]]) -> First
 
 
 def _start(solver: str, places: Mapping[str, str]) -> dict[str, float]:
-    """Returns time [s] and memory [MB] of one process; its caches are in the given places."""
+    """Returns time [s], memory and caches [MB] of one process; its caches are in the given places."""
     command = [sys.executable, "-m", "finforce_eval.bench_process", solver, "default"]
     begin = perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **places}, cwd=ROOT)
     seconds = perf_counter() - begin
     if done.returncode:
         raise ProcessError(f"the process with solver {solver} ended with {done.returncode}: {done.stderr[-300:]}")
-    return {"seconds": seconds, "memory": json.loads(done.stdout.splitlines()[-1])["memory"]}
+    memory = json.loads(done.stdout.splitlines()[-1])["memory"]
+    caches = sum(path.stat().st_size for place in places.values() for path in Path(place).rglob("*") if path.is_file())
+    return {"seconds": seconds, "memory": memory, "caches": 1e-6 * caches}

@@ -232,6 +232,7 @@ def _costs(figures: Figures) -> list[tuple[str, ...]]:
     memory = " / ".join(f"{starts[name]['memory']:.0f}" for name in order)
     seconds = " / ".join(f"{starts[name]['seconds']:.1f}" for name in order)
     core, full = figures.own["core"], figures.own["full"]
+    caches = f"caches after the first start {starts['all']['caches']:.0f} MB"
     sizes = f"{1e-6 * core['size']:.0f} MB ({core['packages']} packages) / {1e-6 * full['size']:.0f} MB"
     return [
         (
@@ -243,7 +244,7 @@ def _costs(figures: Figures) -> list[tuple[str, ...]]:
         ("Memory of that process, MB", f"{memory}[^own]", "not stated", MISSING),
         (
             "Installed, with all it needs: core / with every extra",
-            f"{sizes} ({full['packages']} packages)[^own]",
+            f"{sizes} ({full['packages']} packages); {caches}[^own]",
             "not stated",
             "SOFA's libraries alone, packed, without Python and plugins: 22.5 MB[^sofa-size]",
         ),

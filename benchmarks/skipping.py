@@ -20,12 +20,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="of idling and of holding that are measured (10)")
     parser.add_argument("--solver", default="", help="tier of the solvers (their default)")
     options = parser.parse_args()
-    figures = measure(options.seconds, options.solver)
+    figures = measure(seconds=options.seconds, solver=options.solver)
     print(format_table(figures))
     if options.json:
         write_figures(options.json, as_json(figures))
     if options.picture:
-        draw(figures).savefig(options.picture)
+        draw(figures, options.picture)
 
 
 if __name__ == "__main__":

@@ -79,6 +79,12 @@ PARTS = (
     Part(name="chain", module="finforce_eval.bench_chain", title="Latency against force error of the whole chain"),
     Part(name="nodes", module="finforce_eval.bench_nodes", title="Share of a core that each node takes", usual=False),
     Part(
+        name="skipping",
+        module="finforce_eval.bench_skipping",
+        title="Share of a core that each node takes on three scenes, with what need not be done and without",
+        usual=False,
+    ),
+    Part(
         name="live",
         module="finforce_eval.bench_live",
         title="Key points out to wrench in, one solver node per jaw",

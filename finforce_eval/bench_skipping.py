@@ -52,6 +52,7 @@ ON, OFF = "rules on", "rules off"
 SETTINGS: Mapping[str, Sequence[str]] = {ON: ("",), OFF: (ALL,)}
 MOST_IDLE = 2.0  # [% of a core] that a node may take while idle
 MOST_STEADY = 0.5  # of the cost without rules that a steady grasp may take
+USUAL_SECONDS, QUICK_SECONDS = 10.0, 3.0  # of idling and of holding that are measured
 WARM_UP, SETTLED = 4.0, 3.0  # [s] of idling, and of holding, before they are measured
 MAX_AGE = 2.0  # [s]; a loaded machine shall be slow, not silent
 
@@ -87,12 +88,17 @@ class SkippingFigures:
 
 
 def measure(
-    seconds: float = 10.0, solver: str = "", settings: Mapping[str, Sequence[str]] = SETTINGS
+    quick: bool = False,
+    *,
+    seconds: float | None = None,
+    solver: str = "",
+    settings: Mapping[str, Sequence[str]] = SETTINGS,
 ) -> SkippingFigures:
     """Return what each node takes in each scene, with the rules and without.
 
     Args:
-        seconds: for which idle and steady grasp are measured, each; the approach takes three.
+        quick: idle and steady grasp are measured for three seconds each, not for ten; the approach takes three.
+        seconds: the same time, where another one is wanted.
         solver: tier; the node's own default when empty.
         settings: rules that are off, by the name of the setting.
 
@@ -102,7 +108,7 @@ def measure(
     """
     source = find_scene(SCENE)
     sections = cut_sections(read_playback(source), SECTIONS)
-    reel = SceneReel(sections, _plan(sections, seconds))
+    reel = SceneReel(sections, _plan(sections, seconds or (QUICK_SECONDS if quick else USUAL_SECONDS)))
     runs = {name: _run(_build_nodes(source, off, solver), reel, name) for name, off in settings.items()}
     return SkippingFigures(
         costs=[cost for run in runs.values() for cost in run.costs],
@@ -264,8 +270,17 @@ def as_json(figures: SkippingFigures) -> dict[str, Any]:
     }
 
 
-def draw(figures: SkippingFigures) -> Figure:
-    """Draw the CPU use of each node, one panel per scene, with the rules and without."""
+def draw(figures: SkippingFigures, path: Path | str) -> None:
+    """Draw the CPU use of each node, one panel per scene, with the rules and without, and write it to a file.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    draw_costs(figures).savefig(path)
+
+
+def draw_costs(figures: SkippingFigures) -> Figure:
+    """Return the picture of `draw`."""
     from finforce_eval.figures import BLACK, BLUE, GREY, new_figure, style_axes
 
     figure, nodes = new_figure(11, 3.6), _nodes_of(figures)

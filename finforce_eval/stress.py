@@ -112,6 +112,7 @@ class Family:
         run: yields the trials of a plan.
         least_sure: share of the trials that must be answered surely; a code that is never sure is honest and useless.
         timed: whether no step may exceed ten times the median; not where the trials differ in size on purpose.
+        ruled: whether the exit status asks for the rule; not where what the estimator is told is false on purpose.
     """
 
     name: str
@@ -119,6 +120,7 @@ class Family:
     run: Callable[[Plan], Iterable[Trial]]
     least_sure: float = 0.0
     timed: bool = True
+    ruled: bool = True
 
 
 def attempt(

@@ -105,6 +105,21 @@ def interpolate_slopes(table, m, step, out):
 
 
 @njit(**_OPTIONS)
+def find_ends(values):
+    """Returns the first index of values (k,) that is not zero and the one after the last; (0, 0) without any."""
+    first, last = 0, 0
+    for k in range(len(values)):
+        if values[k] != 0.0:
+            first = k
+            break
+    for k in range(len(values) - 1, -1, -1):
+        if values[k] != 0.0:
+            last = k + 1
+            break
+    return first, last
+
+
+@njit(**_OPTIONS)
 def _find_cell(table, m):
     """Returns the lower grid point of the cell at m (2,) and the weights of its corners 00, 01, 10, 11."""
     t = min(max(int(np.floor(m[0])), 0), table.shape[0] - 2)

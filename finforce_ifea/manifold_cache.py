@@ -8,11 +8,12 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import struct
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from zipfile import BadZipFile
 
 import numpy as np
@@ -22,6 +23,8 @@ from finforce_ifea.manifold import Manifold
 
 # To be raised when what is stored, or how it is found, changes.
 VERSION = 3
+# What reading a damaged archive raises, one or the other by where the damage is.
+_UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, struct.error, zlib.error)
 _LOG = logging.getLogger(__name__)
 
 
@@ -68,7 +71,7 @@ def _read(path: Path) -> Manifold | None:
             values = {field.name: stored[field.name] for field in fields(Manifold)}
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+    except _UNREADABLE as error:
         _LOG.warning("the stored equilibria %s cannot be read (%s); they are built anew", path.name, error)
         return None
     values["young_modulus"] = float(values["young_modulus"])
@@ -76,13 +79,18 @@ def _read(path: Path) -> Manifold | None:
 
 
 def _write(path: Path, manifold: Manifold) -> None:
-    """Stores a manifold, whole or not at all."""
+    """Stores a manifold, whole or not at all; what a killed process has left of it is removed."""
+    part = path.with_suffix(f".{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
-            np.savez(part, **{field.name: getattr(manifold, field.name) for field in fields(Manifold)})
-        os.replace(part.name, path)
+        for left in path.parent.glob(f"{path.stem}.*.part"):
+            left.unlink(missing_ok=True)
+        with part.open("wb") as file:
+            np.savez(file, **{field.name: getattr(manifold, field.name) for field in fields(Manifold)})
+        os.replace(part, path)
     except OSError as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
         _LOG.warning("the equilibria cannot be stored in %s (%s); the next start builds them anew", path.parent, error)
 
 

@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 from finforce_ifea.factor import Factor
 from finforce_ifea.manifold import Manifold
 from finforce_ifea.model import LARGEST_MOVE, JawModel, Linearization
-from finforce_ifea.reduced_loops import LARGEST_GRID_STEP, find_grid_step, follow, move_points, place_points
+from finforce_ifea.nearest import LARGEST_GRID_STEP, find_grid_step
+from finforce_ifea.reduced_loops import SHALLOW, follow, move_points, place_points
+
+# The depth on the grid waits until its height is so near.
+_BESIDE = 1.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,14 +63,25 @@ class ReducedModel:
         self.loads, self.compliance = self.manifold.loads, self.manifold.compliance
         self.shape_compliance = self.manifold.shape_compliance
         stiffness = LARGEST_MOVE / np.abs(np.diagonal(self.compliance[0, 0]))
-        self.reach = np.r_[stiffness, LARGEST_GRID_STEP, LARGEST_GRID_STEP]
+        self.reach = np.r_[stiffness, LARGEST_GRID_STEP, manifold.loads.shape[1]]
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
         """Returns the loads that q (size,) holds, and how far its grid coordinates are from the nearest equilibrium."""
         moves = self.moves(q)
         step = find_grid_step(self.manifold.moves, moves, q[-2:])[:2]
+        if q[-2] < SHALLOW:
+            step = self._find_shallow_step(q, step[0])
         force = np.r_[q[:-2], -step]
         return Linearization(force=force, energy=0.5 * float(moves @ q[:-2]), smallest_det=1.0, tangent=None)
+
+    def _find_shallow_step(self, q: NDArray, by_depth: float) -> NDArray:
+        """Returns the step (2,) of grid coordinates where the loads tell the height: that first, then the depth."""
+        sizes, rods = np.abs(q[:-2:2]), self.manifold.rods
+        if not sizes.any():
+            return np.array([by_depth, 0.0])
+        height = float(sizes @ self.manifold.heights[1:] / sizes.sum())
+        by_height = np.interp(height, rods, np.arange(len(rods))) - q[-1]
+        return np.array([by_depth if abs(by_height) < _BESIDE else 0.0, by_height])
 
     def moves(self, q: NDArray) -> NDArray:
         """Returns the motions of the rows (2 n,) [m], x and z interleaved."""

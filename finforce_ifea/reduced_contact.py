@@ -11,6 +11,8 @@ from finforce_ifea.surface import ContactSurface
 
 # A shape this share of the finger's length from a stored one has an error of about a per cent of its force.
 _FARTHEST_SHAPE = 0.0056
+# A step larger than this share of what is allowed is cut where the energy rises by this share of the fall at its start.
+_LARGE_STEP, _TOO_FAR, _BISECTIONS = 0.3, 0.5, 6
 
 
 class ReducedContact:
@@ -40,11 +42,16 @@ class ReducedContact:
         contact = self.indenter.press(points, self.surface.stiffness, self.face_x, place)
         parts = (contact.forces, contact.springs, contact.by_shape)
         step = step_contact(q, self._tables, self._face, moves, points, parts)
+        correction, force = step.correction, step.force
+        if step.touches and step.size > _LARGE_STEP and not correction[-2:].any():
+            share = self._find_share(q, points, correction, place)
+            correction = share * correction
+            force = share * force + (1.0 - share) * np.array([q[:-2:2].sum(), 0.0, q[1:-2:2].sum()])
         return PressedState(
             touches=step.touches,
-            correction=step.correction,
+            correction=correction,
             modes=step.modes,
-            force=step.force,
+            force=force,
             force_modes=step.force_modes,
             pressure_point=step.pressure_point,
             pressure_place=step.pressure_place,
@@ -52,6 +59,27 @@ class ReducedContact:
             size=step.size,
             extrapolation=step.away / self._farthest,
         )
+
+    def _find_share(self, q: NDArray, points: NDArray, step: NDArray, place: NDArray) -> float:
+        """Returns the share of a step up to which the energy of jaw and object falls; corners make it rise again.
+
+        Along a step of the loads that moves the rows by du and contact points (p, 3) by dx, it changes by
+        (lambda - p)^T du, all as far as the step has gone.
+        """
+        after = self.model.moves(q + step)
+        motion, moved = place_contact(self._face, after) - points, after - self.model.moves(q)
+
+        def change_energy(share: float) -> float:
+            contact = self.indenter.press(points + share * motion, self.surface.stiffness, self.face_x, place)
+            return float((q[:-2] + share * step[:-2]) @ moved - (contact.forces * motion).sum())
+
+        share, low, high = 1.0, 0.0, 1.0
+        if change_energy(1.0) <= _TOO_FAR * abs(change_energy(0.0)):
+            return 1.0
+        for _ in range(_BISECTIONS):
+            share = 0.5 * (low + high)
+            low, high = (low, share) if change_energy(share) > 0.0 else (share, high)
+        return share
 
     def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
         """Returns the step of a jaw that has lost contact, cut where its surface meets the object again."""

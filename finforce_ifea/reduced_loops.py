@@ -6,23 +6,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.manifold import add_product, blend, interpolate, interpolate_slopes
+from finforce_ifea.manifold import add_product, blend, find_ends, interpolate
 from finforce_ifea.model import LARGEST_MOVE
+from finforce_ifea.nearest import LARGEST_GRID_STEP, WATCHED, approach_grid, bound_grid_step, find_grid_step
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# Every so manieth row tells how near a stored equilibrium is; the grid coordinates move by at most so much at once.
-_WATCHED = 4
-LARGEST_GRID_STEP = 2.0
-# Damping of the search for the nearest equilibrium, as a share of the largest curvature, and as squared metres.
-_DAMPING, _DAMPING_FLOOR = 1e-6, 1e-12
 # The grid coordinates wait until a correction is below this share of what is allowed: a shape far from equilibrium says
 # little of the nearest one.
 _CALM = 0.15
-# A step of the grid coordinates that leads away from the stored equilibria is halved so often, then left out; by so much
-# it may, as a share and in metres.
-_HALVINGS, _SLACK, _SLACK_FLOOR = 4, 1e-2, 1e-8
 # Below this grid coordinate of the depth a jaw is too little bent to tell the height by its shape.
-_SHALLOW = 0.5
+SHALLOW = 0.5
 
 
 class FaceRows(NamedTuple):
@@ -68,21 +61,6 @@ class ContactStep(NamedTuple):
 
 
 @njit(**_OPTIONS)
-def _find_ends(values):
-    """Returns the first index of values (k,) that is not zero and the one after the last; (0, 0) without any."""
-    first, last = 0, 0
-    for k in range(len(values)):
-        if values[k] != 0.0:
-            first = k
-            break
-    for k in range(len(values) - 1, -1, -1):
-        if values[k] != 0.0:
-            last = k + 1
-            break
-    return first, last
-
-
-@njit(**_OPTIONS)
 def follow(moves, compliance, loads, q):
     """Returns motions (k,) [m] of a table moves (T, Z, k) with its compliance (T, Z, k, 2 n) for unknowns q."""
     count = loads.shape[2]
@@ -91,7 +69,7 @@ def follow(moves, compliance, loads, q):
     for k in range(count):
         extra[k] = q[k] - extra[k]
     interpolate(moves, m, out)
-    first, last = _find_ends(extra)
+    first, last = find_ends(extra)
     add_product(compliance, m, extra, first, last, 1, out)
     return out
 
@@ -108,7 +86,7 @@ def move_points(compliance, q, modes):
     count, k = compliance.shape[3], modes.shape[1]
     first, last = count, 0
     for c in range(k):
-        begin, end = _find_ends(modes[:count, c])
+        begin, end = find_ends(modes[:count, c])
         if end > 0:
             first, last = min(first, begin), max(last, end)
     first = min(first, last)
@@ -121,66 +99,6 @@ def move_points(compliance, q, modes):
             for c in range(k):
                 out[i, c] += part[i, j] * modes[first + j, c]
     return out.reshape(size // 3, 3, k)
-
-
-@njit(**_OPTIONS)
-def find_grid_step(moves, now, m):
-    """Returns the step from grid coordinates m (2,) towards the stored equilibrium nearest to motions now (2 n,) [m].
-
-    A damped step of Gauss and Newton on the distance of every so manieth row; it does not leave the grid. The third
-    number is the root mean square distance at m [m].
-    """
-    count = (moves.shape[2] // 2 + _WATCHED - 1) // _WATCHED
-    at = np.empty((3, 2 * count))
-    interpolate_slopes(moves, m, _WATCHED, at)
-    a = b = c = u = v = square = 0.0
-    for k in range(count):
-        for axis in range(2):
-            miss = now[2 * _WATCHED * k + axis] - at[0, 2 * k + axis]
-            by_depth, by_height = at[1, 2 * k + axis], at[2, 2 * k + axis]
-            a, b, c = a + by_depth * by_depth, b + by_depth * by_height, c + by_height * by_height
-            u, v, square = u + by_depth * miss, v + by_height * miss, square + miss * miss
-    damping = _DAMPING * max(a, c) + _DAMPING_FLOOR
-    a, c = a + damping, c + damping
-    det = a * c - b * b
-    step = np.array([(c * u - b * v) / det, (a * v - b * u) / det, np.sqrt(square / count)])
-    return _bound_grid_step(step, m, moves)
-
-
-@njit(**_OPTIONS)
-def _bound_grid_step(step, m, moves):
-    """Returns a step of the grid coordinates that is not too long and does not leave the grid."""
-    for axis in range(2):
-        step[axis] = min(max(step[axis], -LARGEST_GRID_STEP), LARGEST_GRID_STEP)
-        step[axis] = min(max(m[axis] + step[axis], 0.0), moves.shape[axis] - 1.0) - m[axis]
-    return step
-
-
-@njit(**_OPTIONS)
-def _measure_miss(tables, loads, m):
-    """Returns the root mean square distance [m] of a jaw under loads (2 n,) [N] from the equilibrium stored at m."""
-    count = len(loads)
-    extra, miss = np.empty(count), np.zeros(count)
-    interpolate(tables[2], m, extra)
-    for k in range(count):
-        extra[k] = loads[k] - extra[k]
-    first, last = _find_ends(extra)
-    add_product(tables[1], m, extra, first, last, _WATCHED, miss)
-    return np.sqrt((miss**2).sum() / ((count // 2 + _WATCHED - 1) // _WATCHED))
-
-
-@njit(**_OPTIONS)
-def _approach_grid(tables, loads, m, step):
-    """Shortens a step (3,) of grid coordinates m (2,), see `find_grid_step`, until it leads nearer to the stored ones.
-
-    The step takes the jaw to stay as it is, which it does not where compliances change fast, as at the base.
-    """
-    largest = (1.0 + _SLACK) * step[2] + _SLACK_FLOOR
-    for _ in range(_HALVINGS):
-        if _measure_miss(tables, loads, m + step[:2]) <= largest:
-            return
-        step[:2] *= 0.5
-    step[:2] = 0.0
 
 
 @njit(**_OPTIONS)
@@ -246,7 +164,7 @@ def _solve_rows(q, compliance, loads, stiffness):
     for k in range(len(loads)):
         loads[k, 0] -= q[k]
         known[k] = abs(q[k]) + abs(stiffness[k, 3])
-    first, last = _find_ends(known)
+    first, last = find_ends(known)
     size = last - first
     if size == 0:
         return out, 0.0
@@ -259,7 +177,32 @@ def _solve_rows(q, compliance, loads, stiffness):
                 for j in range(size):
                     A[i, j] += s * C[k, j]
     out[first:last] = np.linalg.solve(A, loads[first:last])
-    return out, np.abs(C @ out[first:last, 0]).max()
+    return out, np.abs(C @ np.ascontiguousarray(out[first:last, 0])).max()
+
+
+@njit(**_OPTIONS)
+def _hold_base(q, compliance, face, contact, steps):
+    """Returns what of the contact force the clamp holds below the first row, and its derivatives (2, 4) [N]."""
+    out, moved = np.zeros((2, 4)), np.zeros((2, 4))
+    forces, springs, by_shape = contact
+    if not ((face.low < 0) & (springs[:, 0, 0] + springs[:, 2, 2] > 0.0)).any():
+        return out
+    rows = np.empty((2, len(steps)))
+    blend(compliance, q[len(steps) :], 0, 2, 0, len(steps), rows)
+    moved = rows @ steps
+    for p in range(len(forces)):
+        held, spring = 1.0 - face.share[p], springs[p]
+        if face.low[p] >= 0:
+            continue
+        for a in range(2):
+            out[a, 0] += held * forces[p, 2 * a]
+            out[a, 1] -= held * spring[2 * a, 0]
+            out[a, 2] += held * by_shape[p, 2 * a]
+            out[a, 3] += held * spring[2 * a, 2]
+            for c in range(4):
+                share = spring[2 * a, 0] * moved[0, c] + spring[2 * a, 2] * moved[1, c]
+                out[a, c] -= held * face.share[p] * share
+    return out
 
 
 @njit(**_OPTIONS)
@@ -293,20 +236,22 @@ def step_contact(q, tables, face, moves, points, contact):
     correction, modes = np.zeros(count + 2), np.zeros((count + 2, 3))
     correction[:count], modes[:count] = steps[:, 0], steps[:, 1:]
     after = moves.copy()
-    first, last = _find_ends(correction[:count])
-    add_product(tables[1], q[count:], correction[:count], first, last, _WATCHED, after)
+    first, last = find_ends(correction[:count])
+    add_product(tables[1], q[count:], correction[:count], first, last, WATCHED, after)
     nearest = find_grid_step(tables[0], after, q[count:])
     if size <= _CALM:
-        _approach_grid(tables, q[:count] + correction[:count], q[count:], nearest)
+        approach_grid(tables, q[:count] + correction[:count], q[count:], nearest)
     correction[count:] = nearest[:2]
-    if q[count] < _SHALLOW and total > 0.0:
+    if q[count] < SHALLOW and total > 0.0:
         step = np.array([correction[count], np.interp(place[2], face.rods, np.arange(len(face.rods))) - q[count + 1]])
-        correction[count:] = _bound_grid_step(step, q[count:], tables[0])
+        correction[count:] = bound_grid_step(step, q[count:], tables[0])
     turned = np.abs(correction[count:]).max() / LARGEST_GRID_STEP
     if size > _CALM:
         correction[count:] = 0.0
     size = max(size, turned)
+    held = _hold_base(q, tables[1], face, contact, steps)
     force, force_modes = np.zeros(3), np.zeros((3, 3))
+    force[::2], force_modes[::2] = held[:, 0], held[:, 1:]
     for k in range(count):
         axis = 2 * (k % 2)
         force[axis] += q[k] + correction[k]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image
 
 import finforce_ros as ros
@@ -34,6 +35,8 @@ from finforce_skipping import IDLE, LATE, UNHEARD, Skips
 
 if TYPE_CHECKING:
     from finforce_keypoints.detector import JawKeypoints
+
+STAMPED = 12  # bytes of a serialised message up to the end of its stamp
 
 
 class DoorGroup(MutuallyExclusiveCallbackGroup):
@@ -74,7 +77,7 @@ class KeypointDetectorNode(Node):
         source, age = self.feed.source, parameters.max_age
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}
-        self.rested, self.idling = float("-inf"), Idling()
+        self.rested, self.idling, self.info = float("-inf"), Idling(), b""
         self.qos = ros.QosWatch(self)
         self.out = DetectorOutputs(self.qos, parameters, names, self.card, self.skips)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
@@ -92,7 +95,7 @@ class KeypointDetectorNode(Node):
     def _subscribe(self) -> None:
         """Create the subscriptions; images that a newer one overtook are passed over."""
         parameters = self.parameters
-        self.qos.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR)
+        self.qos.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR, raw=True)
         # as bytes: of an image that nobody looks at no more than the header is read
         self.depth_group = DoorGroup()
         self.depths = ros.LargeSubscription(
@@ -103,10 +106,13 @@ class KeypointDetectorNode(Node):
             for topic in parameters.color_topics
         }
 
-    def _on_info(self, message: CameraInfo) -> None:
-        """Keep the camera's intrinsics."""
+    def _on_info(self, data: bytes) -> None:
+        """Keep the camera's intrinsics, which hardly ever change."""
+        if (said := data[STAMPED:]) == self.info:
+            return
         with self._refusals():
-            self.feed.take_info(message)
+            self.feed.take_info(deserialize_message(data, CameraInfo))
+            self.info = said
 
     def _on_color(self, topic: str, data: bytes) -> None:
         """Take the newest colour image of the camera's topic."""

@@ -118,7 +118,7 @@ class StillWatch:
         self._jaws: dict[str, JawWatch] = {}
         self._camera: CameraIntrinsics | None = None
         self._values = np.empty(0)
-        self._verdict: bool | None = None
+        self._has_moved = False
         self._doubted = False
         self._half = HALVES[0]
 
@@ -132,8 +132,10 @@ class StillWatch:
         before, self._values = self._values, _gather(color, self._inner)
         if np.array_equal(before, self._values):
             return None
-        self._verdict = self._judge(self._values)
-        return self._tell(stamp) if self._verdict else None
+        if self._judge(self._values):
+            return self._tell(stamp)
+        self._has_moved = True
+        return None
 
     @property
     def _is_sure(self) -> bool:
@@ -155,12 +157,12 @@ class StillWatch:
         A single picture that looks moved changes nothing; after a second one the mean begins anew.
         """
         last, self._last = self._last, found
-        verdict, self._verdict = self._verdict, None
+        has_moved, self._has_moved = self._has_moved, False
         if not found or found.keys() != last.keys() or _have_moved(found, last):
             self._forget()
         elif camera is not self._camera or not self._jaws:
             self._begin(found, color, camera)
-        elif self._add(found, color, verdict):
+        elif not has_moved and self._add(found, color):
             if self._half < HALVES[-1] and any(jaw.is_vague for jaw in self._jaws.values()):
                 self._begin(found, color, camera, HALVES[-1])
             return self._tell(next(iter(found.values())).stamp) if self._is_sure else found
@@ -170,17 +172,16 @@ class StillWatch:
             self._doubted = True
         return found
 
-    def _add(self, found: Mapping[str, JawKeypoints], color: NDArray, verdict: bool | None) -> bool:
-        """Add a picture to the means if it is still, as the verdict says; return whether it was."""
+    def _add(self, found: Mapping[str, JawKeypoints], color: NDArray, *, first: bool = False) -> bool:
+        """Add a picture to the means if it is still, as the first one is; return whether it was."""
         patches = np.split(_gather(color, self._all), self._ends)
         patches = [part.reshape(jaw.spots.pixels.shape) for jaw, part in zip(self._jaws.values(), patches, strict=True)]
-        if verdict is None:
-            verdict = self._judge(np.concatenate([part[INNER].ravel() for part in patches]))
-        if verdict:
+        is_still = first or self._judge(np.concatenate([part[INNER].ravel() for part in patches]))
+        if is_still:
             self._doubted = False
             for (side, jaw), part in zip(self._jaws.items(), patches, strict=True):
                 jaw.add(found[side], part)
-        return verdict
+        return is_still
 
     def _begin(
         self, found: Mapping[str, JawKeypoints], color: NDArray, camera: CameraIntrinsics, half: int = HALVES[0]
@@ -195,7 +196,7 @@ class StillWatch:
         self._all, self._ends = _join([jaw.pixels for jaw in spots.values()])
         self._inner, self._inner_ends = _join([jaw.pixels[INNER] for jaw in spots.values()])
         self._jaws = {side: JawWatch(found[side], jaw) for side, jaw in spots.items()}
-        self._add(found, color, verdict=True)
+        self._add(found, color, first=True)
 
 
 def _have_moved(found: Mapping[str, JawKeypoints], last: Mapping[str, JawKeypoints]) -> bool:

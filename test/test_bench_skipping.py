@@ -2,7 +2,17 @@
 
 import pytest
 
-from finforce_eval.bench_skipping import OFF, ON, SceneCost, SkippingFigures, as_json, draw, find_cost, format_table
+from finforce_eval.bench_skipping import (
+    OFF,
+    ON,
+    SceneCost,
+    SkippingFigures,
+    as_json,
+    draw,
+    draw_costs,
+    find_cost,
+    format_table,
+)
 from finforce_eval.errors import RecordingError
 from finforce_eval.playback import RawMessage
 from finforce_eval.scene_reel import Part, SceneReel, cut_sections, read_word
@@ -76,6 +86,8 @@ def test_the_json_holds_figures_and_aims():
     assert written["aims"] == {"idle_pct": 2.0, "steady_share": 0.5}
 
 
-def test_the_picture_has_a_panel_for_each_scene():
-    picture = draw(figures())
+def test_the_picture_has_a_panel_for_each_scene(tmp_path):
+    draw(figures(), tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").stat().st_size > 0
+    picture = draw_costs(figures())
     assert [axes.get_title(loc="left") for axes in picture.axes] == ["idle", "approach", "grasp"]

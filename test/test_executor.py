@@ -1,6 +1,7 @@
 """Claims about the executor that keeps its wait set: nothing is lost, whatever comes and goes."""
 
 from time import monotonic
+from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -9,6 +10,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+import finforce_executor
 import finforce_ros as ros
 from finforce_executor import KeepingExecutor, is_wanted
 from finforce_skipping import ALL, UNCHANGED, UNHEARD, Skips
@@ -125,3 +127,49 @@ def test_a_topic_is_wanted_while_somebody_subscribes(probe):
     probe.hear("shown", DiagnosticArray)
     probe.connected(out)
     assert is_wanted(out, skips) and skips.describe()[f"skipped: {UNHEARD}"] == "1"
+
+
+def rename_event_handler(monkeypatch):
+    monkeypatch.delattr("rclpy.event_handler.EventHandler")
+
+
+def rename_entities(monkeypatch):
+    monkeypatch.setitem(finforce_executor.ADDERS, "subscriptions", "add_reader")
+
+
+def change_wait_set(monkeypatch):
+    monkeypatch.setattr(finforce_executor._Kept, "wait", lambda self: None)
+
+
+@pytest.mark.parametrize("change", [rename_event_handler, rename_entities, change_wait_set])
+def test_where_rclpy_is_another_one_all_are_answered_by_its_own_executor(probe, monkeypatch, change):
+    worker, executor = Worker(context=probe.context), KeepingExecutor(context=probe.context)
+    said = []
+    monkeypatch.setattr(finforce_executor, "get_logger", lambda _: SimpleNamespace(warning=said.append))
+    out = probe.speak("plain", String)
+    executor.obey(worker)
+    executor.add_node(worker)
+    work(probe, (worker, executor), out.get_subscription_count)
+    change(monkeypatch)
+    executor._release()  # as when something came or went
+    for number in range(5):
+        out.publish(String(data=str(number)))
+    work(probe, (worker, executor), lambda: len(worker.heard) == 5 and worker.ticks > 3)
+    assert worker.heard == list("01234")
+    assert len(said) == 1 and UNCHANGED in said[0]
+    executor.remove_node(worker)
+    worker.destroy_node()
+
+
+def test_an_error_of_a_callback_is_none_of_rclpys(probe, monkeypatch):
+    worker, executor = Worker(context=probe.context), KeepingExecutor(context=probe.context)
+    worker.create_subscription(String, "wrong", lambda message: message.nothing, 10)
+    out = probe.speak("wrong", String)
+    executor.add_node(worker)
+    work(probe, (worker, executor), out.get_subscription_count)
+    out.publish(String())
+    with pytest.raises(AttributeError, match="nothing"):
+        work(probe, (worker, executor), lambda: False)
+    assert not executor._is_strange
+    executor.remove_node(worker)
+    worker.destroy_node()

@@ -76,6 +76,29 @@ def test_a_slow_tracker_delays_nothing_and_its_poses_are_used():
             assert late.T_jaw_object[0, 3] == 0.001 * k
 
 
+@pytest.mark.parametrize("order", ["in time", "late"])
+def test_an_object_pose_between_two_poses_of_a_jaw_that_stands_still_is_used(order):
+    pairing, T_camera_jaw = PosePairing(MS), moved(0.1, turn=(0.3, -0.2, 1.0))
+    seen = lambda: pairing.add_object(FRAME, T_camera_jaw @ moved(0.03))  # noqa: E731
+    steps = pairing.add_jaw(0, T_camera_jaw)
+    if order == "in time":
+        steps += seen()
+    steps += pairing.add_jaw(3 * FRAME, T_camera_jaw)
+    if order == "late":
+        steps += seen()
+    assert due(steps) == [0, 3 * FRAME]  # no contact is said of an image without a jaw pose
+    (used,) = [step for step in steps if step.T_jaw_object is not None]
+    assert used.stamp == FRAME
+    np.testing.assert_allclose(used.T_jaw_object, moved(0.03), atol=1e-12)
+
+
+@pytest.mark.parametrize(("way", "later"), [(1e-3, 3 * FRAME), (0.0, 10 * FRAME)])
+def test_between_two_poses_of_a_jaw_that_moved_or_was_not_seen_for_long_none_is_used(way, later):
+    pairing = PosePairing(MS)
+    steps = [*pairing.add_jaw(0, moved()), *pairing.add_object(FRAME, moved()), *pairing.add_jaw(later, moved(way))]
+    assert all(step.T_jaw_object is None for step in steps)
+
+
 def test_stamps_farther_apart_than_the_tolerance_do_not_belong_together():
     pairing = PosePairing(5 * MS)
     pairing.add_jaw(0, np.eye(4))

@@ -8,7 +8,7 @@ import pytest
 from keypoint_scene_fakes import CAMERA
 from still_fakes import SIDES, bend, found_at, move_all, picture
 
-from finforce_keypoints.stillness import LARGEST_CREEP, LARGEST_SHIFT, LEAST_IMAGES, StillWatch
+from finforce_keypoints.stillness import JUDGED, LARGEST_CREEP, LARGEST_ERROR, LARGEST_SHIFT, LEAST_IMAGES, StillWatch
 
 PERIOD = 1.0 / 30.0
 
@@ -121,6 +121,48 @@ def test_after_two_pictures_that_look_moved_the_new_place_is_learnt():
         watch.take(found_at(8.0), color, CAMERA)
     assert watch.confirm(9.0, picture(750, move), CAMERA) is not None
     assert watch.confirm(9.0, picture(751), CAMERA) is None
+
+
+def test_a_full_look_believes_its_own_picture_not_the_one_before(seen):
+    watch, found = watch_of(), found_at(9.0)
+    assert watch.confirm(8.9, seen["none", "left"], CAMERA) is not None
+    assert watch.take(found, seen["tip", "left"], CAMERA) is found
+
+
+DIM = {"gain": 0.3, "offset": 80.0}  # contrast of a dark jaw in a dark grasp
+
+
+@pytest.fixture(scope="module")
+def dim():
+    """A watch that has seen little contrast."""
+    watch = StillWatch()
+    for number in range(JUDGED + SETTLED):
+        watch.take(found_at(number * PERIOD), picture(number, **DIM), CAMERA)
+    return watch
+
+
+def test_where_little_is_to_be_seen_more_is_looked_at(dim):
+    watch = StillWatch()
+    for number in range(JUDGED + 1):  # the first one only says where the jaws are
+        watch.take(found_at(number * PERIOD), picture(number, **DIM), CAMERA)
+    assert all(jaw.spots.pixels.shape[1] > 15 for jaw in watch._jaws.values())
+    assert all(jaw._model.errors.max() <= LARGEST_ERROR for jaw in dim._jaws.values())
+    assert dim.confirm(9.0, picture(800, **DIM), CAMERA) is not None
+    assert watch_of()._jaws["left"].spots.pixels.shape[1] < 15
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("move", [move_all, bend])
+def test_there_too_a_motion_is_seen_on_the_very_picture_that_shows_it(dim, side, move):
+    bound = max((jaw.limits + 3.0 * jaw._model.errors).max() for jaw in dim._jaws.values())
+    assert bound < 3.0 * LARGEST_SHIFT
+    ways = (1.25 * bound, -1.25 * bound, 4.0 * bound)
+    assert not any(dim.confirm(9.0, picture(810, move(way), side=side, **DIM), CAMERA) for way in ways)
+
+
+def test_a_key_point_that_is_well_seen_may_go_no_farther_because_another_is_not():
+    limits = watch_of()._jaws["left"].limits
+    assert limits.min() == LARGEST_SHIFT and limits.shape == (16,)
 
 
 @pytest.mark.parametrize("images", [1, LEAST_IMAGES - 1])
