@@ -1,6 +1,6 @@
 """CPU time of each node on three scenes, with the rules of what need not be done and without; table, JSON, picture.
 
-    python benchmarks/skipping.py [--json OUT] [--picture OUT.png] [--seconds 10] [--solver NAME]
+    python benchmarks/skipping.py [--json OUT] [--picture OUT.png] [--seconds 10] [--solver NAME] [--each]
 
 It renders one grasp (two minutes, kept in the user's cache) and runs all nodes twice for half a minute. Nothing else
 should run meanwhile; the table says what did.
@@ -9,7 +9,7 @@ should run meanwhile; the table says what did.
 import argparse
 
 from finforce_eval.bench import write_figures
-from finforce_eval.bench_skipping import as_json, draw, format_table, measure
+from finforce_eval.bench_skipping import EACH, SETTINGS, as_json, draw, format_each, format_table, measure
 
 
 def main() -> None:
@@ -19,12 +19,14 @@ def main() -> None:
     parser.add_argument("--picture", metavar="OUT", help="draw them")
     parser.add_argument("--seconds", type=float, default=10.0, help="of idling and of holding that are measured (10)")
     parser.add_argument("--solver", default="", help="tier of the solvers (their default)")
+    parser.add_argument("--each", action="store_true", help="switch off one rule after the other, not all at once")
     options = parser.parse_args()
-    figures = measure(seconds=options.seconds, solver=options.solver)
-    print(format_table(figures))
+    settings = EACH if options.each else SETTINGS
+    figures = measure(seconds=options.seconds, solver=options.solver, settings=settings)
+    print(format_each(figures) if options.each else format_table(figures))
     if options.json:
         write_figures(options.json, as_json(figures))
-    if options.picture:
+    if options.picture and not options.each:
         draw(figures, options.picture)
 
 

@@ -65,7 +65,12 @@ MODELS = (
         title="solid, default mesh, with thicknesses and clamp of the calibration", solver="solid", calibration="bench"
     ),
 )
-INVERSE_MODELS = (MODELS[0], MODELS[3], Model(title="--solver paper", solver="paper"))
+INVERSE_MODELS = (
+    Model(title="--solver reduced", solver="reduced"),
+    MODELS[0],
+    MODELS[3],
+    Model(title="--solver paper", solver="paper"),
+)
 
 
 def load_truth(path: Path) -> list[Truth]:
@@ -140,7 +145,7 @@ def _press_as_deep_as_it_goes(mechanics, face_x: float, truth: Truth):
 
 def invert_model(model: Model, cases: Sequence[Truth], progress: Callable[[], object]) -> list[InverseCase]:
     """Returns the forces that an estimator finds in noise-free shapes, its relaxation switched off."""
-    calibration = replace(load_calibration("bench"), relaxation=())
+    calibration = replace(load_calibration("bench"), relaxation=(), solver="")
     settings = EstimatorSettings(solver=model.solver, mesh=model.mesh)
     results = []
     for truth in cases:

@@ -64,9 +64,8 @@ def measure_start(solver: str, mesh: str) -> Start:
 def _probe(solver: str, mesh: str, cache: str) -> dict[str, float]:
     """Returns the figures of one fresh process."""
     command = [sys.executable, "-m", "finforce_eval.bench_process", solver, mesh]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env={**os.environ, "XDG_CACHE_HOME": cache, "FINFORCE_CACHE": ""}
-    )
+    surroundings = {**os.environ, "XDG_CACHE_HOME": cache, "FINFORCE_CACHE": ""}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=surroundings)
     if done.returncode:
         raise ProcessError(f"the process with solver {solver} ended with {done.returncode}: {done.stderr[-300:]}")
     return json.loads(done.stdout.splitlines()[-1])

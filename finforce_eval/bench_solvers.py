@@ -45,7 +45,7 @@ class TierFigures:
         step_exact: time per step with noise-free key points [ms].
         step: time per step with noisy ones [ms].
         cpu: processor time of the same steps [ms].
-        yardstick: processor time of SuperLU on the whole jaw's stiffness matrix, 522 vertices, before and after these steps [ms].
+        yardstick: processor time of SuperLU on the whole jaw's stiffness matrix, 522 vertices, around these steps [ms].
         start: memory and set-up of a fresh process; None where another tier has the same.
     """
 

@@ -58,8 +58,7 @@ class FrameModel:
     and thin: they bend in plane strain, but narrow as they stretch. No point's y changes.
 
     Attributes:
-        size: number of unknowns.
-        rotations: which unknowns are rotations (size,).
+        size, rotations, reach: see there.
     """
 
     def __init__(

@@ -29,7 +29,7 @@ class Manifold:
         young_modulus: of the jaw that was pressed [Pa]; loads are in proportion to it.
         heights: of the clamp and the rows (n + 1,) [m].
         rods: heights of the rod (Z,) [m].
-        depths: largest depth of the rod at each height (Z,) [m]; the grid divides it evenly.
+        depths: largest depth of the rod at each height (Z,) [m]; the grid divides it, denser where it begins.
         loads: (T, Z, 2 n) [N].
         moves: of the rows (T, Z, 2 n) [m].
         compliance: of the rows (T, Z, 2 n, 2 n) [m/N], in single precision.

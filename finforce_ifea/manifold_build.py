@@ -14,19 +14,26 @@ from finforce_ifea.mechanics import Mechanics
 from finforce_ifea.rolling import PressedState, RollingContact, limit_step
 from finforce_ifea.solid import SolidModel
 
-DEPTHS, HEIGHTS, SHAPES, ROWS = 12, 27, 40, 56
+DEPTHS, HEIGHTS, SHAPES, ROWS = 16, 33, 40, 56
 # As shares of the face: radius of the rod, largest depth, where the rod is first, and how far from the top it is last.
 _ROD, _DEEPEST, _LOWEST, _TOP = 0.2, 0.19, 0.11, 0.03
-# By so much the rods stand denser at the base than in the middle: forces change fastest with height there.
+# By so much the rods stand denser at base and tip than on the average: forces change fastest with height there.
 _DENSER = 0.5
+# So much of a course is divided by the square of the step's number: a jaw may stiffen early.
+_EARLY = 0.8
 # The rod stops where it needs this many times the force that it needs half way up at full depth.
 _HARDEST = 12.0
 _LONGEST, _SHORTEST = 0.5e-3, 0.02e-3
-_ITERATIONS, _TOLERANCE = 30, 1e-9
+# What is not stored need not be as exact.
+_ITERATIONS, _TOLERANCE, _PASSING = 30, 1e-9, 1e-6
+# Quarters of a course that are tried next where it cannot be divided.
+_KEPT = 3
 _ON_FACE = 1e-4
 _FEWEST_ROWS, _MOST_ROWS = 12, 84
+# Rows of nodes nearer together than this share of their mean distance are those of an unstructured mesh.
+_CLOSEST = 0.1
 # What the outcome depends on beside the jaw.
-GRID = (DEPTHS, HEIGHTS, SHAPES, ROWS, _ROD, _DEEPEST, _LOWEST, _TOP, _DENSER, _HARDEST)
+GRID = (DEPTHS, HEIGHTS, SHAPES, ROWS, _ROD, _DEEPEST, _LOWEST, _TOP, _DENSER, _EARLY, _HARDEST)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,7 +75,7 @@ def build_rest(mechanics: Mechanics, young_modulus: float) -> Manifold:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Grid:
-    """Equilibria q (T, Z, size) under rods at heights (Z,) [m], pressed in evenly up to depths (Z,) [m]."""
+    """Equilibria q (T, Z, size) under rods at heights (Z,) [m], pressed in up to depths (Z,) [m]."""
 
     rods: NDArray
     depths: NDArray
@@ -79,29 +86,57 @@ def _press_everywhere(contact: RollingContact, progress: Callable[[float], None]
     """Returns the equilibria under rods at all heights."""
     low, high = contact.surface.heights[[0, -1]]
     share = np.linspace(0.0, 1.0, HEIGHTS)
-    share = (1.0 - _DENSER) * share + _DENSER * share**2
+    share = share - _DENSER * np.sin(2.0 * np.pi * share) / (2.0 * np.pi)
     heights = low + (_LOWEST + (1.0 - _TOP - _LOWEST) * share) * (high - low)
     rods = [_Rod(contact, height) for height in heights]
     hardest = _HARDEST * float(np.linalg.norm(rods[HEIGHTS // 2].press(np.inf)[-1].state.force))
     depths, states = [], []
     for number, rod in enumerate(rods):
-        course = rod.press(hardest)
-        depths.append(course[-1].depth)
-        states.append(rod.divide(course, DEPTHS))
+        course, divided = rod.press(hardest), None
+        while divided is None:
+            depth = _find_depth(course, hardest)
+            divided = rod.divide(course, depth, DEPTHS)
+            course = course[: _KEPT * len(course) // 4]
+            if divided is None and not course:
+                raise ContactError(f"the jaw cannot be pressed evenly at a height of {1e3 * heights[number]:.1f} mm")
+        depths.append(depth)
+        states.append(divided)
         progress((number + 1) / HEIGHTS)
     return _Grid(rods=heights, depths=np.array(depths), q=np.array(states).transpose(1, 0, 2))
 
 
+def _find_depth(course: list[_Equilibrium], hardest: float) -> float:
+    """Returns the depth [m] at which a course ends or, found between its steps, needs the largest force [N].
+
+    Depths that change smoothly with height make equilibria that do.
+    """
+    forces = [0.0, *(float(np.linalg.norm(item.state.force)) for item in course[-2:])]
+    if len(course) < 2 or not forces[-2] < hardest < forces[-1]:
+        return course[-1].depth
+    return float(np.interp(hardest, forces[-2:], [item.depth for item in course[-2:]]))
+
+
 def _choose_rows(mechanics: Mechanics) -> NDArray:
-    """Returns the heights (n + 1,) [m] of the rows, the clamp's first: a solid mesh's own, if they are not too many."""
-    mesh, face_x = mechanics.mesh, mechanics.contact.face_x
-    on_face = np.abs(mesh.nodes[:, 0] - face_x) < _ON_FACE
+    """Returns the heights (n + 1,) [m] of the rows, the clamp's first.
+
+    A solid moves linearly between its nodes: their own heights are best, divided where they are few. Where they are too
+    many or too close together, as in unstructured meshes, and of frames the rows divide the face evenly.
+    """
+    mesh, surface = mechanics.mesh, mechanics.contact.surface
+    on_face = np.abs(mesh.nodes[:, 0] - mechanics.contact.face_x) < _ON_FACE
     held = np.isin(np.arange(len(mesh.nodes)), mesh.clamped)
-    base = mesh.nodes[on_face & held, 2].max(initial=mechanics.contact.surface.low[1])
     own = np.unique(np.round(mesh.nodes[on_face & ~held, 2], 7))
-    if not (isinstance(mechanics.model, SolidModel) and _FEWEST_ROWS <= len(own) <= _MOST_ROWS):
-        own = np.linspace(base, mechanics.contact.surface.high[1], ROWS + 1)[1:]
-    return np.r_[base, own]
+    base = mesh.nodes[on_face & held, 2].max(initial=-np.inf)
+    if base >= own[0] > -np.inf and np.isfinite(base):
+        raise ContactError("the inner face is held above its lower end, expected one that is held at its base or not")
+    if not np.isfinite(base):  # nothing holds the face: its lower end is a row of its own
+        base = surface.low[1] - (surface.high[1] - surface.low[1]) / ROWS
+    gaps = np.diff(np.r_[base, own])
+    even = gaps.min() > _CLOSEST * gaps.mean()
+    if not (isinstance(mechanics.model, SolidModel) and even and len(own) <= _MOST_ROWS):
+        return np.linspace(base, surface.high[1], ROWS + 1)
+    parts = 1 if len(own) >= _FEWEST_ROWS else -(-ROWS // len(own))
+    return np.interp(np.arange(parts * len(own) + 1) / parts, np.arange(len(own) + 1), np.r_[base, own])
 
 
 class _Rod:
@@ -119,7 +154,7 @@ class _Rod:
         while not course or course[-1].depth < self._deepest - 1e-9:
             before = course[-1] if course else None
             depth = min((before.depth if before else 0.0) + step, self._deepest)
-            found = self._settle(before, depth)
+            found = self._settle(before, depth, _PASSING)
             if found is None:
                 step *= 0.5
                 if step < _SHORTEST:
@@ -132,22 +167,24 @@ class _Rod:
             raise ContactError(f"the jaw cannot be pressed at a height of {1e3 * self._height:.1f} mm")
         return course
 
-    def divide(self, course: list[_Equilibrium], count: int) -> list[NDArray]:
-        """Returns the unknowns of equilibria that divide a course evenly in depth, the unloaded one first."""
+    def divide(self, course: list[_Equilibrium], largest: float, count: int) -> list[NDArray] | None:
+        """Returns the unknowns of equilibria that divide a course up to a depth [m], denser at its beginning.
+
+        The unloaded one comes first. None where one is not found: the jaw goes over to another shape there.
+        """
         depths = np.array([item.depth for item in course])
         states = [np.zeros(self._contact.model.size)]
-        for depth in depths[-1] * np.arange(1, count + 1) / count:
+        share = np.arange(1, count + 1) / count
+        for depth in largest * ((1.0 - _EARLY) * share + _EARLY * share**2):
             below = int(np.searchsorted(depths, depth + 1e-12)) - 1
-            found = self._settle(course[below] if below >= 0 else None, depth)
+            found = self._settle(course[below] if below >= 0 else None, depth, _TOLERANCE)
             if found is None:
-                raise ContactError(
-                    f"no equilibrium of a rod {1e3 * depth:.2f} mm deep at a height of {1e3 * self._height:.1f} mm"
-                )
+                return None
             states.append(found.q)
         return states
 
-    def _settle(self, start: _Equilibrium | None, depth: float) -> _Equilibrium | None:
-        """Returns the equilibrium at a depth [m] of the rod, None when it is not found."""
+    def _settle(self, start: _Equilibrium | None, depth: float, tolerance: float) -> _Equilibrium | None:
+        """Returns the equilibrium at a depth [m] of the rod, to a tolerance of the unknowns; or None."""
         contact, model = self._contact, self._contact.model
         place = np.array([depth, np.log(self._radius), self._height])
         q = np.zeros(model.size)
@@ -162,7 +199,7 @@ class _Rod:
             q = q + step
             if not (np.isfinite(q).all() and state.smallest_det > 0):
                 return None
-            if np.abs(step).max() < _TOLERANCE:
+            if np.abs(step).max() < tolerance:
                 return _Equilibrium(depth=depth, q=q, state=state)
         return None
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from finforce_ifea.manifold import Manifold
 
 # To be raised when what is stored, or how it is found, changes.
-VERSION = 3
+VERSION = 5
 # What reading a damaged archive raises, one or the other by where the damage is.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, struct.error, zlib.error)
 _LOG = logging.getLogger(__name__)

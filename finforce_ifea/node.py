@@ -45,6 +45,7 @@ class IfeaSolverNode(Node):
         self.skips = Skips(SOLVER, parameters.skip_off)
         jaw = load_parameter_jaw(parameters)
         self.contacts = build_contact_feed(jaw, parameters)
+        self.get_logger().info(f"preparing jaw '{jaw.name}': a minute or two at its first start, seconds later on")
         self.estimator = build(jaw, parameters, settings)
         self.estimator.spares = self.skips.allows(AWAY)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)

@@ -1,8 +1,14 @@
 """Claims about the benchmark of skipped work: what is played when, and what its figures say."""
 
+from dataclasses import replace
+
 import pytest
 
-from finforce_eval.bench_skipping import (
+from finforce_eval.bench_skipping import EACH, OF_NODE
+from finforce_eval.errors import RecordingError
+from finforce_eval.playback import RawMessage
+from finforce_eval.scene_reel import Part, SceneReel, cut_sections, read_word
+from finforce_eval.skipping_figures import (
     OFF,
     ON,
     SceneCost,
@@ -11,12 +17,11 @@ from finforce_eval.bench_skipping import (
     draw,
     draw_costs,
     find_cost,
+    format_each,
     format_table,
 )
-from finforce_eval.errors import RecordingError
-from finforce_eval.playback import RawMessage
-from finforce_eval.scene_reel import Part, SceneReel, cut_sections, read_word
 from finforce_keypoints.parameters import COLOR_TOPIC
+from finforce_skipping import EVERYWHERE
 
 SECOND = 1_000_000_000
 
@@ -91,3 +96,19 @@ def test_the_picture_has_a_panel_for_each_scene(tmp_path):
     assert (tmp_path / "picture.png").stat().st_size > 0
     picture = draw_costs(figures())
     assert [axes.get_title(loc="left") for axes in picture.axes] == ["idle", "approach", "grasp"]
+
+
+def test_a_rule_that_is_off_alone_is_set_beside_all_of_them():
+    found = figures()
+    alone = [cost for cost in found.costs if cost.setting == OFF]
+    both = replace(found, memory={ON: {}, OFF: {}}, costs=[*found.costs, *(replace(cost, node="x") for cost in alone)])
+    line = next(line for line in format_each(both).splitlines() if line.startswith(OFF))
+    assert line.split()[-6:-4] == ["12.0", "nan"]  # 6 % each; the second node was not measured with all rules
+    only = replace(found, memory={ON: {}, OFF: {}})
+    line = next(line for line in format_each(only).splitlines() if line.startswith(OFF))
+    assert line.split()[-6:] == ["6.0", "4.5", "nan", "nan", "10.0", "6.0"]
+
+
+def test_every_rule_that_is_measured_alone_is_one_of_some_node():
+    known = {rule for rules in (EVERYWHERE, *OF_NODE.values()) for rule in rules}
+    assert {rule for off in EACH.values() for rule in off} - {""} <= known

@@ -46,6 +46,36 @@ def test_second_request_finds_what_the_first_has_built(folder):
     assert build.count == 2
 
 
+def test_any_damaged_byte_costs_a_build_at_most(folder):
+    build, random = Builder(), np.random.default_rng(0)
+    fetch_manifold(KEY, build)
+    path = folder / f"{KEY}.npz"
+    whole = path.read_bytes()
+    for _ in range(300):
+        damaged = bytearray(whole)
+        damaged[random.integers(len(whole))] ^= 1 << random.integers(8)
+        path.write_bytes(damaged)
+        assert fetch_manifold(KEY, build).young_modulus == 2.5e7
+    assert build.count > 100
+
+
+def test_what_a_killed_builder_left_is_removed_and_a_full_disk_leaves_nothing(folder, monkeypatch, caplog):
+    folder.mkdir()
+    (folder / f"{KEY}.99.part").write_bytes(b"half")
+    fetch_manifold(KEY, Builder())
+    assert not list(folder.glob("*.part"))
+
+    def fill(file, **_):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", fill)
+    with caplog.at_level(logging.WARNING):
+        fetch_manifold("other", Builder())
+    assert "cannot be stored" in caplog.text
+    assert not list(folder.glob("*.part")) and not (folder / "other.npz").exists()
+
+
 @pytest.mark.parametrize("damage", [lambda data: data[: len(data) // 2], lambda data: b"", lambda data: b"no archive"])
 def test_damaged_file_is_built_anew_and_said_so(folder, caplog, damage):
     build = Builder()

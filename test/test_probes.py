@@ -16,8 +16,10 @@ def pressed():
 
 @pytest.fixture(scope="module")
 def wide():
-    """A block so wide that its tangent is stored sparse."""
-    model = SolidModel(block((8, 8, 8), EDGE), TPU, symmetric=False)
+    """A block that is taken to be so wide that its tangent is stored sparse."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("finforce_ifea.solid._BANDED_COST_LIMIT", 1e7)
+        model = SolidModel(block((8, 8, 8), EDGE), TPU, symmetric=False)
     assert not model.banded
     return model
 

@@ -10,6 +10,8 @@ from reduced_fakes import box, press, settle
 
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
+from finforce_ifea.inverse import Problem, solve_inverse
+from finforce_ifea.jaw import load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact
 from finforce_ifea.rolling import limit_step
@@ -137,6 +139,48 @@ def test_given_contact_gives_the_force_of_the_full_solver():
     loaded = np.abs(full) > 0.3
     assert loaded.sum() > 60
     np.testing.assert_allclose(other[loaded], full[loaded], rtol=0.02)
+
+
+@pytest.mark.parametrize("height", [0.0015, 0.0026])
+def test_force_on_the_lowest_element_counts_what_the_clamp_holds(height):
+    force, _ = compare(RoundIndenter, np.log(0.004), height, [0.02e-3, 0.05e-3])
+    assert np.abs(force).max() < 0.003
+
+
+def test_wide_box_that_changes_its_edge_is_followed():
+    """Without a limit to the energy, Newton's method swings between contacts at 7 mm for ever."""
+    force, _ = compare(lambda: OutlineIndenter((box(0.03306),)), 0.01538, 0.03059, np.array([6.0, 7.0, 8.0]) * 1e-3)
+    assert np.abs(force).max() < 0.01
+
+
+def test_steel_finger_is_right_near_its_tip_where_it_stiffens_at_once():
+    jaw = load_jaw("steel")
+    full, other = (build_mechanics(jaw, EstimatorSettings(solver=name)) for name in ("frame", "reduced"))
+    depths = [0.3e-3, 1.5e-3]
+    forces = [
+        [
+            np.linalg.norm(state.force)
+            for _, state in press(each.contact, RoundIndenter(), np.log(0.0225), 0.1201, depths)
+        ]
+        for each in (full, other)
+    ]
+    np.testing.assert_allclose(forces[1], forces[0], rtol=0.01)
+
+
+@pytest.mark.parametrize("height", [0.025, 0.045, 0.065])
+def test_given_contact_is_found_from_rest_in_one_frame(height):
+    """The height on the grid follows the load at once; the full solver needs 8 iterations for 6 mm."""
+    model, face = reduced().model, BENCH.inner_face_x
+    [(bent, _)] = press(reduced().contact, RoundIndenter(), np.log(0.0125), height, [0.006])
+    points = np.array([[face, 0.0, height]])
+    problem = Problem(
+        effectors=model.attach(BENCH.keypoints, 3e-3),
+        targets=keypoints(reduced(), bent),
+        contacts=model.attach(points),
+        neighbours=model.attach(np.repeat(points, 2, axis=0) + [[0.0, 0.0, -1e-3], [0.0, 0.0, 1e-3]]),
+        weights=np.ones(1),
+    )
+    assert solve_inverse(model, problem, np.zeros(model.size), iterations=12, tolerance=5e-3).converged
 
 
 def test_forces_in_three_axes_are_refused():
