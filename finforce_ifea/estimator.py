@@ -10,7 +10,7 @@ from finforce_ifea.calibration import Calibration
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
 from finforce_ifea.gate import KeypointGate
 from finforce_ifea.jaw import Jaw
-from finforce_ifea.mechanics import Mechanics, build_mechanics, choose_solver
+from finforce_ifea.mechanics import Mechanics, build_chosen
 from finforce_ifea.observation import (
     Contact,
     Observation,
@@ -61,7 +61,7 @@ class JawEstimator:
         self.settings = settings or EstimatorSettings()
         self.calibration = calibration
         self.jaw = calibration.apply(jaw) if calibration else jaw
-        self.mechanics: Mechanics = build_mechanics(self.jaw, choose_solver(self.settings))
+        self.mechanics: Mechanics = build_chosen(self.jaw, self.settings)
         self._rolling = PlaceTracker(self.mechanics.contact, self.jaw.keypoints, self.settings)
         self._pointed = PointTracker(self.jaw, self.mechanics, self.settings, self._rolling.response)
         self._tracker: PlaceTracker | PointTracker = self._rolling
@@ -244,7 +244,7 @@ class JawEstimator:
         return self._relaxation.update(elastic, dt)
 
     def _solution(self, track: Track, force: NDArray, used: NDArray) -> Solution:
-        extrapolated = _EXTRAPOLATED * track.extrapolation**2
+        extrapolated = _EXTRAPOLATED * track.extrapolation
         share = float(np.sqrt(self._force_error**2 + track.place_error**2 + extrapolated**2))
         numbers = find_numbers(
             force,

@@ -1,8 +1,9 @@
 """The mechanics of a jaw by name: mesh, model and contact surface; knows no key point."""
 
+import logging
 from dataclasses import dataclass, replace
 
-from finforce_ifea.errors import JawFileError
+from finforce_ifea.errors import ContactError, JawFileError
 from finforce_ifea.jaw import Jaw
 from finforce_ifea.locking import warn_of_locking
 from finforce_ifea.mesh import VolumeMesh
@@ -62,6 +63,24 @@ def choose_solver(settings: EstimatorSettings) -> EstimatorSettings:
     if settings.solver == "default" and settings.force_axes == "normal":
         return replace(settings, solver="reduced")
     return settings
+
+
+def build_chosen(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
+    """Builds the mechanics of an estimator; a jaw of which no equilibria can be stored is described in full by default.
+
+    Raises:
+        JawFileError: The jaw cannot be described by the model that is named.
+        MeshError: The mesh cannot be built.
+        ContactError: The jaw cannot be pressed, and "reduced" was asked for.
+    """
+    chosen = choose_solver(settings)
+    try:
+        return build_mechanics(jaw, chosen)
+    except ContactError as error:
+        if chosen is settings:
+            raise
+        logging.getLogger(__name__).warning("no stored equilibria of %s (%s); every step is slower", jaw.name, error)
+        return build_mechanics(jaw, settings)
 
 
 def choose_full(settings: EstimatorSettings) -> EstimatorSettings:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from threading import Timer
 from time import perf_counter
 from typing import Any
 
@@ -24,6 +25,8 @@ from finforce_ifea.parameters import NodeParameters, build_contact_feed, build_e
 from finforce_ifea.report import describe_solution, outcome_of_solution, peer_alarms
 from finforce_ifea.settings import EstimatorSettings
 from finforce_skipping import AWAY, IDLE, LATE, SOLVER, Skips
+
+SLOW = 4.0  # s of preparation, after which somebody may wonder
 
 
 class IfeaSolverNode(Node):
@@ -45,8 +48,8 @@ class IfeaSolverNode(Node):
         self.skips = Skips(SOLVER, parameters.skip_off)
         jaw = load_parameter_jaw(parameters)
         self.contacts = build_contact_feed(jaw, parameters)
-        self.get_logger().info(f"preparing jaw '{jaw.name}': a minute or two at its first start, seconds later on")
-        self.estimator = build(jaw, parameters, settings)
+        with self._patience(jaw.name):
+            self.estimator = build(jaw, parameters, settings)
         self.estimator.spares = self.skips.allows(AWAY)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
         self.health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
@@ -58,6 +61,17 @@ class IfeaSolverNode(Node):
         self._subscribe(parameters.jaw_name)
         source = "fixed" if self.contacts.is_fixed else "by topic"
         self.get_logger().info(f"{parameters.jaw_name} jaw '{jaw.name}' ready, contact {source}")
+
+    @contextmanager
+    def _patience(self, jaw: str) -> Iterator[None]:
+        """Say what takes so long, if it does."""
+        words = f"preparing jaw '{jaw}': a minute or two at its first start, seconds later on"
+        late = Timer(SLOW, lambda: self.get_logger().info(words))
+        late.start()
+        try:
+            yield
+        finally:
+            late.cancel()
 
     def _serve(self, side: str) -> None:
         """Offer services and diagnostics."""

@@ -8,14 +8,15 @@ from estimator_fakes import magnitudes, make_estimator, ramp, record, run
 from mechanics_fakes import BENCH, bench_mechanics
 from reduced_fakes import box, press, settle
 
-from finforce_ifea.errors import JawFileError
+from finforce_ifea.errors import ContactError, JawFileError
 from finforce_ifea.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
 from finforce_ifea.inverse import Problem, solve_inverse
 from finforce_ifea.jaw import load_jaw
-from finforce_ifea.mechanics import build_mechanics
+from finforce_ifea.mechanics import build_chosen, build_mechanics
 from finforce_ifea.observation import Contact
 from finforce_ifea.rolling import limit_step
 from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.solid import SolidModel
 
 DEPTHS = np.array([0.5, 2.0, 5.0, 10.0]) * 1e-3
 # Steps of depth [m], log radius and height [m] for central differences.
@@ -194,3 +195,15 @@ def test_steps_are_limited_by_the_reach_of_loads_and_grid_coordinates():
     limited = limit_step(model, 100.0 * step)
     assert np.isclose((np.abs(limited) / model.reach).max(), 1.0)
     np.testing.assert_array_equal(limit_step(model, 1e-6 * step), 1e-6 * step)
+
+
+def test_jaw_of_which_nothing_can_be_stored_is_described_in_full_unless_reduced_is_asked_for(monkeypatch, caplog):
+    def refuse(*_):
+        raise ContactError("the jaw cannot be pressed")
+
+    monkeypatch.setattr("finforce_ifea.reduction.fetch_manifold", refuse)
+    chosen = build_chosen(BENCH, EstimatorSettings(mesh="coarse"))
+    assert isinstance(chosen.model, SolidModel)
+    assert "the jaw cannot be pressed" in caplog.text
+    with pytest.raises(ContactError):
+        build_chosen(BENCH, EstimatorSettings(mesh="coarse", solver="reduced"))
