@@ -38,6 +38,8 @@ _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are un
 _UNCALIBRATED = 0.1
 # Relative error of forces at the distance from stored shapes that those are good for.
 _EXTRAPOLATED = 0.015
+# Relative error of a jaw that is taken to be linear, 10 mm deep.
+_LINEAR = 0.05
 # Share of a force that nobody has seen along z.
 _LEAN = 0.3
 
@@ -68,7 +70,8 @@ class JawEstimator:
         self._gate = KeypointGate(self.jaw, self.settings)
         self._relaxation = Relaxation(calibration.relaxation if calibration else ())
         solver = self.settings.solver
-        self._force_error = calibration.expect_error(self.jaw, solver) if calibration else _UNCALIBRATED
+        known = calibration.expect_error(self.jaw, solver) if calibration else _UNCALIBRATED
+        self._force_error = float(np.hypot(known, _LINEAR)) if solver == "linear" else known
         self._taring = TareKeeper(
             self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
         )

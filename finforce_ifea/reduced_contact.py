@@ -26,7 +26,9 @@ class ReducedContact:
         upper = np.clip(np.searchsorted(model.manifold.heights, surface.heights) - 1, 0, shares.shape[1] - 1)
         share = shares[np.arange(len(upper)), upper]
         self._face = FaceRows(surface.points, upper - 1, share, model.manifold.rods)
-        self._farthest = _FARTHEST_SHAPE * (surface.heights[-1] - surface.heights[0])
+        length = surface.heights[-1] - surface.heights[0]
+        # the rest alone is stored on purpose where no rod was pressed in
+        self._farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
         self._tables = (model.manifold.moves, model.compliance, model.loads)
 
     def begin(self, height: float) -> NDArray:
