@@ -36,7 +36,7 @@ def require_onnx() -> Any:
     Raises:
         MissingDependencyError: it is not installed.
     """
-    return import_library("onnx", "other forms of the network")
+    return import_library("onnx", "another form of the network")
 
 
 def write_dynamic(folder: Path) -> Path:
