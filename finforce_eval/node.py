@@ -64,11 +64,15 @@ class PlayerNode(Node):
         super().destroy_node()
 
     def has_listeners(self, topics: Iterable[str]) -> bool:
-        """Say whether somebody listens to each of the topics, whether they are played from here or not."""
-        return all(
-            self._outputs[topic].get_subscription_count() if topic in self._outputs else self.count_subscribers(topic)
-            for topic in topics
-        )
+        """Say whether somebody else listens to each of the topics, whether they are played from here or not."""
+        return all(self._count_others(topic) > 0 for topic in topics)
+
+    def _count_others(self, topic: str) -> int:
+        """Return how many listen to a topic beside this node."""
+        own = sum(subscription.topic_name == topic for subscription in self.subscriptions)
+        if topic in self._outputs:
+            return self._outputs[topic].get_subscription_count() - own
+        return self.count_subscribers(topic) - own
 
     def wait_for(self, condition: Callable[[], bool], patience: float) -> bool:
         """Spin until a condition holds, for at most `patience` [s]; return whether it does."""
