@@ -31,6 +31,7 @@ from finforce_graph import Process, ReplayOptions, replay_processes
 from finforce_ifea.errors import MissingDependencyError
 from finforce_ifea.jaw import Jaw
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce_skipping import IDLE
 
 PATIENCE = 180.0  # s; a first start compiles the element loops
 LINGER = 0.3  # s; the last answers may still be on their way when the last message has left
@@ -110,7 +111,7 @@ def replay(
         options = _graph_options(recording, setup, calibration_file, playing)
         processes = replay_processes(replace(options, images=from_images), Path())
         log = ReplayLog(sides)
-        _run(_with_detector(processes, recording, keypoints), messages, log, playing)
+        _run(_for_scores(processes, recording, keypoints), messages, log, playing)
     if from_images:
         recording = with_detections(recording, {side: found.side_log() for side, found in log.detections.items()})
     evaluation = _score(recording, setup, log)
@@ -157,14 +158,12 @@ def _unplayed(sides: Sequence[str], from_images: bool) -> set[str]:
     return {COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC}
 
 
-def _with_detector(processes: Sequence[Process], recording: Recording, keypoints: KeypointSource) -> list[Process]:
-    """Return the processes, that of the key point detector with the parameters of the recording's camera."""
-    return [
-        replace(process, parameters={**process.parameters, **keypoints.node_parameters(recording)})
-        if process.executable == "keypoint_detector"
-        else process
-        for process in processes
-    ]
+def _for_scores(processes: Sequence[Process], recording: Recording, keypoints: KeypointSource) -> list[Process]:
+    """Return the processes that answer every image, so that each is scored; the detector knows the camera's parameters."""
+    more = {name: {"skip_off": [IDLE]} for name in ("keypoint_detector", "contact_estimator", "ifea_solver")}
+    if any(each.executable == "keypoint_detector" for each in processes):
+        more["keypoint_detector"] |= keypoints.node_parameters(recording)
+    return [replace(each, parameters={**each.parameters, **more.get(each.executable, {})}) for each in processes]
 
 
 def _results_of(sides: Sequence[str]) -> set[str]:
