@@ -159,7 +159,7 @@ def _unplayed(sides: Sequence[str], from_images: bool) -> set[str]:
 
 
 def _for_scores(processes: Sequence[Process], recording: Recording, keypoints: KeypointSource) -> list[Process]:
-    """Return the processes that answer every image, so that each is scored; the detector knows the camera's parameters."""
+    """Return the processes: they answer every image, so that each is scored, and the detector knows the camera."""
     more = {name: {"skip_off": [IDLE]} for name in ("keypoint_detector", "contact_estimator", "ifea_solver")}
     if any(each.executable == "keypoint_detector" for each in processes):
         more["keypoint_detector"] |= keypoints.node_parameters(recording)
