@@ -17,6 +17,7 @@ from finforce_ifea.reduced_loops import SHALLOW, follow, move_points, place_poin
 
 # The depth on the grid waits until its height is so near.
 _BESIDE = 1.0
+_ON_FACE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,6 +35,25 @@ class ReducedProbe:
     shapes: NDArray
     compliance: NDArray
     rows: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FacePoints:
+    """Points of the inner face, which the rows beside them move.
+
+    Attributes:
+        points: undeformed positions (p, 3) [m].
+        rows: what share each row has in a point (p, n).
+    """
+
+    points: NDArray
+    rows: NDArray
+
+    def spread(self, moves: NDArray) -> NDArray:
+        """Returns the motions (p, 3) [m] of the points for those of the rows (2 n,) [m]."""
+        out = np.zeros(self.points.shape)
+        out[:, ::2] = self.rows @ moves.reshape(-1, 2)
+        return out
 
 
 class _Identity:
@@ -54,8 +74,9 @@ class ReducedModel:
 
     rotations = None
 
-    def __init__(self, manifold: Manifold, full: JawModel, young_modulus: float) -> None:
-        """Scales a manifold to a modulus [Pa] of the jaw that `full` describes."""
+    def __init__(self, manifold: Manifold, full: JawModel, young_modulus: float, face_x: float) -> None:
+        """Scales a manifold to a modulus [Pa] of the jaw that `full` describes, its inner face in the plane x [m]."""
+        self._face_x = face_x
         factor = young_modulus / manifold.young_modulus
         self.manifold, self._full = scale_manifold(manifold, factor), full
         self.rows = manifold.loads.shape[2]
@@ -87,9 +108,13 @@ class ReducedModel:
         """Returns the motions of the rows (2 n,) [m], x and z interleaved."""
         return follow(self.manifold.moves, self.compliance, self.loads, q)
 
-    def attach(self, points: NDArray, max_distance: float = 1e-3) -> ReducedProbe:
+    def attach(self, points: NDArray, max_distance: float = 1e-3) -> ReducedProbe | FacePoints:
         """Returns a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
         points = np.array(points, float)
+        low, high = self.manifold.heights[[0, -1]]
+        on_face = (np.abs(points[:, 0] - self._face_x) < _ON_FACE) & (points[:, 2] >= low) & (points[:, 2] <= high)
+        if on_face.all():
+            return FacePoints(points=points, rows=share_rows(self.manifold.heights, points[:, 2]))
         full, basis, zero = self._full, self.manifold.basis, np.zeros(self._full.size)
         motion = full.project(full.attach(points, max_distance), zero, basis).reshape(3 * len(points), -1)
         return ReducedProbe(
@@ -99,15 +124,20 @@ class ReducedModel:
             rows=share_rows(self.manifold.heights, points[:, 2]),
         )
 
-    def positions(self, probe: ReducedProbe, q: NDArray) -> NDArray:
+    def positions(self, probe: ReducedProbe | FacePoints, q: NDArray) -> NDArray:
         """Returns the deformed positions (p, 3) [m] of a probe."""
+        if isinstance(probe, FacePoints):
+            return probe.points + probe.spread(self.moves(q))
         return place_points(probe.points, probe.shapes, probe.compliance, self.loads, q)
 
-    def project(self, probe: ReducedProbe, q: NDArray, modes: NDArray) -> NDArray:
-        """Returns the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the unknowns."""
+    def project(self, probe: ReducedProbe | FacePoints, q: NDArray, modes: NDArray) -> NDArray:
+        """Returns the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the loads alone."""
+        if isinstance(probe, FacePoints):
+            now = self.moves(q)
+            return np.stack([probe.spread(self.moves(q + mode) - now) for mode in modes.T], axis=2)
         return move_points(probe.compliance, q, np.ascontiguousarray(modes))
 
-    def load(self, probe: ReducedProbe, q: NDArray, forces: NDArray) -> NDArray:
+    def load(self, probe: ReducedProbe | FacePoints, q: NDArray, forces: NDArray) -> NDArray:
         """Returns the loads (size,) [N] at the rows of forces (p, 3) [N] at points of the inner face."""
         return np.r_[(probe.rows.T @ forces[:, [0, 2]]).ravel(), 0.0, 0.0]
 

@@ -31,7 +31,7 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
         manifold = build_rest(full, modulus)
     else:
         manifold = fetch_manifold(name_manifold(full, jaw), lambda: _build_watched(full, jaw))
-    model = ReducedModel(manifold, full.model, modulus)
+    model = ReducedModel(manifold, full.model, modulus, full.contact.face_x)
     surface = full.contact.surface
     middle = surface.points[:: surface.across].copy()
     middle[:, 1] = 0.0

@@ -207,3 +207,17 @@ def test_jaw_of_which_nothing_can_be_stored_is_described_in_full_unless_reduced_
     assert "the jaw cannot be pressed" in caplog.text
     with pytest.raises(ContactError):
         build_chosen(BENCH, EstimatorSettings(mesh="coarse", solver="reduced"))
+
+
+def test_points_of_the_inner_face_move_with_its_rows_as_the_full_mechanics_has_them():
+    full, other = bench_mechanics(), reduced()
+    points = np.array([[BENCH.inner_face_x, 0.0, height] for height in (0.021, 0.0405, 0.066)])
+    [(a, _)] = press(full.contact, RoundIndenter(), np.log(0.0125), 0.040, [0.006])
+    [(b, state)] = press(other.contact, RoundIndenter(), np.log(0.0125), 0.040, [0.006])
+    probe = other.model.attach(points)
+    found = other.model.positions(probe, b)
+    # the middle of the face bends a little more than the mean across it
+    np.testing.assert_allclose(found, full.model.positions(full.model.attach(points, 1e-3), a), atol=0.08e-3)
+    small = 1e-6 * state.modes
+    moved = np.stack([other.model.positions(probe, b + mode) - found for mode in small.T], axis=2)
+    np.testing.assert_allclose(other.model.project(probe, b, small), moved, atol=1e-12)
