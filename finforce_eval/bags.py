@@ -144,12 +144,6 @@ def damage_reported(name: str) -> Iterator[None]:
         raise RecordingError(f"{name}: truncated or damaged: {reason}") from error
 
 
-def read_stamp(data: bytes | memoryview) -> int:
-    """Return the stamp [ns] of CDR bytes that begin with a std_msgs/Header."""
-    seconds, nanoseconds = struct.unpack_from(_stamp_layout(data), data, 4)
-    return seconds * NANOSECONDS + nanoseconds
-
-
 def restamp(data: bytes | memoryview, stamp: int) -> bytes:
     """Return CDR bytes that begin with a std_msgs/Header with another stamp [ns]."""
     changed = bytearray(data)

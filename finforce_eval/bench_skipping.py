@@ -19,9 +19,9 @@ from finforce_eval.bench_scenes import BenchScene, find_scene
 from finforce_eval.cpu_share import CpuMeter, busy_seconds
 from finforce_eval.live import ReplayLog
 from finforce_eval.memory import resident_bytes
-from finforce_eval.node_run import PATIENCE, find_processes
+from finforce_eval.node_run import await_listeners, find_processes
 from finforce_eval.playback import RawMessage, read_playback
-from finforce_eval.processes import ProcessError, ProcessGroup
+from finforce_eval.processes import ProcessGroup
 from finforce_eval.recording import read_recording
 from finforce_eval.scene_reel import OBJECT_TOPIC, Part, SceneReel, Span, cut_sections
 from finforce_eval.skipping_figures import (  # noqa: F401 - for those who print and draw
@@ -183,12 +183,7 @@ def _run(nodes: Sequence[Process], reel: SceneReel, setting: str) -> _Run:
         player.offer(reel)
         player.listen((), log)  # the grasp force and diagnostics: more listeners would ask for more work
 
-        def ready() -> bool:
-            group.check()
-            return player.has_listeners(awaited)
-
-        if not player.wait_for(ready, PATIENCE):
-            raise ProcessError(f"nobody listens to {' or '.join(awaited)} after {PATIENCE:g} s")
+        await_listeners(player, group, awaited)
         player.spin_until(monotonic() + 0.5)
         pids = find_processes([node.name for node in nodes])
         watch = _Watch(CpuMeter(pids), reel, lambda: len(log.grasp), setting)

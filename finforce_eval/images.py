@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from finforce_camera import MILLIMETRE, CameraIntrinsics, ImageError, IntrinsicsError
 from finforce_contact.messages import camera_from_info, same_camera
-from finforce_eval.bags import BagReader, check_types, open_bag, read_stamp
+from finforce_eval.bags import BagReader, check_types, open_bag
 from finforce_eval.errors import RecordingError
 from finforce_eval.image_messages import CAMERA_INFO, COMPRESSED, IMAGE, color_from_message, depth_from_message
 from finforce_ifea.errors import ObservationError
+from finforce_ifea.messages import read_stamp
 from finforce_keypoints.images import RgbdImage, check_image
 
 # the ends of topics by which the images are found, whatever the camera is called; the first that is there counts

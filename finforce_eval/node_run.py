@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from os import getpid
 from pathlib import Path
 from time import monotonic, time_ns
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from finforce_eval.cpu_share import CpuMeter, busy_seconds
 from finforce_eval.film import Film
@@ -19,6 +19,9 @@ from finforce_eval.memory import child_processes, resident_bytes
 from finforce_eval.playback import RawMessage
 from finforce_eval.processes import ProcessError, ProcessGroup
 from finforce_ifea.errors import MissingDependencyError
+
+if TYPE_CHECKING:
+    from finforce_eval.node import PlayerNode
 
 PATIENCE = 180.0  # [s]; a first start compiles the element loops
 PLAYER = "player"
@@ -66,6 +69,21 @@ class NodeRun:
     seconds: float
 
 
+def await_listeners(player: PlayerNode, nodes: ProcessGroup, topics: Collection[str]) -> None:
+    """Wait until somebody beside the player listens to each of the topics.
+
+    Raises:
+        ProcessError: a process ended, or nobody listens after three minutes.
+    """
+
+    def ready() -> bool:
+        nodes.check()
+        return player.has_listeners(topics)
+
+    if not player.wait_for(ready, PATIENCE):
+        raise ProcessError(f"nobody listens to {' or '.join(topics)} after {PATIENCE:g} s")
+
+
 def run_nodes(
     processes: Sequence[Runnable], film: Film, sides: Sequence[str], awaited: Collection[str], *, detector: bool = False
 ) -> NodeRun:
@@ -93,12 +111,7 @@ def run_nodes(
         player.offer(film)
         player.listen(sides, log, detector=detector)
 
-        def ready() -> bool:
-            nodes.check()
-            return player.has_listeners(awaited)
-
-        if not player.wait_for(ready, PATIENCE):
-            raise ProcessError(f"nobody listens to {' or '.join(awaited)} after {PATIENCE:g} s")
+        await_listeners(player, nodes, awaited)
         player.spin_until(monotonic() + LINGER)
         pids = find_processes([process.name for process in processes])
         meter = CpuMeter({**pids, PLAYER: getpid()})

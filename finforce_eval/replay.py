@@ -21,9 +21,10 @@ from finforce_eval.evaluate import Evaluation, check_keypoint_count, score_resul
 from finforce_eval.grasp_scoring import GraspScore, score_grasp
 from finforce_eval.keypoint_source import IMAGES, TRUTH, KeypointSource
 from finforce_eval.live import ReplayLog, live_result
+from finforce_eval.node_run import await_listeners
 from finforce_eval.objects import find_mesh, require_mesh
 from finforce_eval.playback import Playback, RawMessage, read_playback
-from finforce_eval.processes import ProcessError, ProcessGroup
+from finforce_eval.processes import ProcessGroup
 from finforce_eval.results import CaseResult
 from finforce_eval.tracks import Recording
 from finforce_eval.writer import write_recording
@@ -33,7 +34,6 @@ from finforce_ifea.jaw import Jaw
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_skipping import IDLE
 
-PATIENCE = 180.0  # s; a first start compiles the element loops
 LINGER = 0.3  # s; the last answers may still be on their way when the last message has left
 RESULTS = ("wrench", "wrench_stddev", "surface", "markers", "contact", "object_outline")
 
@@ -224,12 +224,7 @@ def _run(processes: Sequence[Process], messages: Playback, log: ReplayLog, playi
         player.offer(messages)
         player.listen(log.jaws, log, detector=detects)
 
-        def ready() -> bool:
-            nodes.check()
-            return player.has_listeners(awaited)
-
-        if not player.wait_for(ready, PATIENCE):
-            raise ProcessError(f"nobody listens to {' or '.join(awaited)} after {PATIENCE:g} s")
+        await_listeners(player, nodes, awaited)
         player.spin_until(monotonic() + LINGER)
         bar = stack.enter_context(tqdm(total=len(messages), unit="msg", desc="replay", disable=None))
         log.offset = 0 if playing.has_clock else time_ns() - messages.begin

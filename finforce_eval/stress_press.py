@@ -15,13 +15,12 @@ from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.forward import Cylinder, Press, press_jaw
 from finforce_ifea.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_mechanics
+from finforce_ifea.penalty import measure_penalty_energy
 from finforce_ifea.settings import EstimatorSettings
 
 # The truth comes from the estimator's own mechanics: no more than this share of a force is left to it.
 FORCE_ERROR = 0.01
 COURSE_STEPS = 16
-# The penalty of the contact rises quadratically over this depth [m].
-SMOOTH_DEPTH = 2e-5
 OWN_MECHANICS = ("solid", "frame")
 
 
@@ -104,14 +103,5 @@ class Bench:
         work = float(PchipInterpolator(grid, pushes).integrate(grid[0], grid[-1]))
         points = model.positions(surface.probe, presses[-1].q)
         contact = rigid.press(points, surface.stiffness, self.jaw.inner_face_x, presses[-1].depth, height)
-        springs = float(_spring_energy(np.linalg.norm(contact.forces, axis=1), surface.stiffness).sum())
-        energy = presses[-1].energy + springs
+        energy = presses[-1].energy + measure_penalty_energy(contact.forces, surface.stiffness)
         return (work - energy) / max(work, energy)
-
-
-def _spring_energy(push: NDArray, stiffness: NDArray) -> NDArray:
-    """Returns the energy (p,) [J] of springs that push (p,) [N], quadratic over their first 20 um."""
-    kink = 0.5 * stiffness * SMOOTH_DEPTH
-    sunk = np.where(push < kink, np.sqrt(2.0 * SMOOTH_DEPTH * push / stiffness), push / stiffness + 0.5 * SMOOTH_DEPTH)
-    first = stiffness * np.minimum(sunk, SMOOTH_DEPTH) ** 3 / (6.0 * SMOOTH_DEPTH)
-    return first + np.where(push < kink, 0.0, 0.5 * (push**2 - kink**2) / stiffness)

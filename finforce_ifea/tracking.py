@@ -132,10 +132,9 @@ class PlaceTracker:
 
     def _is_settled(self, state: PressedState, moved: NDArray, missing: NDArray) -> bool:
         """Whether the last iteration changed nothing that matters."""
-        if state.size >= _SETTLED_CORRECTION:
-            return False
         change = (_SETTLED_MOVE, self.contact.indenter.shape_range.settled_change, _SETTLED_MOVE)
-        return all(max(abs(m), abs(k)) < c for m, k, c in zip(moved, missing, change, strict=True))
+        small = all(max(abs(m), abs(k)) < c for m, k, c in zip(moved, missing, change, strict=True))
+        return small and state.size < _SETTLED_CORRECTION
 
     def _find_touch(self, place: NDArray) -> float:
         """Returns the depth [m] at which the object of a place (3,) first touches the undeformed jaw."""

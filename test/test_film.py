@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from rgbd_fakes import CAMERA, MESH, FakeGripper, FakePhotographer
 
-from finforce_eval.bags import read_stamp
 from finforce_eval.bench_scenes import EVERY_RATE, FINE_RATE, START, SmoothGripper, slot_of
 from finforce_eval.errors import RecordingError
 from finforce_eval.film import MASK_TOPIC, OBJECT_TOPIC, film_images, film_keypoints, film_mask, thin_messages
 from finforce_eval.image_messages import IMAGE
 from finforce_eval.playback import RawMessage
 from finforce_eval.twin_writer import write_footage
+from finforce_ifea.messages import read_stamp
 from finforce_keypoints.gripper_geometry import BENCH_CAMERA
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_twin.photographer import Setting
