@@ -11,7 +11,7 @@ ROS := $(if $(AMENT_PREFIX_PATH),ament,plain)
 .PHONY: demo test lint bench build clean
 
 demo: .venv/.$(ROS)-run
-	$(PYTHON) -m finforce_eval.cli demo --report report
+	$(PYTHON) -m finforce_eval.cli.main demo --report report
 
 test: .venv/.$(ROS)-test
 	$(PYTHON) -m pytest
@@ -21,7 +21,7 @@ lint: .venv/.$(ROS)-lint
 	$(PYTHON) -m ruff format --check .
 
 bench: .venv/.$(ROS)-run
-	$(PYTHON) -m finforce_eval.cli bench --json report/bench.json
+	$(PYTHON) -m finforce_eval.cli.main bench --json report/bench.json
 
 build: .venv/.$(ROS)-build
 	$(PYTHON) -m colcon build --event-handlers console_cohesion+

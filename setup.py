@@ -2,7 +2,7 @@
 
 from glob import glob
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 NAME = "finforce"
 
@@ -12,39 +12,12 @@ setup(
     description="Grasp force from the key points of fin-ray jaws, by a mechanical model of the jaw.",
     license="Apache-2.0",
     python_requires=">=3.10",
-    packages=[
-        "finforce_contact",
-        "finforce_driver",
-        "finforce_driver.emulator",
-        "finforce_eval",
-        "finforce_ifea",
-        "finforce_keypoints",
-        "finforce_twin",
-    ],
-    py_modules=[
-        "finforce_bounded",
-        "finforce_camera",
-        "finforce_errors",
-        "finforce_executor",
-        "finforce_graph",
-        "finforce_health",
-        "finforce_heap",
-        "finforce_launch",
-        "finforce_messages",
-        "finforce_optional",
-        "finforce_options",
-        "finforce_raw_image",
-        "finforce_records",
-        "finforce_ros",
-        "finforce_setups",
-        "finforce_skipping",
-        "finforce_start",
-        "finforce_transport",
-    ],
+    packages=find_packages(include=["finforce", "finforce.*", "finforce_*"]),
     package_data={
-        "finforce_ifea": ["jaws/*", "calibrations/*"],
+        "finforce.ros": ["fastdds.xml"],
+        "finforce_ifea.jaw": ["jaws/*", "calibrations/*"],
         "finforce_eval": ["data/*", "data/*/*", "data/*/*/*"],
-        "finforce_keypoints": ["models/*/*", "transport/*"],
+        "finforce_keypoints": ["models/*/*"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
@@ -92,13 +65,13 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "finforce = finforce_eval.cli:main",
-            "contact_estimator = finforce_start:contact_estimator",
-            "gripper_driver = finforce_start:gripper_driver",
-            "ifea_solver = finforce_start:ifea_solver",
-            "keypoint_detector = finforce_start:keypoint_detector",
-            "recording_player = finforce_start:recording_player",
-            "twin_camera = finforce_start:twin_camera",
+            "finforce = finforce_eval.cli.main:main",
+            "contact_estimator = finforce.ros.start:contact_estimator",
+            "gripper_driver = finforce.ros.start:gripper_driver",
+            "ifea_solver = finforce.ros.start:ifea_solver",
+            "keypoint_detector = finforce.ros.start:keypoint_detector",
+            "recording_player = finforce.ros.start:recording_player",
+            "twin_camera = finforce.ros.start:twin_camera",
         ],
     },
 )

@@ -14,16 +14,16 @@ from typing import Any
 
 from tqdm import tqdm
 
-from finforce_eval.bench import write_figures
-from finforce_eval.cli import add_jaw_options
-from finforce_eval.commands import Setup, make_setup
-from finforce_eval.contacts import parse_contacts
+from finforce_eval.bench.bench import write_figures
+from finforce_eval.cli.evaluate import Setup, make_setup
+from finforce_eval.cli.main import add_jaw_options
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluate import evaluate_recording, score_results
-from finforce_eval.recording import read_recording
-from finforce_eval.results import CaseResult
-from finforce_eval.scoring import CaseScore
-from finforce_eval.tracks import Recording
+from finforce_eval.evaluation.contact_choice import parse_contacts
+from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.evaluation.scoring import CaseScore
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import Recording
 
 PLACES = {"upper": 60, "middle": 40, "lower": 20}
 COLUMNS = {

@@ -29,14 +29,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from finforce_driver.bus import Frame
+from finforce_driver.can.bus import Frame
+from finforce_driver.can.protocol import Command, decode_move, split_identifier
+from finforce_driver.can.serial_bus import SerialBus
 from finforce_driver.errors import DriverError
 from finforce_driver.gripper import Gripper
-from finforce_driver.protocol import Command, decode_move, split_identifier
-from finforce_driver.serial_bus import SerialBus
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import Phase
-from finforce_eval.bench import describe_machine, row_from_times, write_figures
+from finforce_eval.bench.bench import describe_machine, row_from_times, write_figures
 
 STARTED = 10.0  # [s] that the emulator may take
 

@@ -22,7 +22,8 @@ from driver_oracle import Guard, Oracle, Tape
 from driver_tally import Tally, print_tally, tally_json
 from tqdm import tqdm
 
-from finforce_driver.bus import Frame
+from finforce_driver.can.bus import Frame
+from finforce_driver.can.protocol import Command, decode_move, split_identifier
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, draw_plan
 from finforce_driver.emulator.firmware import EmulatedGripper
@@ -30,10 +31,9 @@ from finforce_driver.emulator.protection import Fault
 from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
 from finforce_driver.errors import DriverError
 from finforce_driver.gripper import Gripper
-from finforce_driver.protocol import Command, decode_move, split_identifier
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, Outcome, Phase
-from finforce_eval.bench import describe_machine, write_figures
+from finforce_eval.bench.bench import describe_machine, write_figures
 
 PER_RUN = 100
 PERIOD = 0.4  # [s] in which one fault is injected

@@ -1,4 +1,4 @@
-"""Compares what a driver says of an emulated gripper with the truth, state by state; knows no driver's inside."""
+"""Compares what a driver says of an emulated gripper with the truth, state by state."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import math
 from collections import Counter, deque
 from dataclasses import dataclass
 
+from finforce_driver.can.protocol import Move
 from finforce_driver.emulator.control import Mode
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.mechanism import Jaws
 from finforce_driver.emulator.protection import Fault
-from finforce_driver.protocol import Move
 from finforce_driver.state import GripperState, Outcome, Phase
 from finforce_driver.units import GripperScale
 

@@ -1,4 +1,4 @@
-"""What came out of runs with faults, added up, printed, and as JSON; knows no driver."""
+"""What came out of runs with faults, added up, printed, and as JSON."""
 
 from __future__ import annotations
 

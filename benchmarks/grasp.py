@@ -24,8 +24,8 @@ from grasp_twin import TWINS, EstimatorSensor, build_plant, build_pressed
 from grasp_world import Case, Course, NoisySensor, Plant, World, build_spring
 from tqdm import tqdm
 
-from finforce_driver.grasp_status import GraspPhase
-from finforce_eval.bench import describe_machine, write_figures
+from finforce_driver.grasp.status import GraspPhase
+from finforce_eval.bench.bench import describe_machine, write_figures
 
 FORCES = (1.0, 2.0, 3.0, 4.0, 5.0)  # [N]
 SPEEDS = (0.004, 0.008)  # [m/s] of the opening: 4 mm/s of the opening, and of each jaw

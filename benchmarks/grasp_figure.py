@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from finforce_eval.figures import BLACK, BLUE, GREY, ORANGE, new_figure, style_axes
+from finforce_eval.figures.figures import BLACK, BLUE, GREY, ORANGE, new_figure, style_axes
 
 BEFORE, AFTER = -0.4, 6.0  # [s] about first touch that are drawn
 

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.estimator import ContactEstimator
-from finforce_ifea.calibration import load_calibration
 from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.gripper import R_GRIPPER_JAW
+from finforce_ifea.grasp_force import R_GRIPPER_JAW
+from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.observation import Observation, Solution
-from finforce_twin.pressing import PressedGrasp
-from finforce_twin.scenarios import build_scenario
+from finforce_twin.gripper.pressing import PressedGrasp
+from finforce_twin.scenes.scenarios import build_scenario
 
 POINT_NOISE = 0.15e-3  # [m] per axis, of a detected key point from image to image
 POSE_PERIOD, POSE_SHIFT, POSE_TURN = 0.1, 0.3e-3, np.deg2rad(0.3)  # [s], [m], [rad] of the object's tracker

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from finforce_eval.bench import write_figures
-from finforce_eval.bench_detection import time_product
-from finforce_eval.bench_scenes import FIRST_SEED, UNSEEN, record_unseen
-from finforce_eval.cli import main as finforce
-from finforce_ifea.errors import FinforceError
+from finforce.errors import FinforceError
+from finforce_eval.bench.bench import write_figures
+from finforce_eval.bench.detection import time_product
+from finforce_eval.bench.scenes import FIRST_SEED, UNSEEN, record_unseen
+from finforce_eval.cli.main import main as finforce
 
 SOURCES = ("images", "truth")
 COLUMNS = (

@@ -18,9 +18,9 @@ from peer_measure import DEFAULT, FULL, OUTLINE, measure_all
 from peer_rows import HEAD, Figures, join_names, list_rows
 from speed_page import fill_page, name_places
 
-from finforce_eval.bench import describe_machine, write_figures
-from finforce_eval.bench_solvers import SOFA
-from finforce_eval.markdown import markdown_rows
+from finforce_eval.bench.bench import describe_machine, write_figures
+from finforce_eval.bench.solvers import SOFA
+from finforce_eval.evaluation.markdown import markdown_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 RATE_AIM, ERROR_AIM = 80.0, 0.1

@@ -1,4 +1,4 @@
-"""What the comparison with the peer measures itself: steps beside a yardstick, noise, starts; knows no page."""
+"""What the comparison with the peer measures itself: steps beside a yardstick, noise, starts."""
 
 import json
 import os
@@ -15,14 +15,14 @@ import numpy as np
 from peer_install import measure_installation, read_project
 from tqdm import tqdm
 
-from finforce_eval.bench import row_from_times, time_calls
-from finforce_eval.bench_cases import LEVELS, Press, bench_finger, load_cases, record_press
-from finforce_eval.bench_growth_solver import factorise_sparse
-from finforce_eval.bench_scores import score_shapes
-from finforce_eval.bench_tiers import TIERS, Run, Tier, run_tier
-from finforce_eval.processes import ProcessError
-from finforce_ifea.jaw import load_jaw
-from finforce_ifea.solid import SolidModel
+from finforce_eval.bench.bench import row_from_times, time_calls
+from finforce_eval.bench.cases import LEVELS, Press, bench_finger, load_cases, record_press
+from finforce_eval.bench.growth_solver import factorise_sparse
+from finforce_eval.bench.scores import score_shapes
+from finforce_eval.bench.tiers import TIERS, Run, Tier, run_tier
+from finforce_eval.replay.processes import ProcessError
+from finforce_ifea.fem.solid import SolidModel
+from finforce_ifea.jaw.jaw import load_jaw
 
 ROOT = Path(__file__).resolve().parents[1]
 SEED = 1
@@ -210,7 +210,7 @@ def _summarise_starts(name: str, starts: Sequence[Mapping[str, float]]) -> First
 
 def _start(solver: str, places: Mapping[str, str]) -> dict[str, float]:
     """Returns time [s], memory and caches [MB] of one process; its caches are in the given places."""
-    command = [sys.executable, "-m", "finforce_eval.bench_process", solver, "default"]
+    command = [sys.executable, "-m", "finforce_eval.bench.process", solver, "default"]
     begin = perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **places}, cwd=ROOT)
     seconds = perf_counter() - begin

@@ -1,4 +1,4 @@
-"""The rows of the table that compares finforce with the paper and with SOFA: figures in, words out; measures nothing.
+"""The rows of the table that compares finforce with the paper and with SOFA: figures in, words out.
 
 What is quoted stands here beside the footnote that says where it is from; what was not measured says so.
 """
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from peer_measure import DEFAULT, FULL, HEIGHTS, OUTLINE
 
-from finforce_eval.bench_solvers import SOFA
+from finforce_eval.bench.solvers import SOFA
 
 # Table I of the paper, RMSE [N] on 15, 25, 35 mm.
 TABLE_I = {"upper": (0.22, 0.52, 0.57), "middle": (0.24, 0.28, 0.24), "lower": (0.69, 0.62, 1.21)}

@@ -20,16 +20,16 @@ from pose_tracking_methods import ROUND, IcpTracker, compute_deviation
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from finforce_camera import CameraIntrinsics
+from finforce.camera import CameraIntrinsics
+from finforce.transforms import move_pose
 from finforce_contact.errors import PoseLostError
-from finforce_contact.pose_source import ObjectPose
-from finforce_contact.pose_tracking import PoseTracker
-from finforce_contact.poses import move_pose
-from finforce_contact.triangles import ObjectMesh
-from finforce_eval.bench import write_figures
-from finforce_twin.depth_camera import build_d405
-from finforce_twin.objects import OBJECT_NAMES, build_object
-from finforce_twin.pose_sequences import Frame, Motion, render_sequence
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.pose.source import ObjectPose
+from finforce_contact.pose.tracker import PoseTracker
+from finforce_eval.bench.bench import write_figures
+from finforce_twin.rendering.depth_camera import build_d405
+from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
+from finforce_twin.scenes.pose_sequences import Frame, Motion, render_sequence
 
 STEPS = {"848x480": 1, "424x240": 2}
 HIDDEN = (0.0, 0.3, 0.5)

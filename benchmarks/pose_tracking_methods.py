@@ -1,4 +1,4 @@
-"""Ways to follow an object that the tracker is compared with, and what a pose is off; computes no images."""
+"""Ways to follow an object that the tracker is compared with, and what a pose is off."""
 
 from dataclasses import dataclass
 from types import ModuleType
@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from finforce_camera import CameraIntrinsics, deproject
+from finforce.camera import CameraIntrinsics, deproject
+from finforce.transforms import invert_pose, rotation_between
 from finforce_contact.errors import PoseLostError
-from finforce_contact.pose_source import ObjectPose
-from finforce_contact.poses import invert_pose, rotation_between
-from finforce_contact.triangles import ObjectMesh
-from finforce_contact.views import MeshView
-from finforce_twin.pose_sequences import Frame
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.views import MeshView
+from finforce_contact.pose.source import ObjectPose
+from finforce_twin.scenes.pose_sequences import Frame
 
 ROUND = ("cylinder", "bottle")
 HANDLE_RADIUS, HANDLE_SHARE = 0.042, 0.015  # the mug's body ends within; fewer of its pixels say nothing of its turn

@@ -18,20 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_camera import deproject
-from finforce_contact.chamfer import Chamfer, compute_chamfer
-from finforce_contact.closing import build_poisson_mesh
+from finforce.camera import deproject
 from finforce_contact.errors import ReconstructionError
-from finforce_contact.image_evidence import collect_evidence
-from finforce_contact.object_mesh import ObjectMesh
-from finforce_contact.paper_alignment import scale_coarsely
-from finforce_contact.reconstructed import GeneratedMesh
-from finforce_contact.reconstruction import METHODS, reconstruct
-from finforce_eval.bench import write_figures
-from finforce_twin.depth_camera import build_d405
-from finforce_twin.guesses import GuessError, draw_guess, place_mesh
-from finforce_twin.objects import OBJECT_NAMES, build_object
-from finforce_twin.scenes import Scene, draw_scene, roughen_mask
+from finforce_contact.mesh.chamfer import Chamfer, compute_chamfer
+from finforce_contact.mesh.closing import build_poisson_mesh
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.reconstruction.evidence import collect_evidence
+from finforce_contact.reconstruction.paper_alignment import scale_coarsely
+from finforce_contact.reconstruction.reconstruction import METHODS, reconstruct
+from finforce_contact.reconstruction.result import GeneratedMesh
+from finforce_eval.bench.bench import write_figures
+from finforce_twin.rendering.depth_camera import build_d405
+from finforce_twin.scenes.guesses import GuessError, draw_guess, place_mesh
+from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
+from finforce_twin.scenes.table import Scene, draw_scene, roughen_mask
 
 DISTANCES = (13e-3, 16e-3)  # [m] of the guess from the truth
 ALONE = "alone"  # the choice between primitive and completion

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from finforce_driver.bus import Frame
-from finforce_driver.slcan import LONGEST_LINE, SlcanParser, encode_frame
-from finforce_eval.bench import describe_machine, write_figures
+from finforce_driver.can.bus import Frame
+from finforce_driver.can.slcan import LONGEST_LINE, SlcanParser, encode_frame
+from finforce_eval.bench.bench import describe_machine, write_figures
 
 BATCH = 500  # lines that are fed as one stream, in pieces
 LARGEST_PIECE = 200  # [bytes]

@@ -1,4 +1,4 @@
-"""The page docs/verification.md: results in, Markdown out; computes no mechanics."""
+"""The page docs/verification.md: results in, Markdown out."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_eval.bench import write_figures
-from finforce_eval.commands import Setup, make_setup
-from finforce_eval.evaluate import evaluate_recording
-from finforce_eval.places import InnerSurface
-from finforce_eval.recording import read_recording
-from finforce_eval.tracks import Recording
+from finforce_eval.bench.bench import write_figures
+from finforce_eval.cli.evaluate import Setup, make_setup
+from finforce_eval.evaluation.evaluate import evaluate_recording
+from finforce_eval.evaluation.places import InnerSurface
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import Recording
 
 
 def true_places(path: Path, recording: Recording, face_x: float) -> dict[float, tuple[float, float]]:

@@ -1,1 +1,1 @@
-"""The object: its mesh, its pose and the place where it touches a jaw; knows nothing of key points."""
+"""The object: its mesh, its pose and the place where it touches a jaw."""

@@ -1,4 +1,4 @@
-"""Depth images and masks in, poses of the object out; knows no jaw, and tracks nothing itself."""
+"""Depth images and masks in, poses of the object out."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from finforce_camera import CameraIntrinsics, ImageError
+from finforce.camera import CameraIntrinsics, ImageError
+from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.messages import camera_from_info, depth_from_image, mask_from_image, same_camera, stamp_of
-from finforce_contact.object_mesh import ObjectMesh
 from finforce_contact.parameters import ContactParameters
-from finforce_contact.pose_settings import TrackerSettings
-from finforce_contact.pose_source import ObjectPose
-from finforce_contact.pose_tracking import PoseTracker
+from finforce_contact.pose.source import ObjectPose
+from finforce_contact.pose.tracker import PoseTracker
+from finforce_contact.settings import TrackerSettings
 
 SECOND = 1e-9  # s/ns
 DEPTH = 32  # images that may wait for their mask, which a segmentation takes a while to find

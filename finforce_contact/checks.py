@@ -1,11 +1,12 @@
-"""Numbers that are none, refused before anything is computed with them; knows no jaw and no object."""
+"""Numbers that are none, refused before anything is computed with them."""
 
 from math import isfinite
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finforce_ifea.errors import ContactError, FinforceError
+from finforce.errors import FinforceError
+from finforce_ifea.errors import ContactError
 
 
 def to_floats(values: ArrayLike, what: str, error: type[FinforceError]) -> NDArray:

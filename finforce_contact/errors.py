@@ -1,17 +1,13 @@
 """Errors of objects, poses, images and reconstructions; no contact is a result and none of these."""
 
-from finforce_camera import ImageError
-from finforce_ifea.errors import FinforceError
+from finforce.camera import ImageError
+from finforce.errors import FinforceError, PoseError
 
 __all__ = ["ImageError", "ObjectMeshError", "PoseError", "PoseLostError", "ReconstructionError"]
 
 
 class ObjectMeshError(FinforceError, ValueError):
     """An object mesh cannot be read, has the wrong size, or has no surface to touch."""
-
-
-class PoseError(FinforceError, ValueError):
-    """Numbers that were given as a pose are none."""
 
 
 class PoseLostError(FinforceError, RuntimeError):

@@ -1,4 +1,7 @@
-"""Object poses and the deformed jaw in, contact rows out, image after image; knows no solver and no ROS."""
+"""What a contact estimator says about one image.
+
+Object poses and the deformed jaw in, contact rows out, image after image.
+"""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -7,26 +10,83 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.errors import ObservationError, PoseError
+from finforce.skipping import AWAY, CONTACT, STILL, Skips
+from finforce.transforms import check_pose, invert_pose
 from finforce_contact.checks import check_stamp, check_wrench
-from finforce_contact.closest import ClosestLocalizer
-from finforce_contact.enclosure import surrounds
-from finforce_contact.errors import PoseError
-from finforce_contact.estimate import ContactEstimate, blank_estimate
-from finforce_contact.gaps import count_inside
-from finforce_contact.inner_face import build_inner_face
-from finforce_contact.intersection import IntersectionLocalizer
-from finforce_contact.localization import Localizer, OutlineLocalizer, Place, Scene
-from finforce_contact.object_mesh import ObjectMesh
-from finforce_contact.pose_filter import FilteredPose, PoseFilter
-from finforce_contact.poses import check_pose, invert_pose
-from finforce_contact.rest import RestWatch
-from finforce_contact.section import Section, SectionKeeper
+from finforce_contact.localization.closest import ClosestLocalizer
+from finforce_contact.localization.gaps import count_inside
+from finforce_contact.localization.inner_face import build_inner_face
+from finforce_contact.localization.outline_localizer import Localizer, OutlineLocalizer, Place, Scene
+from finforce_contact.localization.section import Section, SectionKeeper
+from finforce_contact.localization.stillness import RestWatch
+from finforce_contact.localization.touch import SURELY_BENT, TouchBelief, describe_conflict
+from finforce_contact.mesh.enclosure import surrounds
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.paper_contact import IntersectionLocalizer
+from finforce_contact.pose.filter import FilteredPose, PoseFilter
 from finforce_contact.settings import ContactSettings
-from finforce_contact.touch import SURELY_BENT, TouchBelief, describe_conflict
-from finforce_ifea.errors import ObservationError
-from finforce_ifea.jaw import Jaw
-from finforce_ifea.outline import ObjectOutline
-from finforce_skipping import AWAY, CONTACT, STILL, Skips
+from finforce_ifea.contact_mechanics.outline import ObjectOutline
+from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.observation import Contact
+
+STATUSES = ("touching", "apart", "no_object", "no_pose")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ContactEstimate:
+    """Where the object touches a jaw, or would touch first; without rows when nobody knows.
+
+    Attributes:
+        stamp: of the image [s].
+        status: "touching", "apart", "no_object" or "no_pose".
+        message: what to tell the user, empty when there is nothing to tell.
+        points: (n, 3) [m] on the undeformed inner surface.
+        candidates: (n,) the jaw's candidate nearest to each point.
+        weights: (n,) shares of the force, sum 1.
+        touching: whether object and jaw touch.
+        skipped: why no new place was looked for, empty when one was.
+        outline: of the object in the finger's plane, None when its pose is not known or the mode has no use for it.
+        T_jaw_object: (4, 4), None when not known.
+        probability: of contact, as far as the mode tells.
+    """
+
+    stamp: float
+    status: str
+    message: str
+    points: NDArray
+    candidates: NDArray
+    weights: NDArray
+    touching: bool
+    skipped: str
+    outline: ObjectOutline | None
+    T_jaw_object: NDArray | None
+    probability: float
+
+    @property
+    def contact(self) -> Contact | None:
+        """The contact for the solver, None when there are no rows."""
+        if not len(self.points):
+            return None
+        return Contact(points=self.points, weights=self.weights, touching=self.touching, outline=self.outline)
+
+
+def blank_estimate(stamp: float, status: str, message: str, T_jaw_object: NDArray | None = None) -> ContactEstimate:
+    """Returns an estimate without rows, for whatever is no known contact."""
+    return ContactEstimate(
+        stamp=stamp,
+        status=status,
+        message=message,
+        points=np.empty((0, 3)),
+        candidates=np.empty(0, np.int64),
+        weights=np.empty(0),
+        touching=False,
+        skipped="",
+        outline=None,
+        T_jaw_object=T_jaw_object,
+        probability=0.0,
+    )
+
 
 __all__ = ["ContactEstimate", "ContactEstimator"]
 

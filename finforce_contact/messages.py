@@ -1,4 +1,4 @@
-"""Messages into poses, surfaces and images, contacts into columns; any object with a message's attributes will do."""
+"""Messages into poses, surfaces and images, contacts into columns."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_camera import CameraIntrinsics, ImageError, ImageLayout, IntrinsicsError, decode_depth
-from finforce_contact.errors import PoseError
-from finforce_contact.poses import pose_from_quaternion
-from finforce_ifea.errors import ObservationError
+from finforce.camera import CameraIntrinsics, ImageError, ImageLayout, IntrinsicsError, decode_depth
+from finforce.errors import ObservationError, PoseError
+from finforce.pointcloud import decode_keypoints
+from finforce.transforms import pose_from_quaternion
 from finforce_ifea.messages import check_cloud, check_frame
-from finforce_ifea.pointcloud import decode_keypoints
 
 if TYPE_CHECKING:
     from finforce_contact.estimator import ContactEstimate

@@ -1,4 +1,4 @@
-"""The contact estimator node: poses, surfaces and images in, contacts out; it converts, calls and publishes."""
+"""The contact estimator node: poses, surfaces and images in, contacts out."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
-import finforce_ros as ros
+from finforce.errors import FinforceError
+from finforce.health import Health, Idling, Outcome, Report, StampGate
+from finforce.ros import node as ros
+from finforce.settings import refresh_record
+from finforce.skipping import CONTACT, IDLE, UNNEEDED, Skips
 from finforce_contact.camera_feed import StampedPose
-from finforce_contact.inputs import subscribe
+from finforce_contact.diagnostics import describe, object_alarms, outcome_of_estimate
 from finforce_contact.jaw_contact import TimedEstimate
-from finforce_contact.outputs import ContactOutputs
 from finforce_contact.parameters import ContactParameters
-from finforce_contact.pose_settings import TrackerSettings
-from finforce_contact.report import describe, object_alarms, outcome_of_estimate
+from finforce_contact.publishers import ContactOutputs
 from finforce_contact.session import ContactSession
-from finforce_contact.settings import ContactSettings
-from finforce_health import Health, Idling, Outcome, Report, StampGate
-from finforce_ifea.errors import FinforceError
+from finforce_contact.settings import ContactSettings, TrackerSettings
+from finforce_contact.subscriptions import subscribe
 from finforce_ifea.messages import read_stamp
-from finforce_records import refresh_record
-from finforce_skipping import CONTACT, IDLE, UNNEEDED, Skips
 
 
 class ContactEstimatorNode(Node):

@@ -1,4 +1,4 @@
-"""The parameters of a contact estimator node, and what they ask for; knows no ROS."""
+"""The parameters of a contact estimator node, and what they ask for."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from finforce_records import TimeParameters, parameter
+from finforce.settings import TimeParameters, parameter
 
 if TYPE_CHECKING:
-    from finforce_contact.reconstructed import GeneratedMesh
-    from finforce_ifea.jaw import Jaw
+    from finforce_contact.reconstruction.result import GeneratedMesh
+    from finforce_ifea.jaw.jaw import Jaw
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -79,8 +79,8 @@ def load_jaws(parameters: ContactParameters) -> dict[str, Jaw]:
         JawFileError: the file cannot be a jaw.
         CalibrationError: the file is no calibration, or belongs to another jaw.
     """
-    from finforce_ifea.calibration import load_calibration
-    from finforce_ifea.jaw import load_jaw
+    from finforce_ifea.jaw.calibration import load_calibration
+    from finforce_ifea.jaw.jaw import load_jaw
 
     file = parameters.calibration_file
     apply = load_calibration(file).apply if file else lambda jaw: jaw
@@ -94,9 +94,9 @@ def load_generated(parameters: ContactParameters) -> GeneratedMesh | None:
         ObjectMeshError: the file is no mesh.
         PoseError: the pose is not seven finite numbers with a unit quaternion.
     """
-    from finforce_contact.object_mesh import read_triangles
-    from finforce_contact.poses import pose_from_quaternion
-    from finforce_contact.reconstructed import GeneratedMesh
+    from finforce.transforms import pose_from_quaternion
+    from finforce_contact.mesh.object_mesh import read_triangles
+    from finforce_contact.reconstruction.result import GeneratedMesh
 
     if not parameters.generated_mesh:
         return None

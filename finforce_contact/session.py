@@ -1,4 +1,4 @@
-"""The object, where its poses come from, and the jaws that it touches, for several threads; knows no ROS."""
+"""The object, where its poses come from, and the jaws that it touches, for several threads."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from finforce_camera import ImageError
+from finforce.camera import ImageError
+from finforce.errors import FinforceError
+from finforce.skipping import CONTACT, RESTING, Skips
 from finforce_contact.camera_feed import CameraFeed, StampedPose
+from finforce_contact.diagnostics import describe_mesh
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.jaw_contact import SECOND, JawContact, TimedEstimate
+from finforce_contact.mesh.object_mesh import load_object_mesh
+from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.messages import pose_from_message, stamp_of, surface_from_cloud, wrench_from_message
-from finforce_contact.object_mesh import ObjectMesh, load_object_mesh
 from finforce_contact.parameters import ContactParameters, load_generated, load_jaws
-from finforce_contact.pose_settings import TrackerSettings
-from finforce_contact.pose_source import ExternalPoseSource, ObjectPose
-from finforce_contact.report import describe_mesh
-from finforce_contact.settings import ContactSettings
-from finforce_ifea.errors import FinforceError
-from finforce_skipping import CONTACT, RESTING, Skips
+from finforce_contact.pose.source import ExternalPoseSource, ObjectPose
+from finforce_contact.settings import ContactSettings, TrackerSettings
 
 
 class ContactSession:
@@ -88,8 +88,8 @@ class ContactSession:
             ImageError: there are no images, or they cannot be used.
             FinforceError: no mesh explains the image; the object stays what it was.
         """
-        from finforce_contact.image_evidence import collect_evidence
-        from finforce_contact.reconstruction import reconstruct
+        from finforce_contact.reconstruction.evidence import collect_evidence
+        from finforce_contact.reconstruction.reconstruction import reconstruct
 
         if self._camera is None:
             raise ImageError("reconstruct needs images: set pose_source to tracker, or use finforce reconstruct")

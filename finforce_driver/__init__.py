@@ -1,1 +1,1 @@
-"""The SSG-48 gripper: link, protocol, state, force-controlled grasp, and an emulated gripper; knows no jaw."""
+"""The SSG-48 gripper: link, protocol, state, force-controlled grasp, and an emulated gripper."""

@@ -1,6 +1,6 @@
 """What can be wrong with a gripper, its link and what is asked of it."""
 
-from finforce_errors import FinforceError
+from finforce.errors import FinforceError
 
 
 class DriverError(FinforceError):

@@ -1,4 +1,4 @@
-"""The gripper as a program uses it: commands that return at once, a state that is always there; knows no bytes.
+"""The gripper as a program uses it: commands that return at once, a state that is always there.
 
     with Gripper(build_bus("/dev/ttyACM0")) as gripper:
         gripper.wait(lambda state: state.phase is Phase.UNCALIBRATED, 3.0)  # READY, if it is calibrated already
@@ -16,11 +16,11 @@ import secrets
 from collections.abc import Callable
 from threading import Condition, Event, Thread
 
-from finforce_driver.bus import Bus
+from finforce_driver.can.bus import Bus
 from finforce_driver.clock import Clock, MonotonicClock
 from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError
-from finforce_driver.loop import GripperLoop
-from finforce_driver.machine import GripperMachine
+from finforce_driver.machine.loop import GripperLoop
+from finforce_driver.machine.machine import GripperMachine
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, Outcome, Phase
 from finforce_driver.units import GripperScale

@@ -1,4 +1,4 @@
-"""Messages into what a gripper is asked for; any object with a message's attributes will do."""
+"""Messages into what a gripper is asked for."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from finforce_driver.errors import TargetError
-from finforce_driver.grasp_settings import GraspGoal
+from finforce_driver.grasp.settings import GraspGoal
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The node of the SSG-48 gripper: commands and forces in, joint states out; it converts, calls and publishes."""
+"""The node of the SSG-48 gripper: commands and forces in, joint states out."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, PointCloud2
 
-import finforce_ros as ros
-from finforce_driver.command_action import GripperCommandAction
-from finforce_driver.force_feed import ForceSample
-from finforce_driver.grasp_session import GraspSession
-from finforce_driver.grasp_settings import GraspSettings
-from finforce_driver.messages import goal_from_joint_state, move_from_joint_state
-from finforce_driver.outputs import DriverOutputs
-from finforce_driver.parameters import DriverParameters, build_gripper
-from finforce_driver.report import (
+from finforce.errors import FinforceError, MissingDependencyError
+from finforce.health import Level, Outcome, Report
+from finforce.optional import import_library
+from finforce.ros import node as ros
+from finforce_driver.actions import GripperCommandAction
+from finforce_driver.clock import MessageTimes
+from finforce_driver.diagnostics import (
     GripperHealth,
     describe_grasp,
     describe_state,
@@ -32,13 +30,15 @@ from finforce_driver.report import (
     news_of_state,
     outcome_of_state,
 )
+from finforce_driver.grasp.force_feed import ForceSample
+from finforce_driver.grasp.session import GraspSession
+from finforce_driver.grasp.settings import GraspSettings
+from finforce_driver.messages import goal_from_joint_state, move_from_joint_state
+from finforce_driver.parameters import DriverParameters, build_gripper
+from finforce_driver.publishers import DriverOutputs
+from finforce_driver.services import GripperTasks
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState
-from finforce_driver.tasks import GripperTasks
-from finforce_driver.times import MessageTimes
-from finforce_errors import FinforceError, MissingDependencyError
-from finforce_health import Level, Outcome, Report
-from finforce_optional import import_library
 
 JAWS = ("left", "right")
 

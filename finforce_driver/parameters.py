@@ -1,4 +1,4 @@
-"""The parameters of a gripper driver node, and the gripper that they ask for; knows no ROS."""
+"""The parameters of a gripper driver node, and the gripper that they ask for."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from finforce_driver.grasp_settings import GraspGoal
-from finforce_records import ParameterError, TimeParameters, parameter
+from finforce.settings import ParameterError, TimeParameters, parameter
+from finforce_driver.grasp.settings import GraspGoal
 
 if TYPE_CHECKING:
     from finforce_driver.gripper import Gripper
@@ -65,7 +65,7 @@ def build_gripper(parameters: DriverParameters, settings: GripperSettings) -> Gr
     Raises:
         TargetError: a rate is none that ports or SLCAN know, or release_opening is beyond the stroke.
     """
-    from finforce_driver.buses import build_bus
+    from finforce_driver.can.build import build_bus
     from finforce_driver.gripper import Gripper
 
     if not math.isnan(parameters.release_opening):

@@ -1,10 +1,10 @@
-"""What can be set on a gripper: defaults, units, bounds and meanings; knows no ROS and no file."""
+"""What can be set on a gripper: defaults, units, bounds and meanings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from finforce_bounded import check_bounds, setting
+from finforce.settings import check_bounds, setting
 from finforce_driver.errors import TargetError
 
 

@@ -1,12 +1,12 @@
-"""SI units at the edge, bytes inside, and the refusal of what the gripper cannot do; knows no time."""
+"""SI units at the edge, bytes inside, and the refusal of what the gripper cannot do."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
+from finforce_driver.can.protocol import LARGEST_BYTE
 from finforce_driver.errors import TargetError
-from finforce_driver.protocol import LARGEST_BYTE
 from finforce_driver.settings import GripperSettings
 
 TICKS_PER_TURN = 16384  # of the encoder

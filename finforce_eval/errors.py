@@ -1,6 +1,6 @@
 """Errors of recordings and commands; every one is reported as one line and exit status 2."""
 
-from finforce_ifea.errors import FinforceError
+from finforce.errors import FinforceError
 
 
 class RecordingError(FinforceError, ValueError):

@@ -1,1 +1,1 @@
-"""The jaw and its mechanics: geometry, mesh, elements, frame, inverse problem; knows neither ROS nor cameras."""
+"""The jaw and its mechanics: geometry, mesh, elements, frame, inverse problem."""

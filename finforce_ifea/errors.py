@@ -1,6 +1,6 @@
 """What can be wrong with jaws, key points and contacts; what is not raised on purpose is a defect."""
 
-from finforce_errors import FinforceError, MissingDependencyError  # noqa: F401 - the base of those here
+from finforce.errors import FinforceError, MissingDependencyError  # noqa: F401 - the base of those here
 
 
 class JawFileError(FinforceError, ValueError):
@@ -9,10 +9,6 @@ class JawFileError(FinforceError, ValueError):
 
 class MeshError(FinforceError, ValueError):
     """A volume mesh cannot be computed with, or a point does not lie on it."""
-
-
-class ObservationError(FinforceError, ValueError):
-    """Key points came in the wrong shape, frame or number."""
 
 
 class ContactError(FinforceError, ValueError):

@@ -5,12 +5,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.away import AwayWatch
-from finforce_ifea.calibration import Calibration
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
-from finforce_ifea.gate import KeypointGate
-from finforce_ifea.jaw import Jaw
-from finforce_ifea.mechanics import Mechanics, build_chosen
+from finforce_ifea.fem.mechanics import Mechanics, build_chosen
+from finforce_ifea.jaw.calibration import Calibration
+from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.observation import (
     Contact,
     Observation,
@@ -19,15 +17,17 @@ from finforce_ifea.observation import (
     check_contact,
     check_observation,
 )
-from finforce_ifea.point_tracking import PointTracker
-from finforce_ifea.rehearsal import rehearse
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.solution_numbers import find_numbers
-from finforce_ifea.taring import TareKeeper, TareReport
-from finforce_ifea.track import Track
-from finforce_ifea.tracking import PlaceTracker
-from finforce_ifea.verdict import find_doubt
+from finforce_ifea.tare import TareKeeper, TareReport
+from finforce_ifea.tracking.clearance import AwayWatch
+from finforce_ifea.tracking.keypoint_gate import KeypointGate
+from finforce_ifea.tracking.place_tracker import PlaceTracker
+from finforce_ifea.tracking.point_tracker import PointTracker
+from finforce_ifea.tracking.track import Track
+from finforce_ifea.tracking.uncertainty import find_numbers
+from finforce_ifea.tracking.validity import find_doubt
+from finforce_ifea.warm_up import rehearse
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 

@@ -1,19 +1,23 @@
-"""Messages into observations, contacts and forces; any object with a message's attributes will do."""
+"""Messages into observations, contacts and forces.
+
+An object's outline to and from the columns of a point cloud, one row per corner.
+"""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_health import NANOSECONDS
-from finforce_ifea.errors import ContactError, ObservationError
+from finforce.errors import ObservationError
+from finforce.health import NANOSECONDS
+from finforce.pointcloud import decode_columns, decode_keypoints
+from finforce_ifea.contact_mechanics.outline import ObjectOutline, are_same_polygons
+from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, Observation
-from finforce_ifea.outline import ObjectOutline
-from finforce_ifea.outline_cloud import COLUMNS, outline_from_columns
-from finforce_ifea.pointcloud import decode_columns, decode_keypoints
 
 
 def read_stamp(data: bytes) -> int:
@@ -107,3 +111,71 @@ def force_from_wrench(message: Any, frame: str, what: str) -> NDArray[np.float64
     if not np.isfinite(values).all():
         raise ObservationError(f"{what} is not finite: {values}")
     return values
+
+
+STDDEVS = ("stddev_x", "stddev_z", "stddev_tilt")
+COLUMNS = ("x", "z", "u", "v", "polygon", *STDDEVS)
+# Corners that come out farther than this from a turned and shifted outline were not made from one [m].
+_RIGID = 1e-5
+
+
+def columns_from_outline(outline: ObjectOutline | None) -> dict[str, NDArray]:
+    """Return the columns of an outline, without rows when there is none.
+
+    `x y z` [m] are the corners now, in the jaw frame, `u v` [m] as they were cut, about the outline's origin; the
+    motion from `u v` to `x z` is the outline's place and tilt.
+    """
+    if outline is None:
+        corners, sizes, stddev = np.empty((0, 4)), [], np.zeros(3)
+    else:
+        corners = np.hstack([np.concatenate(outline.placed()), np.concatenate(outline.polygons)])
+        sizes, stddev = [len(polygon) for polygon in outline.polygons], np.asarray(outline.stddev)
+    x, z, u, v = corners.astype(np.float32).T
+    spread = np.broadcast_to(stddev.astype(np.float32)[:, None], (3, len(x)))
+    return {
+        "x": x,
+        "y": np.zeros_like(x),
+        "z": z,
+        "u": u,
+        "v": v,
+        "polygon": np.repeat(np.arange(len(sizes)), sizes).astype(np.uint16),
+        **dict(zip(STDDEVS, spread, strict=True)),
+    }
+
+
+def outline_from_columns(columns: Mapping[str, NDArray], previous: ObjectOutline | None = None) -> ObjectOutline | None:
+    """Return the outline of such columns, None without rows.
+
+    Place and tilt are the rigid motion with the least squares of x - (c u - s v) - x0 and z - (s u + c v) - z0.
+
+    Args:
+        columns: those named in `COLUMNS`, (n,) each.
+        previous: whose polygons are used again, the same objects, when no corner was cut anew.
+
+    Raises:
+        ContactError: the corners are no turned and shifted outline, or no outline at all.
+    """
+    if not len(columns["x"]):
+        return None
+    if not all(np.isfinite(columns[name]).all() for name in COLUMNS):
+        raise ContactError("the outline has numbers that are not finite")
+    now, cut = (np.stack([columns[a], columns[b]], axis=1).astype(float) for a, b in (("x", "z"), ("u", "v")))
+    about_now, about_cut = now - now.mean(0), cut - cut.mean(0)
+    (xx, xz), (zx, zz) = about_cut.T @ about_now
+    tilt = float(np.arctan2(xz - zx, xx + zz))
+    turn = np.array([[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]])
+    if not np.abs(about_now - about_cut @ turn).max() < _RIGID:
+        raise ContactError("the corners of the outline are no turned and shifted copy of the outline as it was cut")
+    polygons = np.split(cut, 1 + np.flatnonzero(np.diff(columns["polygon"].astype(int))))
+    return ObjectOutline(
+        polygons=_known_polygons(tuple(polygons), previous),
+        origin=now.mean(0) - cut.mean(0) @ turn,
+        tilt=tilt,
+        stddev=np.array([columns[name][0] for name in STDDEVS], dtype=float),
+    )
+
+
+def _known_polygons(polygons: tuple[NDArray, ...], previous: ObjectOutline | None) -> tuple[NDArray, ...]:
+    """Return the previous polygons when they are equal: what was computed from them still holds."""
+    known = previous.polygons if previous else ()
+    return known if are_same_polygons(known, polygons) else polygons

@@ -1,4 +1,4 @@
-"""The solver node of one jaw: key points and contacts in, wrenches out; it converts, calls and publishes."""
+"""The solver node of one jaw: key points and contacts in, wrenches out."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
-import finforce_ros as ros
-from finforce_health import Health, Idling, Outcome, Report, StampGate
-from finforce_ifea.errors import FinforceError
-from finforce_ifea.gripper import ForcePairing, single_jaw_grasp
+from finforce.errors import FinforceError
+from finforce.health import Health, Idling, Outcome, Report, StampGate
+from finforce.ros import node as ros
+from finforce.skipping import AWAY, IDLE, LATE, SOLVER, Skips
+from finforce_ifea.diagnostics import describe_solution, outcome_of_solution, peer_alarms
+from finforce_ifea.grasp_force import ForcePairing, single_jaw_grasp
 from finforce_ifea.messages import force_from_wrench, observation_from_cloud, read_stamp
 from finforce_ifea.observation import Solution
-from finforce_ifea.outputs import SolverOutputs
 from finforce_ifea.parameters import NodeParameters, build_contact_feed, build_estimator, load_parameter_jaw
-from finforce_ifea.report import describe_solution, outcome_of_solution, peer_alarms
+from finforce_ifea.publishers import SolverOutputs
 from finforce_ifea.settings import EstimatorSettings
-from finforce_skipping import AWAY, IDLE, LATE, SOLVER, Skips
 
 SLOW = 4.0  # s of preparation, after which somebody may wonder
 

@@ -1,14 +1,15 @@
-"""What goes into an estimator and what comes out; knows no mechanics."""
+"""What goes into an estimator and what comes out."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.errors import ContactError, ObservationError
-from finforce_ifea.jaw import Jaw
-from finforce_ifea.outline import ObjectOutline
-from finforce_ifea.pointcloud import check_stddev
+from finforce.errors import ObservationError
+from finforce.pointcloud import check_stddev
+from finforce_ifea.contact_mechanics.outline import ObjectOutline
+from finforce_ifea.errors import ContactError
+from finforce_ifea.jaw.jaw import Jaw
 
 TRUSTED = ("ok", "unloaded")
 

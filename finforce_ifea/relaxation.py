@@ -1,4 +1,4 @@
-"""The finger's relaxation: a linear viscoelastic filter from elastic to measured force; knows no shape.
+"""The finger's relaxation: a linear viscoelastic filter from elastic to measured force.
 
 The force of the shape is F_e; the material adds overstresses that decay, F = F_e + sum_i h_i with
 h_i' = -h_i / tau_i + g_i F_e' (generalised Maxwell model, Simo and Hughes, Computational Inelasticity, 1998, ch. 10).

@@ -1,9 +1,9 @@
-"""What can be set on an estimator: defaults, units, bounds and meanings; knows no ROS and no file."""
+"""What can be set on an estimator: defaults, units, bounds and meanings."""
 
 from dataclasses import dataclass
 
-from finforce_bounded import check_bounds, choice, setting
-from finforce_ifea.errors import ObservationError
+from finforce.errors import ObservationError
+from finforce.settings import check_bounds, choice, setting
 
 SOLVERS = ("default", "reduced", "solid", "frame", "linear", "paper")
 _SOLVER_MEANING = (

@@ -1,4 +1,4 @@
-"""Colour and depth images and intrinsics in, whole RGB-D images out; knows no jaw and finds nothing in them."""
+"""Colour and depth images and intrinsics in, whole RGB-D images out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_camera import CameraIntrinsics, ImageError, ImageLayout
+from finforce.camera import CameraIntrinsics, ImageError, ImageLayout
 from finforce_contact.messages import camera_from_info, depth_from_image, same_camera, stamp_of
 from finforce_ifea.messages import check_frame
 from finforce_keypoints.errors import SyncError

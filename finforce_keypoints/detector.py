@@ -1,4 +1,4 @@
-"""RGB-D images to key points in the jaw frames, image after image; knows neither ROS nor what finds the pixels."""
+"""RGB-D images to key points in the jaw frames, image after image."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_camera import CameraIntrinsics
-from finforce_contact.poses import check_pose
-from finforce_ifea.jaw import Jaw
+from finforce.camera import CameraIntrinsics
+from finforce.skipping import ALL, STILL, Skips
+from finforce.transforms import check_pose
+from finforce_ifea.jaw.jaw import Jaw
+from finforce_keypoints.detectors.pixel_finder import PixelFinder, PixelFinding
 from finforce_keypoints.errors import DetectionError, GeometryError, ImageOrderError, KeypointError
-from finforce_keypoints.finder import PixelFinder, PixelFinding
+from finforce_keypoints.geometry.jaw_localizer import JawKeypoints, JawLocalizer
+from finforce_keypoints.geometry.side_fit import DepthScale
+from finforce_keypoints.geometry.side_picture import find_side
+from finforce_keypoints.geometry.stillness import StillWatch
 from finforce_keypoints.images import RgbdImage, check_image
-from finforce_keypoints.jaw_localizer import JawKeypoints, JawLocalizer
-from finforce_keypoints.localization import DepthScale
-from finforce_keypoints.plane_picture import find_side
-from finforce_keypoints.rules import LOOK_EVERY, RULES, SEARCH_EVERY, SEARCHED, STILL, UNSEEN
-from finforce_keypoints.settings import DetectorSettings
-from finforce_keypoints.stillness import StillWatch
-from finforce_skipping import ALL, Skips
+from finforce_keypoints.settings import LOOK_EVERY, RULES, SEARCH_EVERY, SEARCHED, UNSEEN, DetectorSettings
 
 __all__ = ["JawKeypoints", "KeypointDetector"]
 

@@ -1,7 +1,7 @@
 """The errors that finding key points raises on purpose; one class per cause."""
 
-from finforce_camera import ImageError
-from finforce_ifea.errors import FinforceError
+from finforce.camera import ImageError
+from finforce.errors import FinforceError
 
 
 class KeypointError(FinforceError):

@@ -1,4 +1,4 @@
-"""Colour images with aligned depth: decoded, checked and watched for a camera that fails; knows no jaw and no ROS."""
+"""Colour images with aligned depth: decoded, checked and watched for a camera that fails."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_camera import CameraIntrinsics, ImageError, ImageLayout
+from finforce.camera import CameraIntrinsics, ImageError, ImageLayout
 from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError
 
 COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}

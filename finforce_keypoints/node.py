@@ -1,4 +1,4 @@
-"""The key point detector node: images in, key points and poses of the jaws out; it converts, calls and publishes."""
+"""The key point detector node: images in, key points and poses of the jaws out."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image
 
-import finforce_ros as ros
+from finforce.errors import FinforceError
+from finforce.health import Health, Idling, Outcome, Report, StampGate
+from finforce.ros import node as ros
+from finforce.ros.heap import keep_heap
+from finforce.ros.raw_image import read_image
+from finforce.skipping import IDLE, LATE, UNHEARD, Skips
 from finforce_contact.messages import stamp_of
-from finforce_health import Health, Idling, Outcome, Report, StampGate
-from finforce_heap import keep_heap
-from finforce_ifea.errors import FinforceError
 from finforce_keypoints.camera_feed import SECOND, CameraFeed
-from finforce_keypoints.dot_image import DotSettings
-from finforce_keypoints.finders import BuiltDetector, build_detector
+from finforce_keypoints.detectors.build import BuiltDetector, build_detector
+from finforce_keypoints.detectors.dots import DotSettings
+from finforce_keypoints.diagnostics import describe, outcome_of_keypoints, report_of_rest
 from finforce_keypoints.images import ImagePair
-from finforce_keypoints.outputs import DetectorOutputs
 from finforce_keypoints.parameters import DetectorParameters, load_jaws
-from finforce_keypoints.report import describe, outcome_of_keypoints, report_of_rest
-from finforce_keypoints.rules import RULES
-from finforce_keypoints.settings import DetectorSettings
-from finforce_raw_image import read_image
-from finforce_skipping import IDLE, LATE, UNHEARD, Skips
+from finforce_keypoints.publishers import DetectorOutputs
+from finforce_keypoints.settings import RULES, DetectorSettings
 
 if TYPE_CHECKING:
-    from finforce_keypoints.detector import JawKeypoints
+    from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
 STAMPED = 12  # bytes of a serialised message up to the end of its stamp
 

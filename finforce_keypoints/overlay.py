@@ -1,4 +1,4 @@
-"""Key points drawn into a picture, with NumPy alone; knows no message and decides nothing."""
+"""Key points drawn into a picture, with NumPy alone."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from finforce_keypoints.detector import JawKeypoints
+    from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
 RADIUS = 4.0  # px
 COLORS = {  # by the reason why a key point is not used

@@ -1,4 +1,4 @@
-"""The parameters of a key point detector node, and what they name; knows no ROS."""
+"""The parameters of a key point detector node, and what they name."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
-from finforce_bounded import check_bounds
-from finforce_contact.poses import pose_from_quaternion, pose_numbers
+from finforce.settings import TimeParameters, check_bounds, parameter
+from finforce.transforms import pose_from_quaternion, pose_numbers
 from finforce_keypoints.errors import DetectorSettingsError
-from finforce_keypoints.gripper_geometry import ROBOT_CAMERA
-from finforce_records import TimeParameters, parameter
+from finforce_keypoints.geometry.gripper import ROBOT_CAMERA
 
 if TYPE_CHECKING:
-    from finforce_ifea.jaw import Jaw
+    from finforce_ifea.jaw.jaw import Jaw
 
 # as the RealSense driver calls them; the colour images of a D405 have had both names
 CAMERA = "/camera/camera"
@@ -113,6 +112,6 @@ def load_jaws(parameters: DetectorParameters) -> dict[str, Jaw]:
     Raises:
         JawFileError: the file cannot be a jaw.
     """
-    from finforce_ifea.jaw import load_jaw
+    from finforce_ifea.jaw.jaw import load_jaw
 
     return {side: load_jaw(parameters.jaw_file, side) for side in parameters.sides}

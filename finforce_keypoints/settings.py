@@ -1,8 +1,12 @@
-"""What can be set on a key point detector: defaults, units, bounds and meanings; knows no ROS and no file."""
+"""What can be set on a key point detector: defaults, units, bounds and meanings.
+
+The work that a key point detector leaves out, by the names of its rules.
+"""
 
 from dataclasses import dataclass
 
-from finforce_bounded import check_bounds, setting
+from finforce.settings import check_bounds, setting
+from finforce.skipping import IDLE, STILL
 from finforce_keypoints.errors import DetectorSettingsError
 
 
@@ -68,3 +72,12 @@ class DetectorSettings:
             raise DetectorSettingsError(
                 f"opening_max: got {self.opening_max:g} m, expected more than opening_min, {self.opening_min:g} m"
             )
+
+
+UNSEEN = "jaw not in view"
+ANNOTATED = "annotated image not wanted"
+RULES = (STILL, IDLE, UNSEEN, ANNOTATED)
+
+LOOK_EVERY = 4.0  # [s] after which an image is looked at in full though nothing has moved
+SEARCHED = 30  # images in each of which a lost jaw is looked for
+SEARCH_EVERY = 5  # images, in one of which it is looked for from then on

@@ -1,6 +1,6 @@
 """What can go wrong in the twin; a jaw that touches nothing is a result and none of these."""
 
-from finforce_ifea.errors import FinforceError
+from finforce.errors import FinforceError
 
 
 class ScenarioError(FinforceError, ValueError):

@@ -1,4 +1,4 @@
-"""The twin camera node: a synthetic scene published as a camera would; it renders first, and then plays on time."""
+"""The twin camera node: a synthetic scene published as a camera would."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header, String
 
-import finforce_ros as ros
-from finforce_camera import CameraIntrinsics
-from finforce_contact.poses import pose_numbers
+from finforce.camera import CameraIntrinsics
+from finforce.ros import node as ros
+from finforce.transforms import pose_numbers
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_twin.coupled_gripper import CoupledGripper
-from finforce_twin.encoding import encode_depth, info_fields, sight_columns
-from finforce_twin.flicker import Flicker
-from finforce_twin.live import LiveScene, build_live_scene
+from finforce_twin.footage import Footage, TwinFrame, build_footage, parse_size
+from finforce_twin.gripper.coupled import CoupledGripper
+from finforce_twin.gripper.live import LiveScene, build_live_scene
 from finforce_twin.parameters import TwinParameters
-from finforce_twin.record import Footage, TwinFrame, build_footage, parse_size
-from finforce_twin.script import RATE
+from finforce_twin.rendering.encoding import encode_depth, info_fields, sight_columns
+from finforce_twin.rendering.sensor import Flicker
+from finforce_twin.scenes.script import RATE
 
 PIXEL_TYPES = {"rgb8": np.uint8, "16UC1": np.uint16}
 TOLD_EVERY = 5.0  # s between two words on how far the rendering is

@@ -1,14 +1,14 @@
-"""The parameters of a twin camera node, and the scene that they name; knows no ROS."""
+"""The parameters of a twin camera node, and the scene that they name."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from finforce_records import parameter
+from finforce.settings import parameter
 
 if TYPE_CHECKING:
-    from finforce_twin.scenarios import Scenario
+    from finforce_twin.scenes.scenarios import Scenario
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class TwinParameters:
         Raises:
             ScenarioError: there is no such scene, light or object.
         """
-        from finforce_twin.scenarios import build_scenario
+        from finforce_twin.scenes.scenarios import build_scenario
 
         changes = {"light": self.light, "object": self.object}
         return build_scenario(self.scene, **{name: value for name, value in changes.items() if value})

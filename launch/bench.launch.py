@@ -6,9 +6,9 @@ hardware.
 
 from pathlib import Path
 
-from finforce_launch import describe_launch
-from finforce_options import BenchOptions
-from finforce_setups import bench_processes
+from finforce.systems.launch import describe_launch
+from finforce.systems.live import bench_processes
+from finforce.systems.options import BenchOptions
 
 SHARE = Path(__file__).resolve().parents[1]
 

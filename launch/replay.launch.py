@@ -6,9 +6,9 @@ points in the images of the recording.
 
 from pathlib import Path
 
-from finforce_graph import replay_processes
-from finforce_launch import describe_launch
-from finforce_options import ReplayOptions
+from finforce.systems.launch import describe_launch
+from finforce.systems.options import ReplayOptions
+from finforce.systems.processes import replay_processes
 
 SHARE = Path(__file__).resolve().parents[1]
 

@@ -5,9 +5,9 @@
 
 from pathlib import Path
 
-from finforce_launch import describe_launch
-from finforce_options import RobotOptions
-from finforce_setups import robot_processes
+from finforce.systems.launch import describe_launch
+from finforce.systems.live import robot_processes
+from finforce.systems.options import RobotOptions
 
 SHARE = Path(__file__).resolve().parents[1]
 

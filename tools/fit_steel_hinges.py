@@ -1,7 +1,7 @@
 """Learns where the hinge screws of the measured steel finger sit and where its strips leave the clamp.
 
 Only the six pictures, their base displacements and the object's radius are used; no force is read. Prints the lines for
-finforce_ifea/jaws/steel.yaml.
+finforce_ifea/jaw/jaws/steel.yaml.
 """
 
 import json
@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from finforce_eval.steel import SHIPPED, points_from_picture
-from finforce_ifea.drawing import Drawing
-from finforce_ifea.forward import Cylinder, press_jaw
-from finforce_ifea.jaw import Jaw, load_jaw
-from finforce_ifea.mechanics import build_mechanics
+from finforce_eval.recordings.steel import SHIPPED, points_from_picture
+from finforce_ifea.contact_mechanics.forward_press import Cylinder, press_jaw
+from finforce_ifea.fem.mechanics import build_mechanics
+from finforce_ifea.jaw.drawing import Drawing
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.settings import EstimatorSettings
 
 # What a clamp may be off by [m]; the hinges are free.

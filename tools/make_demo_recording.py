@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from finforce_eval.objects import require_mesh
-from finforce_eval.recording import read_recording
-from finforce_eval.writer import write_recording
+from finforce_eval.recordings.objects import require_mesh
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.writer import write_recording
 
 
 def main() -> None:

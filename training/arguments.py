@@ -1,4 +1,4 @@
-"""What the commands of training share: settings as options, and errors in one line; knows no record."""
+"""What the commands of training share: settings as options, and errors in one line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
 
-from finforce_ifea.errors import FinforceError
+from finforce.errors import FinforceError
 
 
 def add_settings(parser: ArgumentParser, record: type) -> None:

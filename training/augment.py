@@ -1,4 +1,4 @@
-"""Random views, light, dirt and noise for padded pictures; knows no network and no PyTorch."""
+"""Random views, light, dirt and noise for padded pictures."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_bounded import check_bounds, setting
-from finforce_keypoints.optional import import_cv2
+from finforce.optional import import_cv2
+from finforce.settings import check_bounds, setting
 from training.dataset import MARGIN
 from training.errors import RecipeError
 

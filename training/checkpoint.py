@@ -1,4 +1,4 @@
-"""Files that hold a training at one moment, to go on from or to export; knows no pictures."""
+"""Files that hold a training at one moment, to go on from or to export."""
 
 from __future__ import annotations
 

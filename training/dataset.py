@@ -1,4 +1,4 @@
-"""Shards of padded, rectified pictures with their points, on disk and in memory; knows no network and no PyTorch."""
+"""Shards of padded, rectified pictures with their points, on disk and in memory."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Points that a network in training finds in labelled pictures; knows neither losses nor files."""
+"""Points that a network in training finds in labelled pictures."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from finforce_keypoints.decoding import DecodingRule, decode
+from finforce_keypoints.networks.decoding import DecodingRule, decode
 from training.dataset import LabelledPictures
 from training.loading import stack_centres
 from training.network import LOCREF_STD, STRIDE, KeypointNetwork

@@ -1,4 +1,4 @@
-"""Sheets of pictures with true and found points, to look at; knows no network."""
+"""Sheets of pictures with true and found points, to look at."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_keypoints.optional import import_cv2
+from finforce.optional import import_cv2
 from training.augment import Sample
 from training.scoring import Detections
 

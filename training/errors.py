@@ -1,6 +1,6 @@
-"""What can be wrong with labels, data sets and checkpoints; knows nothing else."""
+"""What can be wrong with labels, data sets and checkpoints."""
 
-from finforce_ifea.errors import FinforceError
+from finforce.errors import FinforceError
 
 
 class LabelFileError(FinforceError, ValueError):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from finforce_keypoints.model import KeypointModel, ModelOverrides
+from finforce_keypoints.networks.model import KeypointModel, ModelOverrides
 from training.arguments import one_line_errors
 from training.augment import AugmentSettings, Sample, augment, crop_centre
 from training.dataset import VALIDATION, LabelledPictures, load_pictures

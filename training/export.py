@@ -14,9 +14,9 @@ from typing import Any
 
 import yaml
 
-from finforce_ifea.jaw import load_jaw
-from finforce_keypoints.metadata import METADATA_FILE
-from finforce_keypoints.plane_picture import PlaneGrid, find_side
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side
+from finforce_keypoints.networks.metadata import METADATA_FILE
 from training.arguments import one_line_errors
 from training.checkpoint import build_averaged, load_checkpoint
 from training.dataset import VALIDATION, load_pictures

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_ifea.jaw import load_jaw
-from finforce_keypoints.gripper_geometry import SIDES
-from finforce_keypoints.naming import build_name_map, parse_mapping
-from finforce_keypoints.optional import import_cv2
+from finforce.optional import import_cv2
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_keypoints.geometry.gripper import SIDES
+from finforce_keypoints.networks.naming import build_name_map, parse_mapping
 from training.arguments import one_line_errors
 from training.dataset import TRAIN, LabelledPictures, join_pictures, load_pictures
 from training.errors import LabelFileError

@@ -1,4 +1,4 @@
-"""Label files of DeepLabCut, `CollectedData_*.csv`, old and new style; knows no image and needs no PyTorch."""
+"""Label files of DeepLabCut, `CollectedData_*.csv`, old and new style."""
 
 from __future__ import annotations
 

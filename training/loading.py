@@ -1,4 +1,4 @@
-"""Augmented batches, made in other processes while the network trains; knows no network."""
+"""Augmented batches, made in other processes while the network trains."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import islice
 
 import numpy as np
 
-from finforce_keypoints.optional import import_cv2
+from finforce.optional import import_cv2
 from training.augment import MEAN, STD, AugmentSettings, Sample, augment, crop_centre
 from training.dataset import LabelledPictures, iterate_batches
 from training.optional import import_torch

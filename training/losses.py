@@ -1,4 +1,4 @@
-"""Targets and losses of heat maps and location refinements; knows no network and no pictures."""
+"""Targets and losses of heat maps and location refinements."""
 
 from __future__ import annotations
 

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from finforce_camera import CameraIntrinsics
-from finforce_contact.object_mesh import ObjectMesh
-from finforce_ifea.jaw import Jaw, load_jaw
-from finforce_keypoints.gripper_geometry import BENCH_CAMERA, ROBOT_CAMERA
-from finforce_keypoints.plane_picture import PlaneGrid, find_side, intersect_plane, map_picture, take_picture
-from finforce_twin.bodies import DrawnJaw, draw_jaws
-from finforce_twin.depth_camera import build_d405, build_d405_vga
-from finforce_twin.gripper import JawState, TwinState
-from finforce_twin.objects import OBJECT_NAMES, build_object
-from finforce_twin.photographer import Photographer, Setting, Shot
+from finforce.camera import CameraIntrinsics
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_keypoints.geometry.gripper import BENCH_CAMERA, ROBOT_CAMERA
+from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, intersect_plane, map_picture, take_picture
+from finforce_twin.gripper.gripper import JawState, TwinState
+from finforce_twin.rendering.bodies import DrawnJaw, draw_jaws
+from finforce_twin.rendering.depth_camera import build_d405, build_d405_vga
+from finforce_twin.rendering.photographer import Photographer, Setting, Shot
+from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
 from training.arguments import one_line_errors
 from training.dataset import MARGIN, TRAIN, VALIDATION, LabelledPictures, join_pictures, save_shard
 from training.pressed_shapes import PressedShape, draw_pressed_shapes

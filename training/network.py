@@ -1,4 +1,4 @@
-"""A small heat map network with location refinement; knows no data set and no jaw."""
+"""A small heat map network with location refinement."""
 
 from __future__ import annotations
 

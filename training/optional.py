@@ -2,7 +2,7 @@
 
 from types import ModuleType
 
-from finforce_optional import import_library
+from finforce.optional import import_library
 
 PURPOSE = "training of key point networks"
 

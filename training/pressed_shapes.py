@@ -1,4 +1,4 @@
-"""Shapes of a jaw under many objects, by the forward mechanics; knows no camera."""
+"""Shapes of a jaw under many objects, by the forward mechanics."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_ifea.errors import FinforceError
-from finforce_ifea.forward import Box, Cylinder, Press, RigidObject, press_jaw
-from finforce_ifea.jaw import Jaw
-from finforce_ifea.mechanics import Mechanics, build_mechanics
+from finforce.errors import FinforceError
+from finforce_ifea.contact_mechanics.forward_press import Box, Cylinder, Press, RigidObject, press_jaw
+from finforce_ifea.fem.mechanics import Mechanics, build_mechanics
+from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.settings import EstimatorSettings
 
 DEPTHS = np.array([0.8, 2.0, 3.5, 5.0, 7.0, 9.0, 11.0, 13.0]) * 1e-3

@@ -1,10 +1,10 @@
-"""The settings of one training; knows neither pictures nor networks."""
+"""The settings of one training."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from finforce_bounded import check_bounds, setting
+from finforce.settings import check_bounds, setting
 from training.errors import RecipeError
 
 

@@ -1,4 +1,4 @@
-"""A user's labelled images as pictures of the jaws' side planes; knows neither label files nor networks."""
+"""A user's labelled images as pictures of the jaws' side planes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from finforce_camera import CameraIntrinsics
-from finforce_contact.poses import pose_from_quaternion
-from finforce_ifea.jaw import Jaw
-from finforce_keypoints.gripper_geometry import jaw_in_camera, jaw_in_gripper
-from finforce_keypoints.plane_picture import PlaneGrid, find_side, intersect_plane, map_picture, take_picture
+from finforce.camera import CameraIntrinsics
+from finforce.transforms import pose_from_quaternion
+from finforce_ifea.jaw.jaw import Jaw
+from finforce_keypoints.geometry.gripper import jaw_in_camera, jaw_in_gripper
+from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, intersect_plane, map_picture, take_picture
 from training.dataset import MARGIN, LabelledPictures
 from training.errors import LabelFileError
 

@@ -1,12 +1,12 @@
-"""Further training of an exported network and its export; knows no label files."""
+"""Further training of an exported network and its export."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from dataclasses import replace
 
-from finforce_keypoints.metadata import METADATA_FILE, read_metadata
-from finforce_keypoints.model import find_network
+from finforce_keypoints.networks.metadata import METADATA_FILE, read_metadata
+from finforce_keypoints.networks.model import find_network
 from training.augment import AugmentSettings
 from training.dataset import LabelledPictures
 from training.evaluate import detect_with_model

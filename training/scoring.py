@@ -1,4 +1,4 @@
-"""Errors of found points, hidden points accepted and visible points lost; knows no network and no PyTorch."""
+"""Errors of found points, hidden points accepted and visible points lost."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from finforce_ifea.jaw import load_jaw
+from finforce_ifea.jaw.jaw import load_jaw
 from training.arguments import add_settings, one_line_errors, settings_from
 from training.augment import AugmentSettings
 from training.checkpoint import load_checkpoint

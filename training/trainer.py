@@ -1,4 +1,4 @@
-"""The training loop: steps, schedule, averaged weights, log and checkpoints; knows no command line and no export."""
+"""The training loop: steps, schedule, averaged weights, log and checkpoints."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""The weights of an exported network, to train it further; knows no pictures."""
+"""The weights of an exported network, to train it further."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from finforce_keypoints.metadata import METADATA_FILE, read_metadata
-from finforce_keypoints.model import find_network
+from finforce_keypoints.networks.metadata import METADATA_FILE, read_metadata
+from finforce_keypoints.networks.model import find_network
 from training.errors import CheckpointError
 from training.network import KeypointNetwork, NetworkShape
 from training.optional import import_onnx, import_torch

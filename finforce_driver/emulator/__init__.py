@@ -1,1 +1,1 @@
-"""An emulated SSG-48 behind an emulated SLCAN adapter, in real or in stepped time; knows no driver."""
+"""An emulated SSG-48 behind an emulated SLCAN adapter, in real or in stepped time."""

@@ -1,4 +1,4 @@
-"""A USB-CAN adapter that speaks SLCAN, with grippers on its bus; knows no serial port and no real time."""
+"""A USB-CAN adapter that speaks SLCAN, with grippers on its bus."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections import Counter, deque
 from collections.abc import Iterable
 
-from finforce_driver.bus import Frame
+from finforce_driver.can.bus import Frame
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.errors import TargetError
 

@@ -1,4 +1,4 @@
-"""Ways in which an adapter's line for a frame can go wrong; knows no adapter and no time."""
+"""Ways in which an adapter's line for a frame can go wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a careful driver does not send, judged order by order; knows no frame and no time."""
+"""What a careful driver does not send, judged order by order."""
 
 from __future__ import annotations
 

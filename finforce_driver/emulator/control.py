@@ -1,4 +1,4 @@
-"""What the firmware does in its control loop: moves and their object code, and the calibration; knows no frame."""
+"""What the firmware does in its control loop: moves and their object code, and the calibration."""
 
 from __future__ import annotations
 

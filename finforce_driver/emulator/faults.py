@@ -1,4 +1,4 @@
-"""What can go wrong on the way to a gripper and in it, injected by name or by a seeded plan; knows no driver."""
+"""What can go wrong on the way to a gripper and in it, injected by name or by a seeded plan."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 from random import Random
 
-from finforce_driver.bus import Frame
+from finforce_driver.can.bus import Frame
 from finforce_driver.emulator import broken_lines
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.protection import Fault

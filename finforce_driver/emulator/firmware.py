@@ -1,4 +1,4 @@
-"""The gripper's controller: CAN frames in, frames out, in steps of a millisecond; knows no adapter and no driver."""
+"""The gripper's controller: CAN frames in, frames out, in steps of a millisecond."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable
 
-from finforce_driver.bus import Frame
+from finforce_driver.can.bus import Frame
 from finforce_driver.emulator.conduct import list_violations
 from finforce_driver.emulator.control import Calibration, Endpoints, Mode, MoveControl, Order
 from finforce_driver.emulator.mechanism import STEP, Jaws

@@ -1,4 +1,4 @@
-"""Motor, racks and jaws in steps of a millisecond: motion, current and what the jaws press on; knows no command."""
+"""Motor, racks and jaws in steps of a millisecond: motion, current and what the jaws press on."""
 
 from __future__ import annotations
 

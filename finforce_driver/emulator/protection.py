@@ -1,4 +1,4 @@
-"""Faults that the firmware latches, and its watchdog; knows no motion."""
+"""Faults that the firmware latches, and its watchdog."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pseudo-terminal with an emulated adapter behind it, in real time; knows no SLCAN."""
+"""A pseudo-terminal with an emulated adapter behind it, in real time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The emulated gripper as a program of its own; knows no driver."""
+"""The emulated gripper as a program of its own."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import sys
 from collections.abc import Callable, Sequence
 from threading import Event
 
+from finforce.errors import FinforceError
 from finforce_driver.emulator.adapter import ACK_MODES, EmulatedAdapter
 from finforce_driver.emulator.faults import FaultyAdapter, draw_plan
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.pty_port import PtyPort
 from finforce_driver.emulator.settings import VARIANTS
 from finforce_driver.emulator.virtual import SteppedAdapter
-from finforce_errors import FinforceError
 
 _FAULTS = 10_000  # planned ahead
 

@@ -1,10 +1,10 @@
-"""What can be chosen of an emulated gripper: its build, its firmware and its environment; knows no frame."""
+"""What can be chosen of an emulated gripper: its build, its firmware and its environment."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from finforce_bounded import check_bounds, setting
+from finforce.settings import check_bounds, setting
 from finforce_driver.errors import TargetError
 
 

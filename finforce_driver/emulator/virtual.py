@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from threading import Event
 from typing import Protocol
 
-from finforce_driver.bus import Frame
+from finforce_driver.can.bus import Frame
+from finforce_driver.can.slcan import SlcanParser, encode_frame
 from finforce_driver.errors import LinkError
-from finforce_driver.slcan import SlcanParser, encode_frame
 
 _STEP = 0.001  # [s]
 _LEAST = 1e-6  # [s] that a wait takes: a rest of rounding would not move the clock, and be waited for for ever

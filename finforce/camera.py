@@ -1,0 +1,256 @@
+"""Pixels, rays and depth of a pinhole camera with plumb-bob distortion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.errors import FinforceError
+
+DEPTH_TYPES = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}
+MILLIMETRE = 1e-3  # the unit of 16-bit depth images (REP 118)
+FARTHEST_CENTRE = 10.0  # of a principal point outside its image, in sizes of that image; a cut-out has one
+SHORTEST_FOCAL, LONGEST_FOCAL = 0.01, 1000.0  # of a focal length, in sizes of the image; a cut-out's is long
+UNDISTORTION_STEPS = 50
+UNDISTORTION_TOLERANCE = 1e-10  # of a ray with z = 1
+
+
+class ImageError(FinforceError, ValueError):
+    """A depth image or a mask cannot be used."""
+
+
+class IntrinsicsError(FinforceError, ValueError):
+    """Intrinsics that no camera has."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraIntrinsics:
+    """A pinhole camera; the centre of the upper left pixel has the coordinates (0, 0), as in OpenCV.
+
+    Attributes:
+        width: of the image [px].
+        height: of the image [px].
+        fx: focal length along the rows [px].
+        fy: focal length along the columns [px].
+        cx: column of the principal point [px].
+        cy: row of the principal point [px].
+        distortion: (5,) plumb-bob coefficients k1, k2, p1, p2, k3.
+
+    Raises:
+        IntrinsicsError: a size or a focal length is not positive, a number is not finite, the principal point is far
+            outside the image, or a focal length is out of proportion to it.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: NDArray = field(default_factory=lambda: np.zeros(5))
+
+    def __post_init__(self) -> None:
+        numbers = np.array([self.fx, self.fy, self.cx, self.cy], dtype=float)
+        if self.width < 1 or self.height < 1 or not np.isfinite(numbers).all() or min(self.fx, self.fy) <= 0.0:
+            raise IntrinsicsError(
+                f"intrinsics {self.width}x{self.height}, fx fy cx cy = {numbers.tolist()}: expected a positive size, "
+                "positive focal lengths and finite numbers [px]"
+            )
+        if abs(self.cx) > FARTHEST_CENTRE * self.width or abs(self.cy) > FARTHEST_CENTRE * self.height:
+            raise IntrinsicsError(
+                f"intrinsics {self.width}x{self.height}, cx cy = {numbers[2:].tolist()}: expected a principal point in "
+                "or near the image [px]"
+            )
+        proportion = numbers[:2] / (self.width, self.height)
+        if proportion.min() < SHORTEST_FOCAL or proportion.max() > LONGEST_FOCAL:
+            raise IntrinsicsError(
+                f"intrinsics {self.width}x{self.height}, fx fy = {numbers[:2].tolist()}: expected focal lengths in "
+                f"proportion to the image, {SHORTEST_FOCAL:g} to {LONGEST_FOCAL:g} of its size [px]"
+            )
+        distortion = np.asarray(self.distortion, dtype=float).ravel()
+        if len(distortion) not in (0, 4, 5) or not np.isfinite(distortion).all():
+            raise IntrinsicsError(
+                f"distortion {distortion.tolist()}: expected the plumb-bob coefficients k1 k2 p1 p2 [k3]; "
+                "rectify the images of a camera with another model"
+            )
+        object.__setattr__(self, "distortion", np.pad(distortion, (0, 5 - len(distortion))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageLayout:
+    """How the bytes of an image lie: rows, columns, bytes per row (0: no padding) and byte order."""
+
+    height: int
+    width: int
+    step: int = 0
+    is_bigendian: bool = False
+
+
+@lru_cache(maxsize=4)
+def compute_rays(camera: CameraIntrinsics) -> NDArray:
+    """Return the viewing ray of every pixel, read-only.
+
+    Returns:
+        (h, w, 3) directions in the camera frame with z = 1, so that a ray times its depth is a point.
+    """
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = rays_from_pixels(np.stack((columns, rows), axis=-1).reshape(-1, 2), camera)
+    rays = rays.reshape(camera.height, camera.width, 3)
+    rays.flags.writeable = False
+    return rays
+
+
+def rays_from_pixels(pixels: NDArray, camera: CameraIntrinsics) -> NDArray:
+    """Return the viewing rays (n, 3), z = 1, of pixels (n, 2) given as column and row [px].
+
+    The distortion is inverted by a fixed-point iteration, x = (x_d - tangential(x)) / radial(x).
+
+    Raises:
+        IntrinsicsError: the distortion cannot be inverted at one of the pixels.
+    """
+    pixels = np.asarray(pixels, dtype=float)
+    distorted = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    plane = distorted.copy()
+    if camera.distortion.any():
+        for _ in range(UNDISTORTION_STEPS):
+            radial, tangential = _distortion_at(plane, camera.distortion)
+            previous, plane = plane, (distorted - tangential) / radial[:, None]
+            if np.abs(plane - previous).max(initial=0.0) < UNDISTORTION_TOLERANCE:
+                break
+        else:
+            raise IntrinsicsError(f"distortion {camera.distortion.tolist()}: cannot be inverted within the image")
+    return np.column_stack((plane, np.ones(len(plane))))
+
+
+def _distortion_at(plane: NDArray, coefficients: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the radial factors (n,) and tangential shifts (n, 2) at points (n, 2) of the plane z = 1."""
+    k1, k2, p1, p2, k3 = coefficients
+    x, y = plane.T
+    square = x * x + y * y
+    radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+    shift_x = 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+    shift_y = p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
+    return radial, np.column_stack((shift_x, shift_y))
+
+
+def project(points: NDArray, camera: CameraIntrinsics) -> NDArray:
+    """Return the pixels (n, 2), column and row, of points (n, 3) [m] in the camera frame.
+
+    Points at or behind the camera's plane have no pixel and come back as NaN.
+    """
+    points = np.asarray(points, dtype=float)
+    depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
+    plane = points[:, :2] / depth[:, None]
+    if camera.distortion.any():
+        radial, tangential = _distortion_at(plane, camera.distortion)
+        plane = plane * radial[:, None] + tangential
+    return plane * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+
+
+def deproject(depth: NDArray, camera: CameraIntrinsics, mask: NDArray | None = None) -> NDArray:
+    """Return the points of a depth image, row by row, without the pixels that have no depth.
+
+    Args:
+        depth: (h, w) distance along the optical axis [m], NaN where nothing was measured.
+        camera: of the depth image.
+        mask: (h, w) bool, the pixels wanted; all when absent.
+
+    Returns:
+        (n, 3) points in the camera frame [m].
+
+    Raises:
+        ImageError: an image has another size than the camera.
+    """
+    _check_size(depth, camera)
+    wanted = np.isfinite(depth)
+    if mask is not None:
+        _check_size(mask, camera, "mask")
+        wanted &= np.asarray(mask, dtype=bool)
+    return compute_rays(camera)[wanted] * np.asarray(depth, dtype=float)[wanted, None]
+
+
+def decode_depth(
+    data: NDArray | bytes, encoding: str, layout: ImageLayout | None = None, scale: float = MILLIMETRE
+) -> NDArray:
+    """Return a depth image in metres.
+
+    Args:
+        data: the image (h, w), or its bytes together with their layout.
+        encoding: 16UC1 (or mono16), in steps of `scale`, 0 where invalid; or 32FC1, in metres.
+        layout: how the bytes lie.
+        scale: one step of a 16-bit image [m].
+
+    Returns:
+        (h, w) float32 [m], NaN where nothing was measured.
+
+    Raises:
+        ImageError: the encoding is another one, or the data do not fill the layout.
+    """
+    if encoding not in DEPTH_TYPES:
+        raise ImageError(f"depth image: encoding '{encoding}'; expected 16UC1 [mm] or 32FC1 [m]")
+    if layout is not None:
+        data = _unpack_rows(data, DEPTH_TYPES[encoding], layout)
+    image = np.asarray(data)
+    if image.ndim != 2:
+        raise ImageError(f"depth image: shape {image.shape}; expected (height, width)")
+    if encoding != "32FC1":
+        depth = np.multiply(image, np.float32(scale), dtype=np.float32)
+        depth[image == 0] = np.nan
+        return depth
+    depth = image.astype(np.float32)
+    depth[~(np.isfinite(depth) & (depth > 0.0))] = np.nan
+    return depth
+
+
+def _unpack_rows(data: NDArray | bytes, dtype: np.dtype, layout: ImageLayout) -> NDArray:
+    """Return the image (h, w) of bytes that may have padding at the end of their rows."""
+    raw = np.frombuffer(data, dtype=np.uint8)
+    used = layout.width * dtype.itemsize
+    step = layout.step or used
+    if step < used or len(raw) != step * layout.height:
+        raise ImageError(
+            f"depth image: {len(raw)} bytes with {step} a row; expected {layout.height} rows of at least {used} bytes"
+        )
+    rows = np.ascontiguousarray(raw.reshape(layout.height, step)[:, :used])
+    return rows.view(dtype.newbyteorder(">" if layout.is_bigendian else "<"))
+
+
+def check_depth(depth: NDArray, camera: CameraIntrinsics) -> None:
+    """Refuse a depth image that has another size than its camera, or no depth at all.
+
+    Raises:
+        ImageError: it is one of these.
+    """
+    _check_size(depth, camera)
+    if not (np.isfinite(depth) & (np.nan_to_num(depth) > 0.0)).any():
+        raise ImageError("depth image: no pixel has a depth; is the camera covered, or nearer than it can see?")
+
+
+def check_mask(mask: NDArray, depth: NDArray, least: int = 1) -> None:
+    """Refuse a mask that does not fit its depth image, or selects fewer than `least` pixels with depth.
+
+    Raises:
+        ImageError: it is one of these.
+    """
+    if np.shape(mask) != np.shape(depth):
+        raise ImageError(f"mask: shape {np.shape(mask)}; expected that of the depth image, {np.shape(depth)}")
+    selected = np.asarray(mask, dtype=bool)
+    if not selected.any():
+        raise ImageError("mask: nothing in it; expected the object's pixels to be set")
+    known = int((selected & np.isfinite(depth)).sum())
+    if known < least:
+        raise ImageError(
+            f"mask: {known} of its {int(selected.sum())} pixels have a depth, at least {least} are needed; "
+            "is the object nearer or farther than the camera can see?"
+        )
+
+
+def _check_size(image: NDArray, camera: CameraIntrinsics, what: str = "depth image") -> None:
+    """Refuse an image of another size than its camera."""
+    if np.shape(image) != (camera.height, camera.width):
+        raise ImageError(
+            f"{what}: shape {np.shape(image)}; the intrinsics are of {camera.height} rows and {camera.width} columns"
+        )

@@ -1,0 +1,17 @@
+"""The base of the errors that finforce raises on purpose, and of missing libraries."""
+
+
+class FinforceError(Exception):
+    """The base of every error that finforce raises on purpose."""
+
+
+class MissingDependencyError(FinforceError, ImportError):
+    """An optional library is needed and not installed."""
+
+
+class ObservationError(FinforceError, ValueError):
+    """Key points came in the wrong shape, frame or number."""
+
+
+class PoseError(FinforceError, ValueError):
+    """Numbers that were given as a pose are none."""

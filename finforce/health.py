@@ -1,0 +1,243 @@
+"""How a node is doing: rates, latencies, refusals and the level that follows."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from time import monotonic
+
+import numpy as np
+
+from finforce.errors import FinforceError
+
+NANOSECONDS = 1_000_000_000
+
+
+class Level(IntEnum):
+    """The levels of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+class StampError(FinforceError, ValueError):
+    """A stamp repeats, goes back or lies ahead of the clock."""
+
+
+class StaleError(FinforceError, ValueError):
+    """The data are older than what may be published."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of one message: its level, one word to count it by, one sentence."""
+
+    level: Level
+    reason: str
+    text: str
+
+    @classmethod
+    def of_error(cls, error: FinforceError) -> Outcome:
+        """Return the outcome of a refused message, counted by the name of the error's class."""
+        level = Level.STALE if isinstance(error, StaleError) else Level.ERROR
+        return cls(level=level, reason=type(error).__name__.removesuffix("Error").lower(), text=str(error))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """The state of a node as it is shown: level, sentence and named values."""
+
+    level: Level
+    message: str
+    values: Mapping[str, str] = field(default_factory=dict)
+
+
+class StampGate:
+    """Lets a sample through once, in order, and only while it is fresh.
+
+    Args:
+        max_age: greatest age of a sample [s]; a stamp may lie as far ahead of the clock.
+        restart_gap: a stamp that goes back by more than this begins a new recording [s].
+    """
+
+    def __init__(self, *, max_age: float, restart_gap: float) -> None:
+        self._max_age = round(max_age * NANOSECONDS)
+        self._restart_gap = round(restart_gap * NANOSECONDS)
+        self._last: int | None = None
+
+    def enter(self, stamp: int, now: int) -> bool:
+        """Admit a sample and return whether a new recording begins with it.
+
+        Args:
+            stamp: image time [ns].
+            now: the node's clock [ns].
+
+        Raises:
+            StaleError: the sample is too old.
+            StampError: the stamp repeats, goes back by less than `restart_gap` or lies ahead of the clock.
+        """
+        self.check_age(stamp, now)
+        back = 0 if self._last is None else self._last - stamp
+        if self._last is not None and 0 <= back <= self._restart_gap:
+            verb = f"go back by {back / NANOSECONDS:.3f} s" if back else "stand still"
+            raise StampError(f"the stamps {verb} at {stamp / NANOSECONDS:.3f} s")
+        self._last = stamp
+        return back > 0
+
+    def check_age(self, stamp: int, now: int) -> None:
+        """Refuse a sample that is too old, or ahead of the clock.
+
+        Raises:
+            StaleError: too old.
+            StampError: ahead of the clock by more than the greatest age.
+        """
+        age, limit = (now - stamp) / NANOSECONDS, self._max_age / NANOSECONDS
+        if now - stamp > self._max_age:
+            hint = "; a recording needs /clock and use_sim_time" if age > 3600.0 else ""
+            raise StaleError(f"the data are {age:.3f} s old; at most {limit:g} s are allowed{hint}")
+        if stamp - now > self._max_age:
+            hint = "use_sim_time without /clock?" if now == 0 else "are the clocks synchronised?"
+            raise StampError(f"the stamp lies {-age:.3f} s ahead of the node's clock; {hint}")
+
+
+class Idling:
+    """Passes images over while nothing happens: of every period one is answered, in every node the same.
+
+    Args:
+        period: of the answers [s]; an image is the first one of a period, counted from stamp 0.
+    """
+
+    def __init__(self, period: float = 0.1) -> None:
+        self._period = round(period * NANOSECONDS)
+        self._answered: int | None = None
+        self._ages: deque[int] = deque(maxlen=2)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing happened in the last image that was answered."""
+        return self._answered is not None
+
+    def passes(self, stamp: int) -> bool:
+        """Say whether an image [ns] may be passed over: one of its period was answered, and nothing happened then."""
+        return self._answered == stamp // self._period
+
+    def spare_time(self, now: int) -> float:
+        """Return for how long [s] from `now` [ns] no image will come that has to be answered.
+
+        That which begins the next period takes as long to come as the quicker one of the last two answered.
+        """
+        if self._answered is None or not self._ages:
+            return 0.0
+        left = (self._answered + 1) * self._period + min(self._ages) - now
+        return min(max(left, 0), self._period) / NANOSECONDS
+
+    def note(self, stamp: int, idle: bool, now: int | None = None) -> None:
+        """Note that an image [ns] was answered, whether nothing happened in it, and when [ns] for `spare_time`."""
+        self._answered = stamp // self._period if idle else None
+        if now is not None:
+            self._ages.append(now - stamp)
+
+    def end(self) -> None:
+        """Note that something happens."""
+        self._answered = None
+
+
+class Health:
+    """Keeps the last outcomes of a node and says how it is.
+
+    Attributes:
+        source: the topic that drives the node.
+
+    Args:
+        source: the same, as far as it is known at the start.
+        stale_after: silence after which the node is stale [s].
+        window: number of messages that rates and latencies are taken over.
+    """
+
+    def __init__(self, *, source: str, stale_after: float, window: int = 512) -> None:
+        self.source = source
+        self._stale_after = stale_after
+        self._arrivals: deque[float] = deque(maxlen=window)
+        self._latency: deque[float] = deque(maxlen=window)
+        self._age: deque[float] = deque(maxlen=window)
+        self._refused: Counter[str] = Counter()
+        self._recent: list[Outcome] = []
+        self._last: Outcome | None = None
+        self._arrived = self._published = 0
+
+    def arrive(self, superseded: int = 0) -> None:
+        """Count a message that arrived, and those that a newer one had overtaken."""
+        self._arrived += 1 + superseded
+        self._arrivals.append(monotonic())
+        self._refused["superseded"] += superseded
+
+    def publish(self, outcome: Outcome, *, latency: float, age: float) -> None:
+        """Count a published result: time since its callback began and age of its data [s]."""
+        self._published += 1
+        self._latency.append(latency)
+        self._age.append(age)
+        self._last = outcome
+
+    def refuse(self, outcome: Outcome) -> None:
+        """Count a message of which nothing was published."""
+        self._refused[outcome.reason] += 1
+        self._recent.append(outcome)
+        self._last = outcome
+
+    def report(self, alarms: Sequence[Outcome] = (), values: Mapping[str, str] | None = None) -> Report:
+        """Return the state now, and what was refused since the last report.
+
+        An error goes before the silence that may follow from it; a refusal turns OK into WARN.
+
+        Args:
+            alarms: standing faults, beside the messages'.
+            values: further values to be shown.
+        """
+        level, text = self._state()
+        troubles = [*alarms, *self._recent]
+        if any(trouble.level == Level.ERROR for trouble in troubles):
+            level = Level.ERROR
+        elif troubles:
+            level = max(level, Level.WARN)
+        reasons = {trouble.reason: trouble.text for trouble in troubles}
+        message = "; ".join(dict.fromkeys([*reasons.values(), text]))
+        self._recent.clear()
+        return Report(level=level, message=message, values={**self._figures(), **(values or {})})
+
+    def _state(self) -> tuple[Level, str]:
+        """Return level and sentence from the messages alone."""
+        if not self._arrivals or self._last is None:
+            return Level.STALE, f"nothing has arrived on {self.source}"
+        silence = monotonic() - self._arrivals[-1]
+        if silence > self._stale_after:
+            return Level.STALE, f"nothing has arrived on {self.source} for {silence:.1f} s"
+        return self._last.level, self._last.text
+
+    def _figures(self) -> dict[str, str]:
+        """Return rate, latencies and counts as text."""
+        times = [time for time in self._arrivals if monotonic() - time < 5.0]
+        rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
+        return {
+            "rate [Hz]": f"{rate:.1f}",
+            "callback to published p50 [ms]": _percentile(self._latency, 50),
+            "callback to published p95 [ms]": _percentile(self._latency, 95),
+            "image to published p50 [ms]": _percentile(self._age, 50),
+            "image to published p95 [ms]": _percentile(self._age, 95),
+            "arrived": str(self._arrived),
+            "published": str(self._published),
+            "refused": _counts(self._refused),
+        }
+
+
+def _percentile(seconds: Sequence[float], percent: float) -> str:
+    """Return a percentile of times [s] as text in milliseconds."""
+    return f"{1e3 * float(np.percentile(seconds, percent)):.2f}" if len(seconds) else "-"
+
+
+def _counts(counter: Counter[str]) -> str:
+    """Return counts as text, the most frequent first."""
+    return ", ".join(f"{count} {reason}" for reason, count in counter.most_common() if count) or "none"

@@ -1,0 +1,48 @@
+"""Libraries that not everybody installs, imported where they are used; their absence says what to install."""
+
+from importlib import import_module
+from types import ModuleType
+
+from finforce.errors import MissingDependencyError
+
+
+def import_library(name: str, purpose: str, package: str = "") -> ModuleType:
+    """Return a library.
+
+    Args:
+        name: of the module.
+        purpose: what needs it, for the message.
+        package: what `pip install` calls it; empty: the module's name.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise MissingDependencyError(f"{purpose} needs {name}: pip install {package or name} ({error})") from error
+
+
+def import_manifold3d() -> ModuleType:
+    """Return manifold3d, booleans of solids; raises MissingDependencyError where it is not installed."""
+    return import_library("manifold3d", "contact of meshes")
+
+
+def import_open3d() -> ModuleType:
+    """Return open3d, repair and registration; raises MissingDependencyError where it is not installed."""
+    return import_library("open3d", "repair and registration of meshes")
+
+
+def import_trimesh() -> ModuleType:
+    """Return trimesh, mesh files; raises MissingDependencyError where it is not installed."""
+    return import_library("trimesh", "reading of mesh files")
+
+
+def import_onnxruntime() -> ModuleType:
+    """Return onnxruntime, networks; raises MissingDependencyError where it is not installed."""
+    return import_library("onnxruntime", "running a key point network")
+
+
+def import_cv2() -> ModuleType:
+    """Return cv2, image processing; raises MissingDependencyError where it is not installed."""
+    return import_library("cv2", "image processing of key points", "opencv-contrib-python-headless")

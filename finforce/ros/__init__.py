@@ -1,0 +1,1 @@
+"""Nodes: parameters, quality of service, messages, diagnostics, start and stop."""

@@ -1,0 +1,221 @@
+"""An executor of rclpy that keeps its wait set while nothing comes or goes."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from time import sleep
+from typing import Any, NamedTuple
+
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import get_logger
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+
+from finforce.skipping import UNCHANGED, UNHEARD, Skips
+
+MOST_AT_ONCE = 20  # messages of one topic, after which the others have their turn
+LEAST_SLEEP = 2e-3  # s; to fall asleep and wake up takes time, too
+ADDERS = {
+    "subscriptions": "add_subscription",
+    "timers": "add_timer",
+    "clients": "add_client",
+    "services": "add_service",
+}
+
+
+def is_wanted(publisher: Any, skips: Skips) -> bool:
+    """Say whether a message has to be made for a topic; where nobody subscribes that is counted, and it has not."""
+    wanted = publisher.get_subscription_count() > 0 or not skips.allows(UNHEARD)
+    if not wanted:
+        skips.count(UNHEARD)
+    return wanted
+
+
+class _UnknownRclpyError(Exception):
+    """What the executor reads of rclpy's inside is not there, or something else."""
+
+
+class KeepingExecutor(SingleThreadedExecutor):
+    """Answers as its base does, for half of the time or less.
+
+    The base makes a list and a wait set of all that a node has, twice for each message. Here both are kept until the
+    node says that something came or went, and messages go to plain callbacks at once. Whatever else is ready, as a
+    timer, a service or a coroutine under way, is left to the base, and so is a node with actions. A connection that
+    does not come about is noticed with the next timer. While a node has time to spare, all of that waits.
+
+    It reads what rclpy promises nobody. Where a release of rclpy has that otherwise, it says so once and is its base.
+
+    Args:
+        context: of rclpy.
+    """
+
+    def __init__(self, *, context: Any = None) -> None:
+        super().__init__(context=context)
+        self._skips, self._spare_time = Skips(()), lambda: 0.0
+        self._kept: _Kept | None = None
+        self._is_strange = False
+
+    def obey(self, node: Any) -> None:
+        """Ask a node's `skips` whether the wait set may be kept, its `spare_time` [s] how long messages may wait."""
+        self._skips = getattr(node, "skips", self._skips)
+        self._spare_time = getattr(node, "spare_time", self._spare_time)
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Wait for work and do it; with a time limit [s] as the base does."""
+        if timeout_sec is not None or self._is_strange or not self._skips.allows(UNCHANGED):
+            super().spin_once(timeout_sec)
+            return
+        try:
+            self._spin_kept()
+        except _UnknownRclpyError as error:
+            self._be_base(error)
+
+    def _spin_kept(self) -> None:
+        """Wait with the kept wait set and do what is ready."""
+        with self._own_work():
+            is_foreign = self._is_busy() or self._keep().is_foreign
+        if is_foreign:
+            super().spin_once()
+            return
+        if (spare := self._spare_time()) > LEAST_SLEEP:
+            sleep(spare)  # what comes meanwhile is taken at once
+        with self._own_work():
+            ready = self._keep().wait((self._guard.handle, self._sigint_gc.handle), self.can_execute)
+            is_changed = self._guard.handle.pointer in ready.guards
+        if not self.context.ok():
+            raise ExternalShutdownException
+        if is_changed:
+            self._release()  # something came or went
+        for subscription in ready.messages:
+            if self.can_execute(subscription):
+                self._hand_over(subscription)
+        if ready.has_more:
+            super().spin_once(0.0)
+
+    @contextmanager
+    def _own_work(self) -> Iterator[None]:
+        """Mark what is done with rclpy's inside: an error there is none of a node's, unless rclpy ends."""
+        try:
+            yield
+        except InvalidHandle:
+            raise  # it was taken away meanwhile
+        except Exception as error:
+            if not self.context.ok():
+                raise
+            raise _UnknownRclpyError(f"{type(error).__name__}: {error}") from error
+
+    def _be_base(self, error: _UnknownRclpyError) -> None:
+        """Say why nothing is kept, and keep nothing from now on."""
+        self._is_strange = True
+        with suppress(Exception):
+            self._release()
+        self._kept = None
+        get_logger("finforce").warning(f"this rclpy is another one than expected, '{UNCHANGED}' is off: {error}")
+
+    def _keep(self) -> _Kept:
+        """Return the wait set, made now if there is none."""
+        self._kept = self._kept or _Kept(self.get_nodes(), self.context)
+        return self._kept
+
+    def _is_busy(self) -> bool:
+        """Say whether a coroutine is under way, and forget those that are done."""
+        with self._tasks_lock:
+            self._tasks = [entry for entry in self._tasks if not entry[0].done()]
+            return bool(self._tasks)
+
+    def _hand_over(self, subscription: Subscription) -> None:
+        """Call back with all messages that wait, until the subscription is gone or its group busy."""
+        with suppress(InvalidHandle), (handle := subscription.handle):
+            for _ in range(MOST_AT_ONCE):
+                with self._own_work():
+                    taken = handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is None:
+                    return
+                self._skips.count(UNCHANGED)
+                subscription.callback(taken[0])
+                if not self.can_execute(subscription):
+                    return
+
+    def remove_node(self, node: Node) -> None:
+        """Let go of a node and of all that it has."""
+        self._release()
+        super().remove_node(node)
+
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """End; see the base."""
+        self._release()
+        return super().shutdown(timeout_sec)
+
+    def _release(self) -> None:
+        if self._kept is not None:
+            self._kept.release()
+            self._kept = None
+
+
+class _Ready(NamedTuple):
+    """What a wait has ended with: subscriptions with plain callbacks, pointers of guards, whether there is more."""
+
+    messages: Sequence[Subscription]
+    guards: Collection[int]
+    has_more: bool
+
+
+class _Kept:
+    """What nodes have, and a wait set large enough for it.
+
+    Attributes:
+        is_foreign: whether there is something that only the base can wait for.
+    """
+
+    def __init__(self, nodes: Sequence[Node], context: Any) -> None:
+        from rclpy.event_handler import EventHandler  # not all releases have them
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+
+        waitables = [item for node in nodes for item in node.waitables]
+        foreign = [item for item in waitables if not isinstance(item, EventHandler)]
+        self.is_foreign = bool(foreign) or any(True for node in nodes for _ in node.guards)
+        self._stack = ExitStack()
+        found = {kind: [item for node in nodes for item in getattr(node, kind) if self._hold(item)] for kind in ADDERS}
+        sizes = {kind: len(items) for kind, items in found.items()}
+        self._set = rclpy_implementation.WaitSet(
+            sizes["subscriptions"], 2, sizes["timers"], sizes["clients"], sizes["services"], 0, context.handle
+        )
+        self._entities = [(item, getattr(self._set, ADDERS[kind])) for kind, items in found.items() for item in items]
+        self._plain = {item.handle.pointer: item for item in found["subscriptions"] if _is_plain(item)}
+
+    def _hold(self, entity: Any) -> bool:
+        """Keep an entity's handle until `release`; return whether it still had one."""
+        try:
+            self._stack.enter_context(entity.handle)
+        except InvalidHandle:
+            return False
+        return True
+
+    def release(self) -> None:
+        """Let go of all handles."""
+        self._stack.close()
+
+    def wait(self, guards: Sequence[Any], can_execute: Callable[[Any], bool]) -> _Ready:
+        """Wait until something is ready that may be executed, or a guard is triggered."""
+        waiting = self._set
+        waiting.clear_entities()
+        for guard in guards:
+            waiting.add_guard_condition(guard)
+        for entity, add in self._entities:
+            if can_execute(entity):
+                add(entity.handle)
+        waiting.wait(-1)
+        look = waiting.get_ready_entities
+        pointers = look("subscription")
+        messages = [self._plain[pointer] for pointer in pointers if pointer in self._plain]
+        has_more = len(messages) < len(pointers) or any(map(look, ("timer", "client", "service")))
+        return _Ready(messages, look("guard_condition"), has_more)
+
+
+def _is_plain(subscription: Subscription) -> bool:
+    """Whether a callback takes the message alone, and is done when it returns."""
+    takes_message = subscription._callback_type is Subscription.CallbackType.MessageOnly
+    return takes_message and not inspect.iscoroutinefunction(subscription.callback)

@@ -1,0 +1,196 @@
+"""Messages of ROS from arrays and numbers, exact in their stamps."""
+
+from __future__ import annotations
+
+import array
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3, Wrench, WrenchStamped
+from numpy.typing import ArrayLike, NDArray
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker
+
+from finforce.errors import ObservationError
+from finforce.health import NANOSECONDS, Report
+from finforce.pointcloud import encode_cloud
+from finforce_ifea.messages import check_frame, contact_from_cloud
+
+MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Return a builtin_interfaces/Time as exact integer nanoseconds."""
+    return stamp.sec * NANOSECONDS + stamp.nanosec
+
+
+def stamp_message(stamp: int) -> Time:
+    """Return integer nanoseconds as a builtin_interfaces/Time."""
+    seconds, rest = divmod(stamp, NANOSECONDS)
+    return Time(sec=seconds, nanosec=rest)
+
+
+class KeptMessage:
+    """A message with a header in its serialised form, which can be sent again under other stamps.
+
+    Args:
+        message: of any type that begins with a std_msgs/Header.
+    """
+
+    def __init__(self, message: Any) -> None:
+        self._data = bytearray(serialize_message(message))
+        self._numbers = "<iI" if self._data[1] & 1 else ">iI"
+
+    def at(self, stamp: int) -> bytes:
+        """Return the message with a stamp [ns]."""
+        struct.pack_into(self._numbers, self._data, 4, *divmod(stamp, NANOSECONDS))
+        return bytes(self._data)
+
+
+def cloud_message(header: Header, columns: Mapping[str, ArrayLike]) -> PointCloud2:
+    """Return a cloud of height 1 with one field per column (n,), in their order and type."""
+    encoded = encode_cloud(columns)
+    return PointCloud2(
+        header=header,
+        height=1,
+        width=len(encoded.data) // encoded.point_step,
+        fields=_point_fields(encoded.fields),
+        point_step=encoded.point_step,
+        row_step=len(encoded.data),
+        data=array.array("B", encoded.data),  # an ndarray would be checked byte by byte
+        is_dense=all(bool(np.isfinite(values).all()) for values in columns.values()),
+    )
+
+
+@lru_cache(maxsize=64)
+def _point_fields(entries: Sequence[Any]) -> list[PointField]:
+    """Return a cloud's fields as messages, which all clouds with these fields share."""
+    return [PointField(**vars(entry)) for entry in entries]
+
+
+def xyz_columns(points: ArrayLike) -> dict[str, NDArray[np.float32]]:
+    """Return points (n, 3) as the float32 columns x, y, z."""
+    return dict(zip("xyz", np.asarray(points, dtype=np.float32).reshape(-1, 3).T, strict=True))
+
+
+def image_message(header: Header, picture: NDArray, encoding: str = "rgb8") -> Image:
+    """Return a picture (h, w, 3) of red, green and blue, or (h, w) of another encoding, as an image."""
+    height, width = picture.shape[:2]
+    return Image(
+        header=header,
+        height=height,
+        width=width,
+        encoding=encoding,
+        step=picture.nbytes // height,
+        data=array.array("B", picture.tobytes()),  # an ndarray would be checked byte by byte
+    )
+
+
+def wrench_message(header: Header, force: ArrayLike, torque: ArrayLike = (0.0, 0.0, 0.0)) -> WrenchStamped:
+    """Return a wrench from force (3,) [N] and torque (3,) [N m].
+
+    Raises:
+        ObservationError: a component is not finite; such a wrench must not leave.
+    """
+    numbers = [*map(float, force), *map(float, torque)]
+    if not all(map(math.isfinite, numbers)):
+        raise ObservationError(f"the wrench is not finite: {numbers}")
+    return WrenchStamped(header=header, wrench=Wrench(force=_vector(numbers[:3]), torque=_vector(numbers[3:])))
+
+
+def _vector(xyz: Sequence[float]) -> Vector3:
+    return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
+
+
+def grasp_force(message: WrenchStamped, frame: str) -> float:
+    """Return the grasp force [N] of a grasp_wrench, as it came: it may be no number.
+
+    Raises:
+        ObservationError: the frame is another one.
+    """
+    check_frame(message, frame, "the grasp wrench")
+    return message.wrench.force.x
+
+
+def is_touching(cloud: PointCloud2, frame: str) -> bool:
+    """Say whether a contact estimator's cloud shows the object to touch the jaw.
+
+    Raises:
+        ObservationError: the frame, the height, the fields or the buffer are wrong.
+        ContactError: a coordinate or a weight is not finite.
+    """
+    return bool(contact_from_cloud(cloud, frame, free=False).touching)
+
+
+def joint_state_message(
+    header: Header, names: Sequence[str], positions: ArrayLike, velocities: ArrayLike, efforts: ArrayLike
+) -> JointState:
+    """Return the state of joints (n,) by position [m], velocity [m/s] and effort [N].
+
+    Raises:
+        ObservationError: a number is not finite; such a state must not leave.
+    """
+    columns = [[float(value) for value in values] for values in (positions, velocities, efforts)]
+    if not all(math.isfinite(value) for values in columns for value in values):
+        raise ObservationError(f"the joints' state is not finite: {columns}")
+    return JointState(header=header, name=list(names), position=columns[0], velocity=columns[1], effort=columns[2])
+
+
+def pose_message(header: Header, numbers: Sequence[float]) -> PoseStamped:
+    """Return a pose from x, y, z [m], qx, qy, qz, qw."""
+    x, y, z, *turn = map(float, numbers)
+    orientation = Quaternion(**dict(zip("xyzw", turn, strict=True)))
+    return PoseStamped(header=header, pose=Pose(position=Point(x=x, y=y, z=z), orientation=orientation))
+
+
+def status_message(name: str, source: str, report: Report) -> DiagnosticStatus:
+    """Return a report as the status `name` of a node `source`."""
+    return DiagnosticStatus(
+        level=bytes([report.level]),
+        name=name,
+        message=report.message,
+        hardware_id=source,
+        values=[KeyValue(key=key, value=value) for key, value in report.values.items()],
+    )
+
+
+def points_marker(
+    header: Header,
+    name: str,
+    kind: str,
+    points: ArrayLike,
+    *,
+    color: Sequence[float],
+    scale: Sequence[float],
+    colors: Sequence[Sequence[float]] = (),
+) -> Marker:
+    """Return a marker of points (n, 3) [m]: triangles, spheres or an arrow from the first to the second.
+
+    Args:
+        header: stamp and frame.
+        name: the marker's namespace; each holds one marker.
+        kind: "triangles", "spheres" or "arrow".
+        points: in the frame of the header; none of them deletes the marker.
+        color: red, green, blue, opacity.
+        scale: what the kind makes of it [m].
+        colors: one per point, in place of `color`.
+    """
+    known = [Point(x=x, y=y, z=z) for x, y, z in np.asarray(points, dtype=np.float64).reshape(-1, 3).tolist()]
+    return Marker(
+        header=header,
+        ns=name,
+        type=MARKERS[kind],
+        action=Marker.ADD if known else Marker.DELETE,
+        points=known,
+        color=ColorRGBA(**dict(zip("rgba", color, strict=True))),
+        colors=[ColorRGBA(**dict(zip("rgba", entry, strict=True))) for entry in colors],
+        scale=_vector(scale),
+    )

@@ -1,0 +1,292 @@
+"""What every node shares: parameters, quality of service, diagnostics, start and stop, and messages."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import Field, fields
+from functools import partial
+from threading import Thread
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: F401 - for those who publish
+from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: F401 - for those who publish
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import NameValidationException, ParameterException
+from rclpy.executors import ExternalShutdownException
+from rclpy.expand_topic_name import expand_topic_name
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.subscription import Subscription
+from rclpy.task import Future
+from rclpy.validate_full_topic_name import validate_full_topic_name
+from rclpy.validate_topic_name import validate_topic_name
+from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2  # noqa: F401 - for those who subscribe
+from std_msgs.msg import Header, String  # noqa: F401 - for those who publish
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who publish
+
+from finforce.errors import FinforceError
+from finforce.health import NANOSECONDS, Level, Outcome, Report  # noqa: F401 - for those with stamps
+from finforce.ros.executor import KeepingExecutor, is_wanted  # noqa: F401 - for those who publish
+from finforce.ros.messages import (  # noqa: F401 - for those who publish
+    KeptMessage,
+    cloud_message,
+    grasp_force,
+    image_message,
+    is_touching,
+    joint_state_message,
+    nanoseconds,
+    points_marker,
+    pose_message,
+    stamp_message,
+    status_message,
+    wrench_message,
+    xyz_columns,
+)
+from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
+from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe
+
+SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+STEADY = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
+REQUESTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # one that is passed over waits for ever
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+provide_transport()  # read when the first context is made, whoever makes it
+
+
+def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> RecordT:
+    """Declare a ROS parameter for every field of a frozen dataclass and return the record.
+
+    Field metadata: `description`, `unit`, `min`, `max`, `choices`, `topic` (names one, or several), `settable` (not
+    read-only); NaN may be a default.
+
+    Args:
+        node: the node that gets the parameters.
+        record: the dataclass; every field needs a default.
+        prefix: put before each name, with a dot.
+
+    Raises:
+        ParameterError: a value has the wrong type or is out of bounds, or a topic's name cannot be one.
+    """
+    values = {}
+    for entry in fields(record):
+        name = f"{prefix}.{entry.name}" if prefix else entry.name
+        value = _read_value(node, name, entry)
+        check_value(name, value, entry)
+        if entry.metadata.get("topic"):
+            for topic in (value,) if isinstance(value, str) else value:
+                _check_topic(node, name, topic)
+        values[entry.name] = value
+    return record(**values)
+
+
+def _read_value(node: Node, name: str, entry: Field) -> Any:
+    """Declare a parameter and return its value; an empty list, which has no type in ROS, is one of the field's."""
+    try:
+        value = node.declare_parameter(name, entry.default, describe_field(entry)).value
+    except ParameterException as error:
+        raise ParameterError(f"parameter {name}: {error}") from error
+    if value is None and not isinstance(entry.default, (tuple, list)):
+        raise ParameterError(f"parameter {name} is empty; expected a value such as {entry.default!r}")
+    return () if value is None else value
+
+
+def _check_topic(node: Node, name: str, topic: str) -> None:
+    """Refuse a parameter whose value is no name of a topic."""
+    try:
+        validate_topic_name(topic)
+        validate_full_topic_name(expand_topic_name(topic, node.get_name(), node.get_namespace()))
+    except (NameValidationException, ValueError) as error:
+        # rclpy draws the place under the name, and tells where it was found out
+        why = str(error).splitlines()[0].partition(": ")[2].partition(", at /")[0].rstrip(":")
+        raise ParameterError(f"parameter {name} is {topic!r}; expected the name of a topic: {why}") from error
+
+
+def name_unknown_parameters(node: Node) -> None:
+    """Warn of parameters that were given and that the node does not have: most are misspelt."""
+    for name in node._parameter_overrides:  # rclpy tells of them nowhere else
+        if not node.has_parameter(name):
+            node.get_logger().warning(f"there is no parameter '{name}'; it is ignored")
+
+
+def describe_field(entry: Field) -> ParameterDescriptor:
+    """Return the description, unit, range and choices of a field as ROS tools show them."""
+    fixed, bounds = not entry.metadata.get("settable", False), bounds_of(entry)
+    text = ParameterDescriptor(description=describe(entry), read_only=fixed, additional_constraints=constraints(entry))
+    if bounds and isinstance(entry.default, float):
+        text.floating_point_range = [FloatingPointRange(from_value=float(bounds[0]), to_value=float(bounds[1]))]
+    elif bounds:
+        text.integer_range = [IntegerRange(from_value=bounds[0], to_value=bounds[1])]
+    return text
+
+
+class QosWatch:
+    """Says which connections do not come about because the two ends ask for different service.
+
+    Attributes:
+        node: whose connections these are.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self._suspects: dict[str, tuple[bool, QoSProfile]] = {}
+
+    def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
+        """Create a watched publisher."""
+        events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
+        return self.node.create_publisher(kind, topic, qos, event_callbacks=events)
+
+    def subscription(self, kind: type, topic: str, callback: Callable, qos: QoSProfile, **options: Any) -> Subscription:
+        """Create a watched subscription."""
+        events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
+        return self.node.create_subscription(kind, topic, callback, qos, event_callbacks=events, **options)
+
+    def _suspect(self, topic: str, writes: bool, qos: QoSProfile) -> None:
+        self._suspects[self.node.resolve_topic_name(topic)] = (writes, qos)
+        self.node.get_logger().error("; ".join(self.faults()))
+
+    def faults(self) -> list[str]:
+        """Return one sentence per mismatch that still stands."""
+        found = [self._mismatches(topic, *end) for topic, end in self._suspects.items()]
+        return [sentence for sentences in found for sentence in sentences]
+
+    def _mismatches(self, topic: str, writes: bool, qos: QoSProfile) -> list[str]:
+        """Compare our end of a topic with every other end that stands against it."""
+        node, sentences = self.node, []
+        for end in (node.get_subscriptions_info_by_topic if writes else node.get_publishers_info_by_topic)(topic):
+            pair = (qos, end.qos_profile) if writes else (end.qos_profile, qos)
+            verdict, why = qos_check_compatible(*pair)
+            if verdict == QoSCompatibility.ERROR:
+                sentences.append(f"quality of service of {topic} does not match {end.node_name}: {why}")
+        return sentences
+
+
+class LargeSubscription:
+    """A subscription to messages of a megabyte, whose lost pieces come again, unless their publisher keeps nothing.
+
+    Best effort alone loses most of such messages where Fast DDS has its default of 512 kB of shared memory.
+
+    Attributes:
+        current: the subscription.
+
+    Args:
+        qos: makes subscriptions and watches them.
+        kind: of the messages.
+        topic: of the messages.
+        callback: takes them.
+        options: of the subscription, as its callback group.
+    """
+
+    def __init__(self, qos: QosWatch, kind: type, topic: str, callback: Callable, **options: Any) -> None:
+        self._relax = partial(qos.subscription, kind, topic, callback, SENSOR, **options)
+        self._node, self._topic = qos.node, topic
+        events = SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch)
+        self.current = qos.node.create_subscription(kind, topic, callback, STEADY, event_callbacks=events, **options)
+
+    def _on_mismatch(self, _: Any) -> None:
+        """Take the messages as they come from a publisher that offers no more."""
+        if self._relax is not None:
+            self._node.get_logger().warning(f"{self._topic} comes with best effort: large messages may be lost")
+            self._node.destroy_subscription(self.current)
+            self.current, self._relax = self._relax(), None
+
+
+def publish_diagnostics(
+    node: Node, qos: QosWatch, name: str, period: float, report: Callable[[list[Outcome]], Report]
+) -> None:
+    """Publish a report on /diagnostics every `period` seconds; mismatches of `qos` are its alarms."""
+    publisher = qos.publisher(DiagnosticArray, "/diagnostics", RESULT)
+
+    def publish() -> None:
+        alarms = [Outcome(level=Level.ERROR, reason="qos", text=fault) for fault in qos.faults()]
+        status = status_message(name, node.get_name(), report(alarms))
+        publisher.publish(DiagnosticArray(header=Header(stamp=node.get_clock().now().to_msg()), status=[status]))
+
+    # on the steady clock: a stopped /clock must show, too
+    node.create_timer(period, publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def serve_trigger(node: Node, name: str, action: Callable[[], str], group: CallbackGroup | None = None) -> None:
+    """Offer an action as a Trigger service, aside in a group if it takes long; a refusal comes back as the message."""
+    _serve(node, Trigger, name, lambda _: action(), group)
+
+
+def serve_switch(node: Node, name: str, action: Callable[[bool], str]) -> None:
+    """Offer an action that is told yes or no as a SetBool service; what it refuses comes back as the message."""
+    _serve(node, SetBool, name, lambda request: action(request.data), None)
+
+
+def _serve(node: Node, kind: type, name: str, action: Callable[[Any], str], group: CallbackGroup | None) -> None:
+    def attempt(request: Any) -> tuple[bool, str]:
+        try:
+            return True, action(request)
+        except FinforceError as error:
+            return False, str(error)
+
+    async def answer(request: Any, response: Any) -> Any:
+        answered = await run_aside(node, partial(attempt, request)) if group else attempt(request)
+        response.success, response.message = answered
+        return response
+
+    node.create_service(kind, name, answer, callback_group=group, qos_profile=REQUESTS)
+
+
+async def run_aside(node: Node, action: Callable[[], Any]) -> Any:
+    """Run an action in a thread of its own; only the callback that awaits it, and its group, wait."""
+    done, executor = Future(), node.executor
+
+    def run() -> None:
+        try:
+            done.set_result(action())
+        except Exception as error:
+            done.set_exception(error)
+        executor.wake()  # else it would look again with the next message only
+
+    Thread(target=run, daemon=True).start()
+    return await done
+
+
+def take_newest(subscription: Subscription, message: Any) -> tuple[Any, int]:
+    """Return the newest message waiting behind `message` and how many were passed over."""
+    passed = 0
+    with (handle := subscription.handle):
+        while (taken := handle.take_message(subscription.msg_type, subscription.raw)) is not None:
+            message, passed = taken[0], passed + 1
+    return message, passed
+
+
+def run_node(
+    name: str, build: Callable[[], Node], args: Sequence[str] | None = None, work: Callable[..., None] = rclpy.spin
+) -> int:
+    """Build a node and let it work until it is done, Ctrl-C or SIGTERM; return 0, or 2 on our errors."""
+    try:
+        rclpy.init(args=args)
+    except RuntimeError as error:  # what stands after --ros-args is none of its words
+        print(f"{name}: {str(error).partition(', at ')[0]}", file=sys.stderr)
+        return 2
+    # an executor that is made after a signal cannot be taken down quietly; a node takes long to build
+    executor, node = KeepingExecutor(), None
+    try:
+        node = build()
+        executor.obey(node)
+        work(node, executor)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a launch sends it again after the terminal
+    except FinforceError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except Exception:
+        if rclpy.ok():  # else the signal took the context away while the node was being built
+            raise
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0

@@ -1,0 +1,62 @@
+"""Work that a scene does not need: the rules by name, and how often each was applied."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+
+from finforce.errors import FinforceError
+
+ALL = "all"
+
+# of every node
+UNCHANGED = "wait set unchanged"
+LATE = "frame late"
+UNHEARD = "nobody subscribes"
+EVERYWHERE = (UNCHANGED, LATE, UNHEARD)
+# of a solver
+AWAY = "no object near"
+IDLE = "idle image"
+SOLVER = (AWAY, IDLE)
+# of a contact estimator, which has AWAY and IDLE, too
+STILL = "nothing moved"
+RESTING = "grasp rests"
+UNNEEDED = "jaw not needed"
+CONTACT = (AWAY, IDLE, STILL, RESTING, UNNEEDED)
+
+
+class SkippingError(FinforceError):
+    """A rule that is to be switched off does not exist."""
+
+
+class Skips:
+    """The rules of one node: which may be applied, and how often each was.
+
+    Args:
+        rules: names of the rules that the node has beside those that every node has.
+        off: names of rules that are not to be applied; "all" for none of them.
+
+    Raises:
+        SkippingError: a name in `off` is no rule of the node.
+    """
+
+    def __init__(self, rules: Sequence[str], off: Collection[str] = ()) -> None:
+        rules = tuple(dict.fromkeys((*EVERYWHERE, *rules)))
+        unknown = sorted(set(off) - {*rules, ALL, ""})
+        if unknown:
+            raise SkippingError(f"skip_off: there is no rule {unknown[0]!r}; expected {', '.join(rules)} or {ALL}")
+        self._rules = rules
+        self._off = frozenset(rules if ALL in off else off)
+        self._counts: Counter[str] = Counter()
+
+    def allows(self, rule: str) -> bool:
+        """Returns whether a rule may be applied."""
+        return rule not in self._off
+
+    def count(self, rule: str, times: int = 1) -> None:
+        """Notes that a rule has saved its work."""
+        self._counts[rule] += times
+
+    def describe(self) -> dict[str, str]:
+        """Returns, for the diagnostics, how often each rule saved its work, or that it is off."""
+        return {f"skipped: {rule}": str(self._counts[rule]) if self.allows(rule) else "off" for rule in self._rules}

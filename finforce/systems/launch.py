@@ -1,0 +1,150 @@
+"""Launch descriptions of systems: an argument per option, an action per process or included file."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from finforce.errors import MissingDependencyError
+from finforce.systems.processes import SINGLE_THREAD, Include, Process
+
+OptionsT = TypeVar("OptionsT")
+
+
+def options_from_texts(record: type[OptionsT], texts: Mapping[str, str]) -> OptionsT:
+    """Return an options record from launch arguments, each turned into the type of its default.
+
+    Raises:
+        ValueError: a text is no such value.
+    """
+    values = {entry.name: _value(entry.name, texts[entry.name], entry.default) for entry in fields(record)}
+    return record(**values)
+
+
+def _value(name: str, text: str, default: Any) -> Any:
+    """Turn one text into the type of a default."""
+    if isinstance(default, bool):
+        if text.lower() not in ("true", "false"):
+            raise ValueError(f"{name}:={text}: expected true or false")
+        return text.lower() == "true"
+    try:
+        return type(default)(text)
+    except ValueError:
+        raise ValueError(f"{name}:={text}: expected a {type(default).__name__}") from None
+
+
+def describe_launch(
+    record: type[OptionsT], build: Callable[[OptionsT, Path], Sequence[Process | Include]], share: Path, **defaults: str
+) -> Any:
+    """Return a launch description: one argument per field of the record, one action per process or included file.
+
+    Args:
+        record: the options dataclass.
+        build: options and share folder to processes.
+        share: folder that holds `config`, `urdf` and `rviz`.
+        defaults: of arguments, in place of the record's.
+    """
+    from launch import LaunchDescription
+    from launch.actions import DeclareLaunchArgument, OpaqueFunction
+
+    arguments = [
+        DeclareLaunchArgument(
+            entry.name,
+            default_value=defaults.get(entry.name, _text(entry.default)),
+            description=entry.metadata["description"],
+            choices=entry.metadata.get("choices"),
+        )
+        for entry in fields(record)
+        if entry.default is not MISSING
+    ]
+
+    def start(context: Any) -> list[Any]:
+        options = options_from_texts(record, context.launch_configurations)
+        return [_launch_action(part) for part in build(options, share)]
+
+    return LaunchDescription([*arguments, OpaqueFunction(function=start)])
+
+
+def _text(default: Any) -> str:
+    """Return a default as it is written on a command line."""
+    return str(default).lower() if isinstance(default, bool) else str(default)
+
+
+def _launch_action(part: Process | Include) -> Any:
+    """Return the action that starts a process or includes a file, a line where an optional one cannot be started.
+
+    Raises:
+        MissingDependencyError: a package that is needed is not installed.
+    """
+    from launch.actions import LogInfo
+
+    folder = find_share(part.package)
+    if folder is None:
+        text = _missing(part.package, part.advice)
+        if isinstance(part, Process) and part.optional:
+            return LogInfo(msg=text)
+        raise MissingDependencyError(text)
+    return _node_action(part) if isinstance(part, Process) else _include_action(part, folder)
+
+
+def find_share(package: str) -> Path | None:
+    """Return the share folder of a ROS package, None where it is not installed."""
+    from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+
+    try:
+        return Path(get_package_share_directory(package))
+    except PackageNotFoundError:
+        return None
+
+
+def _missing(package: str, advice: str) -> str:
+    """Say that a package is missing, and what would do."""
+    archive = f"ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{package.replace('_', '-')}"
+    return f"{package} is not installed: sudo apt install {archive}" + (f"; {advice}" if advice else "")
+
+
+def _node_action(process: Process) -> Any:
+    """Return the launch_ros action of a process."""
+    from launch.actions import Shutdown
+    from launch_ros.actions import Node
+    from launch_ros.parameter_descriptions import ParameterValue
+
+    files = [process.parameter_file] if process.parameter_file else []
+    # else a text that reads as a number, or as YAML, would no longer be a text
+    values = {
+        name: ParameterValue(value, value_type=str) if isinstance(value, str) else value
+        for name, value in process.parameters.items()
+    }
+    return Node(
+        package=process.package,
+        executable=process.executable,
+        name=process.name,
+        output="screen",
+        parameters=[*files, values] if values else files,
+        remappings=list(process.remappings.items()),
+        arguments=list(process.arguments),
+        additional_env=SINGLE_THREAD,
+        on_exit=Shutdown(reason=f"{process.name} has ended") if process.ends_all else None,
+    )
+
+
+def _include_action(part: Include, folder: Path) -> Any:
+    """Return the action that includes a launch file, with its own arguments and none of ours.
+
+    Raises:
+        MissingDependencyError: a program that it calls is not on the path.
+    """
+    from launch.actions import GroupAction, IncludeLaunchDescription, SetEnvironmentVariable
+    from launch.launch_description_sources import PythonLaunchDescriptionSource
+
+    for program in part.programs:
+        if shutil.which(program) is None:
+            raise MissingDependencyError(_missing(program, part.advice))
+    source = PythonLaunchDescriptionSource(str(folder / "launch" / part.file))
+    environment = [SetEnvironmentVariable(name, value) for name, value in part.environment.items()]
+    included = IncludeLaunchDescription(source, launch_arguments=list(part.arguments.items()))
+    return GroupAction([*environment, included], scoped=True, forwarding=False)

@@ -1,0 +1,211 @@
+"""The processes of a system, their parameters and remappings, described once."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from finforce.systems.options import ReplayOptions, SolverOptions
+
+# small matrices: more threads per process cost time and make it vary
+SINGLE_THREAD = {
+    name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Process:
+    """One ROS process.
+
+    Attributes:
+        package: that holds the executable.
+        executable: as `ros2 run` finds it.
+        name: of the node.
+        parameters: ROS parameters that differ from the node's defaults.
+        parameter_file: YAML file with more of them, overruled by `parameters`; empty for none.
+        remappings: topic names as the node knows them -> as they are here.
+        arguments: of the program, before those of ROS.
+        ends_all: the whole system ends with this process.
+        optional: the rest starts without it where its package is not installed.
+        advice: what else would do, for who has not got the package.
+    """
+
+    package: str = "finforce"
+    executable: str
+    name: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameter_file: str = ""
+    remappings: Mapping[str, str] = field(default_factory=dict)
+    arguments: tuple[str, ...] = ()
+    ends_all: bool = False
+    optional: bool = False
+    advice: str = ""
+
+    def command(self) -> list[str]:
+        """Return the command line that runs one of our nodes with this Python, without `ros2`."""
+        words = [sys.executable, "-m", "finforce.ros.start", self.executable, *self.arguments]
+        words += ["--ros-args", "-r", f"__node:={self.name}"]
+        if self.parameter_file:
+            words += ["--params-file", self.parameter_file]
+        for name, value in self.parameters.items():
+            words += ["-p", f"{name}:={_yaml(value)}"]
+        for name, other in self.remappings.items():
+            words += ["-r", f"{name}:={other}"]
+        return words
+
+
+@dataclass(frozen=True, kw_only=True)
+class Include:
+    """A launch file of another package, which sees none of our arguments.
+
+    Attributes:
+        package: that holds the file.
+        file: in the package's folder `launch`.
+        arguments: of that file.
+        environment: variables for its processes only.
+        programs: that it calls, each named as the package it comes with.
+        advice: what else would do, for who has not got the package.
+    """
+
+    package: str
+    file: str
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=dict)
+    programs: tuple[str, ...] = ()
+    advice: str = ""
+
+
+def _yaml(value: Any) -> str:
+    """Return a value as YAML with its type beyond doubt, which JSON is, but for NaN."""
+    return ".nan" if value != value else json.dumps(value)
+
+
+def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Process:
+    """Return the solver of one jaw; `parameters` are added to those that the options name."""
+    height = None if math.isnan(options.contact_height) else options.contact_height
+    asked = {
+        "jaw_file": options.jaw_file,
+        "calibration_file": options.calibration_file,
+        # NaN overrules a height in the parameter file
+        "contact_height": math.nan if options.object_mesh else height,
+        "estimator.solver": options.solver,
+        "estimator.mesh": options.mesh,
+    }
+    return Process(
+        executable="ifea_solver",
+        name=f"{side}_ifea_solver",
+        parameters={"jaw_name": side, **given(asked), **parameters, "use_sim_time": options.use_sim_time},
+        parameter_file=options.parameter_file,
+    )
+
+
+def _jaws_process(name: str, jaws: str, asked: Mapping[str, Any], options: SolverOptions) -> Process:
+    """Return a node that serves "left", "right" or "both" jaws, called as its executable."""
+    return Process(
+        executable=name,
+        name=name,
+        parameters={"jaws": jaws, **given(asked), "use_sim_time": options.use_sim_time},
+        parameter_file=options.parameter_file,
+    )
+
+
+def contact_processes(jaws: str, options: SolverOptions, *, waits: bool = False) -> list[Process]:
+    """Return the contact estimator of "left", "right" or "both" jaws, if an object mesh is named.
+
+    Where it `waits` for a mesh, which its services can bring, it is there unless the height of first touch is given.
+    """
+    if not options.object_mesh and not (waits and math.isnan(options.contact_height)):
+        return []
+    asked = {
+        "jaw_file": options.jaw_file,
+        "calibration_file": options.calibration_file,
+        "object_mesh": options.object_mesh,
+        "object_mesh_unit": options.object_mesh_unit,
+        "pose_source": options.pose_source,
+        "contact.mode": options.contact,
+        "contact.mesh": "coarse" if options.solver == "paper" else options.mesh,
+    }
+    return [_jaws_process("contact_estimator", jaws, asked, options)]
+
+
+def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
+    """Return the key point detector of "left", "right" or "both" jaws, if images are to be used.
+
+    Raises:
+        ValueError: the camera's pose is not seven numbers.
+    """
+    if not options.images:
+        return []
+    asked = {
+        "jaw_file": options.jaw_file,
+        "finder": options.finder,
+        "model": options.model,
+        "T_gripper_camera": read_numbers("T_gripper_camera", options.T_gripper_camera, 7),
+    }
+    return [_jaws_process("keypoint_detector", jaws, asked, options)]
+
+
+def read_numbers(name: str, text: str, count: int) -> list[float] | None:
+    """Return the numbers of an option, None for an empty text.
+
+    Raises:
+        ValueError: they are not so many, or none.
+    """
+    words = text.replace(",", " ").split()
+    if not words:
+        return None
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count:
+        raise ValueError(f"{name}:={text}: expected {count} numbers")
+    return numbers
+
+
+def given(asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what was asked for; the rest is the node's own."""
+    return {name: value for name, value in asked.items() if value not in ("", None)}
+
+
+def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
+    """Return the solvers of the jaws in a recording, what feeds them, and the player where a recording is named.
+
+    With two jaws the left one completes the forces on the gripper, with one jaw that one.
+    """
+    if options.jaws == "both":
+        solvers = [solver_process("left", options, peer="right"), solver_process("right", options)]
+    else:
+        solvers = [solver_process(options.jaws, options, completes_grasp=True)]
+    awaited = {"awaits_poses": True} if options.object_mesh else {}
+    awaited |= {"awaits_images": True} if options.images else {}
+    player = Process(
+        executable="recording_player",
+        name="recording_player",
+        parameters={"bag": options.bag, "rate": options.rate, **awaited},
+        ends_all=True,
+    )
+    played = [player] if options.bag else []
+    estimators = [*contact_processes(options.jaws, options), *detector_processes(options.jaws, options)]
+    return [*solvers, *estimators, *played, *viewer(options, share)]
+
+
+def viewer(options: SolverOptions, share: Path, config: str = "finforce.rviz") -> list[Process]:
+    """Return RViz with a shipped configuration, if it was asked for."""
+    if not options.rviz:
+        return []
+    return [
+        Process(
+            package="rviz2",
+            executable="rviz2",
+            name="rviz",
+            parameters={"use_sim_time": options.use_sim_time},
+            arguments=("-d", str(share / "rviz" / config)),
+            advice="or leave rviz:=true out",
+        )
+    ]

@@ -1,0 +1,1 @@
+"""Where the object's outline meets the deformed inner face."""

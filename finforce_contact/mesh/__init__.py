@@ -1,0 +1,1 @@
+"""Object meshes: reading, repair, decimation, views."""

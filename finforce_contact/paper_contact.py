@@ -1,0 +1,154 @@
+"""The contact place by the paper's Algorithm 1: the intersection of deformed jaw and object."""
+
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.optional import import_manifold3d
+from finforce.transforms import invert_pose
+from finforce_contact.errors import ObjectMeshError
+from finforce_contact.localization.contact_patch import Rows
+from finforce_contact.localization.inner_face import InnerFace
+from finforce_contact.localization.outline_localizer import Place, Scene
+from finforce_contact.mesh.solids import solid_from_triangles, to_manifold, triangles_of_solid
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.settings import ContactSettings
+from finforce_ifea.jaw.jaw import Jaw
+
+if TYPE_CHECKING:
+    from manifold3d import Manifold
+
+
+class IntersectionLocalizer:
+    """Algorithm 1 of the paper.
+
+    While status S is false the object is brought along x into slight contact (Eq. 2); the intersection's centre leads
+    to the nearest deformed vertex, from there to the undeformed one, its projection on the inner surface and the
+    nearest candidate. S is true after an intersection and false after none, so that before contact every other
+    image keeps the last place, as in the paper. An object that is deeper than slight contact stays where it is: to draw
+    it back to the surface as it was before it bent would part the two for good.
+    """
+
+    def __init__(self, jaw: Jaw, face: InnerFace, mesh: ObjectMesh, settings: ContactSettings) -> None:
+        """Builds the object's solid.
+
+        Raises:
+            ObjectMeshError: The mesh is not watertight.
+            MissingDependencyError: manifold3d is not installed.
+        """
+        self._candidates = jaw.candidates[:, 1:]
+        self._mesh, self._face, self._offset = face.mesh, face, settings.offset
+        self._object = NearSolid(mesh, settings.margin)
+        self._vertices = np.ascontiguousarray(mesh.vertices)
+        self.reset()
+
+    def reset(self) -> None:
+        """Starts anew, apart."""
+        self._status = False
+        self._last: Rows | None = None
+
+    def locate(self, scene: Scene) -> Place | None:
+        """Returns the place, None before any was found."""
+        shift = self._slight_contact(scene.T) - scene.T[0, 3] if not self._status else 0.0
+        T = scene.T.copy()
+        T[0, 3] += min(shift, 0.0)
+        centre = intersect(self._object.near(T, scene.surface), T, scene.surface, self._mesh.surface)
+        self._status = centre is not None
+        if centre is not None:
+            self._last = self._candidate_of(centre, scene.surface)
+        if self._last is None:
+            return None
+        height = float(self._last.heights[0])
+        bend = float(np.interp(height, self._face.heights, self._face.x - scene.line[:, 0]))
+        return Place(rows=self._last, gap=float("nan"), bend=bend, touching=bool(self._status and shift >= 0.0))
+
+    def _slight_contact(self, T: NDArray) -> float:
+        """Returns t_x = l_0 + l_bd / 2 [m] (Eq. 2), corrected for objects whose origin is not in their middle."""
+        turned = self._vertices @ T[0, :3]
+        low, high = turned.min(), turned.max()
+        return float(self._face.x - self._offset + 0.5 * (high - low) - 0.5 * (high + low))
+
+    def _candidate_of(self, centre: NDArray, surface: NDArray) -> Rows:
+        """Returns the candidate of an intersection's centre (3,) [m]."""
+        nearest = int(((surface - centre) ** 2).sum(axis=1).argmin())
+        projected = self._mesh.nodes[nearest, 1:]
+        chosen = int(((self._candidates - projected) ** 2).sum(axis=1).argmin())
+        return Rows(heights=self._candidates[chosen, 1:], weights=np.ones(1))
+
+
+class NearSolid:
+    """The part of an object's solid near the jaw, cut once and kept while the jaw's box stays within it.
+
+    Attributes:
+        whole: the object's solid, object frame.
+        cuts: how often it was cut.
+    """
+
+    def __init__(self, mesh: ObjectMesh, margin: float) -> None:
+        """Builds the solid; `margin` [m] is kept around the jaw's box.
+
+        Raises:
+            ObjectMeshError: The mesh is not watertight.
+            MissingDependencyError: manifold3d is not installed.
+        """
+        whole = to_manifold(mesh)
+        if whole is None:
+            raise ObjectMeshError(
+                f"the mesh of {mesh.name} is not watertight, and mode 'paper' intersects solids; repair it, or choose "
+                "mode 'estimate'"
+            )
+        self.whole, self.cuts = whole, 0
+        self._margin = margin
+        self._part: Manifold | None = None
+
+    def near(self, T: NDArray, surface: NDArray) -> "Manifold":
+        """Returns the part, object frame, for a pose T_jaw_object (4, 4) and the jaw's vertices (n, 3) [m]."""
+        low, high = surface.min(axis=0), surface.max(axis=0)
+        corners = np.array(list(product(*zip(low, high, strict=True))))
+        if self._part is not None:
+            T_cut_now = self._T_jaw_object @ invert_pose(T)
+            moved = corners @ T_cut_now[:3, :3].T + T_cut_now[:3, 3]
+            if (moved >= self._low).all() and (moved <= self._high).all():
+                return self._part
+        self._cut(T, low, high)
+        return self._part
+
+    def _cut(self, T: NDArray, low: NDArray, high: NDArray) -> None:
+        """Cuts the object by the jaw's box widened by the margin."""
+        self._T_jaw_object, self._low, self._high = T.copy(), low - self._margin, high + self._margin
+        box = import_manifold3d().Manifold.cube(self._high - self._low).translate(self._low)
+        part = self.whole ^ box.transform(invert_pose(T)[:3])
+        part.num_tri()  # booleans are lazy, and would be done again for every image
+        self._part = part
+        self.cuts += 1
+
+
+def intersect(solid: "Manifold", T: NDArray, surface: NDArray, triangles: NDArray) -> NDArray | None:
+    """Returns the centre of volume (3,) [m, jaw frame] of the intersection of an object and a jaw, None if empty.
+
+    Args:
+        solid: the object's solid, object frame.
+        T: T_jaw_object (4, 4).
+        surface: (n, 3) [m] vertices of the jaw.
+        triangles: (t, 3) of its surface.
+    """
+    jaw = solid_from_triangles(surface, triangles)
+    if jaw is None:
+        return None
+    common = jaw ^ solid.transform(np.ascontiguousarray(T[:3]))
+    if common.is_empty():
+        return None
+    vertices, faces = triangles_of_solid(common)
+    return centre_of_volume(vertices, faces)
+
+
+def centre_of_volume(vertices: NDArray, triangles: NDArray) -> NDArray:
+    """Returns the centre (3,) [m] of the volume that triangles bound: the mean of tetrahedra from a vertex."""
+    a, b, c = np.moveaxis(vertices[triangles] - vertices[0], 1, 0)
+    volumes = np.einsum("ij,ij->i", a, np.cross(b, c))
+    total = volumes.sum()
+    if total <= 0.0:
+        return vertices.mean(axis=0)
+    return vertices[0] + volumes @ (a + b + c) / (4.0 * total)

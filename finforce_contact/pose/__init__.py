@@ -1,0 +1,1 @@
+"""Poses of the object: from messages, from a tracker, filtered and paired."""

@@ -1,0 +1,185 @@
+"""Noisy, late and rare poses of an object in a jaw's frame into one smooth course."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.errors import PoseError
+from finforce.transforms import check_pose, move_pose, step_between
+from finforce_contact.checks import check_stamp, to_floats
+from finforce_contact.settings import ContactSettings
+
+_X = 0
+# Samples over which noise is learnt, and how many the assumed noise counts for.
+_NOISE_MEMORY, _NOISE_PRIOR = 60.0, 6.0
+_NOISE_RANGE = (1e-2, 1e2)
+# An average of innovations, one share of each new, that is so many of its standard deviations off calls for a turn.
+_TREND_SHARE, _TREND_SIGMA = 0.35, 3.5
+_TREND_STDDEV = float(np.sqrt(_TREND_SHARE / (2.0 - _TREND_SHARE)))
+_SPEED_SURPRISE = 5e-3
+_LONGEST_FORECAST = 0.2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FilteredPose:
+    """Where the object is.
+
+    Attributes:
+        T: T_jaw_object (4, 4).
+        stddev: (6,) of x, y, z [m] and the rotations about the jaw's x, y, z [rad].
+        speed: of the object along x [m/s].
+    """
+
+    T: NDArray
+    stddev: NDArray
+    speed: float
+
+
+class PoseFilter:
+    """Kalman filter of a pose: x moves at constant speed, all else hardly moves in the frame of a closing jaw.
+
+    Each of the six numbers has a variance of its own. How noisy they are is learnt from the innovations: r = v^2 - p. A
+    pose far off the course is set aside until some in a row agree with each other; a trend in the innovations widens
+    the search at once.
+    """
+
+    def __init__(self, settings: ContactSettings) -> None:
+        """Keeps noise, drift and gates."""
+        self._settings = settings
+        noise = np.repeat([settings.pose_noise, settings.rotation_noise], 3)
+        self._assumed = noise**2
+        self._drift = np.repeat([settings.drift, settings.rotation_drift], 3) ** 2
+        self._drift[_X] = 0.0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets every pose and what was learnt of their noise."""
+        self.stamp: float | None = None
+        self.believed = 0.0
+        self.latest: NDArray | None = None
+        self._scale = np.ones(6)
+        self._learnt = _NOISE_PRIOR
+        self._aside: deque[tuple[float, NDArray]] = deque(maxlen=self._settings.jump_samples)
+
+    def update(self, stamp: float, T: NDArray, covariance: NDArray | None = None) -> str:
+        """Takes a pose and returns what became of it: "used", "late", "aside" or "jump".
+
+        Args:
+            stamp: image capture time [s].
+            T: T_jaw_object (4, 4).
+            covariance: (6, 6) of x, y, z [m] and the rotations about the jaw's axes [rad]; None: learn it.
+
+        Raises:
+            PoseError: Stamp or pose is none, or the covariance has another shape or no positive diagonal.
+        """
+        check_stamp(stamp, "T_jaw_object", PoseError)
+        T = check_pose(T, "T_jaw_object")
+        noise = self._noise(covariance)
+        if self.stamp is not None and stamp <= self.stamp:
+            return "late"
+        self.latest = T
+        if self.stamp is None or stamp - self.stamp > self._settings.pose_timeout:
+            self._begin(stamp, T, noise)
+            return "used"
+        self._predict(stamp)
+        innovation = step_between(self._T, T)
+        spread = self._P + noise
+        if (innovation**2 > self._settings.gate**2 * spread).any():
+            return self._set_aside(stamp, T, noise)
+        self._aside.clear()
+        self._learn(innovation, None if covariance is None else noise)
+        self._follow_trend(innovation / np.sqrt(spread), noise)
+        self._correct(innovation, noise)
+        self.believed = stamp
+        return "used"
+
+    def at(self, stamp: float) -> FilteredPose:
+        """Returns the pose at a time [s], continued at its speed for a fifth of a second at most.
+
+        Raises:
+            PoseError: No pose has come yet.
+        """
+        if self.stamp is None:
+            raise PoseError("no pose of the object has come yet")
+        ahead = max(stamp - self.stamp, 0.0)
+        dt = min(ahead, _LONGEST_FORECAST)
+        T = self._T.copy()
+        T[_X, 3] += dt * self._speed
+        variance = self._P + self._drift * ahead
+        variance[_X] += 2.0 * dt * self._cross + dt**2 * self._speed_variance
+        return FilteredPose(T=T, stddev=np.sqrt(np.maximum(variance, 0.0)), speed=self._speed)
+
+    def _noise(self, covariance: NDArray | None) -> NDArray:
+        """Returns the variances (6,) of a pose; stated ones are raised when the poses scatter more."""
+        if covariance is None:
+            return self._assumed * self._scale
+        stated = to_floats(covariance, "a pose covariance", PoseError)
+        if stated.shape != (6, 6) or not np.isfinite(stated).all() or not (np.diag(stated) > 0).all():
+            raise PoseError(
+                f"a pose covariance {stated.tolist()}, expected (6, 6) with finite numbers and variances above zero; "
+                "leave it out if it is not known"
+            )
+        return np.diag(stated) * np.maximum(self._scale, 1.0)
+
+    def _begin(self, stamp: float, T: NDArray, noise: NDArray, speed: float = 0.0) -> None:
+        """Starts the course at a pose."""
+        self.stamp, self.believed, self._T, self._speed = stamp, stamp, T.copy(), speed
+        self._P, self._cross, self._speed_variance = noise.copy(), 0.0, _SPEED_SURPRISE**2
+        self._trend = np.zeros(6)
+        self._aside.clear()
+
+    def _predict(self, stamp: float) -> None:
+        """Moves the course on to a time [s]: constant speed of x under white acceleration, a random walk else."""
+        dt, power = stamp - self.stamp, self._settings.acceleration**2
+        self._T[_X, 3] += dt * self._speed
+        self._P = self._P + self._drift * dt
+        self._P[_X] += 2.0 * dt * self._cross + dt**2 * self._speed_variance + power * dt**3 / 3.0
+        self._cross += dt * self._speed_variance + power * dt**2 / 2.0
+        self._speed_variance += power * dt
+        self.stamp = stamp
+
+    def _correct(self, innovation: NDArray, noise: NDArray) -> None:
+        """Moves the course towards a pose by the Kalman gain p / (p + r)."""
+        gain = self._P / (self._P + noise)
+        speed_gain = self._cross / (self._P[_X] + noise[_X])
+        self._T = move_pose(self._T, gain * innovation)
+        self._speed += speed_gain * innovation[_X]
+        self._speed_variance -= speed_gain * self._cross
+        self._cross *= 1.0 - gain[_X]
+        self._P = self._P * (1.0 - gain)
+
+    def _learn(self, innovation: NDArray, stated: NDArray | None) -> None:
+        """Averages how much larger the noise is than assumed, or than stated."""
+        base = self._assumed if stated is None else stated / np.maximum(self._scale, 1.0)
+        seen = (innovation**2 - self._P) / base
+        self._learnt = min(self._learnt + 1.0, _NOISE_MEMORY)
+        self._scale = np.clip(self._scale + (seen - self._scale) / self._learnt, *_NOISE_RANGE)
+
+    def _follow_trend(self, standard: NDArray, noise: NDArray) -> None:
+        """Widens what the innovations, in standard deviations (6,), have been off for some while."""
+        self._trend += _TREND_SHARE * (standard - self._trend)
+        turning = np.abs(self._trend) > _TREND_SIGMA * _TREND_STDDEV
+        if not turning.any():
+            return
+        self._P = np.where(turning, self._P + noise, self._P)
+        self._trend[turning] = 0.0
+        if turning[_X]:
+            self._speed_variance += _SPEED_SURPRISE**2
+
+    def _set_aside(self, stamp: float, T: NDArray, noise: NDArray) -> str:
+        """Keeps a pose off the course; once enough in a row agree, the course starts anew from them."""
+        self._aside.append((stamp, T))
+        if len(self._aside) < self._settings.jump_samples or not self._agree(noise):
+            return "aside"
+        (first, T_first), (last, T_last) = self._aside[0], self._aside[-1]
+        self._begin(stamp, T_last, noise, speed=float((T_last - T_first)[_X, 3] / (last - first)))
+        return "jump"
+
+    def _agree(self, noise: NDArray) -> bool:
+        """Whether the poses set aside lie on one straight course."""
+        stamps = np.array([stamp for stamp, _ in self._aside])
+        steps = np.array([step_between(self._aside[0][1], T) for _, T in self._aside])
+        line = np.outer((stamps - stamps[0]) / (stamps[-1] - stamps[0]), steps[-1])
+        return bool(((steps - line) ** 2 <= self._settings.gate**2 * 2.0 * noise).all())

@@ -1,0 +1,116 @@
+"""Poses of jaw and object that belong to one image, whichever comes first."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.transforms import invert_pose
+
+DEPTH = 16  # images that may wait for their other pose
+BRIDGED = 250_000_000  # [ns] between two poses of a jaw that stand for the time between, while it does not move
+UNMOVED = 0.2e-3  # [m] and, for its axes, [1]: a jaw that differs by less has not moved
+
+
+class Step(NamedTuple):
+    """What is to be done next.
+
+    Attributes:
+        stamp: of the image [ns].
+        T_jaw_object: (4, 4), a new pose of the object in the jaw frame; None when the image has none (yet).
+        T_jaw_camera: (4, 4), of the same image.
+        covariance: (6, 6) of the object's pose, camera axes; None when unknown.
+        is_due: the contact of this image is due; else only its pose came late.
+    """
+
+    stamp: int
+    T_jaw_object: NDArray | None
+    T_jaw_camera: NDArray
+    covariance: NDArray | None
+    is_due: bool
+
+
+class _ObjectPose(NamedTuple):
+    stamp: int
+    T_camera_object: NDArray
+    covariance: NDArray | None
+
+
+class PosePairing:
+    """Brings the poses of jaw and object together by their stamps.
+
+    An image is due when its jaw pose comes. It waits for its object pose, at most until the next jaw pose, as long as
+    object poses have kept up so far; a slow tracker delays nothing. Of a jaw that stands still not every image is told:
+    an object pose between two equal poses of the jaw is used with them.
+
+    Args:
+        tolerance: greatest distance of stamps that belong together [ns].
+    """
+
+    def __init__(self, tolerance: int) -> None:
+        self._tolerance = tolerance
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all poses."""
+        self._jaws: deque[tuple[int, NDArray]] = deque(maxlen=DEPTH)
+        self._objects: deque[_ObjectPose] = deque(maxlen=DEPTH)
+        self._waiting = self._in_step = False
+
+    def add_jaw(self, stamp: int, T_camera_jaw: NDArray) -> list[Step]:
+        """Take the pose (4, 4) of the jaw in an image [ns]; return what is to be done now."""
+        overdue = [self._step(*self._jaws[-1], None)] if self._waiting else []
+        self._in_step &= not self._waiting
+        self._jaws.append((stamp, invert_pose(T_camera_jaw)))
+        last = list(self._jaws)[-2:]
+        between = [step for pose in self._objects for step in self._bridge(pose, last[0], last[-1])]
+        found = next((pose for pose in reversed(self._objects) if self.belong(pose.stamp, stamp)), None)
+        self._waiting = found is None and self._in_step
+        steps = [*overdue, *between[-1:]]
+        return steps if self._waiting else [*steps, self._step(*self._jaws[-1], found)]
+
+    def add_object(self, stamp: int, T_camera_object: NDArray, covariance: NDArray | None = None) -> list[Step]:
+        """Take the pose (4, 4) of the object in an image [ns]; return what is to be done now."""
+        pose = _ObjectPose(stamp, T_camera_object, covariance)
+        self._objects.append(pose)
+        jaw = next((jaw for jaw in reversed(self._jaws) if self.belong(jaw[0], stamp)), None)
+        if jaw is None:
+            return [step for last in pairwise(self._jaws) for step in self._bridge(pose, *last)]
+        is_newest = jaw is self._jaws[-1]
+        is_due = is_newest and self._waiting
+        self._in_step |= is_newest
+        self._waiting &= not is_newest
+        return [self._step(*jaw, pose, is_due=is_due)]
+
+    def _bridge(self, pose: _ObjectPose, before: tuple[int, NDArray], after: tuple[int, NDArray]) -> list[Step]:
+        """Return what is to be done with an object pose between two poses of a jaw, nothing if the jaw has moved."""
+        is_between = before[0] + self._tolerance < pose.stamp < after[0] - self._tolerance
+        if not is_between or after[0] - before[0] > BRIDGED or np.abs(after[1] - before[1]).max() > UNMOVED:
+            return []
+        return [self._step(pose.stamp, before[1], pose, is_due=False)]
+
+    def has_object(self, stamp: int) -> bool:
+        """Say whether the object's pose in an image [ns] is known."""
+        return any(self.belong(pose.stamp, stamp) for pose in self._objects)
+
+    def add_late(self, stamp: int, T_camera_jaw: NDArray) -> list[Step]:
+        """Take the pose (4, 4) of the jaw in an image [ns] that is not due any more; return what is to be done now."""
+        found = next((pose for pose in reversed(self._objects) if self.belong(pose.stamp, stamp)), None)
+        return [self._step(stamp, invert_pose(T_camera_jaw), found, is_due=False)] if found else []
+
+    def is_waiting(self, stamp: int) -> bool:
+        """Say whether an image [ns] waits for its object pose."""
+        return self._waiting and self.belong(self._jaws[-1][0], stamp)
+
+    def belong(self, one: int, other: int) -> bool:
+        """Say whether two stamps [ns] are those of one image."""
+        return abs(one - other) <= self._tolerance
+
+    def _step(self, stamp: int, T_jaw_camera: NDArray, pose: _ObjectPose | None, *, is_due: bool = True) -> Step:
+        T_jaw_object = T_jaw_camera @ pose.T_camera_object if pose else None
+        covariance = pose.covariance if pose else None
+        return Step(stamp, T_jaw_object, T_jaw_camera, covariance, is_due)

@@ -1,0 +1,48 @@
+"""The topics that a contact estimator writes, and what stands in each of them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from finforce.ros import node as ros
+from finforce.skipping import Skips
+from finforce.transforms import pose_numbers
+from finforce_contact.messages import contact_columns
+from finforce_ifea.messages import columns_from_outline
+
+if TYPE_CHECKING:
+    from finforce_contact.camera_feed import StampedPose
+    from finforce_contact.jaw_contact import TimedEstimate
+    from finforce_contact.parameters import ContactParameters
+
+
+class ContactOutputs:
+    """The publishers of a contact estimator node.
+
+    Args:
+        qos: makes publishers and watches them.
+        parameters: which jaws, and whether the object's poses are found here.
+        skips: whether what nobody subscribes to is left out.
+    """
+
+    def __init__(self, qos: ros.QosWatch, parameters: ContactParameters, skips: Skips) -> None:
+        cloud, sides = ros.PointCloud2, parameters.sides
+        self._frame, self._skips = parameters.camera_frame, skips
+        self.contact = {side: qos.publisher(cloud, f"{side}/contact", ros.RESULT) for side in sides}
+        self.outline = {side: qos.publisher(cloud, f"{side}/object_outline", ros.RESULT) for side in sides}
+        self.pose = qos.publisher(ros.PoseStamped, "object_pose", ros.RESULT) if parameters.tracks else None
+
+    def send_contact(self, side: str, timed: TimedEstimate) -> None:
+        """Send outline and contact of an image; no rows say that there is none."""
+        header = ros.Header(stamp=ros.stamp_message(timed.stamp), frame_id=f"{side}_jaw")
+        # the outline goes first: the solver looks for it when the contact comes
+        if ros.is_wanted(self.outline[side], self._skips):
+            self.outline[side].publish(ros.cloud_message(header, columns_from_outline(timed.estimate.outline)))
+        if ros.is_wanted(self.contact[side], self._skips):
+            self.contact[side].publish(ros.cloud_message(header, contact_columns(timed.estimate)))
+
+    def send_pose(self, found: StampedPose) -> None:
+        """Send the object's pose, unless it came by topic."""
+        if self.pose is not None and ros.is_wanted(self.pose, self._skips):
+            header = ros.Header(stamp=ros.stamp_message(found.stamp), frame_id=self._frame)
+            self.pose.publish(ros.pose_message(header, pose_numbers(found.pose.T_camera_object)))

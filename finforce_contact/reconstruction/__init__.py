@@ -1,0 +1,1 @@
+"""An object's mesh and pose from one masked depth image."""

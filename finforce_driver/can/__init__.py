@@ -1,0 +1,1 @@
+"""The gripper's CAN link: buses, SLCAN, messages to the bit."""

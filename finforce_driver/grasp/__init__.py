@@ -1,0 +1,1 @@
+"""Grasps controlled by a camera's force."""

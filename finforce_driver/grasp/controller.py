@@ -1,0 +1,243 @@
+"""Closing until a camera's force reaches a set one, and holding it: forces and openings in, moves out."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+
+from finforce_driver.errors import GraspError
+from finforce_driver.grasp.checks import check_force_value, check_gripper, check_silence, is_working
+from finforce_driver.grasp.force_feed import ForceFeed, ForceSample, TouchSample
+from finforce_driver.grasp.jaw_history import JawCourse, JawPlace
+from finforce_driver.grasp.load_watch import LoadWatch, LocatedForce
+from finforce_driver.grasp.plan import GraspPlan
+from finforce_driver.grasp.settings import GraspGoal, GraspSettings
+from finforce_driver.grasp.status import GraspPhase, GraspStatus, GraspStep, GripperMove
+from finforce_driver.state import GripperState
+
+OpeningAt = Callable[[float], float]
+
+_CONTENT = 3  # images at rest without a wish to move after which the force is held
+_SATURATED_AFTER = 1.0  # [s] at the least opening
+_SPARE_STEPS = 3  # that holding may close in any case
+
+
+class ForceGrasp:
+    """One grasp by force, from approach to the end; deterministic, and without input or output of its own.
+
+    Args:
+        goal: force, speed, least opening, time limit.
+        settings: limits and expectations.
+        resolution: opening per step of the gripper [m].
+        closed_opening: opening of the closed gripper [m].
+
+    Raises:
+        TargetError: the set force is above the limit of the settings.
+    """
+
+    def __init__(
+        self,
+        goal: GraspGoal,
+        settings: GraspSettings | None = None,
+        *,
+        resolution: float,
+        closed_opening: float = 0.0,
+    ) -> None:
+        self.goal, self.settings = goal, settings or GraspSettings()
+        self._set_force = self.settings.check_force(goal.force)
+        self._feed = ForceFeed(self.settings.stale_after)
+        self._load = LoadWatch(self.settings, min(self.settings.onset_force, 0.5 * goal.force))
+        self._course = JawCourse(resolution=resolution, closed_opening=closed_opening)
+        self._place = JawPlace(opening=math.nan, resting=False)
+        self._plan = GraspPlan(goal, self.settings, self._load, self._course, self._feed)
+        self._pending: deque[ForceSample | TouchSample] = deque()
+        self._phase, self._reason = GraspPhase.APPROACH, "waits for the first force"
+        self._began = self._held_at = self._spare = self._saturated = math.nan
+        self._content = 0
+        self._asked_to_stop = ""
+
+    def take_force(self, sample: ForceSample) -> None:
+        """Take the force of an image; it counts with the next `update`."""
+        self._pending.append(sample)
+
+    def take_touch(self, touching: bool, stamp: float) -> None:
+        """Take whether the jaws touch the object in the image at `stamp` [s]; it counts with the next `update`."""
+        self._pending.append(TouchSample(stamp=stamp, touching=touching))
+
+    def change_force(self, force: float) -> None:
+        """Set another force [N], up or down, without letting go; the time limit begins anew. The same changes nothing.
+
+        Raises:
+            TargetError: the force is no number, not above zero, or above the limit.
+        """
+        force = self.settings.check_force(force)
+        if force == self._set_force:
+            return
+        self._set_force = force
+        self._began = self._held_at = math.nan
+        self._content = 0
+        if self._phase is GraspPhase.HOLDING:
+            self._phase, self._reason = GraspPhase.LOADING, "goes to another force"
+
+    def stop(self, reason: str) -> None:
+        """End the grasp with the next `update`; the jaws hold where they are."""
+        self._asked_to_stop = reason
+
+    def update(self, state: GripperState, now: float, opening_at: OpeningAt) -> GraspStep:
+        """Take what came since the last call and return what is to be done.
+
+        Args:
+            state: of the gripper, the newest.
+            now: time [s].
+            opening_at: the opening [m] at a past time [s], NaN where it is not known.
+        """
+        if self._phase is GraspPhase.STOPPED:
+            self._pending.clear()
+            return self._step(None, state, now)
+        if math.isnan(self._began):
+            self._began = now
+        try:
+            if self._asked_to_stop:
+                raise GraspError(self._asked_to_stop)
+            check_gripper(state, now)
+            self._course.check_power(state)
+            fresh = self._drain(state, now, opening_at)
+            self._check_limits(state, now)
+            move = self._choose_move(state, now) if fresh else None
+        except GraspError as error:
+            self._phase, self._reason = GraspPhase.STOPPED, str(error)
+            return GraspStep(move=None, stop=is_working(state), status=self._status(state, now))
+        return self._step(move, state, now)
+
+    def _drain(self, state: GripperState, now: float, opening_at: OpeningAt) -> bool:
+        """Take what is pending and return whether the jaws may be planned for anew.
+
+        Raises:
+            GraspError: a force is none, jumped, is above the limit, or has gone.
+        """
+        fresh = False
+        while self._pending:
+            sample = self._pending.popleft()
+            if isinstance(sample, TouchSample):
+                # before the first force, an image that shows the jaws apart shows that nothing presses
+                counts = self._feed.admit_touch(sample, now) and not self._feed.heard and not sample.touching
+                force = 0.0
+            else:
+                check_force_value(sample.force)
+                counts, force = self._feed.admit(sample), sample.force
+            if counts:
+                fresh |= self._locate(force, sample.stamp, state, opening_at)
+        return fresh
+
+    def _locate(self, force: float, stamp: float, state: GripperState, opening_at: OpeningAt) -> bool:
+        """Take a force [N] with the opening at the time of its image; False where that is not known."""
+        place = self._course.locate(stamp, state, opening_at)
+        if math.isnan(place.opening):
+            return False
+        way = self._course.way_stddev(self._place, place)
+        passing = self._course.stepping and not place.resting and self._load.loaded
+        located = LocatedForce(
+            force=force,
+            stamp=stamp,
+            opening=place.opening,
+            way_stddev=way,
+            resting=place.resting,
+            passing=passing,
+        )
+        self._load.take(located, self._feed.is_touching(stamp))
+        if not (self._load.doubtful or passing):
+            self._place = place
+        if self._phase is GraspPhase.APPROACH:
+            words = "closes to the set force" if self._load.loaded else "closes until something presses"
+            self._phase = GraspPhase.LOADING if self._load.loaded else GraspPhase.APPROACH
+            self._reason = words
+        return True
+
+    def _check_limits(self, state: GripperState, now: float) -> None:
+        """Refuse to go on beyond a limit.
+
+        Raises:
+            GraspError: forces are late, time is up, or the jaws do not follow, slip, or may not close further.
+        """
+        check_silence(self._feed, now, self._began, self.settings)
+        course, pressing = self._course, 0.0 if math.isnan(self._load.force) else self._load.pressing
+        got = f"{pressing:.2f} N of {self._set_force:g} N"
+        if self._phase is not GraspPhase.HOLDING and now - self._began > self.goal.time_limit:
+            raise GraspError(f"{got} within the time limit of {self.goal.time_limit:g} s")
+        if now - self._saturated > _SATURATED_AFTER:
+            raise GraspError(f"{got} with the jaws at their least opening, {1e3 * course.target:.1f} mm")
+        if course.is_late(now, state.opening):
+            raise GraspError(
+                f"{got}: the jaws stay at {1e3 * state.opening:.1f} mm on their way to {1e3 * course.target:.1f} mm; "
+                f"is something in the way, or the motor's limit of {self._motor_force:g} N too low?"
+            )
+        if self._held_at - course.target > self._spare:
+            way = 1e3 * (self._held_at - course.target)
+            raise GraspError(
+                f"{got} although the jaws closed by {way:.1f} mm while holding: the object slips or yields"
+            )
+
+    def _choose_move(self, state: GripperState, now: float) -> GripperMove | None:
+        """Return the next move, None where the jaws are to go on as they do."""
+        if self._load.doubtful:
+            return self._pause(state, now)
+        wish = self._plan.wish(self._set_force)
+        target = self._plan.limit(wish)
+        self._watch(wish, target, now)
+        speed = self._plan.choose_speed(target)
+        return self._move(target, speed, state, now) if self._plan.is_worth(target, speed, state.opening) else None
+
+    def _watch(self, wish: float, target: float, now: float) -> None:
+        """See whether the force is held, and whether the least opening keeps it from being reached."""
+        is_content = self._load.resting and target == self._course.target
+        if not (is_content and wish < target):
+            self._saturated = math.nan
+        elif math.isnan(self._saturated):
+            self._saturated = now
+        held = is_content and wish == target and self._load.loaded
+        self._content = self._content + 1 if held else 0
+        if self._content >= _CONTENT and self._phase is not GraspPhase.HOLDING:
+            self._phase, self._reason, self._held_at = GraspPhase.HOLDING, "holds the set force", target
+            # as it is now: a force that drifts while the jaws close looks like something that gets softer
+            yielded = self.settings.relaxation * self._set_force / self._load.model.stiffness
+            self._spare = yielded + _SPARE_STEPS * self._course.resolution
+
+    def _pause(self, state: GripperState, now: float) -> GripperMove | None:
+        """Return a move that keeps the jaws where they are until the next image says what to think of this one."""
+        here = self._course.nearest(state.opening)
+        is_closing = here - self._course.target > 0.5 * self._course.resolution
+        return self._move(here, self._course.speed, state, now) if is_closing else None
+
+    def _move(self, target: float, speed: float, state: GripperState, now: float) -> GripperMove:
+        self._course.command(target, speed, now, self._course.locate(now, state, lambda _: state.opening))
+        return GripperMove(opening=target, speed=speed, force=self._motor_force)
+
+    @property
+    def _motor_force(self) -> float:
+        """The motor's limit [N]: no hindrance to the set force, which both jaws give, and friction takes from."""
+        return max(self.settings.motor_force, 3.0 * self._set_force)
+
+    def _step(self, move: GripperMove | None, state: GripperState, now: float) -> GraspStep:
+        return GraspStep(move=move, stop=False, status=self._status(state, now))
+
+    def _status(self, state: GripperState, now: float) -> GraspStatus:
+        """Return the grasp as it is."""
+        load, model, feed = self._load, self._load.model, self._feed
+        here = self._course.locate(now, state, lambda _: state.opening).opening
+        return GraspStatus(
+            phase=self._phase,
+            reason=self._reason,
+            goal=self._set_force,
+            force=load.force,
+            predicted=model.predict(here) if load.loaded else math.nan,
+            stiffness=model.stiffness,
+            stiffness_stddev=model.stiffness_stddev,
+            latency=feed.latency,
+            period=feed.period,
+            overshoot_bound=self._plan.overshoot_bound(self._set_force),
+            peak=load.peak,
+            resolution=self._plan.resolution,
+            target=self._course.target,
+            refused=dict(feed.refused),
+        )

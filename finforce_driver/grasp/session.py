@@ -1,0 +1,183 @@
+"""The force-controlled grasps of one gripper, begun, changed and ended by calls from outside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from threading import Condition
+from typing import TYPE_CHECKING
+
+from finforce_driver.errors import DriverError, GraspError
+from finforce_driver.grasp.controller import ForceGrasp
+from finforce_driver.grasp.force_feed import ForceSample, TouchSample
+from finforce_driver.grasp.settings import GraspGoal, GraspSettings
+from finforce_driver.grasp.status import GraspPhase, GraspStatus, GraspStep
+from finforce_driver.state import GripperState
+
+if TYPE_CHECKING:
+    from finforce_driver.gripper import Gripper
+
+MARGIN = 2.0  # s beyond the time limit of a goal, after which nobody waits for its grasp any longer
+SETTLED = (GraspPhase.HOLDING, GraspPhase.STOPPED)
+
+
+class GraspSession:
+    """Hands forces and states to a grasp, and its moves to the gripper, one at a time from whatever thread.
+
+    The gripper's own thread must not wait for it: it is the gripper's moves that are made here.
+
+    Attributes:
+        goal: of the grasp that runs, or of the next.
+        status: of the grasp that runs, or of the last; None before the first.
+
+    Args:
+        gripper: that grasps.
+        goal: the first.
+        settings: of all grasps.
+        ended: called when a grasp has ended.
+
+    Raises:
+        TargetError: the force of the goal is above the limit of the settings, or its opening beyond the stroke.
+    """
+
+    def __init__(
+        self, gripper: Gripper, goal: GraspGoal, settings: GraspSettings, ended: Callable[[], None] = lambda: None
+    ) -> None:
+        settings.check_force(goal.force)
+        _check_opening(goal, gripper)
+        self.goal = goal
+        self.status: GraspStatus | None = None
+        self._gripper, self._settings, self._ended = gripper, settings, ended
+        self._grasp: ForceGrasp | None = None
+        self._touches: dict[str, TouchSample] = {}
+        self._touch_told = -math.inf
+        self._changed = Condition()
+
+    @property
+    def runs(self) -> bool:
+        """Whether a grasp is under way, or holds."""
+        return self._grasp is not None
+
+    def set_goal(self, goal: GraspGoal) -> None:
+        """Take a goal for the next grasp; its force at once, too, for one that runs.
+
+        Raises:
+            TargetError: the force is above the limit, or the least opening beyond the stroke.
+        """
+        self._settings.check_force(goal.force)
+        _check_opening(goal, self._gripper)
+        with self._changed:
+            self.goal = goal
+            if self._grasp is not None:
+                self._grasp.change_force(goal.force)
+
+    def run(self, begun: Callable[[], None] = lambda: None) -> GraspStatus:
+        """Begin a grasp, if none runs, and wait; return how it is once the force is held, and go on holding it.
+
+        Args:
+            begun: called when a grasp has begun that the gripper does not refuse.
+
+        Raises:
+            GraspError: it was ended before; the gripper holds where it is.
+        """
+        with self._changed:
+            if self._grasp is None:
+                self._begin()
+                if self.runs:
+                    begun()
+            if not self._changed.wait_for(self._is_settled, self.goal.time_limit + MARGIN):
+                self.stop("the gripper did not answer in time")
+            if self.status.phase is GraspPhase.STOPPED:
+                raise GraspError(f"the grasp was ended: {self.status.reason}")
+            return self.status
+
+    def take_force(self, sample: ForceSample) -> None:
+        """Hand the force of an image to the grasp that runs, and let it act on it."""
+        with self._changed:
+            if self._grasp is not None:
+                self._grasp.take_force(sample)
+                self.update(self._gripper.state)
+
+    def take_touch(self, jaw: str, touching: bool, stamp: float) -> None:
+        """Hand on whether a jaw touches the object in the image at `stamp` [s]: if any does, or none of both."""
+        with self._changed:
+            self._touches[jaw] = TouchSample(stamp=stamp, touching=touching)
+            fresh = [touch for touch in self._touches.values() if touch.stamp > stamp - self._settings.stale_after]
+            complete = all(touch.stamp >= stamp for touch in fresh)
+            if self._grasp is not None and stamp > self._touch_told and (touching or complete):
+                self._touch_told = stamp
+                self._grasp.take_touch(any(touch.touching for touch in fresh), stamp)
+
+    def update(self, state: GripperState) -> None:
+        """Let the grasp that runs do what is due; what the gripper refuses ends it."""
+        with self._changed:
+            if self._grasp is None:
+                return
+            step = self._grasp.update(state, self._gripper.clock.now(), self._gripper.opening_at)
+            self._tell(step.status)
+            if step.status.phase is GraspPhase.STOPPED:
+                self._grasp = None
+                self._ended()
+            try:
+                self._act(step)
+            except DriverError as error:
+                self._end(str(error))
+                with suppress(DriverError):
+                    self._gripper.hold()
+
+    def replace(self, command: Callable[[], None], reason: str) -> None:
+        """Give the gripper another command; the grasp ends, unless the command is refused.
+
+        Raises:
+            DriverError: it is refused.
+        """
+        with self._changed:
+            command()
+            self._end(reason)
+
+    def stop(self, reason: str) -> None:
+        """End the grasp that runs; the gripper holds in place.
+
+        Raises:
+            GripperStateError: the gripper cannot hold: its jaws are limp.
+        """
+        with self._changed:
+            self._end(reason)
+            self._gripper.hold()
+
+    def _begin(self) -> None:
+        """Make a grasp and let it look at the gripper."""
+        resolution, closed = self._gripper.resolution, self._gripper.settings.closed_opening
+        self._grasp = ForceGrasp(self.goal, self._settings, resolution=resolution, closed_opening=closed)
+        self.status = None
+        self.update(self._gripper.state)
+
+    def _act(self, step: GraspStep) -> None:
+        """Do what a step asks for."""
+        if step.stop:
+            self._gripper.hold()
+        elif step.move is not None:
+            self._gripper.move(step.move.opening, step.move.speed, step.move.force)
+
+    def _end(self, reason: str) -> None:
+        """Forget the grasp that runs and say why."""
+        if self._grasp is not None:
+            self._grasp = None
+            last = self.status or GraspStatus(phase=GraspPhase.STOPPED, reason=reason, goal=self.goal.force)
+            self._tell(replace(last, phase=GraspPhase.STOPPED, reason=reason))
+            self._ended()
+
+    def _tell(self, status: GraspStatus) -> None:
+        self.status = status
+        self._changed.notify_all()
+
+    def _is_settled(self) -> bool:
+        return self.status is not None and self.status.phase in SETTLED
+
+
+def _check_opening(goal: GraspGoal, gripper: Gripper) -> None:
+    """Refuse a least opening [m] that the jaws are never above; below the closed one it limits nothing."""
+    settings = gripper.settings
+    settings.check_opening("least opening", max(goal.least_opening, settings.closed_opening))

@@ -1,0 +1,1 @@
+"""The gripper as a state machine: orders, replies, moves, stops."""

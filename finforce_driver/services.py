@@ -1,0 +1,175 @@
+"""What a gripper's services do, each as one call that answers with a sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from finforce_driver.errors import GripperStateError, GripperTimeoutError
+from finforce_driver.grasp.session import GraspSession
+from finforce_driver.messages import MoveRequest
+from finforce_driver.parameters import DriverParameters
+from finforce_driver.state import GripperState, Outcome, Phase
+
+if TYPE_CHECKING:
+    from finforce_driver.gripper import Gripper
+
+CALIBRATION_TIMEOUT = 50.0  # s; the driver gives up after 35 s, and a reset may go before
+CLEARING_TIMEOUT = 2.0  # s; it takes 0.2 s
+WATCH_PERIOD = 0.1  # s
+MOVE_MARGIN = 5.0  # s beyond the time that the way takes
+ABSENT = (Phase.DISCONNECTED, Phase.PROBING)
+LIMP = (*ABSENT, Phase.FAULT, Phase.UNCALIBRATED)
+
+
+class GripperTasks:
+    """Commands that end whatever the gripper was about, and wait for what becomes of them.
+
+    What is refused leaves the gripper as it was, a grasp by force included.
+
+    Args:
+        gripper: that is commanded.
+        session: its grasps by force.
+        parameters: how far and how fast it opens, and how hard it grasps without vision.
+    """
+
+    def __init__(self, gripper: Gripper, session: GraspSession, parameters: DriverParameters) -> None:
+        self._gripper, self._session, self._parameters = gripper, session, parameters
+        self._commands = 0
+
+    def close(self) -> None:
+        """End what is under way, and have nobody wait any longer."""
+        self._command(lambda: None, "the driver ends")
+
+    def move(self, request: MoveRequest, reason: str = "another move was commanded") -> None:
+        """Go to an opening; return at once.
+
+        Raises:
+            DriverError: the move was refused.
+        """
+        self._command(lambda: self._gripper.move(request.opening, request.speed, request.force), reason)
+
+    def stop(self) -> str:
+        """Hold in place."""
+        self._session.stop("stopped by command")
+        self._count()
+        return "the gripper holds in place"
+
+    def estop(self) -> str:
+        """Stop at once, limp; before anything else is looked at."""
+        self._gripper.estop()
+        self._command(lambda: None, "emergency stop")
+        if self._gripper.state.phase in ABSENT:
+            return "emergency stop: no gripper answers; it is sent as soon as one does, until clear_errors ends it"
+        return "emergency stop: the jaws are limp; clear_errors ends it"
+
+    def activate(self, on: bool) -> str:
+        """Switch the power stage on or off."""
+        self._command(lambda: self._gripper.activate(on), "the gripper was switched")
+        return "the gripper is active" if on else "the gripper is off, its jaws are limp"
+
+    def calibrate(self) -> str:
+        """Find the end stops, and wait for it."""
+        self._command(self._gripper.calibrate, "a calibration was commanded")
+        state = self._await(lambda state: state.phase is not Phase.CALIBRATING, CALIBRATION_TIMEOUT, self._commands)
+        _check(state, "the calibration failed")
+        return "calibrated: the jaws are closed, and limp until the first move"
+
+    def clear_errors(self) -> str:
+        """Clear what is latched, and wait for it; without a fault nothing changes, for a grasp neither."""
+        self._gripper.clear_errors()
+        state = self._await(_is_clear, CLEARING_TIMEOUT, self._commands)
+        return f"no error is latched; the gripper is {state.phase.value}"
+
+    def grasp(self) -> str:
+        """Close until the set force is reached by vision; return while it is held."""
+        status = self._session.run(self._count)
+        return f"holds {status.force:.2f} N, set {status.goal:.2f} N: {status.reason}"
+
+    def grasp_without_vision(self) -> str:
+        """Close until something resists, by the motor's current alone; return while it is held."""
+        given = self._parameters
+        least, force = self._gripper.settings.closed_opening, given.motor_force
+        state = self.go(MoveRequest(opening=least, speed=given.grasp_speed, force=force), "a grasp without vision")
+        if state.outcome is not Outcome.GRASPED:
+            self._gripper.hold()
+            raise GripperStateError(f"nothing was grasped: {state.outcome.value} at {1e3 * state.opening:.1f} mm")
+        return f"holds with {force:.0f} N by the motor's current, without vision, at {1e3 * state.opening:.1f} mm"
+
+    def release(self) -> str:
+        """Open, and wait for it."""
+        given, widest = self._parameters, self._gripper.settings.closed_opening + self._gripper.settings.stroke
+        opening = widest if math.isnan(given.release_opening) else given.release_opening
+        state = self.go(MoveRequest(opening=opening, speed=given.release_speed), "release was commanded")
+        if state.outcome is not Outcome.REACHED:
+            raise GripperStateError(f"the gripper did not open: {state.outcome.value} at {1e3 * state.opening:.1f} mm")
+        return f"open: {1e3 * state.opening:.1f} mm"
+
+    def go(
+        self,
+        request: MoveRequest,
+        reason: str = "another move was commanded",
+        leave: Callable[[GripperState], bool] = lambda state: False,
+    ) -> GripperState:
+        """Go to an opening; return the state when the move is over, whatever ended it.
+
+        Args:
+            request: the move.
+            reason: for the grasp by force that it ends.
+            leave: asked ten times a second on the way; true ends the waiting, not the move.
+
+        Raises:
+            DriverError: the move was refused, another command came, or the gripper was lost.
+        """
+        self.move(request, reason)
+        own, settings = self._commands, self._gripper.settings
+        longest = settings.stroke / (request.speed or settings.default_speed) + MOVE_MARGIN
+        for _ in range(math.ceil(longest / WATCH_PERIOD)):
+            with suppress(GripperTimeoutError):
+                return _check(self._await(_is_over, WATCH_PERIOD, own), "the move was lost")
+            if leave(state := self._gripper.state):
+                return state
+        raise GripperTimeoutError(f"the move has no end after {longest:.1f} s")
+
+    def _command(self, command: Callable[[], None], reason: str) -> None:
+        """Give a command that ends whatever the gripper was about."""
+        self._session.replace(command, reason)
+        self._count()
+
+    def _count(self) -> None:
+        """Note that there was another command, for those who wait for the end of an earlier one."""
+        self._commands += 1
+
+    def _await(self, condition: Callable[[GripperState], bool], timeout: float, own: int) -> GripperState:
+        """Return the first state with a condition.
+
+        Args:
+            condition: of the state.
+            timeout: longest wait [s].
+            own: number of the command whose end is waited for.
+
+        Raises:
+            GripperTimeoutError: there was none in time.
+            GripperStateError: another command came.
+        """
+        state = self._gripper.wait(lambda state: self._commands != own or condition(state), timeout)
+        if self._commands != own:
+            raise GripperStateError("another command came in between")
+        return state
+
+
+def _is_clear(state: GripperState) -> bool:
+    return state.phase is not Phase.FAULT and not state.estopped
+
+
+def _is_over(state: GripperState) -> bool:
+    return state.phase is not Phase.MOVING
+
+
+def _check(state: GripperState, what: str) -> GripperState:
+    """Return a state, unless it is one in which the jaws are limp."""
+    if state.phase in LIMP:
+        raise GripperStateError(f"{what}: {state.message}")
+    return state

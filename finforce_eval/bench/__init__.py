@@ -1,0 +1,1 @@
+"""Run time against error of everything that one image passes through."""

@@ -1,0 +1,188 @@
+"""Presses of the bench finger as a camera would see them, made from shapes of an independent program.
+
+data/pressed_bench.npz holds key points [mm] and forces [N] of CalculiX 2.20 (20-node hexahedra, large displacements,
+frictionless contact, St. Venant-Kirchhoff, 30 MPa, 0.45) for nine cylinders at depths of 1 to 10 mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.bench.camera import Camera, Sight
+from finforce_ifea.contact_mechanics.outline import ObjectOutline
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_ifea.observation import Contact, Observation
+
+TRUTH = Path(__file__).parents[1] / "data" / "pressed_bench.npz"
+YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45
+HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
+LEVELS = (0.002, 0.004, 0.006, 0.008, 0.010)
+PERIOD = 1.0 / 30.0
+REST_FRAMES, HOLD_FRAMES, SCORED_FRAMES = 60, 45, 30
+SPEED = 2e-3
+# Corners of the polygon that stands for a cylinder.
+_CORNERS = 96
+# Constant errors of a tracked object's origin [m] and turn [rad], as the contact estimator expects them.
+_POSE_ERROR = np.array([0.5e-3, 0.5e-3, 5e-3])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BenchCase:
+    """One cylinder pressed into the finger.
+
+    Attributes:
+        name: for tables.
+        height_name: "lower", "middle" or "upper".
+        height: of the cylinder's axis [m].
+        radius: of the cylinder [m].
+        depth: (n,) [m], rising.
+        moved: displacements of the key points (n, K, 3) [m].
+        force: on the jaw (n, 3) [N].
+    """
+
+    name: str
+    height_name: str
+    height: float
+    radius: float
+    depth: NDArray
+    moved: NDArray
+    force: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Press:
+    """One case as a sequence of images.
+
+    Attributes:
+        case: what was pressed.
+        observations: n images.
+        heights: the contact at the height of first touch, image by image.
+        outlines: the contact with the object's outline, image by image.
+        force: true forces on the jaw (n, 3) [N].
+        held: images in the last second of a level (n,) bool.
+        ends: the last image of each level (levels,).
+    """
+
+    case: BenchCase
+    observations: Sequence[Observation]
+    heights: Sequence[Contact]
+    outlines: Sequence[Contact]
+    force: NDArray
+    held: NDArray
+    ends: NDArray
+
+    def contacts(self, kind: str) -> Sequence[Contact]:
+        """Returns the contacts of a kind, "height" or "outline", image by image."""
+        return self.outlines if kind == "outline" else self.heights
+
+
+def load_cases(path: Path | str = TRUTH) -> tuple[BenchCase, ...]:
+    """Returns the nine cases."""
+    data = np.load(path)
+    cases = []
+    for key in sorted(name.removesuffix("_depth") for name in data if name.endswith("_depth")):
+        diameter, height = key.split("_")
+        cases.append(
+            BenchCase(
+                name=f"Ø{diameter} {height}",
+                height_name=height,
+                height=HEIGHTS[height],
+                radius=5e-4 * float(diameter),
+                depth=1e-3 * data[f"{key}_depth"].astype(float),
+                moved=1e-3 * (data[f"{key}_keypoints"].astype(float) - data["keypoints0"]),
+                force=data[f"{key}_force"].astype(float),
+            )
+        )
+    return tuple(cases)
+
+
+def bench_finger() -> Jaw:
+    """Returns the bench jaw with the material of the truth."""
+    jaw = load_jaw("bench")
+    return replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
+
+
+def record_press(case: BenchCase, jaw: Jaw, camera: Camera | None = None, seed: int = 0) -> Press:
+    """Returns a press to all levels at 2 mm/s, each held for 1.5 s, after two seconds at rest.
+
+    Between the depths of the truth key points and forces are interpolated without overshoot.
+
+    Args:
+        case: what is pressed.
+        jaw: the finger, whose key points are those of the truth.
+        camera: makes noise and hides points; None sees everything exactly.
+        seed: of the noise.
+    """
+    from scipy.interpolate import PchipInterpolator  # megabytes that a process measuring its memory need not have
+
+    course = _build_course()
+    depth = course.depth
+    grid = np.r_[0.0, case.depth]
+    shapes = np.concatenate([np.zeros((1, *jaw.keypoints.shape)), case.moved])
+    points = jaw.keypoints + PchipInterpolator(grid, shapes)(depth)
+    force = PchipInterpolator(grid, np.concatenate([np.zeros((1, 3)), case.force]))(depth)
+    axes = np.stack([jaw.inner_face_x + case.radius - depth, np.full(len(depth), case.height)], axis=1)
+    random = np.random.default_rng([seed, round(1e4 * case.radius), round(1e3 * case.height)])
+    sight = Sight(points=points, likelihood=np.ones(points.shape[:2]))
+    if camera is not None:
+        sight = camera.look(points, axes, case.radius, random)
+    contact = Contact.fixed(jaw, case.height)
+    return Press(
+        case=case,
+        observations=_observe(sight),
+        heights=[contact] * len(depth),
+        outlines=_outlines(contact, axes, case.radius, 0.0 if camera is None else random.standard_normal(3)),
+        force=force,
+        held=course.held,
+        ends=course.ends,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Course:
+    """Depths (n,) [m] image by image, which of them are held (n,), and the last image of each level (levels,)."""
+
+    depth: NDArray
+    held: NDArray
+    ends: NDArray
+
+
+def _build_course() -> _Course:
+    """Returns rest, then ramps and holds."""
+    parts, ends = [np.zeros(REST_FRAMES)], []
+    for level in LEVELS:
+        steps = round((level - parts[-1][-1]) / SPEED / PERIOD)
+        parts += [np.linspace(parts[-1][-1], level, steps + 1)[1:], np.full(HOLD_FRAMES, level)]
+        ends.append(sum(map(len, parts)) - 1)
+    depth = np.concatenate(parts)
+    held = np.zeros(len(depth), bool)
+    for end in ends:
+        held[end - SCORED_FRAMES + 1 : end + 1] = True
+    return _Course(depth=depth, held=held, ends=np.array(ends))
+
+
+def _observe(sight: Sight) -> list[Observation]:
+    return [
+        Observation(stamp=1.0 + PERIOD * index, points=points, likelihood=likelihood)
+        for index, (points, likelihood) in enumerate(zip(sight.points, sight.likelihood, strict=True))
+    ]
+
+
+def _outlines(contact: Contact, axes: NDArray, radius: float, error: NDArray | float) -> list[Contact]:
+    """Returns the contact with a round outline at axes (n, 2) [m], its pose off by `error` standard deviations (3,)."""
+    angles = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
+    polygons = (radius * np.stack([np.cos(angles), np.sin(angles)], axis=1),)
+    wrong = _POSE_ERROR * error
+    return [
+        replace(
+            contact,
+            free=False,
+            outline=ObjectOutline(polygons=polygons, origin=axis + wrong[:2], tilt=float(wrong[2]), stddev=_POSE_ERROR),
+        )
+        for axis in axes
+    ]

@@ -1,0 +1,139 @@
+"""The messages of a bench scene as a camera of some rate gives them, in memory.
+
+They are decoded before they are played, so that the player takes no time from the nodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from finforce.transforms import pose_from_quaternion
+from finforce_contact.mesh.object_mesh import load_object_mesh
+from finforce_contact.mesh.views import MeshView
+from finforce_eval.bench.scenes import FINE_RATE, POSE_SLOTS, slot_of
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.keypoint_source import TRUTH, KeypointSource
+from finforce_eval.recordings.image_messages import IMAGE
+from finforce_eval.recordings.objects import require_mesh
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import NANOSECONDS
+from finforce_eval.recordings.twin_writer import FRAME
+from finforce_eval.recordings.writer import MessageFactory, write_recording
+from finforce_eval.replay.playback import Playback, RawMessage, read_playback
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+
+OBJECT_TOPIC, MASK_TOPIC = "/object_pose", "/object_mask"
+MASK_DEPTH = 5e-3  # [m] between measured and true depth of the object's pixels; what is farther off hides it
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Film:
+    """Messages that are played as a `Playback` is; every iteration gives the same.
+
+    Attributes:
+        messages: in the order of their times.
+        repeats: how often they are played, each time as if it had gone on.
+        period: from the beginning of one time to that of the next [ns].
+    """
+
+    messages: Sequence[RawMessage]
+    repeats: int = 1
+    period: int = 0
+
+    @property
+    def begin(self) -> int:
+        """Time of the first message [ns]."""
+        return self.messages[0].time
+
+    @property
+    def types(self) -> dict[str, str]:
+        """Type by topic."""
+        return {message.topic: message.msgtype for message in self.messages}
+
+    def __len__(self) -> int:
+        return self.repeats * len(self.messages)
+
+    def __iter__(self) -> Iterator[RawMessage]:
+        yield from self.messages
+        for number in range(1, self.repeats):
+            shift = number * self.period
+            for message in self.messages:
+                data = message.restamped(message.stamp + shift)
+                yield message._replace(time=message.time + shift, data=data)
+
+    def joined(self, other: Iterable[RawMessage]) -> Film:
+        """Return the film with further messages, each at its time."""
+        messages = sorted([*self.messages, *other], key=lambda message: message.time)
+        return replace(self, messages=messages)
+
+
+def film_images(source: Path, rate: int, *, poses: bool = True) -> Film:
+    """Return what a camera sees at a rate [Hz], with the object's poses at 10 Hz unless they are left out.
+
+    Raises:
+        RecordingError: the scene has no images at this rate.
+    """
+    topics = {COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, *([OBJECT_TOPIC] if poses else [])}
+    return thin_messages(read_playback(source), topics, rate)
+
+
+def film_keypoints(source: Path, rate: int) -> Film:
+    """Return the true key points and jaw poses of a scene at a rate [Hz], with the object's poses at 10 Hz.
+
+    Raises:
+        RecordingError: the scene has no images at this rate.
+    """
+    recording = KeypointSource(source=TRUTH).apply(read_recording(source))
+    with TemporaryDirectory() as folder:
+        plain = write_recording(replace(recording, images=None), Path(folder) / "truth")
+        topics = {f"/{side}/{name}" for side in recording.jaws for name in ("keypoints", "jaw_pose")}
+        return thin_messages(read_playback(plain), topics | {OBJECT_TOPIC}, rate)
+
+
+def thin_messages(messages: Playback, topics: set[str], rate: int) -> Film:
+    """Return the messages of some topics at a rate [Hz]."""
+    if FINE_RATE % rate:
+        raise RecordingError(f"rate {rate} Hz: expected a divisor of {FINE_RATE} Hz")
+    step = FINE_RATE // rate
+    kept = [
+        message
+        for message in messages
+        if message.topic in topics
+        and slot_of(message.stamp) % (POSE_SLOTS if message.topic == OBJECT_TOPIC else step) == 0
+    ]
+    images = {slot_of(message.stamp) // step for message in kept if message.topic != OBJECT_TOPIC}
+    if not images or len(images) <= max(images):
+        raise RecordingError(
+            f"the scene has {len(images)} images at {rate} Hz, some are missing; expected one for {rate} Hz"
+        )
+    return Film(messages=kept, period=len(images) * step * NANOSECONDS // FINE_RATE)
+
+
+def film_mask(source: Path) -> RawMessage:
+    """Return the mask of the object in the first image, as a segmentation would give it, at the image's time.
+
+    Raises:
+        FinforceError: there is no object, or its mesh cannot be used.
+    """
+    recording = read_recording(source)
+    stamp, image = next(iter(recording.images))
+    pose = pose_from_quaternion(recording.object_pose.position[0], recording.object_pose.quaternion[0])
+    seen = MeshView(load_object_mesh(require_mesh(recording, None))).render(pose, image.camera).depth
+    mask = np.abs(np.nan_to_num(image.depth) - np.nan_to_num(seen, nan=np.inf)) < MASK_DEPTH
+    factory = MessageFactory()
+    message = factory.typestore.types[IMAGE](
+        header=factory.header(stamp, FRAME),
+        height=mask.shape[0],
+        width=mask.shape[1],
+        encoding="mono8",
+        is_bigendian=0,
+        step=mask.shape[1],
+        data=np.where(mask, 255, 0).astype(np.uint8).ravel(),
+    )
+    data = bytes(factory.typestore.serialize_cdr(message, IMAGE))
+    return RawMessage(stamp, MASK_TOPIC, IMAGE, data, True)

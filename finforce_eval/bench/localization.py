@@ -1,0 +1,279 @@
+"""Time against place error of the ways to find a contact, on a bench recording with ground truth.
+
+The error is the distance, on the undeformed surface, from the place found to where the line of action of the true force
+cuts the deformed surface. Times and errors are of the same calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.errors import MissingDependencyError
+from finforce_contact.estimator import ContactEstimator
+from finforce_contact.mesh.object_mesh import load_object_mesh
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_eval.bench.localization_methods import METHODS, Method, Setup
+from finforce_eval.cli.demo import RECORDING
+from finforce_eval.evaluation.places import InnerSurface, true_lines
+from finforce_eval.evaluation.scoring import match_truth
+from finforce_eval.figures.time_error import ErrorPoint, ErrorSeries, TimeStats, draw_time_error, time_stats
+from finforce_eval.recordings.objects import track_object
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import Recording
+from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.jaw.calibration import load_calibration
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.observation import Observation
+
+LEAST_FORCE = 0.1  # [N], below which the line of a measured force says nothing of its place
+EVERY, EVERY_QUICK = 5, 25  # images between two that are looked at
+GRIDS = ((48, 9), (100, 24), (200, 49))  # triangles around and along a cylinder: 1, 5 and 20 thousand
+RADIUS, LENGTH = 0.0125, 0.06  # [m] of the cylinder of the shipped recording
+WARM = 5  # calls that compile and cut before any is timed
+APART = 0.05  # [m] that the object is moved away, to time a scene without contact
+JITTER, SEED = 0.05e-3, 1  # [m], so that no two calls are alike
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """One image in true contact.
+
+    Attributes:
+        T: of the object in the jaw frame (4, 4).
+        surface: deformed (n, 3) [m].
+        wrench: force (3,) [N] and torque (3,) [N m] of the image before; None when not known.
+        true: height of the true place [m].
+    """
+
+    T: NDArray
+    surface: NDArray
+    wrench: tuple[NDArray, NDArray] | None
+    true: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodRow:
+    """One way with one mesh: place errors [mm] where it found a place, and times [ms].
+
+    Attributes:
+        method: its name.
+        triangles: of the mesh.
+        found: share of the images on which it found a place.
+        median: of the errors; NaN when it found none, as the next two.
+        p95: of the same.
+        largest: of the same.
+        contact: times on the images in contact.
+        apart: times with the object 50 mm away.
+    """
+
+    method: str
+    triangles: int
+    found: float
+    median: float
+    p95: float
+    largest: float
+    contact: TimeStats
+    apart: TimeStats
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizationFigures:
+    """What was measured, and what could not be."""
+
+    rows: Sequence[MethodRow]
+    notes: Sequence[str] = ()
+
+
+def measure(quick: bool) -> LocalizationFigures:
+    """Return times and place errors of every way with 1, 5 and 20 thousand triangles, on the shipped recording.
+
+    Args:
+        quick: look at fewer images, for a first impression.
+    """
+    meshes = [build_cylinder(RADIUS, LENGTH, *grid) for grid in GRIDS]
+    return measure_methods([RECORDING], meshes, EVERY_QUICK if quick else EVERY)
+
+
+def measure_methods(
+    paths: Sequence[str | Path], meshes: Sequence[ObjectMesh] = (), every: int = EVERY
+) -> LocalizationFigures:
+    """Return times and place errors over bench recordings.
+
+    Args:
+        paths: of the recordings.
+        meshes: to be looked at in place of the recordings' own, each for all images.
+        every: images between two that are looked at.
+    """
+    from tqdm import tqdm
+
+    calls: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    away: dict[tuple[str, int], list[float]] = {}
+    notes: list[str] = []
+    for path in paths:
+        recording = read_recording(path)
+        own = load_object_mesh(Path(path).parent / recording.case["mesh"])
+        frames = list(follow(recording, own, every))
+        for mesh in tqdm(meshes or [own], desc="contact places", unit="mesh", disable=None, leave=False):
+            for name, method in build_methods(mesh, notes).items():
+                key = name, len(mesh.triangles)
+                calls.setdefault(key, []).extend(_run(method, frames, _stay))
+                away.setdefault(key, []).extend(spent for spent, _ in _run(method, frames, _jittered_apart()))
+    rows = [summarise(*key, np.array(found), away[key]) for key, found in calls.items()]
+    return LocalizationFigures(rows=rows, notes=list(dict.fromkeys(notes)))
+
+
+def build_methods(mesh: ObjectMesh, notes: list[str]) -> dict[str, Method]:
+    """Return the ways to find a place on a mesh by name; of a missing library there is a note instead."""
+    jaw = load_calibration("bench").apply(load_jaw("bench"))
+    methods: dict[str, Method] = {}
+    for name, build in METHODS.items():
+        try:
+            methods[name] = build(Setup(jaw=jaw, mesh=mesh))
+        except MissingDependencyError as error:
+            notes.append(f"{name}: not measured: {error}")
+    return methods
+
+
+def follow(recording: Recording, mesh: ObjectMesh, every: int) -> Iterator[Frame]:
+    """Yield every so-manieth image in true contact; surface and wrench are the solver's, with the estimated contact."""
+    track = recording.jaw("left")
+    solver = JawEstimator(load_jaw("bench"), calibration=load_calibration("bench"))
+    estimator = ContactEstimator(solver.jaw, mesh=mesh)
+    lines = true_lines(recording, "left", track.keypoints.stamps, solver.jaw.inner_face_x)
+    force = np.linalg.norm(match_truth(recording.truth("left"), track.keypoints.stamps), axis=1)
+    inner = InnerSurface(solver.surface(), solver.jaw.inner_face_x)
+    seen_object = track_object(recording, "left")
+    poses = list(zip(seen_object.stamps, seen_object.poses, strict=True))
+    wrench = None
+    for index, stamp in enumerate(track.keypoints.stamps):
+        while poses and poses[0][0] <= stamp:
+            when, T = poses.pop(0)
+            estimator.take_pose(1e-9 * when, T)
+        surface = solver.surface()
+        estimate = estimator.update(1e-9 * stamp, surface, wrench)
+        if index % every == 0 and force[index] > LEAST_FORCE and estimate.T_jaw_object is not None:
+            true = inner.cut(surface, lines.points[index], lines.directions[index])
+            if np.isfinite(true):
+                yield Frame(T=estimate.T_jaw_object, surface=surface, wrench=wrench, true=true)
+        points, likelihood = track.keypoints.points[index], track.keypoints.likelihood[index]
+        solution = solver.update(
+            Observation(stamp=1e-9 * stamp, points=points, likelihood=likelihood), estimate.contact
+        )
+        wrench = (solution.force, solution.torque) if solution.status == "ok" else None
+
+
+def _stay(T: NDArray) -> NDArray:
+    """Return a pose as it is."""
+    return T
+
+
+def _jittered_apart() -> Callable[[NDArray], NDArray]:
+    """Return what moves poses (4, 4) away from the jaw, each a little differently."""
+    random = np.random.default_rng(SEED)
+
+    def move(T: NDArray) -> NDArray:
+        moved = T.copy()
+        moved[:3, 3] += np.array([APART, 0.0, 0.0]) + JITTER * random.standard_normal(3)
+        return moved
+
+    return move
+
+
+def _run(method: Method, frames: Sequence[Frame], place: Callable[[NDArray], NDArray]) -> Iterator[tuple[float, float]]:
+    """Yield the time [s] and the place error [m] of each image, NaN where no place was found; warm from the first."""
+    for frame in frames[:WARM]:
+        method(place(frame.T), frame.surface, frame.wrench)
+    for frame in frames:
+        T = place(frame.T)
+        begin = perf_counter()
+        found = method(T, frame.surface, frame.wrench)
+        yield perf_counter() - begin, np.nan if found is None else abs(found - frame.true)
+
+
+def summarise(method: str, triangles: int, calls: NDArray, away: Sequence[float]) -> MethodRow:
+    """Return the statistics of calls (n, 2), time [s] and error [m], and of times without contact [s]."""
+    errors = 1e3 * calls[np.isfinite(calls[:, 1]), 1]
+    median, p95, largest = np.percentile(errors, [50, 95, 100]).tolist() if len(errors) else [float("nan")] * 3
+    return MethodRow(
+        method=method,
+        triangles=triangles,
+        found=len(errors) / len(calls),
+        median=median,
+        p95=p95,
+        largest=largest,
+        contact=time_stats(calls[:, 0]),
+        apart=time_stats(away),
+    )
+
+
+def build_cylinder(radius: float, length: float, around: int, along: int) -> ObjectMesh:
+    """Return a closed cylinder about y [m] with 2 `around` (`along` + 1) triangles."""
+    angle = 2.0 * np.pi * np.arange(around) / around
+    y = np.linspace(-0.5 * length, 0.5 * length, along + 1)
+    circle = np.tile(radius * np.array([np.cos(angle), np.sin(angle)]), along + 1)
+    rings = np.stack([circle[0], np.repeat(y, around), circle[1]], axis=1)
+    a, b = np.arange(around), (np.arange(around) + 1) % around
+    side = np.stack([a, a + around, b, b, a + around, b + around], axis=1).reshape(-1, 3)
+    sides = np.concatenate([side + around * ring for ring in range(along)])
+    last, low, high = around * along, len(rings), len(rings) + 1
+    caps = [np.stack([a, b, np.full(around, low)], axis=1), np.stack([b, a, np.full(around, high)], axis=1)]
+    caps[1][:, :2] += last
+    return ObjectMesh(
+        vertices=np.vstack([rings, [0.0, y[0], 0.0], [0.0, y[-1], 0.0]]),
+        triangles=np.concatenate([sides, *caps]).astype(np.int32),
+        watertight=True,
+        name="cylinder",
+    )
+
+
+def format_table(figures: LocalizationFigures) -> str:
+    """Return the rows as a table in Markdown, with the notes below."""
+    lines = [
+        "| contact place | triangles | n | found | error: median/mm | p95 | max | in contact: p50/ms | p99 "
+        "| 50 mm apart: p50/ms | p99 |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row.method} | {row.triangles} | {row.contact.n} | {row.found:.0%} | {row.median:.2f} | {row.p95:.2f} "
+        f"| {row.largest:.2f} | {row.contact.p50:.3f} | {row.contact.p99:.3f} | {row.apart.p50:.3f} "
+        f"| {row.apart.p99:.3f} |"
+        for row in figures.rows
+    ]
+    return "\n".join([*lines, *figures.notes])
+
+
+def as_json(figures: LocalizationFigures) -> dict[str, Any]:
+    """Return the figures as plain values; errors in mm, times in ms."""
+    return asdict(figures)
+
+
+def draw(figures: LocalizationFigures, path: Path | str) -> None:
+    """Draw time against the 95th percentile of the place error; ways that do not answer always are hollow."""
+    by_method: dict[str, list[MethodRow]] = {}
+    for row in figures.rows:
+        by_method.setdefault(row.method, []).append(row)
+    draw_time_error(
+        [_series(name, rows) for name, rows in by_method.items()],
+        path,
+        title="Contact place: time against error; numbers: thousand triangles",
+        error="place error, 95th percentile [mm]",
+        time="time for one image [ms]",
+    )
+
+
+def _series(name: str, rows: Sequence[MethodRow]) -> ErrorSeries:
+    """Return the rows of one way as a series."""
+    share = min(row.found for row in rows)
+    label = name if share == 1.0 else f"{name}\n(finds {share:.0%})"
+    points = [
+        ErrorPoint(text=f"{row.triangles / 1e3:.0f}", time=row.contact.p50, slow=row.contact.p99, error=row.p95)
+        for row in rows
+    ]
+    return ErrorSeries(name=label, points=points, complete=share == 1.0)

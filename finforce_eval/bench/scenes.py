@@ -1,0 +1,222 @@
+"""Rendered scenes with truth for benchmarks, none of whose seeds a network was trained on; kept once they are made.
+
+A scene is rendered as a camera of 180 Hz would see it, without what no camera of 30, 60 or 90 Hz sees. Knows no node.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from finforce_twin.gripper.gripper import JawState, TwinState
+    from finforce_twin.scenes.scenarios import Scenario
+
+FINE_RATE = 180  # [Hz] of the slots in which images can lie; 30, 60 and 90 divide it
+SCRIPT_SLOTS = 6  # slots from one state of a script to the next
+EVERY_RATE = (0, 2, 3, 4)  # slots of those six that a camera of 30, 60 or 90 Hz sees
+POSE_SLOTS = 18  # the object is tracked at 10 Hz
+START = 1_000_000_000_000  # [ns] stamp of slot 0, as the twin has it
+SIZE = "640x480"
+FARTHEST = 0.4  # [m]; depth beyond it is left away, which makes a recording smaller
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchScene:
+    """One scene.
+
+    Attributes:
+        scenario: its name in the twin.
+        seed: of textures, lights, background and noise.
+        changes: numbers of the scenario that differ.
+        slots: of six, those that are rendered; (0,) is a camera of 30 Hz.
+    """
+
+    scenario: str
+    seed: int
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    slots: tuple[int, ...] = (0,)
+
+    def build(self) -> Scenario:
+        """Return the scenario.
+
+        Raises:
+            ScenarioError: there is none of this name, or a number is out of its bounds.
+        """
+        from finforce_twin.scenes.scenarios import build_scenario
+
+        return build_scenario(self.scenario, **self.changes)
+
+
+# [s] of rest at each level and of its record: a grasp of five seconds
+_SHORT = {"settle": 0.3, "record": 0.8}
+GRASP = BenchScene(scenario="grasp_cylinder", seed=101, changes=_SHORT)
+GRASP_FAST = replace(GRASP, slots=EVERY_RATE)
+DIM = BenchScene(scenario="grasp_asymmetric", seed=102, changes={**_SHORT, "light": "dim"})
+CALIBRATION = BenchScene(scenario="shifting", seed=103, changes={"shift_time": 0.4, "settle": 0.1, "record": 0.1})
+
+# Name of a case: scene, and what is changed in it; no object is one of the shapes trained on.
+UNSEEN: dict[str, tuple[str, dict[str, Any]]] = {
+    "cylinder": ("grasp_cylinder", {}),
+    "cube": ("grasp_cube", {}),
+    "asymmetric": ("grasp_asymmetric", {}),
+    "bottle": ("grasp_cylinder", {"object": "bottle", "scale": 0.45, "turn_x": 1.5708}),
+    "shifting": ("shifting", {}),
+    "fast close": ("fast_close", {}),
+    "bench middle": ("bench_cylinder", {}),
+    "bench lower": ("bench_cylinder_lower", {}),
+    "weight": ("weight_turn", {}),
+    "weight, dim": ("weight_turn_dim", {}),
+}
+FIRST_SEED = 101
+
+
+class SmoothGripper:
+    """A gripper of the twin between the states of its script, too: straight from one to the next.
+
+    Args:
+        gripper: that plays the scenario at 30 Hz.
+        slots: of the six between two of its states, those that there are.
+    """
+
+    def __init__(self, gripper: Any, slots: tuple[int, ...]) -> None:
+        self._gripper, self._slots = gripper, slots
+
+    def __len__(self) -> int:
+        """Return the number of states."""
+        return (len(self._gripper) - 1) * len(self._slots) + 1
+
+    def states(self) -> Iterator[TwinState]:
+        """Yield the states, always from the beginning."""
+        states = iter(self._gripper.states())
+        before = next(states)
+        for after in states:
+            for slot in self._slots:
+                yield before if slot == 0 else blend_states(before, after, slot / SCRIPT_SLOTS)
+            before = after
+        yield before
+
+
+def blend_states(before: TwinState, after: TwinState, share: float) -> TwinState:
+    """Return the state at a share of the way between two: x = (1 - s) x_before + s x_after; turns the short way."""
+    pose = before.T_gripper_object
+    if pose is not None:
+        pose = _blend_poses(pose, after.T_gripper_object, share)
+    return replace(
+        before,
+        stamp=_blend(before.stamp, after.stamp, share),
+        jaws={side: _blend_jaws(jaw, after.jaws[side], share) for side, jaw in before.jaws.items()},
+        T_gripper_object=pose,
+        gravity=_blend(before.gravity, after.gravity, share),
+    )
+
+
+def _blend(before: Any, after: Any, share: float) -> Any:
+    return (1.0 - share) * before + share * after
+
+
+def _blend_jaws(before: JawState, after: JawState, share: float) -> JawState:
+    """Return a jaw between two states: place, shape and wrench."""
+    return replace(before, **{name: _blend(value, vars(after)[name], share) for name, value in vars(before).items()})
+
+
+def _blend_poses(before: NDArray, after: NDArray, share: float) -> NDArray:
+    """Return a pose (4, 4) between two."""
+    turn = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec()
+    pose = _blend(before, after, share)
+    pose[:3, :3] = before[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+    return pose
+
+
+def slot_of(stamp: int) -> int:
+    """Return in which slot of 1/180 s a stamp [ns] of a scene lies."""
+    return round((stamp - START) * FINE_RATE / 1_000_000_000)
+
+
+def find_scene(scene: BenchScene, folder: Path | None = None) -> Path:
+    """Return the recording of a scene, rendered under a progress bar unless it is there already.
+
+    Args:
+        scene: what is rendered.
+        folder: of the scenes that were rendered; that in the user's cache without one.
+
+    Raises:
+        FinforceError: the scene cannot be rendered, or a library is missing.
+    """
+    folder = folder or scene_folder()
+    path = folder / f"{scene.scenario}_{scene.seed}_{fingerprint(scene)}"
+    if path.exists():
+        return path
+    folder.mkdir(parents=True, exist_ok=True)
+    unfinished = Path(mkdtemp(dir=folder))
+    try:
+        _render(scene, unfinished / path.name)
+        (unfinished / path.name).replace(path)
+    except OSError:
+        if not path.exists():  # else another process was faster
+            raise
+    finally:
+        rmtree(unfinished, ignore_errors=True)
+    return path
+
+
+def scene_folder() -> Path:
+    """Return where rendered scenes are kept: `finforce/scenes` in XDG_CACHE_HOME, or in ~/.cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "finforce" / "scenes"
+
+
+def fingerprint(scene: BenchScene) -> str:
+    """Return a text that is another one for another scene, and for another twin."""
+    import finforce_twin
+
+    content = hashlib.sha256(json.dumps({**asdict(scene), "size": SIZE}, sort_keys=True).encode())
+    for source in sorted(Path(finforce_twin.__path__[0]).glob("*.py")):
+        content.update(source.read_bytes())
+    return content.hexdigest()[:12]
+
+
+def _render(scene: BenchScene, path: Path) -> None:
+    """Render a scene into a new folder."""
+    from tqdm import tqdm
+
+    from finforce_eval.recordings.twin_writer import RecordingForm, write_footage
+    from finforce_twin.footage import FINGER, Footage, parse_size, set_stage
+    from finforce_twin.gripper.gripper import TwinGripper
+    from finforce_twin.rendering.photographer import Photographer
+
+    gripper = TwinGripper(scene.build(), FINGER)
+    setting = set_stage(gripper, parse_size(SIZE), 1e-3)
+    smooth = SmoothGripper(gripper, scene.slots)
+    footage = Footage(smooth, Photographer(setting, scene.seed), setting, scene.seed)
+    case = {"scene": scene.scenario, "seed": scene.seed, "finger": FINGER, "object": {"kind": scene.build().object}}
+    with tqdm(total=len(footage), unit="image", desc=scene.scenario, disable=None, leave=False) as bar:
+        write_footage(footage, path, form=RecordingForm(farthest=FARTHEST), case=case, seen=lambda _: bar.update())
+
+
+def record_unseen(name: str, seed: int, folder: Path) -> Path:
+    """Record a case of `UNSEEN` with a seed into a folder, unless that was done before; return where.
+
+    Raises:
+        FinforceError: the scene cannot be recorded.
+    """
+    from finforce_eval.cli.twin import record_scene
+    from finforce_eval.recordings.twin_writer import RecordingForm
+    from finforce_twin.footage import parse_size
+    from finforce_twin.scenes.scenarios import build_scenario
+
+    scene, changes = UNSEEN[name]
+    bag = folder / f"{name.replace(',', '').replace(' ', '_')}_{seed}"
+    if not bag.exists():
+        scenario = build_scenario(scene, **changes)
+        record_scene(scenario, seed, bag, camera=parse_size(SIZE), form=RecordingForm())
+    return bag

@@ -1,0 +1,135 @@
+"""The solver tiers that are compared, and what each makes of a press: forces, and seconds per step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from gc import collect, disable, enable
+from time import perf_counter, thread_time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.bench.cases import Press
+from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.settings import SOLVERS, EstimatorSettings
+
+_WARM_UP_FRAMES = 150
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tier:
+    """One way to solve.
+
+    Attributes:
+        name: for tables.
+        solver: `EstimatorSettings.solver`.
+        mesh: `EstimatorSettings.mesh`.
+        contact: what is known of the object: its "height" of first touch, or its "outline".
+        slow: whether it is left out where time is short.
+    """
+
+    name: str
+    solver: str
+    mesh: str = "default"
+    contact: str = "height"
+    slow: bool = False
+
+    def settings(self) -> EstimatorSettings:
+        """Returns the estimator's settings.
+
+        Raises:
+            ObservationError: There is no such solver.
+        """
+        return EstimatorSettings(solver=self.solver, mesh=self.mesh)
+
+
+TIERS = (
+    Tier(name="linear", solver="linear"),
+    Tier(name="reduced", solver="reduced"),
+    Tier(name="frame", solver="frame"),
+    Tier(name="solid, 522 vertices", solver="solid", mesh="coarse"),
+    Tier(name="solid, default mesh", solver="solid"),
+    Tier(name="solid, fine mesh", solver="solid", mesh="fine", slow=True),
+    Tier(name="paper's setting", solver="paper"),
+    Tier(name="reduced, outline known", solver="reduced", contact="outline"),
+    Tier(name="frame, outline known", solver="frame", contact="outline"),
+    Tier(name="solid, default mesh, outline known", solver="solid", contact="outline"),
+)
+
+
+def list_tiers(*, slow: bool = True) -> tuple[Tier, ...]:
+    """Returns the tiers, with one for each solver that has been registered since the list was written."""
+    listed = {tier.solver for tier in TIERS} | {"default"}
+    others = tuple(Tier(name=name, solver=name) for name in SOLVERS if name not in listed)
+    return tuple(tier for tier in TIERS + others if slow or not tier.slow)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """What a tier made of one press.
+
+    Attributes:
+        press: that it was given.
+        force: (n, 3) [N], NaN where it gave none that may be trusted.
+        seconds: of the steps that gave a force (m,).
+        cpu: the processor time of the same steps (m,) [s], from which other processes on the machine take nothing.
+    """
+
+    press: Press
+    force: NDArray
+    seconds: NDArray
+    cpu: NDArray
+
+    @property
+    def errors(self) -> NDArray:
+        """Errors of the magnitude (n,) [N]; NaN where there is no estimate."""
+        return np.linalg.norm(self.force, axis=1) - np.linalg.norm(self.press.force, axis=1)
+
+
+def run_tier(tier: Tier, jaw: Jaw, presses: Sequence[Press], progress=lambda: None) -> list[Run]:
+    """Runs one estimator over presses, each from the start; what compiles is compiled before.
+
+    Args:
+        tier: the way to solve.
+        jaw: the finger.
+        presses: what it is given.
+        progress: called after each press.
+
+    Raises:
+        FinforceError: The tier does not exist, or cannot describe the jaw.
+    """
+    estimator = JawEstimator(jaw, settings=tier.settings())
+    estimator.warm_up()
+    _run_press(tier, estimator, presses[0], _WARM_UP_FRAMES)
+    runs = []
+    for press in presses:
+        runs.append(_run_press(tier, estimator, press))
+        progress()
+    return runs
+
+
+def _run_press(tier: Tier, estimator: JawEstimator, press: Press, frames: int | None = None) -> Run:
+    """Returns what an estimator that starts anew makes of the first frames of a press."""
+    estimator.reset()
+    force = np.full(press.force.shape, np.nan)
+    seconds, cpu = [], []
+    contacts = press.contacts(tier.contact)
+    # a collection in the middle of a step is not the step's own time
+    collect()
+    disable()
+    try:
+        for index, observation in enumerate(press.observations[:frames]):
+            begin, begin_cpu = perf_counter(), thread_time()
+            solution = estimator.update(observation, contacts[index])
+            passed, used = perf_counter() - begin, thread_time() - begin_cpu
+            if solution.trusted:
+                force[index] = solution.force
+            # an unloaded or unsolved frame may be cheaper: it is not what a user waits for
+            if solution.status == "ok":
+                seconds.append(passed)
+                cpu.append(used)
+    finally:
+        enable()
+    return Run(press=press, force=force, seconds=np.array(seconds), cpu=np.array(cpu))

@@ -1,0 +1,1 @@
+"""Material constants from recordings with a force sensor or a kitchen scale."""

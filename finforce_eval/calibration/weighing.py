@@ -1,0 +1,155 @@
+"""The stiffness of a finger from a kitchen scale: held forces against what the scale said, in their order.
+
+For a given shape the force is proportional to the modulus; one factor is all that a scale can tell. Shape, relaxation
+and clamp stay as they were. Knows no files and no options.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.contact_source import ContactSource
+from finforce_eval.evaluation.steps import Estimator
+from finforce_eval.recordings.tracks import Recording
+
+GRAVITY = 9.80665  # [m/s^2] by which kitchen scales turn weight into grams
+LEAST_HOLD = 1.5  # [s]
+LEAST_FORCE = 0.1  # [N]; below it a hold is not told from rest
+_WINDOW = 1.0  # [s] of the end of a hold, when the scale is read
+_DRIFT, _DRIFT_FLOOR = 0.04, 0.02  # of the force and [N] in one window: relaxation is slower, pressing is faster
+_SCALE_ERROR = 0.02  # [N]: two grams
+_RELATIVE_ERROR = 0.02  # of one reading, by the height at which it was pressed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hold:
+    """A force that was held steady.
+
+    Attributes:
+        start: [s] since the first image.
+        end: [s] likewise.
+        force: estimated component along the closing direction, mean of the last second [N].
+    """
+
+    start: float
+    end: float
+    force: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Weighing:
+    """Estimated forces against a scale.
+
+    Attributes:
+        factor: by which the modulus has to be multiplied [-].
+        stddev: of the factor [-].
+        holds: what was held, in time.
+        weights: what the scale said [N].
+        misfit: root mean square of what is left, relative to each weight [-].
+    """
+
+    factor: float
+    stddev: float
+    holds: tuple[Hold, ...]
+    weights: NDArray[np.float64]
+    misfit: float
+
+
+def estimate_pressing(
+    recording: Recording,
+    side: str,
+    estimator: Estimator,
+    source: ContactSource,
+    progress: Callable[[int], Any] = lambda frames: None,
+) -> NDArray[np.float64]:
+    """Return the estimated force along the closing direction of every image (n,) [N], NaN where there is none."""
+    track = recording.jaw(side).keypoints
+    pressing = np.full(len(track.stamps), np.nan)
+    for index, stamp in enumerate(track.stamps):
+        solution = estimator.update(track.observation(index), source.contact_at(int(stamp)))
+        wrench = (solution.force, solution.torque) if solution.trusted else None
+        source.learn(int(stamp), estimator.surface(), wrench)
+        if solution.trusted:
+            pressing[index] = abs(solution.force[0])
+        progress(1)
+    return pressing
+
+
+def find_holds(times: NDArray[np.float64], pressing: NDArray[np.float64]) -> list[Hold]:
+    """Return where a force was held steady for long enough to read a scale, in time.
+
+    Args:
+        times: (n,) [s], rising.
+        pressing: (n,) [N], NaN where unknown.
+    """
+    known = np.isfinite(pressing)
+    times, pressing = times[known], pressing[known]
+    before = np.searchsorted(times, times - 0.5 * _WINDOW)
+    after = np.searchsorted(times, times + 0.5 * _WINDOW, side="right")
+    steady = np.zeros(len(times), dtype=bool)
+    for index, (low, high) in enumerate(zip(before, after, strict=True)):
+        half = (low + high) // 2
+        if half - low < 2 or high - half < 2:
+            continue
+        level, drift = (
+            np.median(pressing[low:high]),
+            abs(np.median(pressing[half:high]) - np.median(pressing[low:half])),
+        )
+        steady[index] = level > LEAST_FORCE and drift < 0.5 * (_DRIFT * level + _DRIFT_FLOOR)
+    edges = np.flatnonzero(np.diff(np.r_[False, steady, False].astype(int)))
+    spans = [(start, end - 1) for start, end in zip(edges[::2], edges[1::2], strict=True)]
+    return [
+        Hold(start=float(times[a]), end=float(times[b]), force=_last(times[a : b + 1], pressing[a : b + 1]))
+        for a, b in spans
+        if times[b] - times[a] >= LEAST_HOLD
+    ]
+
+
+def _last(times: NDArray, pressing: NDArray) -> float:
+    """Return the mean of the last second of a hold [N]."""
+    return float(pressing[times >= times[-1] - _WINDOW].mean())
+
+
+def weigh(holds: Sequence[Hold], grams: Sequence[float], name: str = "the recording") -> Weighing:
+    """Return the factor that brings the holds to the readings: weighted least squares of m g = factor F.
+
+    Args:
+        holds: found in the recordings, in time.
+        grams: read off the scale at the end of each hold, the scale at zero before; the same number.
+        name: of the recording, for messages.
+
+    Raises:
+        RecordingError: another number of holds than of readings, or readings that no scale shows.
+    """
+    weights = np.asarray(grams, dtype=float) * 1e-3 * GRAVITY
+    if not len(weights) or not np.isfinite(weights).all() or (weights <= 0.0).any():
+        raise RecordingError(f"{name}: readings {list(grams)}: expected grams above zero, one for each hold")
+    if len(weights) != len(holds):
+        found = ", ".join(f"{hold.start:.1f}-{hold.end:.1f} s ({hold.force:.2f} N)" for hold in holds) or "none"
+        raise RecordingError(f"{name}: {len(weights)} readings for {len(holds)} holds; holds found: {found}")
+    forces = np.array([hold.force for hold in holds])
+    variance = _SCALE_ERROR**2 + (_RELATIVE_ERROR * weights) ** 2
+    information = float((forces**2 / variance).sum())
+    factor = float((forces * weights / variance).sum() / information)
+    misfit = float(np.sqrt(np.mean((1.0 - factor * forces / weights) ** 2)))
+    spread = max(1.0, float(np.sqrt(np.mean((weights - factor * forces) ** 2 / variance))))
+    return Weighing(
+        factor=factor, stddev=spread / np.sqrt(information), holds=tuple(holds), weights=weights, misfit=misfit
+    )
+
+
+def format_weighing(weighing: Weighing) -> str:
+    """Return the table of the holds, the factor and what is left."""
+    lines = [f"{'hold [s]':>16} {'scale [N]':>10} {'estimate [N]':>13} {'after [N]':>10}"]
+    for hold, weight in zip(weighing.holds, weighing.weights, strict=True):
+        span = f"{hold.start:.1f} - {hold.end:.1f}"
+        lines.append(f"{span:>16} {weight:10.3f} {hold.force:13.3f} {weighing.factor * hold.force:10.3f}")
+    left = f"left over {100 * weighing.misfit:.1f} % of a reading"
+    lines.append(f"modulus times {weighing.factor:.3f} ± {weighing.stddev:.3f}; {left}")
+    return "\n".join(lines)

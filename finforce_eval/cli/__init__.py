@@ -1,0 +1,1 @@
+"""The `finforce` command, a file per subcommand."""

@@ -1,0 +1,142 @@
+"""`finforce demo`: a recording through the real nodes, a table and a report; from images unless told otherwise."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+from finforce_eval.cli.evaluate import make_setup
+from finforce_eval.cli.replay import format_replay
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.keypoint_source import IMAGES, KeypointSource
+from finforce_eval.evaluation.report import write_report
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import Recording
+from finforce_eval.replay.replay import Replay, replay
+
+RECORDING, CALIBRATION = Path(__file__).parents[1] / "data" / "bench_cyl25_middle", "bench"
+# the synthetic scene of a run from images, and the calibration of its finger
+SCENE, SEED, FINGER, SCENE_CALIBRATION = "grasp_cylinder", 4, 0, "twin"
+SIZE = "640x480"
+FOLDER = "recording"  # in the folder of the report
+
+
+def run_demo(options: argparse.Namespace) -> None:
+    """Replay a recording, print the error of the force, write the report.
+
+    Raises:
+        FinforceError: the scene cannot be rendered, or ROS 2 or another library is not installed.
+        ProcessError: a node cannot be started, or ended early.
+    """
+    from_images = options.source == IMAGES
+    recording = prepare_recording(Path(options.report) / FOLDER) if from_images else read_recording(RECORDING)
+    calibration = SCENE_CALIBRATION if from_images else CALIBRATION
+    stamps = recording.images.stamps if from_images else recording.jaw("left").keypoints.stamps
+    way = "key point detector, contact estimator and solvers" if from_images else "contact estimator and solver"
+    print(f"Playing {recording.name}, {(stamps[-1] - stamps[0]) * 1e-9:.0f} s, through {way} ...", flush=True)
+    names = argparse.Namespace(
+        jaw="bench",
+        solver="default",
+        mesh="default",
+        contact=options.contact or (["estimate"] if from_images else []),
+        source=options.source,
+        calibration=calibration,
+    )
+    setup = make_setup(names)
+    keypoints = KeypointSource(source=options.source, jaw_file=names.jaw)
+    result = replay(recording, setup, calibration_file=calibration, keypoints=keypoints)
+    print(format_replay(result))
+    page = write_report(
+        result.evaluation,
+        options.report,
+        keypoint_names=setup.jaw.keypoint_names,
+        about=setup.about,
+        recordings=[result.recording],
+        title="From images to forces through the nodes" if from_images else "One loading cycle through the nodes",
+    )
+    print(f"\n{format_summary(result)}\nReport: {page}")
+
+
+def format_summary(result: Replay) -> str:
+    """Return the few figures that matter, one a line: error of the grasp force, pixel error, delay."""
+    score, sight = result.grasp_score, result.evaluation.total.sight
+    error, delay, lines = score.error, score.delay, []
+    if error.rmse_N is not None:
+        where = f"of {score.largest:.2f} N at most; {error.n} of {score.frames} images in the record phases answered"
+        lines.append(f"Grasp force: {error.rmse_N:.3f} N RMSE, {error.max_error_N:.3f} N largest error, {where}")
+    if sight.pixel_median_px is not None:
+        median, p95 = sight.pixel_median_px, sight.pixel_p95_px
+        lines.append(f"Key points: {median:.2f} px off in the median, {p95:.2f} px at the 95th percentile")
+    if delay.n:
+        lines.append(f"Delay: the grasp force shows {delay.median_ms:.0f} ms after its true onset")
+    elif delay.missed:
+        lines.append("Delay: the grasp force did not show within a second of its true onset")
+    return "\n".join(lines)
+
+
+def prepare_recording(folder: Path) -> Recording:
+    """Return the recording of the demo's scene in a folder; what is there is used if it is whole and of that scene.
+
+    Raises:
+        RecordingError: the folder holds something else than a recording of a synthetic scene.
+        FinforceError: the scene cannot be rendered.
+    """
+    recording = find_recording(folder)
+    if recording is None:
+        clear_folder(folder)
+        print(f"Rendering the scene {SCENE} into {folder}, once ...", flush=True)
+        _render(folder)
+        recording = read_recording(folder)
+    return replace(recording, name=SCENE)
+
+
+def find_recording(folder: Path) -> Recording | None:
+    """Return the recording in a folder if it is a whole one of the demo's scene, seed and finger, else None."""
+    if not folder.is_dir():
+        return None
+    try:
+        recording = read_recording(folder)
+    except RecordingError:
+        return None
+    # it is written after all images: without it the recording was broken off
+    wanted: dict[str, Any] = {"scene": SCENE, "seed": SEED, "finger": FINGER}
+    is_wanted = all(recording.case.get(name) == value for name, value in wanted.items())
+    return recording if is_wanted and recording.images is not None else None
+
+
+def clear_folder(folder: Path) -> None:
+    """Remove a recording that the demo has made, whole or broken off.
+
+    Raises:
+        RecordingError: the folder holds something else.
+    """
+    if not folder.exists():
+        return
+    if not (_is_synthetic(folder) or {path.name for path in folder.iterdir()} <= {f"{folder.name}.mcap"}):
+        raise RecordingError(
+            f"{folder}: holds something else than a recording of a synthetic scene, expected one or no such folder; "
+            "move it away, or give another --report"
+        )
+    rmtree(folder)
+
+
+def _is_synthetic(folder: Path) -> bool:
+    """Say whether a folder's `case.json` names a synthetic scene."""
+    try:
+        return "scene" in json.loads((folder / "case.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError):
+        return False
+
+
+def _render(folder: Path) -> None:
+    """Render the demo's scene into a new folder, under a progress bar."""
+    from finforce_eval.cli.twin import record_scene
+    from finforce_eval.recordings.twin_writer import RecordingForm
+    from finforce_twin.footage import parse_size
+    from finforce_twin.scenes.scenarios import build_scenario
+
+    record_scene(build_scenario(SCENE), SEED, folder, camera=parse_size(SIZE), form=RecordingForm(), finger=FINGER)

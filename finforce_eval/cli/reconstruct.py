@@ -1,0 +1,158 @@
+"""`finforce reconstruct`: a masked depth image in, the object's mesh and its pose out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.optional import import_trimesh
+from finforce_contact.errors import ObjectMeshError
+from finforce_contact.mesh.object_mesh import read_triangles
+from finforce_contact.reconstruction.evidence import ImageEvidence, collect_evidence
+from finforce_contact.reconstruction.reconstruction import FROM_GENERATED, reconstruct
+from finforce_contact.reconstruction.result import GeneratedMesh, Reconstruction
+from finforce_eval.errors import OptionError
+from finforce_eval.recordings.image_files import read_depth, read_generated_pose, read_image, read_intrinsics, read_mask
+
+OUTPUTS = (".stl", ".ply", ".glb")
+
+
+def run_reconstruct(options: argparse.Namespace) -> None:
+    """Reconstruct, write mesh, pose and picture, and print what came out.
+
+    Raises:
+        FinforceError: an input cannot be used, or nothing explains the image.
+    """
+    check_options(options)
+    evidence, color = read_evidence(options)
+    generated = read_generated(options) if options.mesh else None
+    with StageBar() as bar:
+        result = reconstruct(evidence, generated, options.method or "", bar.report)
+    write_result(result, Path(options.output))
+    print(describe_result(result))
+    print(f"Mesh: {options.output} (metres); pose: {pose_path(Path(options.output))}")
+    if options.picture:
+        write_picture(options.picture, result, evidence, color)
+        print(f"Picture: {options.picture}")
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """Refuse options that do not go together, before anything is read.
+
+    Raises:
+        OptionError: they do not.
+    """
+    if Path(options.output).suffix.lower() not in OUTPUTS:
+        raise OptionError(f"-o {options.output}: expected a name that ends in {', '.join(OUTPUTS)}")
+    if bool(options.mesh) != bool(options.pose):
+        raise OptionError("--mesh and --pose go together: the generated mesh, and where its generator puts it")
+    if options.method in FROM_GENERATED and not options.mesh:
+        raise OptionError(f"--method {options.method} needs --mesh and --pose; without them: primitive or completion")
+    if options.method and options.method not in FROM_GENERATED and options.mesh:
+        raise OptionError(f"--method {options.method} uses no generated mesh; leave out --mesh and --pose")
+
+
+def read_evidence(options: argparse.Namespace) -> tuple[ImageEvidence, NDArray | None]:
+    """Return what the images say, and the colour picture where one was given.
+
+    Raises:
+        FinforceError: an image cannot be used.
+    """
+    depth, mask = read_depth(options.depth), read_mask(options.mask)
+    color = read_image(options.color) if options.color else None
+    if color is not None and (color.ndim != 3 or color.shape[:2] != depth.shape):
+        raise OptionError(f"{options.color}: shape {color.shape}; expected colour of the depth's size, {depth.shape}")
+    return collect_evidence(depth, mask, read_intrinsics(options.intrinsics, depth.shape)), color
+
+
+def read_generated(options: argparse.Namespace) -> GeneratedMesh:
+    """Return the generated mesh with its guessed place.
+
+    Raises:
+        FinforceError: mesh or pose cannot be used.
+    """
+    vertices, triangles = read_triangles(options.mesh)
+    if len(triangles) == 0:
+        raise ObjectMeshError(f"{options.mesh}: no triangles; expected a mesh")
+    affine = read_generated_pose(options.pose)
+    return GeneratedMesh(vertices=vertices, triangles=triangles, affine=affine, name=Path(options.mesh).stem)
+
+
+class StageBar:
+    """A progress bar that starts anew with each stage."""
+
+    def __enter__(self) -> StageBar:
+        """Show the bar."""
+        from tqdm import tqdm
+
+        form = "{desc:28s} {percentage:3.0f}%|{bar:30}| {elapsed}"
+        self._bar = tqdm(total=1.0, bar_format=form, leave=False, disable=None)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Take the bar away."""
+        self._bar.close()
+
+    def report(self, stage: str, share: float) -> None:
+        """Show a stage and the share of it that is done."""
+        self._bar.set_description_str(stage, refresh=False)
+        self._bar.n = share
+        self._bar.refresh()
+
+
+def write_result(result: Reconstruction, output: Path) -> None:
+    """Write the mesh in metres, and beside it the pose with all that is known of its quality, as JSON."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    trimesh = import_trimesh()
+    mesh = trimesh.Trimesh(result.mesh.vertices, result.mesh.triangles, process=False)
+    mesh.export(output, file_type=output.suffix[1:].lower())
+    pose_path(output).write_text(json.dumps(_as_json(result), indent=2) + "\n", encoding="utf-8")
+
+
+def pose_path(output: Path) -> Path:
+    """Return where the pose of a mesh file goes."""
+    return output.with_suffix(".pose.json")
+
+
+def _as_json(result: Reconstruction) -> dict[str, Any]:
+    """Return pose and quality."""
+    return {
+        "T_camera_object": result.T_camera_object.tolist(),
+        "scale": result.scale.tolist(),
+        "method": result.method,
+        "watertight": result.mesh.watertight,
+        "triangles": len(result.mesh.triangles),
+        "extent_m": np.ptp(result.mesh.vertices, axis=0).tolist(),
+        "score": asdict(result.score),
+        "notes": list(result.mesh.notes),
+    }
+
+
+def describe_result(result: Reconstruction) -> str:
+    """Return size, agreement and notes as lines."""
+    size = " x ".join(f"{1e3 * side:.1f}" for side in np.ptp(result.mesh.vertices, axis=0))
+    kind = "watertight" if result.mesh.watertight else "NOT watertight"
+    lines = [
+        f"{result.method}: {size} mm, {len(result.mesh.triangles)} triangles, {kind}",
+        f"distance of the measured surface {1e3 * result.score.residual:.2f} mm (median), outline and mask overlap "
+        f"{100.0 * result.score.overlap:.1f} %",
+    ]
+    return "\n".join([*lines, *(f"note: {note}" for note in result.mesh.notes)])
+
+
+def write_picture(path: str, result: Reconstruction, evidence: ImageEvidence, color: NDArray | None) -> None:
+    """Write the picture of mesh over image.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    from finforce_eval.figures.reconstruction import draw_reconstruction
+
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    draw_reconstruction(result, evidence, color).savefig(path)

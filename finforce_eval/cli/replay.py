@@ -1,0 +1,103 @@
+"""`finforce replay`: options in, a recording through the real nodes, scores out as text and files."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+
+from finforce_eval.cli.evaluate import Setup, make_setup, write_json
+from finforce_eval.cli.main import Parser, add_jaw_options, add_source_options
+from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.tables import evaluation_json, format_table
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.replay.replay import Playing, Replay, replay
+
+
+def format_replay(result: Replay) -> str:
+    """Return the table of the score, with the state of the nodes below."""
+    lines = [format_table(result.evaluation), ""]
+    began = (
+        "images" if any(case.detector_ms is not None for case in result.evaluation.results.values()) else "key points"
+    )
+    lines.append(f"Step times are from {began} out to wrench in, over the middleware and back.")
+    lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {_largest(result.grasp):.2f} N{_shown(result)}.")
+    for name, state in result.health.items():
+        own = " / ".join(state.get(f"callback to published {part} [ms]", "-") for part in ("p50", "p95"))
+        lines.append(f"{name}: {state['message']}; refused: {state.get('refused', '-')}; in the node {own} ms")
+    return "\n".join(lines)
+
+
+def _shown(result: Replay) -> str:
+    """Return in words when the grasp force showed."""
+    delay = result.grasp_score.delay
+    if not delay.n:
+        return f", missed at {delay.missed} onsets" if delay.missed else ""
+    return f", above 0.1 N {delay.median_ms:.0f} ms (at most {delay.max_ms:.0f} ms) after {delay.n} true onsets"
+
+
+def _largest(values: Mapping[int, float]) -> float:
+    return max(values.values(), default=math.nan)
+
+
+def build_parser() -> Parser:
+    """Return the parser of `finforce replay`."""
+    text = "play a recording through the real nodes in real time and score it"
+    parser = Parser(prog="finforce replay", description=text)
+    parser.add_argument("bag", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
+    add_jaw_options(parser)
+    add_source_options(parser)
+    parser.add_argument("--calibration", metavar="FILE", help="calibration file, or a shipped name")
+    parser.add_argument("--rate", type=float, default=1.0, help="speed; other than 1 on /clock (1)")
+    parser.add_argument("--sim-time", action="store_true", help="keep the stamps, give the time on /clock")
+    parser.add_argument(
+        "--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID, to look on with RViz; else one by chance"
+    )
+    parser.add_argument("--params", default="", metavar="FILE", help="further ROS parameters of the solvers")
+    parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
+    parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
+    return parser
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run `finforce replay`.
+
+    Raises:
+        FinforceError: an option, the recording or a node fails.
+    """
+    parser = build_parser()
+    options = parser.parse_args(argv)
+    if not 0.01 <= options.rate <= 100.0:
+        parser.error(f"--rate {options.rate:g}: expected 0.01 to 100")
+    if options.domain is not None and not 0 <= options.domain <= 232:
+        parser.error(f"--domain {options.domain}: expected 0 to 232")
+    setup = make_setup(options)
+    playing = Playing(
+        rate=options.rate, sim_time=options.sim_time, domain=options.domain, parameter_file=options.params
+    )
+    keypoints, calibration = parse_source(options), options.calibration or ""
+    recording = read_recording(options.bag, keypoints.pairing)
+    result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
+    print(format_replay(result))
+    _write(result, setup, options)
+    return 0
+
+
+def _write(result: Replay, setup: Setup, options: argparse.Namespace) -> None:
+    """Write what was asked for."""
+    if options.json:
+        score = result.grasp_score
+        grasp = {"grasp": asdict(score.error), "grasp_delay": asdict(score.delay)}
+        write_json(options.json, evaluation_json(result.evaluation, **grasp, **setup.about))
+    if options.report:
+        from finforce_eval.evaluation.report import write_report
+
+        page = write_report(
+            result.evaluation,
+            options.report,
+            keypoint_names=setup.jaw.keypoint_names,
+            about=setup.about,
+            recordings=[result.recording],
+        )
+        print(f"Report: {page}")

@@ -1,0 +1,53 @@
+"""The subcommand `weigh`: options to records, calls, and print."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from finforce_eval.calibration.weighing import estimate_pressing, find_holds, format_weighing, weigh
+from finforce_eval.cli.evaluate import make_setup, read_keypoints
+from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.evaluate import check_keypoint_count
+from finforce_ifea.jaw.calibration import Calibration, name_mechanics, save_calibration
+
+
+def run_weigh(options: argparse.Namespace) -> None:
+    """Find the holds of a recording, and scale the stiffness by what a scale said of them."""
+    if options.output and not options.grams:
+        raise OptionError("-o needs --grams: the readings of the scale, one for each hold")
+    setup = make_setup(options).side(options.side)
+    (recording,) = read_keypoints(options, (options.side,))
+    check_keypoint_count(recording, options.side, setup.jaw)
+    stamps = recording.jaw(options.side).keypoints.stamps
+    with tqdm(total=len(stamps), unit="frame", desc=recording.name, disable=None, leave=False) as bar:
+        pressing = estimate_pressing(
+            recording, options.side, setup.estimator(), setup.source(recording), progress=bar.update
+        )
+    holds = find_holds((stamps - stamps[0]) * 1e-9, pressing)
+    if not options.grams:
+        for number, hold in enumerate(holds, 1):
+            print(f"hold {number}: {hold.start:.1f} to {hold.end:.1f} s, estimated {hold.force:.3f} N")
+        print(f"{len(holds)} holds; give their readings with --grams")
+        return
+    weighing = weigh(holds, options.grams, recording.name)
+    print(format_weighing(weighing))
+    base = setup.calibration or Calibration(young_modulus=setup.jaw.material.young_modulus, jaw=setup.jaw.name)
+    scaled = replace(
+        base,
+        solver=name_mechanics(setup.jaw, setup.settings.solver),
+        young_modulus=base.young_modulus * weighing.factor,
+        force_error=float(np.clip(max(weighing.misfit, base.force_error), 0.005, 0.5)),
+    )
+    if options.output:
+        Path(options.output).parent.mkdir(parents=True, exist_ok=True)
+        save_calibration(
+            scaled,
+            options.output,
+            uncertainty={"young_modulus": scaled.young_modulus * weighing.stddev / weighing.factor},
+        )
+        print(f"Calibration: {options.output}")

@@ -1,0 +1,1 @@
+"""Estimators over recordings, offline: steps, results, scores, tables."""

@@ -1,0 +1,309 @@
+"""Errors of an estimate against the truth, as numbers.
+
+How far /grasp_wrench is from the truth, and how late.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.evaluation.contact_scoring import (
+    OnsetStats,
+    PlaceStats,
+    given_distance,
+    onset_stats,
+    place_stats,
+    solved_distance,
+)
+from finforce_eval.evaluation.delay_scoring import DelayStats, delay_stats, onset_delays
+from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.evaluation.sight_scoring import SightStats, sight_stats
+from finforce_eval.recordings.tracks import Recording, WrenchTrack
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stats:
+    """Errors over a set of frames, named as in the JSON; None where there is nothing to compute from.
+
+    Attributes:
+        n: frames.
+        rmse_N: root mean square error [N].
+        nrmsd_pct: the same over the range of the true force [%].
+        max_error_N: largest absolute error [N].
+        bias_N: mean error [N]; positive when the estimate is too large.
+    """
+
+    n: int
+    rmse_N: float | None
+    nrmsd_pct: float | None
+    max_error_N: float | None
+    bias_N: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """Mean and sample standard deviation over cycles; `std` is None for a single cycle."""
+
+    mean: float | None
+    std: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CycleStats:
+    """How the errors vary from loading cycle to loading cycle."""
+
+    n: int
+    rmse_N: Spread
+    nrmsd_pct: Spread
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepTimes:
+    """Wall time per step [ms]; None without steps."""
+
+    p50: float | None
+    p95: float | None
+    p99: float | None
+    max: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaseScore:
+    """The score of a case, or of all cases together.
+
+    Attributes:
+        frames: key point frames given to the estimator.
+        solved: those with a trusted estimate.
+        skipped: the others; they are in no error.
+        record_frames: frames of the `record` phases (every frame without phases).
+        record_skipped: those of them without a trusted estimate.
+        all: errors over the record phases.
+        load: of them, on the way in.
+        unload: of them, on the way out.
+        step_ms: time per step.
+        cycles: "all", "load", "unload" -> variation over the loading cycles.
+        mean_rmse_N: mean of the RMSE of the cases.
+        contact_ms: time per step of the contact estimator.
+        place: distance of the contact that was given to the estimator from the true pressure centre.
+        solved_place: the same of the estimator's own contact place.
+        onset: delay of `touching`.
+        delay: of the force after its true onset.
+        sight: how well the key points were seen.
+        detector_ms: time per image of the key point detector.
+    """
+
+    frames: int
+    solved: int
+    skipped: int
+    record_frames: int
+    record_skipped: int
+    all: Stats
+    load: Stats
+    unload: Stats
+    step_ms: StepTimes
+    cycles: Mapping[str, CycleStats]
+    mean_rmse_N: float | None
+    contact_ms: StepTimes
+    place: PlaceStats
+    solved_place: PlaceStats
+    onset: OnsetStats
+    delay: DelayStats
+    sight: SightStats
+    detector_ms: StepTimes
+
+
+def force_range(truths: Iterable[NDArray[np.float64]]) -> float:
+    """Return the range of the norm of the true forces, each (n, 3) [N], over all recordings of a call."""
+    norms = [np.linalg.norm(truth, axis=1) for truth in truths]
+    finite = np.concatenate([norm[np.isfinite(norm)] for norm in norms] or [np.zeros(0)])
+    return float(np.ptp(finite)) if finite.size else 0.0
+
+
+def match_truth(truth: WrenchTrack, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the true force at the given stamps (n, 3) [N], matched as by `match_samples`.
+
+    Args:
+        truth: measured wrenches.
+        stamps: (n,) image times [ns].
+    """
+    return match_samples(truth.stamps, truth.force, stamps)
+
+
+def match_samples(
+    times: NDArray[np.int64], values: NDArray[np.float64], stamps: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return what was sampled at other times, at the given stamps.
+
+    A sample at the very stamp is taken as it is; between two that are no further apart than two and a half periods of
+    the samples it is interpolated; elsewhere it is NaN.
+
+    Args:
+        times: (m,) of the samples [ns].
+        values: (m, k) the samples.
+        stamps: (n,) [ns].
+
+    Returns:
+        (n, k).
+    """
+    matched = np.full((len(stamps), values.shape[1]), np.nan)
+    after = np.clip(np.searchsorted(times, stamps, side="left"), 0, len(times) - 1)
+    exact = times[after] == stamps
+    matched[exact] = values[after[exact]]
+    before = after - 1
+    inside = ~exact & (before >= 0) & (times[after] > stamps)
+    if inside.any():
+        gap = times[after] - times[before]
+        inside &= gap <= 2.5 * np.median(np.diff(times))
+    rows, left, right = np.flatnonzero(inside), before[inside], after[inside]
+    share = (stamps[rows] - times[left]) / (times[right] - times[left])
+    matched[rows] = values[left] + share[:, None] * (values[right] - values[left])
+    return matched
+
+
+def compute_stats(errors: NDArray[np.float64], span: float) -> Stats:
+    """Return the statistics of errors.
+
+    Args:
+        errors: (n,) norm of the estimate minus norm of the truth [N].
+        span: range of the true force [N]; 0 leaves `nrmsd_pct` open.
+    """
+    if errors.size == 0:
+        return Stats(n=0, rmse_N=None, nrmsd_pct=None, max_error_N=None, bias_N=None)
+    rmse = float(np.sqrt(np.mean(errors**2)))
+    return Stats(
+        n=int(errors.size),
+        rmse_N=rmse,
+        nrmsd_pct=100.0 * rmse / span if span > 0.0 else None,
+        max_error_N=float(np.abs(errors).max()),
+        bias_N=float(errors.mean()),
+    )
+
+
+def _spread(values: Sequence[float | None]) -> Spread:
+    """Return mean and sample standard deviation of the numbers among values."""
+    numbers = [value for value in values if value is not None]
+    if not numbers:
+        return Spread(mean=None, std=None)
+    return Spread(mean=float(np.mean(numbers)), std=float(np.std(numbers, ddof=1)) if numbers[1:] else None)
+
+
+def _selected(result: CaseResult, phase: str) -> NDArray[np.bool_]:
+    """Return the frames (n,) that count for "all", "load" or "unload"."""
+    return result.counted if phase == "all" else result.counted & (result.direction == phase)
+
+
+def _errors(results: Sequence[CaseResult], phase: str) -> NDArray[np.float64]:
+    """Return the errors of a phase over all results (n,) [N]."""
+    return np.concatenate([result.error[_selected(result, phase)] for result in results])
+
+
+def _cycle_stats(results: Sequence[CaseResult], phase: str, span: float) -> CycleStats:
+    """Score every loading cycle for itself."""
+    cycles = []
+    for result in results:
+        chosen = _selected(result, phase)
+        numbers = np.unique(result.cycle[chosen])
+        cycles += [compute_stats(result.error[chosen & (result.cycle == k)], span) for k in numbers]
+    return CycleStats(
+        n=len(cycles),
+        rmse_N=_spread([cycle.rmse_N for cycle in cycles]),
+        nrmsd_pct=_spread([cycle.nrmsd_pct for cycle in cycles]),
+    )
+
+
+def _detector_times(cases: Sequence[CaseResult]) -> list[NDArray[np.float64]]:
+    """Return the times of the detector, once for each recording: it sees both jaws in one pass."""
+    times = {case.detector_ms.tobytes(): case.detector_ms for case in cases if case.detector_ms is not None}
+    return list(times.values())
+
+
+def _step_times(steps: NDArray[np.float64]) -> StepTimes:
+    """Return the percentiles of times (n,) [ms]; NaN is a step that was not timed."""
+    timed = steps[np.isfinite(steps)]
+    if timed.size == 0:
+        return StepTimes(p50=None, p95=None, p99=None, max=None)
+    p50, p95, p99, longest = (float(value) for value in np.percentile(timed, [50, 95, 99, 100]))
+    return StepTimes(p50=p50, p95=p95, p99=p99, max=longest)
+
+
+def score_case(results: CaseResult | Sequence[CaseResult], span: float) -> CaseScore:
+    """Score one case, or several together.
+
+    Args:
+        results: the time series.
+        span: range of the true force over the call's recordings [N], see `force_range`.
+    """
+    cases = [results] if isinstance(results, CaseResult) else list(results)
+    frames = sum(len(case.stamps) for case in cases)
+    solved = sum(int(case.solved.sum()) for case in cases)
+    stats = {phase: compute_stats(_errors(cases, phase), span) for phase in ("all", "load", "unload")}
+    each = [compute_stats(case.error[case.counted], span).rmse_N for case in cases]
+    return CaseScore(
+        frames=frames,
+        solved=solved,
+        skipped=frames - solved,
+        record_frames=sum(int(case.scored.sum()) for case in cases),
+        record_skipped=sum(int((case.scored & ~case.solved).sum()) for case in cases),
+        step_ms=_step_times(np.concatenate([case.step_ms for case in cases])),
+        cycles={phase: _cycle_stats(cases, phase, span) for phase in stats},
+        mean_rmse_N=_spread(each).mean,
+        contact_ms=_step_times(np.concatenate([np.zeros(0), *(c.contact.step_ms for c in cases if c.contact)])),
+        place=place_stats(np.concatenate([given_distance(case) for case in cases])),
+        solved_place=place_stats(np.concatenate([solved_distance(case) for case in cases])),
+        onset=onset_stats(cases),
+        delay=delay_stats([delay for case in cases for delay in case.delays]),
+        sight=sight_stats([case.sight for case in cases if case.sight is not None]),
+        detector_ms=_step_times(np.concatenate([np.zeros(0), *_detector_times(cases)])),
+        **stats,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspScore:
+    """The grasp force against the smaller of the jaws' true forces.
+
+    Attributes:
+        error: over the record phases, or over every image without phases.
+        frames: images that were to be scored, with or without an answer.
+        largest: true grasp force [N]; NaN where it is not known.
+        delay: after the true onsets.
+    """
+
+    error: Stats
+    frames: int
+    largest: float
+    delay: DelayStats
+
+
+def score_grasp(recording: Recording, grasp: Mapping[int, float], lag: Mapping[int, float]) -> GraspScore:
+    """Return how good grasp forces were; of a recording without the truth of all jaws nothing is known.
+
+    Args:
+        recording: that was played.
+        grasp: by recorded stamp [ns] -> [N].
+        lag: from the image to the grasp force [s], by recorded stamp [ns].
+    """
+    if any(track.truth is None for track in recording.jaws.values()):
+        nothing = compute_stats(np.zeros(0), 0.0)
+        return GraspScore(error=nothing, frames=0, largest=float("nan"), delay=delay_stats([]))
+    stamps = next(iter(recording.jaws.values())).keypoints.stamps
+    forces = [np.linalg.norm(match_truth(recording.truth(side), stamps), axis=1) for side in recording.jaws]
+    truth, said = np.min(forces, axis=0), _rows(grasp, stamps)
+    scored = recording.phases_at(stamps).scored & np.isfinite(truth)
+    error = (said - truth)[scored]
+    known = truth[np.isfinite(truth)]
+    return GraspScore(
+        error=compute_stats(error[np.isfinite(error)], float(np.ptp(known)) if known.size else 0.0),
+        frames=int(scored.sum()),
+        largest=float(known.max()) if known.size else float("nan"),
+        delay=delay_stats(onset_delays(stamps * 1e-9, truth, said, _rows(lag, stamps))),
+    )
+
+
+def _rows(values: Mapping[int, float], stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return one value per stamp, NaN where there is none."""
+    return np.array([values.get(int(stamp), np.nan) for stamp in stamps])

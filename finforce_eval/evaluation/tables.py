@@ -1,0 +1,168 @@
+"""Scores as text: the paper's table for the terminal and for Markdown, and the JSON of `evaluate`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from finforce_eval.evaluation.evaluate import Evaluation
+from finforce_eval.evaluation.markdown import markdown_rows
+from finforce_eval.evaluation.scoring import CaseScore, Spread, Stats
+from finforce_eval.evaluation.sight_table import format_sight
+
+PHASES = ("all", "load", "unload")
+HEADER = ("RMSE/N", "NRMSD/%", "max/N")
+
+
+def format_number(value: float | None, digits: int = 2) -> str:
+    """Return a number, or a dash for none."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _format_spread(spread: Spread) -> str:
+    """Return mean and standard deviation over the cycles."""
+    mean = format_number(spread.mean)
+    return mean if spread.std is None else f"{mean}±{spread.std:.2f}"
+
+
+def score_cells(score: CaseScore, phase: str) -> list[str]:
+    """Return RMSE, NRMSD (mean ± standard deviation over the cycles) and maximum error of a phase."""
+    cycles = score.cycles[phase]
+    stats: Stats = getattr(score, phase)
+    return [
+        _format_spread(cycles.rmse_N),
+        _format_spread(cycles.nrmsd_pct),
+        format_number(stats.max_error_N),
+    ]
+
+
+def table_rows(evaluation: Evaluation) -> list[list[str]]:
+    """Return one row per case and one for all: name, three numbers for each phase, bias, solved frames."""
+    rows = []
+    for name, score in [*evaluation.scores.items(), ("all", evaluation.total)]:
+        solved = 100.0 * (1.0 - score.record_skipped / max(score.record_frames, 1))
+        cells = [cell for phase in PHASES for cell in score_cells(score, phase)]
+        rows.append([name, *cells, f"{format_number(score.all.bias_N)}", f"{solved:.1f}"])
+    return rows
+
+
+def format_table(evaluation: Evaluation) -> str:
+    """Return the table for a terminal, with a line of summary below."""
+    head = ["case", *HEADER * len(PHASES), "bias/N", "solved/%"]
+    rows = table_rows(evaluation)
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+    groups = [sum(widths[1 + 3 * k : 4 + 3 * k]) + 4 for k in range(len(PHASES))]
+    titles = (f" {phase} ".center(width, "-") for phase, width in zip(PHASES, groups, strict=True))
+    lines = [" " * widths[0] + "  " + "  ".join(titles), _join(head, widths)]
+    rule = "-" * len(lines[1])
+    lines += [rule, *(_join(row, widths) for row in rows[:-1]), rule, _join(rows[-1], widths)]
+    contact = format_contact_table(evaluation)
+    below = ["", contact, *contact_lines()] if contact else []
+    below += format_sight(evaluation)
+    return "\n".join([*lines, "", *summary_lines(evaluation), *below])
+
+
+def _join(cells: Sequence[str], widths: Sequence[int]) -> str:
+    """Set the first cell to the left and the others to the right."""
+    rest = (cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True))
+    return "  ".join([cells[0].ljust(widths[0]), *rest])
+
+
+CONTACT_HEADER = (
+    "contact", "given: median/mm", "p95/mm", "max/mm", "solved: median/mm", "p95/mm", "max/mm",
+    "onset: median", "earliest", "latest", "missed", "false touches/%", "p50/ms", "p99/ms",
+)  # fmt: skip
+
+
+def contact_rows(evaluation: Evaluation) -> list[list[str]]:
+    """Return one row per case and one for all: where the contact came from, place, onset and time; none without any."""
+    rows = []
+    for name, score in [*evaluation.scores.items(), ("all", evaluation.total)]:
+        result = evaluation.results.get(name)
+        source = "" if result is None or result.contact is None else result.contact.source
+        places = [
+            format_number(value)
+            for place in (score.place, score.solved_place)
+            for value in (place.median_mm, place.p95_mm, place.max_mm)
+        ]
+        onset = score.onset
+        frames = [format_number(v, 0) for v in (onset.median_frames, onset.earliest_frames, onset.max_frames)]
+        missed = str(onset.missed) if onset.n + onset.missed else "-"
+        false = format_number(onset.false_pct, 1)
+        times = [format_number(score.contact_ms.p50), format_number(score.contact_ms.p99)]
+        rows.append([name, source, *places, *frames, missed, false, *times])
+    return rows if any(result.contact is not None for result in evaluation.results.values()) else []
+
+
+def format_contact_table(evaluation: Evaluation) -> str:
+    """Return the contact's rows for a terminal, empty without any."""
+    rows = contact_rows(evaluation)
+    if not rows:
+        return ""
+    head = ["", "contact", "median", "p95", "max", "median", "p95", "max", "median", "first", "last", "missed",
+            "false/%", "p50", "p99"]  # fmt: skip
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+    groups = (("", 0, 2), ("given/mm", 2, 5), ("solved/mm", 5, 8), ("onset/frames", 8, 13), ("ms", 13, 15))
+    titles = [f" {t} ".center(sum(widths[a:b]) + 2 * (b - a - 1), "-" if t else " ") for t, a, b in groups]
+    lines = ["  ".join(titles), _join(head, widths)]
+    return "\n".join([*lines, "-" * len(lines[1]), *(_join(row, widths) for row in rows)])
+
+
+def contact_lines() -> list[str]:
+    """Return what the numbers of the contact mean."""
+    return [
+        "Contact: distance along the undeformed surface between the true pressure centre and the contact that the "
+        "solver was given (given) and that it found (solved), above 0.2 N; onset: frames from 0.02 N of true force to "
+        "the `touching` that stays, one per loading cycle, negative is early; false: share of the frames without true "
+        "force that were said to touch; ms: a step of the contact estimator alone."
+    ]
+
+
+def summary_lines(evaluation: Evaluation) -> list[str]:
+    """Return what the table's numbers mean, and the times."""
+    total = evaluation.total
+    step = total.step_ms
+    rmse = {name: score.all.rmse_N for name, score in evaluation.scores.items()}
+    worst = max(rmse, key=lambda name: rmse[name] or 0.0)
+    return [
+        f"Mean RMSE of {len(rmse)} case{'s' if rmse.keys() - {worst} else ''}: "
+        f"{format_number(total.mean_rmse_N, 3)} N, worst {format_number(rmse[worst], 3)} N ({worst}). "
+        f"RMSE and NRMSD: mean ± standard deviation over the cycles, {total.cycles['all'].n} in all; "
+        f"NRMSD: over the force range {evaluation.span:.2f} N.",
+        f"{total.frames} frames, {total.solved} solved, {total.skipped} skipped; in the record phases "
+        f"{total.record_frames - total.record_skipped} of {total.record_frames} solved. "
+        f"Step: p50 {format_number(step.p50)}, p95 {format_number(step.p95)}, "
+        f"p99 {format_number(step.p99)}, max {format_number(step.max)} ms.",
+    ]
+
+
+def markdown_table(evaluation: Evaluation) -> str:
+    """Return the table in Markdown."""
+    head = ["case", *(f"{phase}: {name}" for phase in PHASES for name in HEADER), "bias/N", "solved/%"]
+    return "\n".join(markdown_rows(head, table_rows(evaluation)))
+
+
+def markdown_contact_table(evaluation: Evaluation) -> list[str]:
+    """Return the contact's table in Markdown and what it means; no line without any."""
+    rows = contact_rows(evaluation)
+    if not rows:
+        return []
+    return ["", *markdown_rows(["case", *CONTACT_HEADER], rows, texts=2), "", *contact_lines()]
+
+
+def evaluation_json(evaluation: Evaluation, **about: Any) -> dict[str, Any]:
+    """Return the object that `evaluate --json` writes.
+
+    Args:
+        evaluation: the scores.
+        about: what else stands at the top: jaw, solver, contact, ...
+    """
+    cases = {name: asdict(score) | _contact_name(evaluation, name) for name, score in evaluation.scores.items()}
+    return {"cases": cases, "all": asdict(evaluation.total), "force_range_N": evaluation.span, **about}
+
+
+def _contact_name(evaluation: Evaluation, name: str) -> dict[str, str]:
+    """Return where the contact of a case came from."""
+    contact = evaluation.results[name].contact
+    return {} if contact is None else {"contact": contact.source}

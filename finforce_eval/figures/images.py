@@ -1,0 +1,274 @@
+"""What the key point detector made of a recording's images, as pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.evaluation.sight_scoring import compare_sight
+from finforce_eval.figures.figures import BLUE, GREEN, GREY, ORANGE, new_figure, style_axes
+from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, Recording
+from finforce_keypoints.overlay import COLORS, draw_keypoints
+
+COUNT, COLUMNS = 6, 2
+WIDTH = 11.0  # [in] of a figure
+MARGIN = 0.08  # of the jaws' extent in the image that is left on each side of them
+LEAST_MARGIN = 12  # [px]
+TILE = 640  # [px] at least, to which an image is enlarged
+RADIUS = 7.0  # [px] there, of what marks a key point that was found
+MEANING = {
+    "": "used",
+    "likelihood": "likelihood too low",
+    "depth": "no depth",
+    "workspace": "outside the workspace",
+    "image": "outside the image",
+}
+HIGHEST = 20.0  # [px] of error that is drawn
+WHITE, BLACK = "white", "black"
+
+
+class Region(NamedTuple):
+    """A part of an image: first column and row, width and height [px]."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+class FoundPixels(NamedTuple):
+    """Key points of one jaw in a picture, as `finforce_keypoints.overlay` draws them."""
+
+    pixels: NDArray
+    valid: NDArray
+    reasons: NDArray
+
+
+def choose_images(stamps: NDArray[np.int64], largest: int | None = None) -> NDArray[np.int64]:
+    """Return the stamps of six images, evenly spread; the one nearest to `largest` is taken in place of its neighbour.
+
+    Args:
+        stamps: (n,) of all images [ns], rising.
+        largest: time of the largest force [ns]; None without any.
+    """
+    count = min(COUNT, len(stamps))
+    # the middles of equal parts: first and last image show the least
+    rows = ((np.arange(count) + 0.5) * len(stamps) / count).astype(int)
+    if largest is not None:
+        row = int(np.argmin(np.abs(stamps - largest)))
+        rows[np.argmin(np.abs(rows - row))] = row
+    return stamps[rows]
+
+
+def find_region(pixels: NDArray[np.float64], width: int, height: int) -> Region:
+    """Return the part of an image in which pixels (n, 2) lie, with a margin; the whole image without any."""
+    seen = pixels[np.isfinite(pixels).all(axis=1)]
+    size = np.array([width, height])
+    seen = seen[((seen >= 0) & (seen < size)).all(axis=1)]
+    if not len(seen):
+        return Region(0, 0, width, height)
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    margin = np.maximum(MARGIN * (high - low), LEAST_MARGIN)
+    first = np.maximum(np.floor(low - margin), 0).astype(int)
+    last = np.minimum(np.ceil(high + margin) + 1, size).astype(int)
+    return Region(*first.tolist(), *(last - first).tolist())
+
+
+def draw_images(recording: Recording, results: Sequence[CaseResult], skeleton: Sequence[Sequence[int]] = ()) -> Any:
+    """Draw six images where the jaws are, with the key points found, the true ones, and the forces.
+
+    Args:
+        recording: with images and detections.
+        results: of its jaws.
+        skeleton: pairs of key points to be joined.
+
+    Returns:
+        A matplotlib figure.
+
+    Raises:
+        RecordingError: an image is damaged.
+    """
+    snapshots = [result.snapshot for result in results if result.snapshot is not None]
+    largest = max(snapshots, key=lambda taken: float(np.linalg.norm(taken.force)), default=None)
+    stamps = choose_images(recording.images.stamps, largest and largest.stamp)
+    camera = recording.images.camera
+    region = find_region(_known_pixels(recording, stamps), camera.width, camera.height)
+    lines = -(-len(stamps) // COLUMNS)
+    figure = new_figure(WIDTH, lines * (WIDTH / COLUMNS * region.height / region.width + 0.3) + 0.4)
+    panels = figure.subplots(lines, COLUMNS, squeeze=False).ravel()
+    for axes in panels:
+        axes.set_axis_off()
+    reasons: set[str] = set()
+    for axes, taken in zip(panels, recording.images.at(stamps), strict=False):
+        found = [_found_at(track.detection, taken.stamp) for track in _detected(recording).values()]
+        picture, scale = enlarge(taken.image.color, region)
+        axes.imshow(draw_keypoints(picture, [_moved(entry, region, scale) for entry in found], skeleton, radius=RADIUS))
+        for track in _detected(recording).values():
+            _draw_truth(axes, track, taken.stamp, (region, scale))
+        is_largest = largest is not None and taken.stamp == largest.stamp
+        axes.set_title(describe_image(recording, results, taken.stamp, is_largest), loc="left", fontsize=9)
+        reasons |= {str(reason) for entry in found for reason in entry.reasons[np.isfinite(entry.pixels).all(axis=1)]}
+    _explain(figure, reasons, has_truth=any(track.sight is not None for track in _detected(recording).values()))
+    return figure
+
+
+def _detected(recording: Recording) -> Mapping[str, JawTrack]:
+    """Return the jaws that a detector looked for."""
+    return {side: track for side, track in recording.jaws.items() if track.detection is not None}
+
+
+def _known_pixels(recording: Recording, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return where the key points truly are, where that is known, else where they were found and used (n, 2) [px]."""
+    pixels = [np.zeros((0, 2))]
+    for track in _detected(recording).values():
+        known = track.sight or track.detection
+        chosen = np.isin(known.stamps, stamps)[:, None] & (track.sight.visible if track.sight else known.accepted)
+        pixels.append(known.pixels[chosen])
+    return np.concatenate(pixels)
+
+
+def enlarge(color: NDArray[np.uint8], region: Region) -> tuple[NDArray[np.uint8], int]:
+    """Return a part of an image (h, w, 3), enlarged, and by how much."""
+    from PIL import Image
+
+    scale = max(1, -(-TILE // region.width))
+    left, top, width, height = region
+    part = Image.fromarray(np.ascontiguousarray(color[top : top + height, left : left + width]))
+    return np.asarray(part.resize((scale * width, scale * height), Image.Resampling.BICUBIC)), scale
+
+
+def place_pixels(pixels: NDArray[np.float64], region: Region, scale: int) -> NDArray[np.float64]:
+    """Return pixels (n, 2) of an image in the enlarged part; whole numbers are the middles of pixels in both."""
+    return (pixels - [region.left, region.top] + 0.5) * scale - 0.5
+
+
+def _moved(found: FoundPixels, region: Region, scale: int) -> FoundPixels:
+    return found._replace(pixels=place_pixels(found.pixels, region, scale))
+
+
+def _found_at(detection: DetectionTrack, stamp: int) -> FoundPixels:
+    """Return what was found in the image at a stamp [ns]."""
+    row = int(np.searchsorted(detection.stamps, stamp))
+    return FoundPixels(detection.pixels[row], detection.accepted[row], detection.reasons[row])
+
+
+def _draw_truth(axes: Any, track: JawTrack, stamp: int, place: tuple[Region, int]) -> None:
+    """Draw a cross at each true key point, black where it is hidden."""
+    if track.sight is None:
+        return
+    for row in np.flatnonzero(track.sight.stamps == stamp):
+        pixels, visible = place_pixels(track.sight.pixels[row], *place), track.sight.visible[row]
+        for chosen, color in ((visible, WHITE), (~visible, BLACK)):
+            axes.plot(
+                *pixels[chosen].T, "+", color=color, markersize=4, markeredgewidth=0.8, scalex=False, scaley=False
+            )
+
+
+def describe_image(recording: Recording, results: Sequence[CaseResult], stamp: int, is_largest: bool = False) -> str:
+    """Return the time of an image in its recording, and the forces that were estimated and measured then."""
+    seconds = (stamp - int(recording.images.stamps[0])) * 1e-9
+    words = [f"t = {seconds:.2f} s", *(_describe_force(result, stamp, len(results) > 1) for result in results)]
+    return ",  ".join(word for word in words if word) + ("  (largest)" if is_largest else "")
+
+
+def _describe_force(result: CaseResult, stamp: int, is_named: bool) -> str:
+    """Return the force on one jaw in words."""
+    rows = np.flatnonzero(result.stamps == stamp)
+    if not rows.size:
+        return ""
+    force, truth = float(result.magnitude[rows[0]]), float(result.true_magnitude[rows[0]])
+    said = f"{force:.2f} N" if np.isfinite(force) else "no estimate"
+    known = f" (true {truth:.2f} N)" if np.isfinite(truth) else ""
+    return f"{result.side} {said}{known}" if is_named else said + known
+
+
+def _explain(figure: Any, reasons: Iterable[str], *, has_truth: bool) -> None:
+    """Say below the pictures what the marks mean."""
+    from matplotlib.lines import Line2D
+
+    style = {"linestyle": "", "markeredgecolor": "black", "markeredgewidth": 0.6}
+    entries = [
+        Line2D([], [], marker="o", color=np.array(COLORS[reason]) / 255.0, label=label, **style)
+        for reason, label in MEANING.items()
+        if reason in reasons
+    ]
+    if has_truth:
+        for color, label in ((WHITE, "true place, visible"), (BLACK, "true place, hidden")):
+            entries.append(Line2D([], [], marker="+", color=color, linestyle="", label=label))
+    if entries:
+        style = {"facecolor": GREY, "edgecolor": "none", "framealpha": 1.0, "fontsize": 9}
+        figure.legend(handles=entries, loc="outside lower left", ncols=len(entries), **style)
+
+
+def draw_detection(recording: Recording) -> Any:
+    """Draw over time how far the key points found lie from the true ones, how many were used, and their likelihood.
+
+    Args:
+        recording: with images and detections.
+
+    Returns:
+        A matplotlib figure.
+    """
+    jaws = _detected(recording)
+    drawn = [_draw_counts, _draw_likelihood]
+    if any(track.sight is not None for track in jaws.values()):
+        drawn.insert(0, _draw_pixel_error)
+    figure = new_figure(WIDTH, 1.8 * len(drawn) + 0.8)
+    panels = figure.subplots(len(drawn), len(jaws), sharex=True, sharey="row", squeeze=False)
+    begin = int(recording.images.stamps[0])
+    for column, (side, track) in enumerate(jaws.items()):
+        for axes, draw in zip(panels[:, column], drawn, strict=True):
+            style_axes(axes)
+            draw(axes, track, begin)
+        panels[0, column].set_title(f"{recording.name}, {side} jaw", loc="left", fontsize=10)
+        panels[-1, column].set_xlabel("time [s]")
+    for axes in panels.ravel():
+        axes.label_outer()
+    if len(drawn) > 2:
+        panels[0, 0].set_ylim(0.0, min(panels[0, 0].get_ylim()[1], HIGHEST))
+    for axes in panels[:, 0]:
+        axes.legend(loc="best", ncols=2, frameon=False, fontsize=8)
+    return figure
+
+
+def _draw_pixel_error(axes: Any, track: JawTrack, begin: int) -> None:
+    """Draw the distance of what was found from the truth, over the key points that were visible."""
+    axes.set(ylabel="pixel error [px]")
+    if track.sight is None:
+        return
+    times = np.intersect1d(track.detection.stamps, track.sight.stamps)
+    error = compare_sight(track.detection, track.sight).pixel_error
+    for percent, color, label in ((95, ORANGE, "95th percentile"), (50, BLUE, "median of the visible")):
+        axes.plot((times - begin) * 1e-9, _percentile(error, percent), color=color, linewidth=1.0, label=label)
+
+
+def _draw_counts(axes: Any, track: JawTrack, begin: int) -> None:
+    """Draw how many key points were used, and how many could be seen."""
+    if track.sight is not None:
+        seconds = (track.sight.stamps - begin) * 1e-9
+        axes.plot(seconds, track.sight.visible.sum(axis=1), color=GREY, linewidth=2.2, label="visible")
+    seconds = (track.detection.stamps - begin) * 1e-9
+    axes.plot(seconds, track.detection.accepted.sum(axis=1), color=GREEN, linewidth=1.1, label="used")
+    axes.set(ylabel="key points", ylim=(0, track.keypoints.count + 1))
+
+
+def _draw_likelihood(axes: Any, track: JawTrack, begin: int) -> None:
+    """Draw the likelihood of the key points that were used."""
+    seconds = (track.keypoints.stamps - begin) * 1e-9
+    likelihood = np.where(track.detection.accepted, track.keypoints.likelihood, np.nan)
+    for percent, color, label in ((50, BLUE, "median of the used"), (0, GREY, "lowest")):
+        axes.plot(seconds, _percentile(likelihood, percent), color=color, linewidth=1.0, label=label)
+    axes.set(ylabel="likelihood", ylim=(0, 1.05))
+
+
+def _percentile(values: NDArray[np.float64], percent: float) -> NDArray[np.float64]:
+    """Return a percentile of what is finite in each row (n, k), NaN where nothing is."""
+    chosen = np.full(len(values), np.nan)
+    known = np.isfinite(values).any(axis=1)
+    if known.any():
+        chosen[known] = np.nanpercentile(values[known], percent, axis=1)
+    return chosen

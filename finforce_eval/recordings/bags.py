@@ -1,0 +1,156 @@
+"""rosbag2 files (mcap, sqlite3) opened and their messages decoded."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from finforce.errors import FinforceError, MissingDependencyError
+from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.tracks import NANOSECONDS
+
+
+class Sample(NamedTuple):
+    """A message and the time [ns] at which the bag received it."""
+
+    time: int
+    message: Any
+
+
+class RawSample(NamedTuple):
+    """An undecoded message: its topic, the time of receipt [ns] and its CDR bytes."""
+
+    topic: str
+    time: int
+    data: bytes | memoryview
+
+
+class BagReader:
+    """An open bag.
+
+    Args:
+        reader: of rosbags.
+        types: of rosbags; what is not in it cannot be decoded.
+        name: of the recording, for messages.
+    """
+
+    def __init__(self, reader: Any, types: Any, name: str) -> None:
+        self._reader, self._types, self.name = reader, types, name
+        self.connections = reader.connections
+        self.count = reader.message_count
+        self.types = {connection.topic: connection.msgtype for connection in reader.connections}
+
+    def raw(self, topics: Collection[str]) -> Iterator[RawSample]:
+        """Yield the messages of some topics in the order of their receipt."""
+        chosen = [connection for connection in self.connections if connection.topic in topics]
+        for connection, time, data in self._reader.messages(connections=chosen) if chosen else ():
+            yield RawSample(connection.topic, time, data)
+
+    def decode(self, sample: RawSample) -> Any:
+        """Return the message of a sample."""
+        return self._types.deserialize_cdr(sample.data, self.types[sample.topic])
+
+    def encode(self, msgtype: str, fields: Mapping[str, Any]) -> bytes:
+        """Return the CDR bytes of a message with these fields."""
+        return bytes(self._types.serialize_cdr(self._types.types[msgtype](**fields), msgtype))
+
+    def knows(self, msgtype: str) -> bool:
+        """Say whether messages of a type can be decoded."""
+        return msgtype in self._types.fielddefs
+
+    def definition(self, msgtype: str) -> tuple:
+        """Return the fields of a known type as rosbags describes them."""
+        return self._types.fielddefs[msgtype]
+
+    def foreign_notes(self) -> list[str]:
+        """Name the topics whose type is unknown."""
+        return [
+            f"{connection.topic} skipped: unknown type {connection.msgtype}"
+            for connection in self.connections
+            if not self.knows(connection.msgtype)
+        ]
+
+
+@contextmanager
+def open_bag(source: Path, name: str) -> Iterator[BagReader]:
+    """Open a bag for the length of a `with` block.
+
+    Args:
+        source: what `bag_source` returned.
+        name: of the recording, for messages.
+
+    Raises:
+        RecordingError: damaged or empty; also when it shows later, in the block.
+        MissingDependencyError: rosbags is not installed.
+    """
+    try:
+        from rosbags.rosbag2 import Reader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise MissingDependencyError("reading a recording needs rosbags: pip install rosbags") from error
+    # not AnyReader: it registers every definition in the bag and ends at a foreign one it cannot parse
+    types = get_typestore(Stores.ROS2_JAZZY)
+    with damage_reported(name), Reader(source) as reader:
+        if reader.message_count == 0:
+            raise RecordingError(f"{name}: the recording is empty: it holds no messages")
+        yield BagReader(reader, types, name)
+
+
+def check_types(connections: Iterable[Any], expected: Mapping[str, Collection[str]], name: str) -> None:
+    """Refuse a topic of ours with another type than one of those expected.
+
+    Raises:
+        RecordingError: there is one.
+    """
+    for connection in connections:
+        allowed = expected.get(connection.topic)
+        if allowed is not None and connection.msgtype not in allowed:
+            wanted = " or ".join(allowed)
+            raise RecordingError(f"{name}: {connection.topic} is {connection.msgtype}; expected {wanted}")
+
+
+def bag_source(path: Path) -> Path:
+    """Return what rosbags can open: a folder with metadata.yaml, or the one bag file in a folder without.
+
+    Raises:
+        RecordingError: there is no such thing.
+    """
+    if not path.exists():
+        raise RecordingError(f"{path}: no such recording")
+    path = path.resolve()
+    if path.is_file() and path.suffix not in (".mcap", ".db3"):
+        raise RecordingError(f"{path.name}: not a recording; expected a rosbag2 folder, .mcap or .db3")
+    if path.is_file() or (path / "metadata.yaml").exists():
+        return path
+    files = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
+    if len(files) != 1:
+        found = f"no metadata.yaml and {len(files)} bag files" if files else "no metadata.yaml, .mcap or .db3"
+        raise RecordingError(f"{path.name}: the folder is no recording: {found} in it")
+    return files[0]
+
+
+@contextmanager
+def damage_reported(name: str) -> Iterator[None]:
+    """Turn whatever a bag reader raises on damaged bytes into one RecordingError."""
+    try:
+        yield
+    except (FinforceError, KeyboardInterrupt):
+        raise
+    except Exception as error:  # struct, sqlite3, zstd, lz4, yaml, ... each has its own classes
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RecordingError(f"{name}: truncated or damaged: {reason}") from error
+
+
+def restamp(data: bytes | memoryview, stamp: int) -> bytes:
+    """Return CDR bytes that begin with a std_msgs/Header with another stamp [ns]."""
+    changed = bytearray(data)
+    struct.pack_into(_stamp_layout(data), changed, 4, *divmod(stamp, NANOSECONDS))
+    return bytes(changed)
+
+
+def _stamp_layout(data: bytes | memoryview) -> str:
+    """Return int32 sec, uint32 nanosec in the byte order that the encapsulation names."""
+    return "<iI" if data[1] & 1 else ">iI"

@@ -1,0 +1,179 @@
+"""Images, intrinsics and generated poses from files, checked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.camera import CameraIntrinsics, decode_depth
+from finforce.errors import MissingDependencyError, PoseError
+from finforce_contact.reconstruction.generator_axes import affine_from_generator
+from finforce_eval.errors import OptionError
+
+FARTHEST = 10.0  # [m] of the median depth; more means that the numbers are no metres
+POSE_FORMS = (
+    '{"rotation": [w, x, y, z], "translation": [x, y, z], "scale": s, "axes": "glb" or "canonical"}, '
+    '{"matrix": 4x4}, {"T_camera_object": 4x4} as reconstruct writes it, or a bare 4x4 list'
+)
+INTRINSICS_FORMS = "fx fy cx cy, or a JSON or YAML file with these names, or one of a ROS camera (K and D)"
+
+
+def read_image(path: Path | str) -> NDArray:
+    """Return the pixels of a picture (h, w) or (h, w, channels), as the file has them.
+
+    Raises:
+        OSError: the file is missing or no picture.
+        MissingDependencyError: Pillow is not installed.
+    """
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise MissingDependencyError("reading pictures needs Pillow: pip install pillow") from error
+    with Image.open(path) as image:
+        return np.array(image.convert("RGB") if image.mode == "P" else image)
+
+
+def read_depth(path: Path | str) -> NDArray:
+    """Return a depth image (h, w) [m], NaN invalid, of a 16-bit PNG in millimetres or an .npy file in metres.
+
+    Raises:
+        OptionError: the file holds neither.
+    """
+    path = Path(path)
+    image = _read_array(path) if path.suffix == ".npy" else read_image(path)
+    if image.ndim != 2 or image.dtype.kind not in "uif" or image.dtype == np.uint8:
+        raise OptionError(
+            f"{path.name}: {image.dtype} of shape {image.shape}; expected a 16-bit grey PNG [mm] or an .npy file of "
+            "shape (height, width) [m]"
+        )
+    if image.dtype.kind in "ui":
+        return decode_depth(np.clip(image, 0, 65535).astype(np.uint16), "16UC1")
+    depth = decode_depth(image, "32FC1")
+    if np.isfinite(depth).any() and np.nanmedian(depth) > FARTHEST:
+        raise OptionError(f"{path.name}: a median depth of {np.nanmedian(depth):.0f} m; are these millimetres?")
+    return depth
+
+
+def read_mask(path: Path | str) -> NDArray:
+    """Return a mask (h, w) of a picture or an .npy file: alpha where there is one, else what is brighter than half.
+
+    Raises:
+        OptionError: the file holds no such thing.
+    """
+    path = Path(path)
+    image = _read_array(path) if path.suffix == ".npy" else read_image(path)
+    if image.ndim == 3 and image.shape[2] in (2, 4):
+        image = image[..., -1]
+    elif image.ndim == 3:
+        image = image.max(axis=2)
+    if image.ndim != 2 or image.dtype.kind not in "buif":
+        raise OptionError(f"{path.name}: {image.dtype} of shape {image.shape}; expected a picture or (height, width)")
+    return image.astype(bool) if image.dtype == bool else image > 0.5 * max(float(np.nan_to_num(image).max()), 1e-9)
+
+
+def _read_array(path: Path) -> NDArray:
+    """Return the array of an .npy file."""
+    try:
+        return np.load(path, allow_pickle=False)
+    except ValueError as error:
+        raise OptionError(f"{path.name}: no .npy file of numbers ({error})") from error
+
+
+def read_intrinsics(words: Sequence[str], shape: tuple[int, int]) -> CameraIntrinsics:
+    """Return the camera of images (h, w) from numbers or a file.
+
+    Args:
+        words: fx fy cx cy [and k1 k2 p1 p2 k3], or one file name.
+        shape: height and width of the images.
+
+    Raises:
+        OptionError: they are neither, or of a camera with images of another size.
+        IntrinsicsError: no camera has them.
+    """
+    named = _intrinsics_from_file(Path(words[0])) if len(words) == 1 else _name_numbers(words)
+    for name, size in (("height", shape[0]), ("width", shape[1])):
+        if int(named.get(name, size)) != size:
+            raise OptionError(f"intrinsics: {name} {named[name]}, the depth image has {size}")
+    try:
+        values = {name: float(named[name]) for name in ("fx", "fy", "cx", "cy")}
+        distortion = np.array(named.get("distortion", []), dtype=float)
+    except (KeyError, TypeError, ValueError) as error:
+        raise OptionError(f"intrinsics: {error!r} is missing or no number; expected {INTRINSICS_FORMS}") from None
+    return CameraIntrinsics(width=shape[1], height=shape[0], **values, distortion=distortion)
+
+
+def _name_numbers(words: Sequence[str]) -> dict[str, Any]:
+    """Return numbers by their names."""
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (4, 8, 9):
+        raise OptionError(f"--intrinsics {' '.join(words)}: expected {INTRINSICS_FORMS}")
+    return {**dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=False)), "distortion": numbers[4:]}
+
+
+def _intrinsics_from_file(path: Path) -> dict[str, Any]:
+    """Return intrinsics by name; of a ROS camera's file, K and D are taken apart."""
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise OptionError(f"{path.name}: neither JSON nor YAML ({error})") from error
+    if not isinstance(content, Mapping):
+        raise OptionError(f"{path.name}: expected {INTRINSICS_FORMS}")
+    named = {str(name): value for name, value in content.items()}
+    for size in ("width", "height"):
+        named.setdefault(size, named.get(f"image_{size}"))
+    named = {name: value for name, value in named.items() if value is not None}
+    matrix = _find_list(named, ("K", "k", "camera_matrix"))
+    if matrix is not None and len(matrix) == 9:
+        named.update(fx=matrix[0], cx=matrix[2], fy=matrix[4], cy=matrix[5])
+    distortion = _find_list(named, ("distortion", "D", "d", "coeffs", "distortion_coefficients"))
+    return {**named, "distortion": distortion or []}
+
+
+def _find_list(named: Mapping[str, Any], names: Sequence[str]) -> list | None:
+    """Return the first list under one of the names; those of OpenCV's files lie one level deeper."""
+    for name in names:
+        value = named.get(name)
+        value = value.get("data") if isinstance(value, Mapping) else value
+        if isinstance(value, list):
+            return list(np.ravel(value))
+    return None
+
+
+def read_generated_pose(path: Path | str) -> NDArray:
+    """Return the map (4, 4) of a generated mesh into the camera frame.
+
+    Raises:
+        OptionError: the file is no JSON of one of `POSE_FORMS`.
+        PoseError: its numbers are no pose.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(content, list):
+            content = {"matrix": content}
+        for key in ("matrix", "T_camera_object"):
+            if key in content:
+                return _check_matrix(np.array(content[key], dtype=float), path.name)
+        parts = [content[name] for name in ("rotation", "translation", "scale")]
+        return affine_from_generator(*parts, mesh_axes=content.get("axes", "glb"))
+    except PoseError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise OptionError(f"{path.name}: {error!r}; expected {POSE_FORMS}") from None
+
+
+def _check_matrix(matrix: NDArray, name: str) -> NDArray:
+    """Refuse what is no map (4, 4)."""
+    if matrix.shape != (4, 4):
+        raise OptionError(f"{name}: a matrix of shape {matrix.shape}; expected {POSE_FORMS}")
+    return matrix

@@ -1,0 +1,200 @@
+"""The RGB-D images of a bag: found, paired by their stamps, and read one by one; never all of them are in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, IntrinsicsError
+from finforce.errors import ObservationError
+from finforce_contact.messages import camera_from_info, same_camera
+from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.bags import BagReader, check_types, open_bag
+from finforce_eval.recordings.image_messages import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    color_from_message,
+    depth_from_message,
+)
+from finforce_ifea.messages import read_stamp
+from finforce_keypoints.images import RgbdImage, check_image
+
+# the ends of topics by which the images are found, whatever the camera is called; the first that is there counts
+COLOR_ENDS = tuple(f"color/{name}{end}" for end in ("", "/compressed") for name in ("image_raw", "image_rect_raw"))
+DEPTH_ENDS = tuple(f"aligned_depth_to_color/image_raw{end}" for end in ("", "/compressedDepth", "/compressed"))
+INFO_ENDS = ("color/camera_info",)
+PAIRED = 8_000_000  # as the detector node takes colour and depth for one image: distance of their stamps [ns]
+
+
+class StampedImage(NamedTuple):
+    """A whole image and its exact stamp [ns]."""
+
+    stamp: int
+    image: RgbdImage
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ImageTrack:
+    """Where the images of a recording lie; iterating reads them.
+
+    Attributes:
+        source: the bag.
+        name: of the recording, for messages.
+        topics: of colour and depth.
+        stamps: (n,) of the colour images [ns], strictly rising.
+        depth_stamps: (n,) of their depth images [ns].
+        camera: intrinsics.
+        frame_id: of the camera.
+        unpaired: colour images left out because no depth image is of their time.
+        depth_scale: one step of a 16-bit depth image [m].
+    """
+
+    source: Path
+    name: str
+    topics: tuple[str, str]
+    stamps: NDArray[np.int64]
+    depth_stamps: NDArray[np.int64]
+    camera: CameraIntrinsics
+    frame_id: str
+    unpaired: int = 0
+    depth_scale: float = MILLIMETRE
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def between(self, start: int, stop: int) -> ImageTrack:
+        """Return the images with start <= stamp < stop [ns]."""
+        chosen = (self.stamps >= start) & (self.stamps < stop)
+        return replace(self, stamps=self.stamps[chosen], depth_stamps=self.depth_stamps[chosen])
+
+    def at(self, stamps: NDArray[np.int64]) -> ImageTrack:
+        """Return the images at some stamps [ns]."""
+        chosen = np.isin(self.stamps, stamps)
+        return replace(self, stamps=self.stamps[chosen], depth_stamps=self.depth_stamps[chosen])
+
+    def __iter__(self) -> Iterator[StampedImage]:
+        """Read the images in the order of their stamps.
+
+        Raises:
+            RecordingError: an image is damaged, of unknown encoding, or of another size than its camera.
+        """
+        color, depth = self.topics
+        wanted = {color: set(self.stamps.tolist()), depth: set(self.depth_stamps.tolist())}
+        pairs = zip(self.stamps.tolist(), self.depth_stamps.tolist(), strict=True)
+        waiting: dict[tuple[str, int], Any] = {}
+        pair = next(pairs, None)
+        with open_bag(self.source, self.name) as bag:
+            for raw in bag.raw(self.topics):
+                stamp = read_stamp(raw.data)
+                if stamp in wanted[raw.topic]:
+                    waiting[raw.topic, stamp] = bag.decode(raw)
+                while pair and {(color, pair[0]), (depth, pair[1])} <= waiting.keys():
+                    yield self._image(pair[0], waiting.pop((color, pair[0])), waiting[depth, pair[1]])
+                    waiting = {key: kept for key, kept in waiting.items() if key[0] == color or key[1] >= pair[1]}
+                    pair = next(pairs, None)
+
+    def _image(self, stamp: int, color: Any, depth: Any) -> StampedImage:
+        try:
+            image = RgbdImage(
+                stamp=stamp * 1e-9,
+                color=color_from_message(color),
+                depth=depth_from_message(depth, self.depth_scale),
+                camera=self.camera,
+            )
+            check_image(image)
+        except ImageError as error:
+            raise RecordingError(f"{self.name}: image at {stamp * 1e-9:.3f} s: {error}") from error
+        return StampedImage(stamp, image)
+
+
+def find_images(bag: BagReader, source: Path, pairing: int = PAIRED) -> ImageTrack | None:
+    """Return the images of an open bag; None without colour images.
+
+    Args:
+        bag: where they lie.
+        source: of the bag.
+        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
+
+    Raises:
+        RecordingError: there are colour images, but no depth, no camera_info or nothing that belongs together; a topic
+            is of another type; stamps go back; the camera changes.
+    """
+    color = _find_topic(bag, COLOR_ENDS)
+    if color is None:
+        return None
+    depth, info = _find_topic(bag, DEPTH_ENDS), _find_topic(bag, INFO_ENDS)
+    missing = [ends[0] for topic, ends in ((depth, DEPTH_ENDS), (info, INFO_ENDS)) if topic is None]
+    if missing:
+        raise RecordingError(f"{bag.name}: there are images on {color}, but nothing on {' and '.join(missing)}")
+    expected = {color: (IMAGE, COMPRESSED), depth: (IMAGE, COMPRESSED), info: (CAMERA_INFO,)}
+    check_types(bag.connections, expected, bag.name)
+    camera, frame_id = _read_camera(bag, info)
+    found: dict[str, list[int]] = {color: [], depth: []}
+    for raw in bag.raw((color, depth)):
+        found[raw.topic].append(read_stamp(raw.data))
+    stamps = {topic: _rising(times, topic, bag.name) for topic, times in found.items()}
+    nearest = _nearest(stamps[depth], stamps[color])
+    paired = np.abs(stamps[depth][nearest] - stamps[color]) <= pairing
+    if not paired.any():
+        raise RecordingError(f"{bag.name}: no depth image on {depth} within {pairing / 10**6:g} ms of one on {color}")
+    return ImageTrack(
+        source=source,
+        name=bag.name,
+        topics=(color, depth),
+        stamps=stamps[color][paired],
+        depth_stamps=stamps[depth][nearest[paired]],
+        camera=camera,
+        frame_id=frame_id,
+        unpaired=int((~paired).sum()),
+    )
+
+
+def _find_topic(bag: BagReader, ends: Sequence[str]) -> str | None:
+    """Return the topic with the first of some ends; one without messages does not count."""
+    counts: dict[str, int] = {}
+    for connection in bag.connections:
+        counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+    for end in ends:
+        topics = sorted(topic for topic, count in counts.items() if topic.endswith(f"/{end}") and count)
+        if len(topics) > 1:
+            raise RecordingError(f"{bag.name}: several cameras: {', '.join(topics)}; expected one in a recording")
+        if topics:
+            return topics[0]
+    return None
+
+
+def _read_camera(bag: BagReader, topic: str) -> tuple[CameraIntrinsics, str]:
+    """Return the camera of all images, and its frame."""
+    camera, frame = None, ""
+    for raw in bag.raw((topic,)):
+        info = bag.decode(raw)
+        try:
+            seen = camera_from_info(info, info.header.frame_id)
+        except (ObservationError, IntrinsicsError) as error:
+            raise RecordingError(f"{bag.name}: {topic}: {error}") from error
+        if camera is not None and not (same_camera(camera, seen) and info.header.frame_id == frame):
+            raise RecordingError(f"{bag.name}: the camera on {topic} changes; expected one in a recording")
+        camera, frame = seen, info.header.frame_id
+    return camera, frame
+
+
+def _rising(stamps: Sequence[int], topic: str, name: str) -> NDArray[np.int64]:
+    """Return stamps (n,) [ns] that were made sure to rise."""
+    times = np.array(stamps, dtype=np.int64)
+    wrong = np.flatnonzero(np.diff(times) <= 0)
+    if wrong.size:
+        raise RecordingError(f"{name}: the stamps of {topic} do not rise at message {wrong[0] + 1}")
+    return times
+
+
+def _nearest(times: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return for each stamp the index of the nearest of rising times."""
+    after = np.clip(np.searchsorted(times, stamps), 0, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(stamps - times[before] <= times[after] - stamps, before, after)

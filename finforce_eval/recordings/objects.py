@@ -1,0 +1,159 @@
+"""The object of a recording: its mesh file, and its pose in the frame of a jaw over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from finforce.errors import PoseError
+from finforce.transforms import invert_pose, pose_from_quaternion
+from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.tracks import PoseTrack, Recording
+
+# A pose of the object and one of the jaw are of the same image up to this distance of their stamps [ns].
+PAIRED = 50_000_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectTrack:
+    """Poses of the object in the frame of one jaw.
+
+    Attributes:
+        stamps: (n,) image time [ns], rising.
+        poses: T_jaw_object (n, 4, 4) [m].
+        cameras: (n, 3) the camera's place in the jaw frame [m]; None when it is not known.
+        unpaired: poses left out because no pose of the jaw is of their time.
+    """
+
+    stamps: NDArray[np.int64]
+    poses: NDArray[np.float64]
+    cameras: NDArray[np.float64] | None = None
+    unpaired: int = 0
+
+
+def find_mesh(recording: Recording, object_file: str | None = None) -> Path | None:
+    """Return the mesh file that was given, or the one that the `case.json` names; None without either.
+
+    The path in a `case.json` is relative to the folder that holds the recordings: the one above the recording's own
+    folder, or the one with the bag file itself. A mesh in the recording's own folder is found when that was renamed.
+    """
+    if object_file is not None:
+        return Path(object_file)
+    name = recording.case.get("mesh")
+    if not isinstance(name, str) or not name:
+        return None
+    path = recording.path.resolve()
+    folder = path if path.is_dir() else path.parent
+    places = (folder.parent / name, folder / name, folder / Path(name).name)
+    return next((place for place in places if place.is_file()), None)
+
+
+def require_mesh(recording: Recording, object_file: str | None = None) -> Path:
+    """Return the object's mesh file.
+
+    Raises:
+        RecordingError: there is none.
+    """
+    path = find_mesh(recording, object_file)
+    if path is not None:
+        return path
+    name = recording.case.get("mesh")
+    found = f"the mesh '{name}' of its case.json is not there" if name else "no mesh in a case.json beside it"
+    raise RecordingError(f"{recording.name}: no object mesh: {found}; give --object MESH or --contact fixed:Z_MM")
+
+
+def has_object(recording: Recording, side: str) -> bool:
+    """Say whether a recording tells where the object is in the frame of the jaw `side`, or images will."""
+    poses, track = recording.object_pose, recording.jaw(side)
+    return poses is not None and (_is_in_jaw(poses, side) or track.pose is not None or track.is_awaited)
+
+
+def track_object(recording: Recording, side: str) -> ObjectTrack:
+    """Return the object's poses in the frame of a jaw, T_jaw_object = inv(T_camera_jaw) T_camera_object.
+
+    The jaw's pose is the one nearest in time. Poses that came late are put in their place. Object poses may be recorded
+    in the frame of the jaw itself; no poses of the jaw are needed then.
+
+    Args:
+        recording: with object poses.
+        side: "left" or "right".
+
+    Raises:
+        RecordingError: poses are missing, of different frames, never of the same time, or no poses.
+    """
+    objects = recording.object_pose
+    if objects is None:
+        raise RecordingError(
+            f"{recording.name}: no object poses: /object_pose is absent or has no messages; give --contact fixed:Z_MM"
+        )
+    T_parent_object = _matrices(objects, "/object_pose", recording.name)
+    order = np.argsort(objects.stamps, kind="stable")
+    stamps, T_parent_object = objects.stamps[order], T_parent_object[order]
+    if _is_in_jaw(objects, side):
+        return ObjectTrack(stamps=stamps, poses=T_parent_object)
+    jaw = _require_jaw_poses(recording, side, objects.frame_id)
+    T_camera_jaw = _matrices(jaw, f"/{side}/jaw_pose", recording.name)
+    nearest = _nearest(jaw.stamps, stamps)
+    paired = np.abs(jaw.stamps[nearest] - stamps) <= PAIRED
+    if not paired.any():
+        raise RecordingError(f"{recording.name}: no /{side}/jaw_pose within {PAIRED // 10**6} ms of any /object_pose")
+    T_jaw_camera = np.stack([invert_pose(T) for T in T_camera_jaw])[nearest[paired]]
+    return ObjectTrack(
+        stamps=stamps[paired],
+        poses=T_jaw_camera @ T_parent_object[paired],
+        cameras=T_jaw_camera[:, :3, 3],
+        unpaired=int((~paired).sum()),
+    )
+
+
+def mean_pose(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean (4, 4) of poses (n, 4, 4): mean position, and the rotation nearest to all by chordal distance."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix()
+    T[:3, 3] = poses[:, :3, 3].mean(axis=0)
+    return T
+
+
+def _is_in_jaw(poses: PoseTrack, side: str) -> bool:
+    return poses.frame_id.lstrip("/") == f"{side}_jaw"
+
+
+def _require_jaw_poses(recording: Recording, side: str, frame: str) -> PoseTrack:
+    """Return the poses of a jaw in the frame of the object's poses."""
+    poses = recording.jaw(side).pose
+    if poses is None:
+        raise RecordingError(
+            f"{recording.name}: no jaw poses: /{side}/jaw_pose is absent or has no messages, and the object's poses "
+            f"are in '{frame}'; give --contact fixed:Z_MM"
+        )
+    if poses.frame_id.lstrip("/") != frame.lstrip("/"):
+        raise RecordingError(
+            f"{recording.name}: /{side}/jaw_pose is in '{poses.frame_id}' and /object_pose in '{frame}'; "
+            "expected one frame"
+        )
+    return poses
+
+
+def _matrices(track: PoseTrack, topic: str, name: str) -> NDArray[np.float64]:
+    """Return the poses (n, 4, 4) of a track in the order of its messages."""
+    poses = []
+    for index, (position, quaternion) in enumerate(zip(track.position, track.quaternion, strict=True)):
+        try:
+            poses.append(pose_from_quaternion(position, quaternion))
+        except PoseError as error:
+            raise RecordingError(f"{name}: {topic} message {index}: {error}") from error
+    return np.stack(poses)
+
+
+def _nearest(times: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return for each stamp the index of the nearest time; the times may be in any order."""
+    order = np.argsort(times, kind="stable")
+    rising = times[order]
+    after = np.clip(np.searchsorted(rising, stamps), 0, len(rising) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.where(stamps - rising[before] <= rising[after] - stamps, before, after)
+    return order[closer]

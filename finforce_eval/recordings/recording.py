@@ -1,0 +1,258 @@
+"""Bags into recordings: topics to tracks, checked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from finforce.errors import ObservationError
+from finforce.pointcloud import Keypoints, decode_columns, decode_keypoints
+from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.bags import Sample, bag_source, check_types, open_bag
+from finforce_eval.recordings.images import PAIRED, ImageTrack, find_images
+from finforce_eval.recordings.tracks import (
+    JAWS,
+    NANOSECONDS,
+    JawTrack,
+    KeypointTrack,
+    PoseTrack,
+    Recording,
+    SightTrack,
+    WrenchTrack,
+    parse_phases,
+)
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
+POSE = "geometry_msgs/msg/PoseStamped"
+STRING = "std_msgs/msg/String"
+SIGHT_COLUMNS = ("x", "y", "z", "u", "v", "visible")
+TRUE_KEYPOINTS, TRUE_POSE = "ground_truth_keypoints", "ground_truth_jaw_pose"
+TOPICS = {"/object_pose": POSE, "/bench/phase": STRING}
+for _side in JAWS:
+    TOPICS |= {
+        f"/{_side}/keypoints": CLOUD,
+        f"/{_side}/ground_truth_wrench": WRENCH,
+        f"/{_side}/jaw_pose": POSE,
+        f"/{_side}/{TRUE_KEYPOINTS}": CLOUD,
+        f"/{_side}/{TRUE_POSE}": POSE,
+    }
+
+
+class _Content(NamedTuple):
+    """What lies in a bag: messages by topic, images, and notes on what was left aside."""
+
+    samples: Mapping[str, list[Sample]]
+    images: ImageTrack | None
+    notes: list[str]
+
+
+def read_recording(path: str | Path, pairing: int = PAIRED, sides: Sequence[str] = ()) -> Recording:
+    """Read a rosbag2 folder or a single .mcap / .db3 file, with the `case.json` beside it.
+
+    Topics that are not ours are not decoded; those of unknown type are named in `notes`. Images are not read yet; a
+    recording with images may do without key points, its tracks of them are empty then.
+
+    Args:
+        path: the folder or the file.
+        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
+        sides: jaws that are in the images, whether or not a topic tells of them.
+
+    Raises:
+        RecordingError: nothing there, damaged, empty, without key points and images, or with malformed content.
+        MissingDependencyError: rosbags is not installed.
+    """
+    source = bag_source(Path(path))
+    folder = source if source.is_dir() else source.parent
+    name = source.name if source.is_dir() else source.stem
+    samples, images, notes = _read_samples(source, name, pairing)
+    known = [side for side in JAWS if _has_jaw(samples, side, images is not None) or (images and side in sides)]
+    jaws = {side: _jaw_track(samples, side, name) for side in known}
+    if not jaws:
+        raise RecordingError(f"{name}: {_no_jaw(has_images=images is not None)}")
+    phases = samples.get("/bench/phase")
+    poses = samples.get("/object_pose")
+    return Recording(
+        name=name,
+        path=Path(path),
+        jaws=jaws,
+        object_pose=_pose_track(poses, "/object_pose", name) if poses else None,
+        phases=_phases(phases, name) if phases else None,
+        case=_read_case(folder / "case.json"),
+        notes=tuple(notes),
+        images=images,
+    )
+
+
+def _no_jaw(*, has_images: bool) -> str:
+    """Return why nothing is known of a jaw, and what would do."""
+    if not has_images:
+        return "no key points: /left/keypoints and /right/keypoints have no messages; no images either"
+    return (
+        "there are images, but no topic tells which jaws are in them: a score needs their measured force, record "
+        "/left/ground_truth_wrench or /right/ground_truth_wrench (WrenchStamped in left_jaw or right_jaw), too; forces "
+        "without a score: ros2 launch finforce replay.launch.py bag:=FOLDER images:=true contact_height:=METRES"
+    )
+
+
+def _has_jaw(samples: Mapping[str, list[Sample]], side: str, has_images: bool) -> bool:
+    """Say whether a recording tells of a jaw: by its key points, or with images by anything that is the jaw's own."""
+    topics = [topic for topic in samples if topic.startswith(f"/{side}/")]
+    return f"/{side}/keypoints" in topics or (has_images and bool(topics))
+
+
+def _read_samples(source: Path, name: str, pairing: int) -> _Content:
+    """Decode the messages of our topics, by topic, and find the images."""
+    samples: dict[str, list[Sample]] = {}
+    with open_bag(source, name) as bag:
+        check_types(bag.connections, {topic: (kind,) for topic, kind in TOPICS.items()}, name)
+        for raw in bag.raw(TOPICS):
+            samples.setdefault(raw.topic, []).append(Sample(raw.time, bag.decode(raw)))
+        notes = bag.foreign_notes()
+        try:
+            images = find_images(bag, source, pairing)
+        except RecordingError as error:
+            if not any(topic.endswith("/keypoints") for topic in samples):
+                raise
+            images, notes = None, [*notes, str(error)]
+        return _Content(samples, images, notes)
+
+
+def _stamp(sample: Sample) -> int:
+    """Return the header stamp [ns]."""
+    stamp = sample.message.header.stamp
+    return stamp.sec * NANOSECONDS + stamp.nanosec
+
+
+def _stamps(samples: Sequence[Sample], topic: str, name: str, *, strict: bool) -> np.ndarray:
+    """Return the header stamps (n,) [ns] and check their order."""
+    stamps = np.array([_stamp(sample) for sample in samples], dtype=np.int64)
+    steps = np.diff(stamps)
+    wrong = np.flatnonzero(steps <= 0 if strict else steps < 0)
+    if wrong.size:
+        what = "go back" if steps[wrong[0]] < 0 else "stand still"
+        seconds = stamps[wrong[0] + 1] / NANOSECONDS
+        where = f"message {wrong[0] + 1}, {seconds:.3f} s"
+        raise RecordingError(f"{name}: the stamps of {topic} {what} at {where}")
+    return stamps
+
+
+def _jaw_track(samples: Mapping[str, list[Sample]], side: str, name: str) -> JawTrack:
+    """Gather what was recorded of one jaw."""
+    truth = samples.get(f"/{side}/ground_truth_wrench")
+    pose = samples.get(f"/{side}/jaw_pose")
+    true_pose = samples.get(f"/{side}/{TRUE_POSE}")
+    keypoints, sight = samples.get(f"/{side}/keypoints"), samples.get(f"/{side}/{TRUE_KEYPOINTS}")
+    return JawTrack(
+        keypoints=_keypoint_track(keypoints, side, name) if keypoints else KeypointTrack.empty(),
+        truth=_wrench_track(truth, side, name) if truth else None,
+        pose=_pose_track(pose, f"/{side}/jaw_pose", name) if pose else None,
+        sight=_sight_track(sight, side, name) if sight else None,
+        true_pose=_pose_track(true_pose, f"/{side}/{TRUE_POSE}", name) if true_pose else None,
+    )
+
+
+def _check_frame(samples: Sequence[Sample], topic: str, side: str, name: str) -> None:
+    """Refuse messages of a jaw that are not in its frame."""
+    for sample in samples:
+        frame = sample.message.header.frame_id
+        if frame.lstrip("/") != f"{side}_jaw":
+            raise RecordingError(f"{name}: {topic} is in the frame '{frame}'; expected '{side}_jaw'")
+
+
+def _keypoint_track(samples: Sequence[Sample], side: str, name: str) -> KeypointTrack:
+    """Stack the key point clouds of one jaw."""
+    topic = f"/{side}/keypoints"
+    _check_frame(samples, topic, side, name)
+    stamps = _stamps(samples, topic, name, strict=True)
+    clouds = [_cloud(sample, index, topic, name) for index, sample in enumerate(samples)]
+    counts = [len(cloud.points) for cloud in clouds]
+    odd = next((index for index, count in enumerate(counts) if count != counts[0] or count == 0), None)
+    if odd is not None:
+        what = f"message {odd} has {counts[odd]} key points, the first {counts[0]}"
+        raise RecordingError(f"{name}: {topic} {what}; expected the same number above zero in all")
+    points = np.stack([cloud.points for cloud in clouds])
+    infinite = np.isinf(points).any(axis=(1, 2))
+    if infinite.any():
+        first = int(np.argmax(infinite))
+        raise RecordingError(f"{name}: {topic} message {first} has infinite coordinates; NaN says 'no point'")
+    likelihood, stated = np.stack([c.likelihood for c in clouds]), [c.stddev is not None for c in clouds]
+    if any(stated) and not all(stated):
+        first = stated.index(not stated[0])
+        raise RecordingError(f"{name}: {topic} message {first} differs from the first in whether it states stddev_x")
+    stddev = np.stack([c.stddev for c in clouds]) if stated[0] else None
+    return KeypointTrack(stamps=stamps, points=points, likelihood=likelihood, stddev=stddev)
+
+
+def _sight_track(samples: Sequence[Sample], side: str, name: str) -> SightTrack:
+    """Stack the true key points of one jaw."""
+    topic = f"/{side}/{TRUE_KEYPOINTS}"
+    _check_frame(samples, topic, side, name)
+    stamps = _stamps(samples, topic, name, strict=True)
+    try:
+        clouds = [decode_columns(sample.message, SIGHT_COLUMNS) for sample in samples]
+        columns = ([cloud[name] for cloud in clouds] for name in SIGHT_COLUMNS)
+        x, y, z, u, v, visible = (np.array(column, dtype=np.float64) for column in columns)
+    except (ObservationError, ValueError) as error:
+        raise RecordingError(f"{name}: {topic}: {error}") from error
+    points, pixels = np.stack([x, y, z], axis=-1), np.stack([u, v], axis=-1)
+    return SightTrack(stamps=stamps, points=points, pixels=pixels, visible=visible > 0)
+
+
+def _cloud(sample: Sample, index: int, topic: str, name: str) -> Keypoints:
+    """Decode one key point cloud."""
+    try:
+        return decode_keypoints(sample.message)
+    except ObservationError as error:
+        raise RecordingError(f"{name}: {topic} message {index}: {error}") from error
+
+
+def _wrench_track(samples: Sequence[Sample], side: str, name: str) -> WrenchTrack:
+    """Stack the ground truth of one jaw."""
+    topic = f"/{side}/ground_truth_wrench"
+    _check_frame(samples, topic, side, name)
+    stamps = _stamps(samples, topic, name, strict=False)
+    wrenches = [sample.message.wrench for sample in samples]
+    force = np.array([[w.force.x, w.force.y, w.force.z] for w in wrenches])
+    torque = np.array([[w.torque.x, w.torque.y, w.torque.z] for w in wrenches])
+    if not np.isfinite(force).all():
+        raise RecordingError(f"{name}: {topic} holds forces that are not finite")
+    return WrenchTrack(stamps=stamps, force=force, torque=torque)
+
+
+def _pose_track(samples: Sequence[Sample], topic: str, name: str) -> PoseTrack:
+    """Stack poses of one frame; the order of their stamps is not checked, trackers publish late results."""
+    frames = [sample.message.header.frame_id for sample in samples]
+    odd = next((index for index, frame in enumerate(frames) if frame != frames[0]), None)
+    if odd is not None:
+        what = f"message {odd} is in the frame '{frames[odd]}', the first in '{frames[0]}'"
+        raise RecordingError(f"{name}: {topic} {what}; expected one frame")
+    poses = [sample.message.pose for sample in samples]
+    return PoseTrack(
+        stamps=np.array([_stamp(sample) for sample in samples], dtype=np.int64),
+        position=np.array([[p.position.x, p.position.y, p.position.z] for p in poses]),
+        quaternion=np.array([[getattr(p.orientation, axis) for axis in "xyzw"] for p in poses]),
+        frame_id=frames[0],
+    )
+
+
+def _phases(samples: Sequence[Sample], name: str) -> Any:
+    """Read the phases; strings carry no stamp, the time of receipt stands for it."""
+    return parse_phases([s.time for s in samples], [s.message.data for s in samples], name)
+
+
+def _read_case(path: Path) -> dict[str, Any]:
+    """Read `case.json`, empty when absent."""
+    if not path.exists():
+        return {}
+    try:
+        case = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise RecordingError(f"{path.parent.name}/case.json: not JSON: {error}") from error
+    if not isinstance(case, dict):
+        raise RecordingError(f"{path.parent.name}/case.json: expected an object, found {type(case).__name__}")
+    return case

@@ -1,0 +1,341 @@
+"""Recordings as frozen records of NumPy arrays.
+
+What a camera truly saw of a jaw, and what a detector said of it, over time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.errors import RecordingError
+from finforce_ifea.observation import Observation
+
+if TYPE_CHECKING:
+    from finforce_eval.recordings.images import ImageTrack
+
+JAWS = ("left", "right")
+DIRECTIONS = ("load", "unload")
+STAGES = ("ramp", "settle", "record")
+NANOSECONDS = 1_000_000_000
+
+TrackT = TypeVar("TrackT", "KeypointTrack", "WrenchTrack", "PoseTrack", "PhaseTrack", "SightTrack", "DetectionTrack")
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeypointTrack:
+    """Key points of one jaw over time.
+
+    Attributes:
+        stamps: (n,) image time [ns], strictly increasing.
+        points: (n, K, 3) [m], jaw frame; NaN = none.
+        likelihood: (n, K) in [0, 1].
+        stddev: (n, K, 3) one standard deviation [m], jaw frame, NaN = not known; None when nothing says.
+    """
+
+    stamps: NDArray[np.int64]
+    points: NDArray[np.float64]
+    likelihood: NDArray[np.float64]
+    stddev: NDArray[np.float64] | None = None
+
+    @classmethod
+    def empty(cls, count: int = 0) -> KeypointTrack:
+        """Return a track of no image, which stands where key points are still to be found."""
+        return cls(stamps=np.zeros(0, np.int64), points=np.zeros((0, count, 3)), likelihood=np.zeros((0, count)))
+
+    @property
+    def count(self) -> int:
+        """Key points per image, K."""
+        return self.points.shape[1]
+
+    def observation(self, index: int) -> Observation:
+        """Return what an estimator is given of image `index`."""
+        return Observation(
+            stamp=self.stamps[index] * 1e-9,
+            points=self.points[index],
+            likelihood=self.likelihood[index],
+            stddev=None if self.stddev is None else self.stddev[index],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrenchTrack:
+    """Wrenches that an object applies to a jaw over time.
+
+    Attributes:
+        stamps: (n,) [ns].
+        force: (n, 3) [N], jaw frame.
+        torque: (n, 3) [N m], about the origin of the jaw frame.
+    """
+
+    stamps: NDArray[np.int64]
+    force: NDArray[np.float64]
+    torque: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseTrack:
+    """Poses over time.
+
+    Attributes:
+        stamps: (n,) [ns].
+        position: (n, 3) [m], in `frame_id`.
+        quaternion: (n, 4), x y z w.
+        frame_id: the frame in which the pose is given.
+    """
+
+    stamps: NDArray[np.int64]
+    position: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+    frame_id: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhaseTrack:
+    """What the bench was doing, published on change.
+
+    Attributes:
+        stamps: (m,) [ns], begin of each phase.
+        cycle: (m,) number of the loading cycle.
+        direction: (m,) "load" or "unload".
+        displacement_mm: (m,) commanded displacement [mm].
+        stage: (m,) "ramp", "settle" or "record".
+    """
+
+    stamps: NDArray[np.int64]
+    cycle: NDArray[np.int64]
+    direction: NDArray[np.str_]
+    displacement_mm: NDArray[np.float64]
+    stage: NDArray[np.str_]
+
+    def index_at(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return for each stamp [ns] the row of its phase, -1 before the first."""
+        return np.searchsorted(self.stamps, stamps, side="right") - 1
+
+    def displacement_at(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the displacement (n,) [mm] at stamps [ns]: linear over a ramp, held in other phases, 0 before all."""
+        held = np.r_[0.0, self.displacement_mm]
+        begins = np.where(self.stage == "ramp", held[:-1], held[1:])
+        # a ramp that nothing follows has no known end
+        ends = np.r_[held[1:-1], begins[-1]] if self.stage[-1] == "ramp" else held[1:]
+        times = np.stack([self.stamps, np.r_[self.stamps[1:], self.stamps[-1]]], axis=1).ravel()
+        return np.interp(stamps, times, np.stack([begins, ends], axis=1).ravel(), left=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramePhases:
+    """The phases of the bench image by image.
+
+    Attributes:
+        cycle: (n,) loading cycle, 0 without phases.
+        direction: (n,) "load", "unload", or "" without phases.
+        scored: (n,) in a `record` phase; every frame without phases.
+    """
+
+    cycle: NDArray[np.int64]
+    direction: NDArray[np.str_]
+    scored: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JawTrack:
+    """What a recording holds of one jaw.
+
+    Attributes:
+        keypoints: as they were recorded, or as they were found in images; empty before that.
+        truth: measured wrenches.
+        pose: T_camera_jaw over time, of the key point detector.
+        sight: true key points, `true_pose` the true T_camera_jaw: of a synthetic recording.
+        detection: what the detector said, where this call found the key points in images.
+    """
+
+    keypoints: KeypointTrack
+    truth: WrenchTrack | None = None
+    pose: PoseTrack | None = None
+    sight: SightTrack | None = None
+    true_pose: PoseTrack | None = None
+    detection: DetectionTrack | None = None
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether key points and poses are still to come from images."""
+        return not len(self.keypoints.stamps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """One recording.
+
+    Attributes:
+        name: its name, from the folder or the file.
+        path: where it was read from.
+        jaws: "left" and/or "right" -> what was recorded of that jaw.
+        object_pose: T_camera_object over time.
+        phases: phases of the bench, None outside the bench.
+        case: content of `case.json`, empty without it.
+        notes: what was left aside on reading, one sentence each.
+        images: its RGB-D images, read one by one; None without any.
+    """
+
+    name: str
+    path: Path
+    jaws: Mapping[str, JawTrack]
+    object_pose: PoseTrack | None = None
+    phases: PhaseTrack | None = None
+    case: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    images: ImageTrack | None = None
+
+    def jaw(self, side: str) -> JawTrack:
+        """Return what was recorded of the jaw `side`.
+
+        Raises:
+            RecordingError: the recording has no key points of that jaw.
+        """
+        if side not in self.jaws:
+            have = ", ".join(self.jaws)
+            raise RecordingError(f"{self.name}: no key points of the {side} jaw; the recording has {have}")
+        return self.jaws[side]
+
+    def truth(self, side: str) -> WrenchTrack:
+        """Return the measured wrenches of the jaw `side`.
+
+        Raises:
+            RecordingError: there are none.
+        """
+        truth = self.jaw(side).truth
+        if truth is None:
+            topic = f"/{side}/ground_truth_wrench"
+            raise RecordingError(f"{self.name}: no ground truth: {topic} is absent or has no messages")
+        return truth
+
+    def phases_at(self, stamps: NDArray[np.int64]) -> FramePhases:
+        """Return the phase of each stamp [ns]."""
+        frames, phases = len(stamps), self.phases
+        if phases is None:
+            nothing, every = np.full(frames, "", dtype="U6"), np.ones(frames, dtype=bool)
+            return FramePhases(cycle=np.zeros(frames, dtype=np.int64), direction=nothing, scored=every)
+        row = phases.index_at(stamps)
+        return FramePhases(
+            cycle=np.where(row >= 0, phases.cycle[row], 0),
+            direction=np.where(row >= 0, phases.direction[row], ""),
+            scored=(row >= 0) & (phases.stage[row] == "record"),
+        )
+
+    def between(self, start: int, stop: int) -> Recording:
+        """Return the part with start <= stamp < stop [ns]; a phase under way at start begins there."""
+        jaws = {
+            side: JawTrack(
+                keypoints=_cut(track.keypoints, start, stop),
+                truth=track.truth and _cut(track.truth, start, stop),
+                pose=track.pose and _cut(track.pose, start, stop),
+                sight=track.sight and _cut(track.sight, start, stop),
+                true_pose=track.true_pose and _cut(track.true_pose, start, stop),
+                detection=track.detection and _cut(track.detection, start, stop),
+            )
+            for side, track in self.jaws.items()
+        }
+        phases = self.phases
+        if phases is not None:
+            phases = _cut(replace(phases, stamps=_clip_running(phases.stamps, start)), start, stop)
+        pose = self.object_pose and _cut(self.object_pose, start, stop)
+        images = self.images and self.images.between(start, stop)
+        return replace(self, jaws=jaws, object_pose=pose, phases=phases, images=images)
+
+
+def _clip_running(stamps: NDArray[np.int64], start: int) -> NDArray[np.int64]:
+    """Move the last stamp before start to start."""
+    moved = stamps.copy()
+    running = np.searchsorted(stamps, start, side="right") - 1
+    if running >= 0:
+        moved[running] = start
+    return moved
+
+
+def _cut(track: TrackT, start: int, stop: int) -> TrackT:
+    """Return the rows of a track with start <= stamp < stop."""
+    rows = slice(*np.searchsorted(track.stamps, [start, stop], side="left"))
+    arrays = {name: value[rows] for name, value in vars(track).items() if isinstance(value, np.ndarray)}
+    return replace(track, **arrays)
+
+
+def parse_phases(stamps: Sequence[int], texts: Sequence[str], name: str) -> PhaseTrack:
+    """Read phases written `cycle:load|unload:displacement_mm:ramp|settle|record`.
+
+    Args:
+        stamps: begin of each phase [ns].
+        texts: the messages.
+        name: recording name, for the message of an error.
+
+    Raises:
+        RecordingError: a text reads otherwise, or the stamps go back.
+    """
+    rows = [_parse_phase(text, name) for text in texts]
+    cycle, direction, displacement, stage = zip(*rows, strict=True)
+    order = np.asarray(stamps, dtype=np.int64)
+    if (np.diff(order) < 0).any():
+        raise RecordingError(f"{name}: the stamps of /bench/phase go back")
+    return PhaseTrack(
+        stamps=order,
+        cycle=np.asarray(cycle, dtype=np.int64),
+        direction=np.asarray(direction),
+        displacement_mm=np.asarray(displacement, dtype=np.float64),
+        stage=np.asarray(stage),
+    )
+
+
+def _parse_phase(text: str, name: str) -> tuple[int, str, float, str]:
+    """Split one phase."""
+    try:
+        cycle, direction, displacement, stage = text.split(":")
+        if direction in DIRECTIONS and stage in STAGES and np.isfinite(float(displacement)):
+            return int(cycle), direction, float(displacement), stage
+    except ValueError:
+        pass
+    expected = "cycle:load|unload:displacement_mm:ramp|settle|record"
+    raise RecordingError(f"{name}: /bench/phase says '{text}'; expected {expected}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SightTrack:
+    """Where the key points of one jaw truly were, and which of them the camera could see.
+
+    Attributes:
+        stamps: (n,) image time [ns], strictly increasing.
+        points: (n, K, 3) [m], jaw frame.
+        pixels: (n, K, 2) column and row in the raw image [px].
+        visible: (n, K) neither occluded nor outside the image.
+    """
+
+    stamps: NDArray[np.int64]
+    points: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+    visible: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectionTrack:
+    """What the key point detector said of one jaw beside the key points themselves, image by image.
+
+    Attributes:
+        stamps: (n,) image time [ns], strictly increasing.
+        pixels: (n, K, 2) column and row in the raw image [px], NaN = not found.
+        points: (n, K, 3) [m], jaw frame, NaN = no depth.
+        accepted: (n, K) handed on to the solver.
+        reasons: (n, K) why a point was not, one word; "" where it was, or where the jaw was not found.
+        found: (n,) the jaw was found in the image.
+        step_ms: (n,) wall time from image to key points of all jaws [ms], NaN where it was not timed.
+    """
+
+    stamps: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+    points: NDArray[np.float64]
+    accepted: NDArray[np.bool_]
+    reasons: NDArray[np.str_]
+    found: NDArray[np.bool_]
+    step_ms: NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""Recordings through the real nodes, in real time."""

@@ -1,0 +1,203 @@
+"""The real nodes while a film is played: their answers, CPU time and memory."""
+
+from __future__ import annotations
+
+import random
+import sys
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from os import getpid
+from pathlib import Path
+from time import monotonic, time_ns
+from typing import TYPE_CHECKING, Protocol
+
+from finforce.errors import MissingDependencyError
+from finforce_eval.bench.cpu_share import CpuMeter, busy_seconds
+from finforce_eval.bench.film import Film
+from finforce_eval.bench.process import child_processes, resident_bytes
+from finforce_eval.replay.live import ReplayLog
+from finforce_eval.replay.playback import RawMessage
+from finforce_eval.replay.processes import ProcessError, ProcessGroup
+
+if TYPE_CHECKING:
+    from finforce_eval.replay.node import PlayerNode
+
+PATIENCE = 180.0  # [s]; a first start compiles the element loops
+PLAYER = "player"
+QUIET = 25.0  # [% of a core] that everything else may take; above it latencies are those of a busy machine
+LINGER = 1.0  # [s]; the last answers may still be on their way when the last message has left
+
+
+def describe_load(others: Iterable[float]) -> str:
+    """Return a sentence on what else ran during some runs, others (n,) [% of a core]."""
+    largest = max(others, default=0.0)
+    if largest <= QUIET:
+        return f"Everything else on the machine took at most {largest:.0f} % of a core."
+    return (
+        f"THE MACHINE WAS BUSY: everything else took up to {largest:.0f} % of a core; repeat it when nothing else runs."
+    )
+
+
+class Runnable(Protocol):
+    """What a `ProcessGroup` starts: a name, and a command line that has it as `__node:=NAME`."""
+
+    name: str
+
+    def command(self) -> list[str]:
+        """Return the command line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeRun:
+    """What came of a run.
+
+    Attributes:
+        log: the answers, by recorded stamp.
+        cpu: of each process while the film was played, all its threads [% of a core].
+        memory: resident at the film's end [bytes].
+        player: CPU use of this process, which plays [% of a core].
+        others: CPU use of everything else on the machine meanwhile [% of a core]; it should be small.
+        seconds: for which it was played.
+    """
+
+    log: ReplayLog
+    cpu: Mapping[str, float]
+    memory: Mapping[str, int]
+    player: float
+    others: float
+    seconds: float
+
+
+def await_listeners(player: PlayerNode, nodes: ProcessGroup, topics: Collection[str]) -> None:
+    """Wait until somebody beside the player listens to each of the topics.
+
+    Raises:
+        ProcessError: a process ended, or nobody listens after three minutes.
+    """
+
+    def ready() -> bool:
+        nodes.check()
+        return player.has_listeners(topics)
+
+    if not player.wait_for(ready, PATIENCE):
+        raise ProcessError(f"nobody listens to {' or '.join(topics)} after {PATIENCE:g} s")
+
+
+def run_nodes(
+    processes: Sequence[Runnable], film: Film, sides: Sequence[str], awaited: Collection[str], *, detector: bool = False
+) -> NodeRun:
+    """Play a film to processes in real time, stamps shifted to now; nothing outlives the call.
+
+    Args:
+        processes: to be started, and ended.
+        film: what is played.
+        sides: jaws whose results are heard.
+        awaited: topics that somebody has to listen to before the film begins.
+        detector: whether the results of a key point detector are heard, too.
+
+    Raises:
+        ProcessError: a process cannot be started, ended early, or does not listen.
+        MissingDependencyError: ROS 2 is not installed.
+    """
+    try:
+        from finforce_eval.replay.node import open_player
+    except ImportError as error:
+        raise MissingDependencyError(f"running nodes needs ROS 2: pip install 'finforce[ros]' ({error})") from error
+    domain, log = random.randint(1, 99), ReplayLog(tuple(sides))
+    with ExitStack() as stack:
+        player = stack.enter_context(open_player(domain))
+        nodes = stack.enter_context(ProcessGroup(processes, {"ROS_DOMAIN_ID": str(domain)}))
+        player.offer(film)
+        player.listen(sides, log, detector=detector)
+
+        await_listeners(player, nodes, awaited)
+        player.spin_until(monotonic() + LINGER)
+        pids = find_processes([process.name for process in processes])
+        meter = CpuMeter({**pids, PLAYER: getpid()})
+        log.offset = time_ns() - film.begin
+        busy = busy_seconds()
+        meter.sample()
+        player.play(film, offset=log.offset, sent=lambda message: _note(log, message))
+        meter.sample()
+        busy = busy_seconds() - busy
+        memory = {name: resident_bytes(pid) for name, pid in pids.items()}
+        log.ended = True
+        player.spin_until(monotonic() + LINGER)
+        nodes.check()
+    shares = meter.shares()
+    return NodeRun(
+        log=log,
+        cpu={name: shares[name] for name in pids},
+        memory=memory,
+        player=shares[PLAYER],
+        others=max(0.0, 100.0 * busy / meter.elapsed - sum(shares.values())),
+        seconds=meter.elapsed,
+    )
+
+
+def _note(log: ReplayLog, message: RawMessage) -> None:
+    """Note when a message leaves."""
+    log.take_sent(message.topic, message.stamp, monotonic())
+
+
+def find_processes(names: Sequence[str], parent: int | None = None) -> dict[str, int]:
+    """Return the process ids by node name among the children of a process.
+
+    Args:
+        names: of nodes, as `__node:=NAME` in their command lines.
+        parent: whose children; this process's without one.
+
+    Raises:
+        ProcessError: there is none of a name.
+    """
+    words = {pid: _command_of(pid) for pid in child_processes(getpid() if parent is None else parent)}
+    found = {name: pid for name in names for pid, command in words.items() if f"__node:={name}" in command}
+    if missing := sorted(set(names) - set(found)):
+        raise ProcessError(f"no process runs as node {', '.join(missing)}")
+    return found
+
+
+def _command_of(pid: int) -> list[str]:
+    """Return the command line of a process; empty when it has gone."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+    except (FileNotFoundError, ProcessLookupError):
+        return []
+
+
+LISTENER = """
+import sys
+from importlib import import_module
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+rclpy.init(args=sys.argv)
+node = rclpy.create_node("listener")
+quality = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
+for entry in sys.argv[1:sys.argv.index("--ros-args")]:
+    topic, kind = entry.split("=")
+    package, _, name = kind.split("/")
+    node.create_subscription(getattr(import_module(package + ".msg"), name), topic, lambda message: None, quality)
+try:
+    rclpy.spin(node)
+except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+    pass
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listener:
+    """A process that hears topics and does nothing: what receiving them costs by itself.
+
+    Attributes:
+        name: of the node.
+        topics: type by topic.
+    """
+
+    name: str
+    topics: Mapping[str, str]
+
+    def command(self) -> list[str]:
+        """Return the command line."""
+        topics = [f"{topic}={kind}" for topic, kind in self.topics.items()]
+        return [sys.executable, "-c", LISTENER, *topics, "--ros-args", "-r", f"__node:={self.name}"]

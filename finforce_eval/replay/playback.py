@@ -1,0 +1,126 @@
+"""Recorded messages as they lie in a bag, ready to be published again, read one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.bags import BagReader, RawSample, bag_source, open_bag, restamp
+from finforce_eval.recordings.image_messages import COMPRESSED, IMAGE, color_from_message, depth_steps
+from finforce_eval.recordings.images import COLOR_ENDS, DEPTH_ENDS, INFO_ENDS
+from finforce_ifea.messages import read_stamp
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+
+HEADER = "std_msgs/msg/Header"
+# where the nodes listen -> the ends of the topics that are played there
+PLAYED = {COLOR_TOPIC: COLOR_ENDS, DEPTH_TOPIC: DEPTH_ENDS, INFO_TOPIC: INFO_ENDS}
+
+
+class RawMessage(NamedTuple):
+    """One recorded message.
+
+    Attributes:
+        time: when the bag received it [ns].
+        topic: its topic.
+        msgtype: its type, `package/msg/Name`.
+        data: CDR bytes with their four bytes of encapsulation.
+        has_header: the message begins with a std_msgs/Header, whose stamp can be read and written here.
+    """
+
+    time: int
+    topic: str
+    msgtype: str
+    data: bytes
+    has_header: bool
+
+    @property
+    def stamp(self) -> int:
+        """The header's stamp [ns]; the time of receipt without a header."""
+        return read_stamp(self.data) if self.has_header else self.time
+
+    def restamped(self, stamp: int) -> bytes:
+        """Return the bytes with another stamp [ns]; unchanged without a header."""
+        return restamp(self.data, stamp) if self.has_header else self.data
+
+
+class Playback:
+    """The messages of a bag in the order of their receipt; every iteration reads them anew.
+
+    Camera topics come out where the nodes listen, and compressed images as plain ones.
+
+    Args:
+        source: the bag.
+        without: topics to be left out.
+
+    Raises:
+        RecordingError: the bag cannot be read, or holds nothing to be played.
+    """
+
+    def __init__(self, source: Path, without: Collection[str]) -> None:
+        self._source = source
+        with open_bag(source, source.name) as bag:
+            chosen = [entry for entry in bag.connections if entry.topic not in without and bag.knows(entry.msgtype)]
+            self._topics = {entry.topic: _played_topic(entry.topic) for entry in chosen}
+            self._count = sum({id(entry): entry.msgcount for entry in chosen}.values())
+            first = next(bag.raw(self._topics), None)
+            self._headed = {entry.topic: _begins_with_header(bag.definition(entry.msgtype)) for entry in chosen}
+        if first is None:
+            raise RecordingError(f"{source.name}: nothing to be played in it")
+        self.begin = first.time
+        self.types = {self._topics[entry.topic]: _played_type(entry.msgtype) for entry in chosen}
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[RawMessage]:
+        with open_bag(self._source, self._source.name) as bag:
+            for raw in bag.raw(self._topics):
+                topic, kind = self._topics[raw.topic], bag.types[raw.topic]
+                data = _decompress(bag, raw, topic) if kind == COMPRESSED else bytes(raw.data)
+                yield RawMessage(raw.time, topic, _played_type(kind), data, self._headed[raw.topic])
+
+
+def read_playback(path: str | Path, without: Collection[str] = ()) -> Playback:
+    """Return the messages of a bag in the order of their receipt.
+
+    Args:
+        path: rosbag2 folder, .mcap or .db3 file.
+        without: topics to be left out.
+
+    Raises:
+        RecordingError: the bag cannot be read, or holds nothing to be played.
+    """
+    return Playback(bag_source(Path(path)), without)
+
+
+def _played_topic(topic: str) -> str:
+    """Return where a topic is played: those of any camera under the names that the nodes listen to."""
+    return next((ours for ours, ends in PLAYED.items() if topic.endswith(tuple(f"/{end}" for end in ends))), topic)
+
+
+def _played_type(msgtype: str) -> str:
+    return IMAGE if msgtype == COMPRESSED else msgtype
+
+
+def _decompress(bag: BagReader, raw: RawSample, topic: str) -> bytes:
+    """Return the CDR bytes of a sensor_msgs/Image with the pixels of a compressed one."""
+    message: Any = bag.decode(raw)
+    pixels = depth_steps(message) if topic == DEPTH_TOPIC else color_from_message(message)
+    fields = {
+        "header": message.header,
+        "height": pixels.shape[0],
+        "width": pixels.shape[1],
+        "encoding": "16UC1" if topic == DEPTH_TOPIC else "rgb8",
+        "is_bigendian": 0,
+        "step": pixels.strides[0],
+        "data": pixels.reshape(-1).view("u1"),
+    }
+    return bag.encode(IMAGE, fields)
+
+
+def _begins_with_header(definition: tuple) -> bool:
+    """Say whether a type's first field is a std_msgs/Header."""
+    entries = definition[1]
+    return bool(entries) and entries[0][0] == "header" and entries[0][1][1] == HEADER

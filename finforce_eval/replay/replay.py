@@ -1,0 +1,271 @@
+"""A recording through the real nodes, in real time, scored against the measured force."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import monotonic, time_ns
+from typing import Any
+
+from tqdm import tqdm
+
+from finforce.errors import MissingDependencyError
+from finforce.skipping import IDLE
+from finforce.systems.options import ReplayOptions
+from finforce.systems.processes import Process, replay_processes
+from finforce_eval.cli.evaluate import Setup, truth_sides
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.contact_choice import FIXED, ContactChoice
+from finforce_eval.evaluation.detection import awaiting_keypoints, with_detections
+from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, score_results
+from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSource
+from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.evaluation.scoring import GraspScore, score_grasp
+from finforce_eval.recordings.objects import find_mesh, require_mesh
+from finforce_eval.recordings.tracks import Recording
+from finforce_eval.recordings.writer import write_recording
+from finforce_eval.replay.live import ReplayLog, live_result
+from finforce_eval.replay.node_run import await_listeners
+from finforce_eval.replay.playback import Playback, RawMessage, read_playback
+from finforce_eval.replay.processes import ProcessGroup
+from finforce_ifea.jaw.jaw import Jaw
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+
+LINGER = 0.3  # s; the last answers may still be on their way when the last message has left
+RESULTS = ("wrench", "wrench_stddev", "surface", "markers", "contact", "object_outline")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Playing:
+    """How a recording is played.
+
+    Attributes:
+        rate: speed; other than 1 the recorded stamps stay and the nodes take their time from /clock.
+        sim_time: the same at the recorded speed; else the stamps are shifted to now.
+        domain: ROS_DOMAIN_ID; None takes one by chance.
+        parameter_file: YAML file with further ROS parameters of the solvers.
+    """
+
+    rate: float = 1.0
+    sim_time: bool = False
+    domain: int | None = None
+    parameter_file: str = ""
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether the nodes take their time from /clock."""
+        return self.sim_time or self.rate != 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """What came of a replay.
+
+    Attributes:
+        evaluation: scores and time series; their step times are from key points out to wrench in.
+        grasp: stamp [ns] -> grasp force [N].
+        health: node -> its last diagnostics.
+        grasp_score: how far the grasp force is from the truth, and how late.
+        recording: that was played, with the key points that it was played with.
+    """
+
+    evaluation: Evaluation
+    grasp: Mapping[int, float]
+    health: Mapping[str, Mapping[str, str]]
+    grasp_score: GraspScore
+    recording: Recording
+
+
+def replay(
+    recording: Recording,
+    setup: Setup,
+    *,
+    calibration_file: str = "",
+    playing: Playing | None = None,
+    keypoints: KeypointSource | None = None,
+) -> Replay:
+    """Play a recording through solver nodes, one process per jaw, and score what they answer.
+
+    From images it goes through the key point detector's node, too. Nothing outlives the call.
+
+    Args:
+        recording: what is played.
+        setup: jaw, settings and contact.
+        calibration_file: as the nodes load it; empty for none.
+        playing: how it is played.
+        keypoints: where the key points come from; where they were recorded, else from images, without it.
+
+    Raises:
+        RecordingError: no ground truth, another number of key points than the jaw's, or no wrench came.
+        ProcessError: a node cannot be started, or ended early.
+        MissingDependencyError: ROS 2 is not installed.
+    """
+    playing, keypoints = playing or Playing(), keypoints or KeypointSource(jaw_file=str(setup.jaw.path))
+    sides, from_images = tuple(recording.jaws), keypoints.source_of(recording) == IMAGES
+    with ExitStack() as stack:
+        recording = _choose_keypoints(recording, setup.jaw, keypoints, stack)
+        messages = read_playback(recording.path, without=_results_of(sides) | _unplayed(sides, from_images))
+        options = _graph_options(recording, setup, calibration_file, playing)
+        processes = replay_processes(replace(options, images=from_images), Path())
+        log = ReplayLog(sides)
+        _run(_for_scores(processes, recording, keypoints), messages, log, playing)
+    if from_images:
+        recording = with_detections(recording, {side: found.side_log() for side, found in log.detections.items()})
+    evaluation = _score(recording, setup, log)
+    return Replay(
+        evaluation=evaluation,
+        grasp=log.grasp,
+        health=log.health,
+        grasp_score=score_grasp(recording, log.grasp, log.grasp_latency),
+        recording=recording,
+    )
+
+
+def _choose_keypoints(recording: Recording, jaw: Jaw, keypoints: KeypointSource, stack: ExitStack) -> Recording:
+    """Return a recording with the key points that are played, without any where images will give them.
+
+    Raises:
+        RecordingError: there is no ground truth, or another number of key points than the jaw's.
+    """
+    source = keypoints.source_of(recording)
+    if source == IMAGES:
+        recording = awaiting_keypoints(recording)
+    elif source == TRUTH:
+        recording = _write_truth(keypoints.apply(recording), stack)
+    for side in truth_sides(recording):
+        if source != IMAGES:
+            check_keypoint_count(recording, side, jaw)
+    return recording
+
+
+def _write_truth(recording: Recording, stack: ExitStack) -> Recording:
+    """Return a recording that has been written to a folder of its own, for as long as the stack lasts."""
+    folder = Path(stack.enter_context(TemporaryDirectory())) / recording.name.replace("/", "_")
+    plain = replace(recording, images=None)
+    mesh = find_mesh(recording)
+    if mesh is not None:
+        plain = replace(plain, case={**recording.case, "mesh": str(mesh.resolve())})
+    return replace(plain, path=write_recording(plain, folder))
+
+
+def _unplayed(sides: Sequence[str], from_images: bool) -> set[str]:
+    """Return the topics that are found anew, or those of the camera where nobody looks at its images."""
+    if from_images:
+        return {f"/{side}/{name}" for side in sides for name in ("keypoints", "jaw_pose")}
+    return {COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC}
+
+
+def _for_scores(processes: Sequence[Process], recording: Recording, keypoints: KeypointSource) -> list[Process]:
+    """Return the processes: they answer every image, so that each is scored, and the detector knows the camera."""
+    more = {name: {"skip_off": [IDLE]} for name in ("keypoint_detector", "contact_estimator", "ifea_solver")}
+    if any(each.executable == "keypoint_detector" for each in processes):
+        more["keypoint_detector"] |= keypoints.node_parameters(recording)
+    return [replace(each, parameters={**each.parameters, **more.get(each.executable, {})}) for each in processes]
+
+
+def _results_of(sides: Sequence[str]) -> set[str]:
+    """Return the topics that the nodes write; a recording of a live run holds them, too."""
+    own = {f"/{side}/{name}" for side in sides for name in RESULTS}
+    return own | {"/grasp_wrench", "/manipulation_wrench", "/diagnostics", "/clock", "/rosout"}
+
+
+def _graph_options(recording: Recording, setup: Setup, calibration_file: str, playing: Playing) -> ReplayOptions:
+    """Return what the graph of the solvers is asked for."""
+    sides = list(recording.jaws)
+    return ReplayOptions(
+        jaws="both" if len(sides) == 2 else sides[0],
+        jaw_file=str(setup.jaw.path),
+        calibration_file=calibration_file,
+        **_contact_options(recording, setup.contacts),
+        solver=setup.settings.solver,
+        mesh=setup.settings.mesh,
+        parameter_file=playing.parameter_file,
+        use_sim_time=playing.has_clock,
+    )
+
+
+def _contact_options(recording: Recording, choice: ContactChoice) -> dict[str, Any]:
+    """Return a height for the solvers, or what the contact estimator of all jaws needs.
+
+    Raises:
+        FinforceError: height, mesh or poses are missing.
+    """
+    modes = {choice.mode_for(recording, side) for side in recording.jaws}
+    mode = modes.pop() if len(modes) == 1 else FIXED
+    if mode == FIXED:
+        return {"contact_height": choice.height(recording)}
+    for side, track in recording.jaws.items():
+        if recording.object_pose is None or not (track.pose or track.is_awaited):
+            needed = f"/object_pose and /{side}/jaw_pose"
+            raise RecordingError(f"{recording.name}: --contact {mode} needs {needed}; give --contact fixed:Z_MM")
+    mesh = require_mesh(recording, choice.object_file).resolve()
+    return {"contact": mode, "object_mesh": str(mesh), "object_mesh_unit": choice.object_unit}
+
+
+def _run(processes: Sequence[Process], messages: Playback, log: ReplayLog, playing: Playing) -> None:
+    """Start the nodes, wait until they listen, play, and end them."""
+    try:
+        from finforce_eval.replay.node import open_player
+    except ImportError as error:
+        raise MissingDependencyError(f"replay needs ROS 2: pip install 'finforce[ros]' ({error})") from error
+    domain = random.randint(1, 99) if playing.domain is None else playing.domain
+    awaited = [f"/{side}/keypoints" for side in log.jaws]
+    detects = any(process.executable == "keypoint_detector" for process in processes)
+    if detects:
+        awaited += [COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC]
+    if any(process.executable == "contact_estimator" for process in processes):
+        awaited += ["/object_pose", *(f"/{side}/jaw_pose" for side in log.jaws)]
+    with ExitStack() as stack:
+        player = stack.enter_context(open_player(domain))
+        nodes = stack.enter_context(ProcessGroup(processes, {"ROS_DOMAIN_ID": str(domain)}))
+        player.offer(messages)
+        player.listen(log.jaws, log, detector=detects)
+
+        await_listeners(player, nodes, awaited)
+        player.spin_until(monotonic() + LINGER)
+        bar = stack.enter_context(tqdm(total=len(messages), unit="msg", desc="replay", disable=None))
+        log.offset = 0 if playing.has_clock else time_ns() - messages.begin
+
+        def sent(message: RawMessage) -> None:
+            nodes.check()
+            log.take_sent(message.topic, message.stamp, monotonic())
+            bar.update()
+
+        offset = None if playing.has_clock else log.offset
+        player.play(messages, rate=playing.rate, offset=offset, sent=sent)
+        log.ended = True
+        player.spin_until(monotonic() + LINGER)
+        nodes.check()
+
+
+def _score(recording: Recording, setup: Setup, log: ReplayLog) -> Evaluation:
+    """Score the wrenches of every jaw with ground truth.
+
+    Raises:
+        RecordingError: there are none.
+    """
+    results: list[CaseResult] = []
+    sides = truth_sides(recording)
+    for side in sides:
+        if not log.jaws[side].force:
+            raise RecordingError(f"{recording.name}: no wrench came on {side}/wrench: {_words(log, side)}")
+        estimator = setup.side(side).estimator()
+        threshold = setup.settings.likelihood_threshold
+        result = live_result(recording, side, log.jaws[side], likelihood_threshold=threshold, estimator=estimator)
+        results.append(result if len(sides) == 1 else replace(result, name=f"{recording.name}/{side}"))
+    return score_results(results, [recording])
+
+
+def _words(log: ReplayLog, side: str) -> str:
+    """Return what the diagnostics of a jaw said last, those of the key point detector first, where it runs."""
+    said = [log.health[name]["message"] for name in _sources(side) if name in log.health]
+    return "; ".join(said) or "no diagnostics either"
+
+
+def _sources(side: str) -> tuple[str, str]:
+    """Return under which names the nodes report on a jaw."""
+    return f"finforce: {side} key points", f"finforce: {side} jaw"

@@ -1,0 +1,1 @@
+"""Seeded families of hard input, and the rule that every answer is held to."""

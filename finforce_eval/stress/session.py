@@ -1,0 +1,187 @@
+"""Key points of a press in time, what an estimator says of them, and whether that is right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.stress.press import Bench, Course
+from finforce_eval.stress.stress import Trial, attempt
+from finforce_ifea.observation import Contact, Observation, Solution
+
+PERIOD = 1 / 30
+LIKELIHOOD = 0.95
+# Key point noise of a bench camera [m]: across and along its line of sight.
+ACROSS, ALONG = 0.2e-3, 0.45e-3
+SIGHT = np.array([0.25, -0.95, 0.18]) / np.linalg.norm([0.25, -0.95, 0.18])
+OFFSET = 0.2e-3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Step:
+    """What an estimator is given in one image, and the truth.
+
+    Attributes:
+        stamp: [s].
+        points: (K, 3) [m].
+        likelihood: (K,).
+        contact: as for `JawEstimator.update`.
+        force: true (3,) [N].
+        torque: true (3,) [N m].
+        level: see `Trial`.
+        stddev: stated (K, 3) [m], or None.
+    """
+
+    stamp: float
+    points: NDArray
+    likelihood: NDArray
+    contact: Contact | None
+    force: NDArray
+    torque: NDArray
+    level: str = ""
+    stddev: NDArray | None = None
+
+
+def noise_of(random: np.random.Generator, shape: tuple[int, ...], scale: float = 1.0) -> NDArray:
+    """Returns the noise (..., 3) [m] of a bench camera, `scale` times as large."""
+    scatter = ACROSS * random.normal(size=(*shape, 3))
+    return scale * (scatter + ALONG * random.normal(size=(*shape, 1)) * SIGHT)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Session:
+    """An estimator that has tared and is about to see a press.
+
+    Attributes:
+        bench: whose estimator it is.
+        random: of the noise.
+        course: the press.
+        contact: what the estimator is told of the place.
+        offsets: of the key points, constant (K, 3) [m].
+        start: stamp of the last unloaded image [s].
+        level: see `Trial`.
+    """
+
+    bench: Bench
+    random: np.random.Generator
+    course: Course
+    contact: Contact
+    offsets: NDArray
+    start: float
+    level: str = ""
+
+    def steps(self, depths: NDArray, *, scale: float = 1.0) -> list[Step]:
+        """Returns one step for each depth (n,) [m], a period apart, with `scale` times a bench camera's noise."""
+        clean = self.course.keypoints(depths) + self.offsets
+        points = clean + noise_of(self.random, clean.shape[:2], scale)
+        forces, torques = self.course.forces(depths), self.course.torques(depths)
+        return [
+            Step(
+                stamp=self.start + (i + 1) * PERIOD,
+                points=points[i],
+                likelihood=np.full(len(points[i]), LIKELIHOOD),
+                contact=self.contact,
+                force=forces[i],
+                torque=torques[i],
+                level=self.level,
+            )
+            for i in range(len(depths))
+        ]
+
+    def press(self, *, scale: float = 1.0) -> list[Step]:
+        """Returns the steps of a press: three images of rest, 0.4 s of ramp, 0.7 s of hold."""
+        depth = self.course.depth
+        rising = np.linspace(0.0, depth, 13)[1:]
+        return self.steps(np.concatenate([np.zeros(3), rising, np.full(20, depth)]), scale=scale)
+
+    def play(self, seed: int, steps: Iterable[Step]) -> Iterator[Trial]:
+        """Gives steps to the estimator and yields one trial each."""
+        for step in steps:
+            yield attempt(
+                seed,
+                lambda s=step: update(self.bench, s),
+                lambda got, s=step: judge(got, s, self.course.balance),
+                level=step.level,
+            )
+
+
+def open_session(
+    bench: Bench, random: np.random.Generator, *, course: Course | None = None, tare: float = 1.0, level: str = ""
+) -> Session:
+    """Draws a press unless one is given, and lets the estimator tare on images with `tare` times the usual noise.
+
+    The estimator is told the height of first touch, off by what its settings call that height's deviation.
+    """
+    course = course or bench.press(random)
+    offsets = OFFSET * random.normal(size=bench.jaw.keypoints.shape)
+    error = bench.estimator.settings.height_stddev * random.normal()
+    contact = Contact.fixed(bench.jaw, course.height + error)
+    rest = bench.jaw.keypoints + offsets
+    bench.estimator.reset()
+    stamp, likelihood = 10.0, np.full(len(rest), LIKELIHOOD)
+    for noise in noise_of(random, (bench.estimator.settings.tare_frames, len(rest)), tare):
+        stamp += PERIOD
+        seen = Observation(stamp=stamp, points=rest + noise, likelihood=likelihood)
+        bench.estimator.update(seen, contact)
+    return Session(
+        bench=bench, random=random, course=course, contact=contact, offsets=offsets, start=stamp, level=level
+    )
+
+
+def take_another(session: Session, random: np.random.Generator) -> Session:
+    """Returns the session with another press and what is told of it, the estimator going on as it is."""
+    course = session.bench.press(random)
+    error = session.bench.estimator.settings.height_stddev * random.normal()
+    return replace(session, course=course, contact=Contact.fixed(session.bench.jaw, course.height + error))
+
+
+def update(bench: Bench, step: Step) -> Solution:
+    """Returns what the bench's estimator says of a step."""
+    seen = Observation(stamp=step.stamp, points=step.points, likelihood=step.likelihood, stddev=step.stddev)
+    return bench.estimator.update(seen, step.contact)
+
+
+def judge(solution: Solution, step: Step, balance: float = math.nan) -> Trial:
+    """Returns how a solution compares with the truth: along x, along z, in magnitude and in torque."""
+    error = solution.force - step.force
+    magnitude = np.linalg.norm(solution.force) - np.linalg.norm(step.force)
+    torque = solution.torque - step.torque
+    errors = np.abs([error[0], error[2], magnitude, torque[1]])
+    stated = np.array(
+        [
+            solution.force_stddev[0],
+            solution.force_stddev[2],
+            solution.magnitude_stddev,
+            solution.torque_stddev[1],
+        ]
+    )
+    wrench = np.concatenate([solution.force, solution.torque, solution.force_stddev, solution.torque_stddev])
+    return Trial(
+        converged=solution.converged,
+        sure=solution.trusted,
+        residual=solution.residual,
+        kkt=solution.kkt,
+        force_error=float(np.linalg.norm(error)),
+        stddev=solution.magnitude_stddev,
+        deviation=compare(errors, stated),
+        condition=solution.condition,
+        energy_balance=balance,
+        nan=not np.isfinite([*wrench, solution.magnitude_stddev]).all(),
+        note=f"{solution.status}: true {np.linalg.norm(step.force):.3g} N; {describe(errors, stated)}",
+    )
+
+
+def compare(errors: NDArray, stated: NDArray) -> float:
+    """Returns the largest of the errors over their stated standard deviations; no error needs none."""
+    ratio = np.divide(errors, stated, out=np.full(len(errors), np.inf), where=stated > 0.0)
+    return float(np.where(errors > 1e-9, ratio, 0.0).max())
+
+
+def describe(errors: NDArray, stated: NDArray) -> str:
+    """Returns errors and standard deviations in words."""
+    names = ("x", "z", "magnitude", "torque")
+    return ", ".join(f"{n} {e:.3g} ± {s:.2g}" for n, e, s in zip(names, errors, stated, strict=True))

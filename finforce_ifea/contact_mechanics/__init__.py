@@ -1,0 +1,1 @@
+"""Rigid objects pressed into a jaw: surface, indenter, penalty, equilibrium."""

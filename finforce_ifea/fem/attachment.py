@@ -1,0 +1,218 @@
+"""Material points of a mesh as weighted sums of its nodes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.errors import MeshError
+from finforce_ifea.fem.elements import shape_gradients, shape_values
+from finforce_ifea.jaw.mesh import VolumeMesh
+
+_NEWTON_STEPS = 12
+# How far a point may lie outside its element's reference domain and still count as inside [-].
+_INSIDE = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attachment:
+    """Material points as weighted sums of mesh nodes.
+
+    Attributes:
+        nodes: (p, m) node indices.
+        weights: (p, m) [-], rows sum to one.
+    """
+
+    nodes: NDArray
+    weights: NDArray
+
+    def apply(self, values: NDArray) -> NDArray:
+        """Interpolate nodal values (n, ...) at the points, shape (p, ...)."""
+        return np.einsum("pm,pm...->p...", self.weights, values[self.nodes])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfacePoint:
+    """The closest points of a mesh's surface to some points.
+
+    Attributes:
+        points: (p, 3) [m].
+        distances: (p,) [m].
+        triangles: (p,) indices into the mesh's surface.
+    """
+
+    points: NDArray
+    distances: NDArray
+    triangles: NDArray
+
+
+def attach_points(
+    mesh: VolumeMesh, points: NDArray, max_distance: float, names: Sequence[str] | None = None
+) -> Attachment:
+    """Attach points to the elements that contain them, or to the closest point of the surface.
+
+    The local coordinates xi solve sum_i N_i(xi) X_i = x by Newton's method; the weights are N_i(xi).
+
+    Args:
+        mesh: the undeformed mesh.
+        points: (p, 3) [m], jaw frame.
+        max_distance: [m], how far outside the mesh a point may lie.
+        names: (p,), what to call the points in messages.
+
+    Returns:
+        The attachment, with as many nodes per point as an element has.
+
+    Raises:
+        MeshError: A point is not finite or farther than `max_distance` from the mesh.
+    """
+    points = _check_points(points)
+    names = names or [f"point {row}" for row in range(len(points))]
+    location = _locate(mesh, points)
+    outside = np.flatnonzero(location.excess > _INSIDE)
+    if len(outside):
+        closest = find_closest_surface(mesh, points[outside])
+        outside_names = [names[row] for row in outside]
+        _check_distances(points[outside], closest.distances, outside_names, max_distance, "mesh")
+        points = points.copy()
+        points[outside] = closest.points
+        location = _locate(mesh, points)
+    nodes = mesh.elements[location.elements]
+    count = nodes.shape[1]
+    return Attachment(nodes=nodes, weights=shape_values(count, _clamp(location.local, count)))
+
+
+def attach_surface_points(
+    mesh: VolumeMesh, points: NDArray, max_distance: float, names: Sequence[str] | None = None
+) -> Attachment:
+    """Attach points that must lie on the surface, such as contacts.
+
+    Args:
+        mesh: the undeformed mesh.
+        points: (p, 3) [m], jaw frame.
+        max_distance: [m], how far from the surface a point may lie, to either side.
+        names: (p,), what to call the points in messages.
+
+    Returns:
+        The attachment of the closest points of the surface.
+
+    Raises:
+        MeshError: A point is not finite or farther than `max_distance` from the surface.
+    """
+    points = _check_points(points)
+    names = names or [f"point {row}" for row in range(len(points))]
+    closest = find_closest_surface(mesh, points)
+    _check_distances(points, closest.distances, names, max_distance, "surface")
+    return attach_points(mesh, closest.points, max(max_distance, 1e-6))
+
+
+def find_closest_surface(mesh: VolumeMesh, points: NDArray) -> SurfacePoint:
+    """Find the closest point on the surface's triangles for each of points (p, 3) [m].
+
+    It is the projection onto the triangle's plane where that falls into the triangle, else on an edge.
+    """
+    corners = mesh.nodes[mesh.surface]
+    results = [_closest_on_triangles(point, corners) for point in points]
+    triangles = np.array([result[0] for result in results], dtype=np.int64)
+    closest = np.array([result[1] for result in results]).reshape(-1, 3)
+    return SurfacePoint(points=closest, distances=np.linalg.norm(closest - points, axis=1), triangles=triangles)
+
+
+def _closest_on_triangles(point: NDArray, corners: NDArray) -> tuple[int, NDArray]:
+    """Return the index of the triangle (t, 3, 3) closest to a point and the closest point (3,) on it."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    height = ((point - a) * normal).sum(axis=1) / (normal**2).sum(axis=1)
+    foot = point - height[:, None] * normal
+    along = np.roll(corners, -1, axis=1) - corners
+    turn = np.cross(along, foot[:, None] - corners)
+    inside = (np.einsum("tei,ti->te", turn, normal) >= 0.0).all(axis=1)
+    share = ((point - corners) * along).sum(axis=2) / (along**2).sum(axis=2)
+    on_edges = corners + np.clip(share, 0.0, 1.0)[:, :, None] * along
+    nearest = np.linalg.norm(on_edges - point, axis=2).argmin(axis=1)
+    closest = np.where(inside[:, None], foot, on_edges[np.arange(len(corners)), nearest])
+    best = int(np.linalg.norm(closest - point, axis=1).argmin())
+    return best, closest[best]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Location:
+    """Where points lie in a mesh: element (p,), local coordinates (p, 3), excess out of their domain (p,)."""
+
+    elements: NDArray
+    local: NDArray
+    excess: NDArray
+
+
+def _locate(mesh: VolumeMesh, points: NDArray) -> _Location:
+    """Find the element that contains each point, or of those close by the one it leaves least."""
+    corners = mesh.nodes[mesh.elements]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    # curved 10-node elements bulge out of the box of their nodes
+    margin = 0.1 * (high - low).max(axis=1, keepdims=True)
+    low, high = low - margin, high + margin
+    elements = np.zeros(len(points), dtype=np.int64)
+    local = np.zeros((len(points), 3))
+    excess = np.full(len(points), np.inf)
+    for row, point in enumerate(points):
+        near = np.flatnonzero(((point >= low) & (point <= high)).all(axis=1))
+        if len(near) == 0:
+            continue
+        found = _solve_local(corners[near], point)
+        beyond = _excess(found, corners.shape[1])
+        best = beyond.argmin()
+        elements[row], local[row], excess[row] = near[best], found[best], beyond[best]
+    return _Location(elements=elements, local=local, excess=excess)
+
+
+def _solve_local(corners: NDArray, point: NDArray) -> NDArray:
+    """Solve sum_i N_i(xi) X_i = x for xi in each of the elements (e, m, 3), shape (e, 3)."""
+    count = corners.shape[1]
+    local = np.full((len(corners), 3), 0.0 if count == 8 else 0.25)
+    for _ in range(_NEWTON_STEPS):
+        gap = point - np.einsum("em,emi->ei", shape_values(count, local), corners)
+        jacobians = np.einsum("emi,emj->eij", corners, shape_gradients(count, local))
+        step = np.einsum("eij,ej->ei", np.linalg.pinv(jacobians), gap)
+        # far outside, the mapping of a distorted element may fold; a point out there is only ever compared
+        local = np.clip(local + step, -3.0, 3.0)
+        if np.abs(step).max() < 1e-14:
+            break
+    return local
+
+
+def _excess(local: NDArray, node_count: int) -> NDArray:
+    """Return how far local (e, 3) lie outside the reference domain, 0 inside, shape (e,)."""
+    if node_count == 8:
+        return np.maximum(np.abs(local).max(axis=1) - 1.0, 0.0)
+    return np.maximum(np.maximum(-local.min(axis=1), local.sum(axis=1) - 1.0), 0.0)
+
+
+def _clamp(local: NDArray, node_count: int) -> NDArray:
+    """Bring local (p, 3) into the reference domain."""
+    if node_count == 8:
+        return np.clip(local, -1.0, 1.0)
+    weights = np.maximum(np.column_stack([1.0 - local.sum(axis=1), local]), 0.0)
+    return weights[:, 1:] / weights.sum(axis=1, keepdims=True)
+
+
+def _check_points(points: NDArray) -> NDArray:
+    """Refuse points of the wrong shape or not finite."""
+    points = np.asarray(points, dtype=float)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise MeshError(f"points: got shape {points.shape}, expected (p, 3)")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise MeshError(f"point {bad[0]} is not finite: {points[bad[0]].tolist()}")
+    return points
+
+
+def _check_distances(points: NDArray, distances: NDArray, names: Sequence[str], max_distance: float, part: str) -> None:
+    """Refuse points (p, 3) that are too far away, naming the farthest."""
+    if len(distances) == 0 or distances.max() <= max_distance:
+        return
+    worst = int(distances.argmax())
+    at = np.round(1e3 * points[worst], 3).tolist()
+    raise MeshError(
+        f"{names[worst]} at {at} mm is {1e3 * distances[worst]:.3g} mm away from the {part}, "
+        f"expected at most {1e3 * max_distance:.3g} mm"
+    )

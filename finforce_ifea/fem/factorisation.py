@@ -1,0 +1,78 @@
+"""Factorised stiffness matrices, banded where that is cheap and sparse elsewhere."""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg.lapack import dpbtrf, dpbtrs
+from scipy.sparse.linalg import SuperLU, splu
+
+
+class Factor(Protocol):
+    """A factorised symmetric matrix.
+
+    Attributes:
+        positive: whether the matrix is positive definite, and the state that it belongs to stable.
+    """
+
+    @property
+    def positive(self) -> bool:
+        """Whether the matrix is positive definite."""
+        ...
+
+    def solve(self, b: NDArray) -> NDArray:
+        """Returns K^-1 b for b of shape (n,) or (n, k)."""
+        ...
+
+
+class BandedFactor:
+    """Cholesky factor of a positive definite banded matrix."""
+
+    positive = True
+
+    def __init__(self, factor: NDArray) -> None:
+        self._factor = factor
+
+    def solve(self, b: NDArray) -> NDArray:
+        """Returns K^-1 b for b of shape (n,) or (n, k)."""
+        return dpbtrs(self._factor, b, lower=1)[0].reshape(b.shape)
+
+
+class SparseFactor:
+    """LU factor of any regular symmetric matrix, for wide bands and for states beyond a buckling point."""
+
+    def __init__(self, matrix: sparse.csc_matrix) -> None:
+        self._matrix = matrix
+        self._lu = _factorise_sparse(matrix, 0.1)
+
+    @property
+    def positive(self) -> bool:
+        """Whether the matrix is positive definite: elimination along the diagonal meets positive pivots alone."""
+        plain = _factorise_sparse(self._matrix, 0.0)
+        return bool((plain.perm_r == plain.perm_c).all() and (plain.U.diagonal() > 0.0).all())
+
+    def solve(self, b: NDArray) -> NDArray:
+        """Returns K^-1 b for b of shape (n,) or (n, k)."""
+        return self._lu.solve(np.asarray(b))
+
+
+def _factorise_sparse(matrix: sparse.csc_matrix, pivoting: float) -> SuperLU:
+    """Returns the LU factors; above zero, `pivoting` is the share of a column's largest entry that a pivot needs."""
+    options = {"SymmetricMode": True}
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=pivoting, options=options)
+
+
+def factorise_banded(storage: NDArray) -> BandedFactor | None:
+    """Factorises lower banded storage (width + 1, n); returns None when the matrix is not positive definite."""
+    factor, info = dpbtrf(storage, lower=1, overwrite_ab=0)
+    return BandedFactor(factor) if info == 0 else None
+
+
+def sparse_from_banded(storage: NDArray) -> sparse.csc_matrix:
+    """Returns the full symmetric matrix of lower banded storage (width + 1, n)."""
+    width, n = storage.shape[0] - 1, storage.shape[1]
+    lower = sparse.diags([storage[k, : n - k] for k in range(width + 1)], [-k for k in range(width + 1)], format="csc")
+    full = lower + sparse.tril(lower, -1).T
+    full.eliminate_zeros()
+    return full.tocsc()

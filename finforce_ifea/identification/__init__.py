@@ -1,0 +1,1 @@
+"""Material constants of a finger from recordings with true forces."""

@@ -1,0 +1,299 @@
+"""Identification of a finger from recordings with true forces: stiffness, effective thicknesses, clamp, relaxation.
+
+Shape tells the geometry, force the modulus, and the forces' course at steady shape the relaxation. All are found
+together by least squares over the steady loads; the depth of each load and of each recording the object's radius, or
+the tilt of its known outline, are found along the way.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from finforce_ifea.contact_mechanics.indenter import DEPTH, ExpectedObject, expect_object
+from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
+from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
+from finforce_ifea.fem.mechanics import Mechanics, build_mechanics, choose_full
+from finforce_ifea.identification.force_history import (
+    BRANCH_HIGH,
+    BRANCH_LOW,
+    BRANCH_PRIOR,
+    BRANCH_STDDEV,
+    branches_from_parameters,
+    fit_course,
+)
+from finforce_ifea.identification.plateaus import INSTANTS, CalibrationCase, Plateau, find_plateaus
+from finforce_ifea.jaw.calibration import Calibration
+from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
+from finforce_ifea.relaxation import invert_relaxation
+from finforce_ifea.settings import EstimatorSettings
+
+_NAMES = (
+    "young_modulus",
+    "inner_thickness_factor",
+    "outer_thickness_factor",
+    "rib_thickness_factor",
+    "clamped_z",
+    "share_1",
+    "time_constant_1",
+    "share_2",
+    "time_constant_2",
+)
+# Prior means and standard deviations: log modulus about the jaw file's, factors, clamp [mm], shares, log times [s].
+_PRIOR = np.r_[0.0, 1.0, 1.0, 1.0, 0.2, BRANCH_PRIOR]
+_PRIOR_STDDEV = np.r_[1.0, 0.1, 0.1, 0.1, 0.4, BRANCH_STDDEV]
+_LOW = np.r_[-3.0, 0.6, 0.6, 0.6, 0.0, BRANCH_LOW]
+_HIGH = np.r_[3.0, 1.5, 1.5, 1.5, 2.0, BRANCH_HIGH]
+_DIFFERENCE = np.array([1e-3, 2e-3, 2e-3, 4e-3, 2e-2, 1e-3, 1e-2, 1e-3, 1e-2])
+_GEOMETRY = slice(1, 5)
+_FORCE_ERROR, _FORCE_FLOOR = 0.015, 0.01
+_SHAPE_ERROR = 0.05e-3
+_ITERATIONS = 12
+_PER_CASE = 14
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CalibrationFit:
+    """The outcome of an identification.
+
+    Attributes:
+        calibration: the identified finger.
+        uncertainty: standard deviation of each number, in its unit.
+        radii: radius of curvature of each recording's object [m], None where its outline was known.
+        force_rms: root mean square force residual over the steady loads [N].
+        shape_rms: root mean square key point residual [m].
+        plateaus: how many steady loads were used.
+    """
+
+    calibration: Calibration
+    uncertainty: dict[str, float]
+    radii: tuple[float | None, ...]
+    force_rms: float
+    shape_rms: float
+    plateaus: int
+
+
+def fit_calibration(
+    jaw: Jaw,
+    cases: Sequence[CalibrationCase],
+    settings: EstimatorSettings | None = None,
+    progress: Callable[[float], None] = lambda cost: None,
+) -> CalibrationFit:
+    """Identifies a finger.
+
+    Args:
+        jaw: as drawn.
+        cases: recordings with true forces that start unloaded and hold loads steady.
+        settings: solver and mesh for which the calibration is made.
+        progress: called with the cost after every evaluation of the mechanics.
+
+    Raises:
+        CalibrationError: No cases, or recordings that say nothing about the finger.
+    """
+    if not cases:
+        raise CalibrationError("calibration: no recordings, expected at least one")
+    settings = settings or EstimatorSettings()
+    fit = _Fit(jaw, cases, settings, progress)
+    result = least_squares(
+        fit.residuals,
+        fit.start,
+        jac=fit.jacobian,
+        bounds=(fit.low, fit.high),
+        x_scale=fit.stddev,
+        max_nfev=_ITERATIONS,
+        ftol=1e-4,
+        xtol=1e-4,
+    )
+    covariance = np.linalg.inv(result.jac.T @ result.jac)
+    rough = fit.report(result.x, np.sqrt(np.diag(covariance)))
+    course = fit_course(jaw, cases, settings, rough.calibration, progress)
+    return replace(
+        rough,
+        calibration=replace(
+            rough.calibration,
+            young_modulus=rough.calibration.young_modulus * course.scale,
+            relaxation=course.terms,
+            force_error=float(np.clip(course.relative, 0.005, 0.5)),
+        ),
+        uncertainty={**rough.uncertainty, **dict(zip(_NAMES[5:], course.stddev.tolist(), strict=True))},
+        force_rms=course.force_rms,
+    )
+
+
+class _Fit:
+    """Residuals of all parameters: the finger's, then the shape (log radius or tilt) of each recording's object."""
+
+    def __init__(
+        self,
+        jaw: Jaw,
+        cases: Sequence[CalibrationCase],
+        settings: EstimatorSettings,
+        progress: Callable[[float], None],
+    ) -> None:
+        self.jaw, self.cases, self.settings, self.progress = jaw, cases, settings, progress
+        self.plateaus = find_plateaus(cases, jaw, settings, per_case=_PER_CASE)
+        self._starts: list[_PlateauShape | None] = [None] * len(self.plateaus)
+        self.objects = [expect_object(case.contact, settings) for case in cases]
+        bounds = [item.indenter.shape_range for item in self.objects]
+        self.mean = np.r_[_PRIOR, [item.mean[0] for item in self.objects]]
+        self.stddev = np.r_[_PRIOR_STDDEV, [np.sqrt(item.variance[0]) for item in self.objects]]
+        self.low = np.r_[_LOW, [item.low for item in bounds]]
+        self.high = np.r_[_HIGH, [item.high for item in bounds]]
+        self.difference = np.r_[_DIFFERENCE, [item.largest_change / 15 for item in bounds]]
+        self.start = self.mean.copy()
+        self.forces = [np.linalg.norm(case.forces_true, axis=1) for case in cases]
+        self._shapes: dict[bytes, tuple[NDArray, NDArray]] = {}
+
+    def calibration(self, x: NDArray) -> Calibration:
+        """Returns the parameters as a calibration."""
+        return Calibration(
+            young_modulus=float(self.jaw.material.young_modulus * np.exp(x[0])),
+            inner_thickness_factor=float(x[1]),
+            outer_thickness_factor=float(x[2]),
+            rib_thickness_factor=float(x[3]),
+            clamped_z=float(1e-3 * x[4]),
+            relaxation=branches_from_parameters(x[5:9]),
+            jaw=self.jaw.name,
+        )
+
+    def residuals(self, x: NDArray) -> NDArray:
+        """Returns shape, force and prior residuals, each over its standard deviation."""
+        shapes, forces = self._solve_shapes(x)
+        elastic = self._elastic_forces(x)
+        model = np.exp(x[0]) * forces
+        rows = [((target - value) / self._force_stddev(value)) for target, value in zip(elastic, model, strict=True)]
+        total = np.concatenate([shapes, *rows, (x - self.mean) / self.stddev])
+        self.progress(float(total @ total))
+        return total
+
+    def _force_stddev(self, force: float) -> float:
+        return np.sqrt(INSTANTS) * (_FORCE_ERROR * force + _FORCE_FLOOR)
+
+    def _elastic_forces(self, x: NDArray) -> list[NDArray]:
+        """Returns the elastic forces [N] behind the true ones at the instants of each plateau."""
+        terms = self.calibration(x).relaxation
+        elastic = [
+            invert_relaxation(force, case.stamps_true, terms)
+            for force, case in zip(self.forces, self.cases, strict=True)
+        ]
+        return [elastic[plateau.case][plateau.instants] for plateau in self.plateaus]
+
+    def _solve_shapes(self, x: NDArray) -> tuple[NDArray, NDArray]:
+        """Returns the shape residuals and the magnitudes [N] at the drawn modulus; remembers them per geometry."""
+        key = np.r_[x[_GEOMETRY], x[len(_NAMES) :]].tobytes()
+        if key not in self._shapes:
+            mechanics = self._build_finger(x)
+            rest = mechanics.model.attach(self.jaw.keypoints, KEYPOINT_DISTANCE)
+            solver = _PlateauSolver(mechanics, rest)
+            solved = []
+            for plateau, start in zip(self.plateaus, self._starts, strict=True):
+                shape = float(x[len(_NAMES) + plateau.case])
+                solved.append(solver.solve(plateau, self.objects[plateau.case], shape, start))
+            self._starts = solved
+            residuals = np.concatenate([shape.residual for shape in solved])
+            self._shapes = {key: (residuals, np.array([shape.force for shape in solved]))}
+        return self._shapes[key]
+
+    def _build_finger(self, x: NDArray) -> Mechanics:
+        """Returns the mechanics of the finger with parameters x, at the drawn modulus.
+
+        Raises:
+            CalibrationError: No finger can look like that; the recordings are of another one.
+        """
+        calibration = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus)
+        try:
+            return build_mechanics(calibration.apply(self.jaw), choose_full(self.settings))
+        except (JawFileError, MeshError) as error:
+            raise CalibrationError(
+                f"calibration: no shape of the jaw {self.jaw.name!r} comes near the key points ({error}); "
+                "is it the right jaw file?"
+            ) from error
+
+    def jacobian(self, x: NDArray) -> NDArray:
+        """Returns forward differences, each in the direction that stays within the bounds."""
+        centre = self.residuals(x)
+        columns = []
+        for i, step in enumerate(self.difference):
+            step = -step if x[i] + step > self.high[i] else step
+            moved = x.copy()
+            moved[i] += step
+            columns.append((self.residuals(moved) - centre) / step)
+        return np.stack(columns, axis=1)
+
+    def report(self, x: NDArray, stddev: NDArray) -> CalibrationFit:
+        """Returns the fit with its residuals in units."""
+        shapes, forces = self._solve_shapes(x)
+        elastic, model = self._elastic_forces(x), np.exp(x[0]) * forces
+        errors = np.concatenate([target - value for target, value in zip(elastic, model, strict=True)])
+        relative = np.concatenate([target / value - 1.0 for target, value in zip(elastic, model, strict=True)])
+        calibration = replace(
+            self.calibration(x), force_error=float(np.clip(np.sqrt(np.mean(relative**2)), 0.005, 0.5))
+        )
+        scale = np.ones(len(_NAMES))
+        scale[[0, 4, 6, 8]] = calibration.young_modulus, 1e-3, np.exp(x[6]), np.exp(x[8])
+        return CalibrationFit(
+            calibration=calibration,
+            uncertainty=dict(zip(_NAMES, (scale * stddev[: len(_NAMES)]).tolist(), strict=True)),
+            radii=tuple(
+                float(np.exp(shape)) if case.contact.outline is None else None
+                for case, shape in zip(self.cases, x[len(_NAMES) :], strict=True)
+            ),
+            force_rms=float(np.sqrt(np.mean(errors**2))),
+            shape_rms=float(_SHAPE_ERROR * np.sqrt(np.mean(shapes**2))),
+            plateaus=len(self.plateaus),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _PlateauShape:
+    """A solved steady load: unknowns, depth [m], weighted shape residuals, force [N]."""
+
+    q: NDArray
+    depth: float
+    residual: NDArray
+    force: float
+
+
+class _PlateauSolver:
+    """Finds the depth at which the jaw's shape comes closest to the key points of a steady load."""
+
+    def __init__(self, mechanics: Mechanics, probe: Any) -> None:
+        self._contact, self._model, self._probe = mechanics.contact, mechanics.model, probe
+        self._rest = self._model.positions(probe, np.zeros(self._model.size))
+
+    def solve(self, plateau: Plateau, item: ExpectedObject, shape: float, start: _PlateauShape | None) -> _PlateauShape:
+        """Returns the closest shape, found by Gauss-Newton from `start` or from the unloaded jaw.
+
+        Raises:
+            CalibrationError: No shape of the jaw comes close.
+        """
+        self._contact.indenter = item.indenter
+        place = np.array([0.0, shape, item.mean[1]])
+        touch = item.indenter.find_touch(place, *self._contact.surface.heights[[0, -1]])
+        q = np.zeros(self._model.size) if start is None else start.q
+        place[DEPTH] = touch + 0.5e-3 if start is None else start.depth
+        seen = np.isfinite(plateau.keypoints[:, 0])
+        stddev = np.sqrt(plateau.variance[seen, None] + _SHAPE_ERROR**2)
+        for _ in range(60):
+            state = self._contact.linearize(q, place)
+            if not state.touches:
+                q = q + self._contact.approach(q, state.correction, place)
+                continue
+            q = q + limit_step(self._model, state.correction)
+            moved = self._model.positions(self._probe, q) - self._rest
+            mode = self._model.project(self._probe, q, state.modes)[seen][:, [0, 2], DEPTH] / stddev
+            residual = (plateau.keypoints[seen] - moved[seen][:, [0, 2]]) / stddev
+            change = float(np.clip((mode * residual).sum() / (mode**2).sum(), -0.5e-3, 0.5e-3))
+            change = max(change, touch + 3e-5 - place[DEPTH])
+            place[DEPTH] += change
+            q = q + limit_step(self._model, state.modes[:, DEPTH] * change)
+            if abs(change) < 1e-6 and np.abs(state.correction).max() < 1e-6:
+                force = state.force + state.force_modes[:, DEPTH] * change
+                left = (residual - mode * change).ravel()
+                return _PlateauShape(q=q, depth=float(place[DEPTH]), residual=left, force=float(np.linalg.norm(force)))
+        if start is not None:
+            return self.solve(plateau, item, shape, None)
+        raise CalibrationError("calibration: no shape of the jaw comes near the key points; is it the right jaw file?")

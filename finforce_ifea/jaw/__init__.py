@@ -1,0 +1,1 @@
+"""The jaw: its file, drawing, mesh, material and calibration."""

@@ -1,0 +1,237 @@
+"""One jaw: its shape, material, key points and contact candidates."""
+
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.errors import JawFileError, MeshError
+from finforce_ifea.fem.attachment import attach_points, attach_surface_points
+from finforce_ifea.jaw.drawing import Drawing
+from finforce_ifea.jaw.jaw_file import (
+    Material,
+    MeshFile,
+    Table,
+    parse_candidates,
+    parse_drawing,
+    parse_keypoints,
+    parse_material,
+    parse_mesh_file,
+    read_table,
+)
+from finforce_ifea.jaw.mesh import VolumeMesh
+from finforce_ifea.jaw.mesh_file import read_volume_mesh
+from finforce_ifea.jaw.meshing import MeshDensity, mesh_drawing
+
+__all__ = ["Jaw", "Material", "list_shipped_jaws", "load_jaw"]
+
+# How far a key point may lie outside the jaw, and a candidate off its surface [m].
+KEYPOINT_DISTANCE = 3e-3
+_CANDIDATE_DISTANCE = 1e-4
+_KEYS = (
+    "name",
+    "model",
+    "drawing",
+    "mesh",
+    "inner_face_x",
+    "material",
+    "keypoints",
+    "reference_point",
+    "candidates",
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Jaw:
+    """One jaw, undeformed, in its jaw frame.
+
+    Attributes:
+        name: of the finger.
+        path: the file it was read from.
+        side: "left" as in the file, or "right", its mirror image.
+        drawing: the parametric finger, or None.
+        mesh_file: the volume mesh file and how to read it, or None.
+        material: what it is made of.
+        keypoint_names: (K,), in the order of the key point messages.
+        keypoints: (K, 3) [m].
+        reference_point: (3,) [m], the point by which the jaw is found in an image.
+        candidates: (C, 3) [m], possible contact places on the inner surface.
+        inner_face_x: [m], the plane of the inner surface.
+        model: what the file recommends: "solid" or "frame".
+    """
+
+    name: str
+    path: Path
+    side: Literal["left", "right"] = "left"
+    drawing: Drawing | None
+    mesh_file: MeshFile | None
+    material: Material
+    keypoint_names: tuple[str, ...]
+    keypoints: NDArray
+    reference_point: NDArray
+    candidates: NDArray
+    inner_face_x: float
+    model: Literal["solid", "frame"]
+
+    def build_mesh(self, density: MeshDensity | str | None = None) -> VolumeMesh:
+        """Build the volume mesh.
+
+        Args:
+            density: the number of elements of a drawing, or a preset's name ("coarse", "default", "fine").
+                A mesh file has its own density: leave it out, or "default".
+
+        Returns:
+            The checked mesh, mirrored for a right jaw.
+
+        Raises:
+            MeshError: The density is unknown, or the mesh file is bad.
+        """
+        if self.drawing is not None:
+            mesh = mesh_drawing(self.drawing, density or "default")
+        elif density in (None, "default"):
+            file = self.mesh_file
+            mesh = read_volume_mesh(file.path, scale=file.scale, clamp=file.clamp)
+        else:
+            raise MeshError(f"mesh density {density!r}: {self.mesh_file.path.name} has its own; use 'default'")
+        return mesh if self.side == "left" else mesh.mirrored()
+
+    def mirrored(self) -> "Jaw":
+        """Return the other side's jaw, the mirror image y -> -y."""
+        mirror = np.array([1.0, -1.0, 1.0])
+        return replace(
+            self,
+            side="right" if self.side == "left" else "left",
+            keypoints=self.keypoints * mirror,
+            reference_point=self.reference_point * mirror,
+            candidates=self.candidates * mirror,
+        )
+
+
+def list_shipped_jaws() -> tuple[str, ...]:
+    """Return the names of the jaws that come with the package."""
+    files = resources.files("finforce_ifea.jaw").joinpath("jaws").iterdir()
+    return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
+
+
+def load_jaw(name_or_path: str | Path, side: Literal["left", "right"] = "left") -> Jaw:
+    """Load a jaw from its YAML file, see docs/jaw_file.md.
+
+    Args:
+        name_or_path: a shipped name ("bench", "steel") or the path of a file.
+        side: a file describes the left jaw; "right" gives its mirror image.
+
+    Returns:
+        The checked jaw.
+
+    Raises:
+        JawFileError: The file is missing or says something that cannot be a jaw.
+        MeshError: The mesh file that it names is bad.
+        MissingDependencyError: It names a mesh file, and meshio is not installed.
+    """
+    if side not in ("left", "right"):
+        raise JawFileError(f"side: got {side!r}, expected 'left' or 'right'")
+    path = _find_file(name_or_path)
+    try:
+        jaw = _parse_jaw(read_table(path), path)
+    except (JawFileError, MeshError) as error:
+        raise type(error)(f"{path.name}: {error}") from error
+    return jaw if side == "left" else jaw.mirrored()
+
+
+def _find_file(name_or_path: str | Path) -> Path:
+    """Return the path of a shipped jaw's file, or the path as given."""
+    shipped = list_shipped_jaws()
+    if str(name_or_path) in shipped:
+        return Path(str(resources.files("finforce_ifea.jaw").joinpath("jaws", f"{name_or_path}.yaml")))
+    path = Path(name_or_path)
+    if not path.is_file():
+        raise JawFileError(
+            f"there is no jaw file {str(name_or_path)!r}; expected the path of a YAML file or one of "
+            f"{', '.join(shipped)}"
+        )
+    return path
+
+
+def _parse_jaw(table: Table, path: Path) -> Jaw:
+    """Build the jaw from the content of its file."""
+    table.expect_keys((), _KEYS)
+    source = table.expect_one_of("drawing", "mesh")
+    face = ("inner_face_x",) if source == "mesh" else ()
+    table.expect_keys((source, *face, "material", "keypoints", "candidates"), ("name", "model", "reference_point"))
+    drawing = parse_drawing(table.table("drawing")) if source == "drawing" else None
+    inner_face_x = drawing.inner_face_x if drawing is not None else table.length("inner_face_x")
+    keypoints = parse_keypoints(table.table("keypoints"), drawing)
+    jaw = Jaw(
+        name=table.text("name", path.stem),
+        path=path,
+        drawing=drawing,
+        mesh_file=parse_mesh_file(table.table("mesh"), path.parent) if source == "mesh" else None,
+        material=parse_material(table.table("material")),
+        keypoint_names=tuple(keypoints),
+        keypoints=np.array(list(keypoints.values())),
+        reference_point=table.point("reference_point", (0.0, 0.0, 0.0)),
+        candidates=parse_candidates(table, inner_face_x),
+        inner_face_x=inner_face_x,
+        model=_parse_model(table, drawing),
+    )
+    _check_candidates(jaw)
+    _check_points(jaw)
+    return jaw
+
+
+def _parse_model(table: Table, drawing: Drawing | None) -> Literal["solid", "frame"]:
+    """Return the recommended model, and refuse one that cannot describe the jaw."""
+    is_solid = drawing is None or drawing.is_solid
+    model = table.choice("model", ("solid", "frame"), "solid" if is_solid else "frame")
+    if model == "frame" and drawing is None:
+        raise JawFileError("model: got frame, which needs a drawing; expected solid for a mesh file")
+    if model == "solid" and not is_solid:
+        raise JawFileError("model: got solid, expected frame: this drawing has hinges, rigid bars or a rigid tip")
+    return model
+
+
+def _check_candidates(jaw: Jaw) -> None:
+    """Refuse candidates off the plane of the inner face."""
+    for number, point in enumerate(jaw.candidates):
+        if abs(point[0] - jaw.inner_face_x) > _CANDIDATE_DISTANCE:
+            raise JawFileError(
+                f"candidates[{number}] at {_millimetres(point)} lies off the inner surface; "
+                f"expected x = {jaw.inner_face_x:g} m"
+            )
+        if jaw.drawing is not None:
+            half, length = 0.5 * jaw.drawing.width, jaw.drawing.length
+            if abs(point[1]) > half or not 0.0 <= point[2] <= length:
+                raise JawFileError(
+                    f"candidates[{number}] at {_millimetres(point)} lies off the inner surface; "
+                    f"expected y from {-half:g} to {half:g} m and z from 0 to {length:g} m"
+                )
+
+
+def _check_points(jaw: Jaw) -> None:
+    """Refuse key points off the jaw and, of a mesh, candidates off its surface."""
+    if jaw.drawing is not None:
+        distances = jaw.drawing.distance_to(jaw.keypoints)
+        worst = int(distances.argmax())
+        if distances[worst] > KEYPOINT_DISTANCE:
+            raise JawFileError(
+                f"keypoints.{jaw.keypoint_names[worst]} at {_millimetres(jaw.keypoints[worst])} lies "
+                f"{1e3 * distances[worst]:.3g} mm off the jaw, "
+                f"expected at most {1e3 * KEYPOINT_DISTANCE:g} mm"
+            )
+        return
+    mesh = jaw.build_mesh()
+    names = [f"keypoints.{name}" for name in jaw.keypoint_names]
+    candidate_names = [f"candidates[{number}]" for number in range(len(jaw.candidates))]
+    try:
+        attach_points(mesh, jaw.keypoints, KEYPOINT_DISTANCE, names)
+        attach_surface_points(mesh, jaw.candidates, _CANDIDATE_DISTANCE, candidate_names)
+    except MeshError as error:
+        raise JawFileError(str(error)) from error
+
+
+def _millimetres(point: NDArray) -> str:
+    """Return a point [m] as text in millimetres."""
+    return "(" + ", ".join(f"{1e3 * value:.3f}" for value in point) + ") mm"

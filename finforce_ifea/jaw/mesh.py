@@ -1,0 +1,340 @@
+"""A volume mesh with its checks and its surface.
+
+Whether a volume mesh is one piece that its clamp holds.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from finforce_ifea.errors import MeshError
+from finforce_ifea.fem.elements import EDGES_TET10, shape_gradients
+
+FACES_HEX = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+FACES_TET = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+# Where the Jacobian of each kind of element is checked: corners, middles of edges and faces, centre.
+_PLACES_HEX = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+_CORNERS_TET = np.vstack([np.zeros(3), np.eye(3)])
+_PLACES_TET = np.concatenate([[*_CORNERS_TET], _CORNERS_TET[EDGES_TET10].mean(axis=1), [[0.25] * 3]])
+_MIRROR_HEX = [4, 5, 6, 7, 0, 1, 2, 3]
+_MIRROR_TET10 = [0, 2, 1, 3, 6, 5, 4, 7, 9, 8]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VolumeMesh:
+    """A volume mesh of one kind of element; build it with `build_volume_mesh`, which checks it.
+
+    Attributes:
+        nodes: (n, 3) [m], jaw frame.
+        hexes: (m, 8) node indices in the VTK order with positive Jacobians, or None.
+        tets: (m, 4) or (m, 10) node indices in the VTK order with positive Jacobians, or None.
+        clamped: (c,) indices of the nodes that do not move, rising.
+        surface: (t, 3) node indices of the boundary's triangles, outward normals; corner nodes only.
+    """
+
+    nodes: NDArray
+    hexes: NDArray | None
+    tets: NDArray | None
+    clamped: NDArray
+    surface: NDArray
+
+    @property
+    def elements(self) -> NDArray:
+        """The node indices of the elements, shape (m, 4 | 8 | 10)."""
+        return self.hexes if self.hexes is not None else self.tets
+
+    def mirrored(self) -> "VolumeMesh":
+        """Return the mirror image y -> -y, with the same node numbers and positive Jacobians."""
+        hexes = None if self.hexes is None else self.hexes[:, _MIRROR_HEX]
+        tets = None if self.tets is None else self.tets[:, _MIRROR_TET10[: self.tets.shape[1]]]
+        return VolumeMesh(
+            nodes=self.nodes * [1.0, -1.0, 1.0],
+            hexes=hexes,
+            tets=tets,
+            clamped=self.clamped,
+            surface=self.surface[:, [0, 2, 1]],
+        )
+
+
+def build_volume_mesh(
+    *, nodes: NDArray, hexes: NDArray | None = None, tets: NDArray | None = None, clamped: Iterable[int]
+) -> VolumeMesh:
+    """Check a mesh and add its surface.
+
+    Args:
+        nodes: (n, 3) [m], jaw frame.
+        hexes: (m, 8) node indices in the VTK order; or
+        tets: (m, 4) or (m, 10) node indices in the VTK order.
+        clamped: indices of the clamped nodes.
+
+    Returns:
+        The mesh.
+
+    Raises:
+        MeshError: No elements or two kinds of them, wrong shapes, indices out of range or not whole, NaN, millimetres
+            for metres, duplicate or unused nodes, inverted or repeated elements, no clamped nodes.
+    """
+    if (hexes is None) == (tets is None):
+        raise MeshError("expected either hexahedra or tetrahedra, got both or neither")
+    nodes = np.ascontiguousarray(nodes, dtype=float)
+    elements = _to_indices(tets if hexes is None else hexes, "elements")
+    clamped = np.unique(_to_indices(list(clamped), "clamped nodes"))
+    _check_nodes(nodes)
+    _check_elements(elements, len(nodes), (4, 10) if hexes is None else (8,))
+    _check_numbering(nodes, elements)
+    check_jacobians(nodes, elements)
+    _check_clamped(clamped, len(nodes))
+    check_overlaps(elements, elements[:, _faces_of(elements)])
+    return VolumeMesh(
+        nodes=nodes,
+        hexes=None if hexes is None else elements,
+        tets=None if tets is None else elements,
+        clamped=clamped,
+        surface=surface_triangles(elements),
+    )
+
+
+def check_connection(mesh: VolumeMesh) -> None:
+    """Refuse a mesh that is not one piece, or of which a part can turn freely.
+
+    Raises:
+        MeshError: Parts share no node, or hang together by nodes on one line; or the clamped nodes lie on one.
+    """
+    elements = mesh.elements
+    check_pieces(mesh.nodes, elements, elements[:, _faces_of(elements)], mesh.clamped)
+
+
+def surface_triangles(elements: NDArray) -> NDArray:
+    """Return the boundary triangles (t, 3) of elements (m, 4 | 8 | 10), outward normals.
+
+    A face that belongs to one element only is boundary. Quadrilaterals are split along the diagonal from
+    their smallest node index; of 10-node tetrahedra the corners are used.
+    """
+    table = _faces_of(elements)
+    faces = elements[:, table].reshape(-1, table.shape[1])
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return split_faces(faces[np.sort(first[count == 1])])
+
+
+def _faces_of(elements: NDArray) -> NDArray:
+    """Return which corners of elements (m, 4 | 8 | 10) make their faces."""
+    return FACES_HEX if elements.shape[1] == 8 else FACES_TET
+
+
+def split_faces(faces: NDArray) -> NDArray:
+    """Split faces (f, 3 | 4) into triangles along the diagonal from their smallest node index."""
+    if faces.shape[1] == 3:
+        return faces
+    turn = (faces.argmin(axis=1)[:, None] + np.arange(4)) % 4
+    turned = np.take_along_axis(faces, turn, axis=1)
+    return turned[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+
+
+def compute_volume(mesh: VolumeMesh) -> float:
+    """Compute the volume [m^3] that the surface encloses: the sum of a . (b x c) / 6 over its triangles."""
+    a, b, c = np.moveaxis(mesh.nodes[mesh.surface] - mesh.nodes.mean(axis=0), 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def check_jacobians(nodes: NDArray, elements: NDArray) -> None:
+    """Refuse elements whose Jacobian is not positive at every corner, in the middle of edges and faces, and inside.
+
+    Raises:
+        MeshError: Elements are inverted; the message says how many and names the first.
+    """
+    local = _PLACES_HEX if elements.shape[1] == 8 else _PLACES_TET
+    gradients = shape_gradients(elements.shape[1], local)
+    jacobians = np.einsum("mni,pnj->mpij", nodes[elements], gradients)
+    smallest = np.linalg.det(jacobians).min(axis=1)
+    scale = np.abs(np.ptp(nodes[elements], axis=1)).max(axis=1) ** 3
+    inverted = np.flatnonzero(~(smallest > 1e-12 * scale))
+    if len(inverted):
+        centre = np.round(1e3 * nodes[elements[inverted[0]]].mean(axis=0), 2).tolist()
+        raise MeshError(
+            f"{len(inverted)} of {len(elements)} elements are inverted or flat (first: element {inverted[0]} "
+            f"at {centre} mm, Jacobian {smallest[inverted[0]]:.3g}); "
+            "expected positive Jacobians with the nodes in the VTK order: repair or reorder these elements"
+        )
+
+
+def _to_indices(numbers: ArrayLike, name: str) -> NDArray:
+    """Return node indices as integers after having refused what would be rounded or is a mask."""
+    given = np.asarray(numbers)
+    if given.dtype == bool or not np.issubdtype(given.dtype, np.number) and given.size:
+        raise MeshError(f"{name}: got {given.dtype}, expected node indices")
+    if given.size and not (np.isfinite(given).all() and (given == np.rint(given)).all()):
+        raise MeshError(f"{name}: got numbers that are not whole, expected node indices")
+    return np.ascontiguousarray(given, dtype=np.int64)
+
+
+def _check_nodes(nodes: NDArray) -> None:
+    """Refuse coordinates of the wrong shape, not finite, or in millimetres."""
+    if nodes.ndim != 2 or nodes.shape[1] != 3 or len(nodes) == 0:
+        raise MeshError(f"nodes: got shape {nodes.shape}, expected (n, 3)")
+    bad = np.flatnonzero(~np.isfinite(nodes).all(axis=1))
+    if len(bad):
+        raise MeshError(f"{len(bad)} of {len(nodes)} nodes are NaN or infinite (first: node {bad[0]})")
+    extent = np.ptp(nodes, axis=0).max()
+    if extent > 1.0:
+        raise MeshError(
+            f"the mesh is {extent:.4g} m long, expected at most 1 m: it looks like millimetres; give scale: 0.001"
+        )
+    if extent < 1e-3:
+        raise MeshError(f"the mesh is {extent:.4g} m long, expected at least 1 mm: check its scale")
+
+
+def _check_elements(elements: NDArray, node_count: int, corners: tuple[int, ...]) -> None:
+    """Refuse element tables of the wrong shape or with indices out of range."""
+    if elements.ndim != 2 or elements.shape[1] not in corners or len(elements) == 0:
+        expected = " or ".join(f"(m, {n})" for n in corners)
+        raise MeshError(f"elements: got shape {elements.shape}, expected {expected}, at least one")
+    bad = np.flatnonzero(((elements < 0) | (elements >= node_count)).any(axis=1))
+    if len(bad):
+        raise MeshError(
+            f"{len(bad)} elements name nodes out of 0..{node_count - 1} (first: element {bad[0]}: "
+            f"{elements[bad[0]].tolist()})"
+        )
+
+
+def _check_numbering(nodes: NDArray, elements: NDArray) -> None:
+    """Refuse nodes that lie on each other and nodes that no element uses."""
+    tolerance = 1e-7 * np.ptp(nodes, axis=0).max()
+    pairs = cKDTree(nodes).query_pairs(tolerance, output_type="ndarray")
+    if len(pairs):
+        first, second = pairs[np.lexsort(pairs.T[::-1])[0]]
+        at = np.round(1e3 * nodes[first], 3).tolist()
+        raise MeshError(
+            f"{len(pairs)} pairs of duplicate nodes (first: {first} and {second} at {at} mm): "
+            "parts would come apart there; merge the nodes"
+        )
+    unused = np.setdiff1d(np.arange(len(nodes)), elements)
+    if len(unused):
+        raise MeshError(
+            f"{len(unused)} of {len(nodes)} nodes belong to no element (first: node {unused[0]}); remove them"
+        )
+
+
+def _check_clamped(clamped: NDArray, node_count: int) -> None:
+    """Refuse a mesh that nothing holds."""
+    if len(clamped) == 0:
+        raise MeshError("no clamped nodes: nothing holds the mesh; check `clamped` and the scale")
+    if clamped[0] < 0 or clamped[-1] >= node_count:
+        raise MeshError(f"clamped nodes {clamped[0]}..{clamped[-1]}: expected 0..{node_count - 1}")
+    if len(clamped) < 3:
+        raise MeshError(f"{len(clamped)} clamped nodes: expected at least three, else the mesh can turn")
+    if len(clamped) == node_count:
+        raise MeshError("all nodes are clamped: nothing can move; check `clamped` and the scale")
+
+
+# Points count as lying on one line when they leave it by less than this share of the mesh.
+_ON_LINE = 1e-6
+
+
+def check_overlaps(elements: NDArray, faces: NDArray) -> None:
+    """Refuses elements that lie on each other.
+
+    Args:
+        elements: (m, 4 | 8 | 10) node indices.
+        faces: (m, f, 3 | 4) node indices of the corners of each element's faces.
+
+    Raises:
+        MeshError: Elements occur twice, or a face belongs to more than two; the message names the first of them.
+    """
+    _check_repeats(elements[:, : 8 if elements.shape[1] == 8 else 4])
+    face = _number_faces(faces)
+    crowded = np.flatnonzero(np.bincount(face.ravel()) > 2)
+    if len(crowded):
+        sharing = np.flatnonzero((face == crowded[0]).any(axis=1)).tolist()
+        raise MeshError(
+            f"{len(crowded)} faces belong to more than two elements (first: elements {sharing}): the elements overlap; "
+            "remove all but two"
+        )
+
+
+def check_pieces(nodes: NDArray, elements: NDArray, faces: NDArray, clamped: NDArray) -> None:
+    """Refuses a mesh that is not one piece, or of which a part can turn freely.
+
+    Args:
+        nodes: (n, 3) [m].
+        elements: (m, 4 | 8 | 10) node indices.
+        faces: (m, f, 3 | 4) node indices of the corners of each element's faces.
+        clamped: (c,) node indices.
+
+    Raises:
+        MeshError: Elements hang together with the rest by nodes on one line or by none, or the clamped nodes lie on
+            one line; the message names the first of them.
+    """
+    _check_one_piece(nodes, elements)
+    if _on_one_line(nodes[clamped], nodes):
+        raise MeshError(f"the {len(clamped)} clamped nodes lie on one line: the mesh can turn about it")
+    _check_hinges(nodes, elements, _number_faces(faces), clamped)
+
+
+def _number_faces(faces: NDArray) -> NDArray:
+    """Returns a number (m, f) for each face, the same for the same corners."""
+    rows = np.sort(faces, axis=2).reshape(-1, faces.shape[2])
+    return np.unique(rows, axis=0, return_inverse=True)[1].reshape(faces.shape[:2])
+
+
+def _check_repeats(elements: NDArray) -> None:
+    rows = np.sort(elements, axis=1)
+    _, first, number = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    original = first[number.ravel()]
+    repeats = np.flatnonzero(original != np.arange(len(rows)))
+    if len(repeats):
+        raise MeshError(
+            f"{len(repeats)} elements occur twice (first: element {repeats[0]} is element {original[repeats[0]]}): "
+            "they would count as twice as stiff; remove them"
+        )
+
+
+def _check_one_piece(nodes: NDArray, elements: NDArray) -> None:
+    number, piece = _number_pieces(np.repeat(np.arange(len(elements)), elements.shape[1]), elements.ravel(), elements)
+    if number > 1:
+        small = int(np.bincount(piece).argmin())
+        lone = np.flatnonzero(piece == small)
+        centre = np.round(1e3 * nodes[elements[lone[0]]].mean(axis=0), 2).tolist()
+        raise MeshError(
+            f"the mesh falls into {number} pieces that share no node (the smallest has {len(lone)} elements, first: "
+            f"element {lone[0]} at {centre} mm), expected one; merge the nodes where they touch, or remove it"
+        )
+
+
+def _check_hinges(nodes: NDArray, elements: NDArray, face: NDArray, clamped: NDArray) -> None:
+    """Refuses parts, elements joined by faces, that hang together with the rest by nodes on one line."""
+    number, part = _number_pieces(np.repeat(np.arange(len(face)), face.shape[1]), face.ravel(), elements)
+    if number == 1:
+        return
+    held = set(clamped.tolist())
+    for index in range(number):
+        inside = part == index
+        own = np.unique(elements[inside])
+        shared = np.intersect1d(own, elements[~inside])
+        support = np.union1d(shared, [node for node in own.tolist() if node in held]).astype(int)
+        if _on_one_line(nodes[support], nodes):
+            first = int(np.flatnonzero(inside)[0])
+            centre = np.round(1e3 * nodes[elements[first]].mean(axis=0), 2).tolist()
+            raise MeshError(
+                f"a part of {int(inside.sum())} elements (first: element {first} at {centre} mm) is held by nodes on "
+                f"one line ({support[:4].tolist()}): it can turn about it; join it by faces"
+            )
+
+
+def _number_pieces(rows: NDArray, columns: NDArray, elements: NDArray) -> tuple[int, NDArray]:
+    """Returns how many pieces the elements make that are joined by common columns, and each one's piece (m,)."""
+    count = int(columns.max()) + 1
+    incidence = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), (len(elements), count)).tocsr()
+    return connected_components(incidence @ incidence.T, directed=False)
+
+
+def _on_one_line(points: NDArray, nodes: NDArray) -> bool:
+    """Whether points (p, 3) lie on one line, as fewer than three do."""
+    if len(points) < 3:
+        return True
+    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(sizes[1] < _ON_LINE * np.ptp(nodes, axis=0).max())

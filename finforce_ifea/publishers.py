@@ -1,0 +1,127 @@
+"""The topics that a solver writes: what stands in each of them, and when it is sent.
+
+The jaw as it is seen in RViz and Foxglove: surface, key points, contact and force.
+"""
+
+from __future__ import annotations
+
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from finforce.ros import node as ros
+from finforce.ros.messages import points_marker
+from finforce.skipping import Skips
+from finforce_ifea.grasp_force import Grasp
+from finforce_ifea.parameters import NodeParameters
+
+if TYPE_CHECKING:
+    from finforce_ifea.estimator import JawEstimator
+    from finforce_ifea.observation import Observation, Solution
+
+
+class SolverOutputs:
+    """The publishers of a solver node.
+
+    Args:
+        qos: makes publishers and watches them.
+        parameters: which jaw, and whether the forces on the gripper are completed here.
+        skips: whether what nobody subscribes to is left out.
+    """
+
+    def __init__(self, qos: ros.QosWatch, parameters: NodeParameters, skips: Skips) -> None:
+        side = parameters.jaw_name
+        self._parameters, self._skips = parameters, skips
+        self.wrench = qos.publisher(ros.WrenchStamped, f"{side}/wrench", ros.RESULT)
+        self.stddev = qos.publisher(ros.WrenchStamped, f"{side}/wrench_stddev", ros.RESULT)
+        self.surface = qos.publisher(ros.PointCloud2, f"{side}/surface", ros.RESULT)
+        self.markers = qos.publisher(ros.MarkerArray, f"{side}/markers", ros.RESULT)
+        if parameters.peer or parameters.completes_grasp:
+            self.grasp = qos.publisher(ros.WrenchStamped, "grasp_wrench", ros.RESULT)
+            self.manipulation = qos.publisher(ros.WrenchStamped, "manipulation_wrench", ros.RESULT)
+        self._markers_sent = -float("inf")
+
+    def send_wrench(self, header: Any, solution: Solution) -> None:
+        """Send what the object does to the jaw.
+
+        Raises:
+            ObservationError: a component is not finite.
+        """
+        self.wrench.publish(ros.wrench_message(header, solution.force, solution.torque))
+
+    def send_stddev(self, header: Any, solution: Solution) -> None:
+        """Send one standard deviation of the wrench.
+
+        Raises:
+            ObservationError: a component is not finite.
+        """
+        if ros.is_wanted(self.stddev, self._skips):
+            self.stddev.publish(ros.wrench_message(header, solution.force_stddev, solution.torque_stddev))
+
+    def send_grasp(self, header: Any, grasp: Grasp | None) -> None:
+        """Send what the object does to the gripper, once it is known."""
+        if grasp is None:
+            return
+        header = ros.Header(stamp=header.stamp, frame_id=self._parameters.gripper_frame)
+        if ros.is_wanted(self.grasp, self._skips):
+            self.grasp.publish(ros.wrench_message(header, grasp.grasp))
+        if ros.is_wanted(self.manipulation, self._skips):
+            self.manipulation.publish(ros.wrench_message(header, grasp.manipulation))
+
+    def send_shape(self, header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> None:
+        """Send the deformed surface, and markers at their own rate; markers only to listeners, whatever the rules."""
+        if self._parameters.publish_surface and ros.is_wanted(self.surface, self._skips):
+            self.surface.publish(ros.cloud_message(header, ros.xyz_columns(estimator.surface())))
+        due = monotonic() - self._markers_sent >= 1.0 / self._parameters.marker_rate
+        if due and self.markers.get_subscription_count():
+            self._markers_sent = monotonic()
+            markers = build_markers(header, observation, solution, estimator)
+            self.markers.publish(ros.MarkerArray(markers=markers))
+
+
+if TYPE_CHECKING:
+    from finforce_ifea.estimator import JawEstimator
+    from finforce_ifea.observation import Observation, Solution
+
+SURFACE = (0.45, 0.55, 0.65, 0.6)
+USED = (0.1, 0.8, 0.2, 1.0)
+UNUSED = (0.9, 0.2, 0.1, 1.0)
+CONTACT = (1.0, 0.8, 0.0, 1.0)
+FORCE = (0.9, 0.1, 0.6, 1.0)
+NEWTONS_PER_METRE = 200.0  # 5 N are drawn 25 mm long, a third of a bench finger
+KEYPOINT_DIAMETER = 0.003
+CONTACT_DIAMETER = 0.005
+ARROW = (0.002, 0.004, 0.005)  # shaft, head, head length
+
+
+def build_markers(header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> list[Any]:
+    """Return the markers of one image, in the jaw frame: contact and force only where they are trusted."""
+    triangles = np.asarray(estimator.surface())[np.asarray(estimator.surface_triangles)].reshape(-1, 3)
+    seen = np.isfinite(observation.points).all(axis=1)
+    colors = [USED if used else UNUSED for used in np.asarray(solution.keypoints_used)[seen]]
+    touched = solution.trusted and np.any(solution.force)
+    place = np.asarray(solution.contact_point)
+    # the arrow ends on the surface that the object presses on
+    arrow = np.stack([place - np.asarray(solution.force) / NEWTONS_PER_METRE, place]) if touched else ()
+    return [
+        points_marker(header, "surface", "triangles", triangles, color=SURFACE, scale=(1.0, 1.0, 1.0)),
+        points_marker(
+            header,
+            "keypoints",
+            "spheres",
+            observation.points[seen],
+            color=USED,
+            colors=colors,
+            scale=(KEYPOINT_DIAMETER,) * 3,
+        ),
+        points_marker(
+            header,
+            "contact",
+            "spheres",
+            place if touched else (),
+            color=CONTACT,
+            scale=(CONTACT_DIAMETER,) * 3,
+        ),
+        points_marker(header, "force", "arrow", arrow, color=FORCE, scale=ARROW),
+    ]

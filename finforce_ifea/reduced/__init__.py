@@ -1,0 +1,1 @@
+"""Stored equilibria of a jaw: built once, evaluated in microseconds."""

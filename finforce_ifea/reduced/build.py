@@ -1,0 +1,333 @@
+"""What loads on the rows of a jaw's inner face do to it at an equilibrium.
+
+Builds the manifold of a jaw's equilibria: a rod is pressed in at every height.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import eigh
+from scipy.sparse.linalg import splu
+
+from finforce_ifea.contact_mechanics.indenter import RoundIndenter
+from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RollingContact, limit_step
+from finforce_ifea.errors import ContactError
+from finforce_ifea.fem.mechanics import Mechanics
+from finforce_ifea.fem.solid import SolidModel
+from finforce_ifea.reduced.equilibria import STENCIL, Manifold
+
+# Loads below this share of the largest are rounding errors; rows that the mesh cannot tell apart share a load.
+_NOTHING, _RIDGE = 1e-7, 1e-9
+_EVERY = 3
+# Of the responses of one equilibrium so many combinations say nearly all.
+_LEADING = 12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FaceTangent:
+    """One equilibrium at the rows, x and z of each interleaved (2 n,).
+
+    Attributes:
+        load: that holds the jaw (2 n,) [N].
+        move: of the rows (2 n,) [m].
+        compliance: of the rows (2 n, 2 n) [m/N].
+        shape: of the unknowns in the basis (r,).
+        shape_compliance: (r, 2 n).
+    """
+
+    load: NDArray
+    move: NDArray
+    compliance: NDArray
+    shape: NDArray
+    shape_compliance: NDArray
+
+
+class Face:
+    """The rows of the inner face as the full model moves them.
+
+    Attributes:
+        basis: shapes of the unknowns (size, r), orthonormal; to be set before an equilibrium is described.
+    """
+
+    def __init__(self, mechanics: Mechanics, heights: NDArray) -> None:
+        """Keeps the rows at heights (n,) [m]."""
+        surface, self._model = mechanics.contact.surface, mechanics.model
+        across = surface.points[: surface.across, 1]
+        points = np.array([[mechanics.contact.face_x, y, z] for z in heights for y in across])
+        self._probe, self._across, self._count = self._model.attach(points, 1e-3), len(across), len(heights)
+        self.basis = np.zeros((self._model.size, 0))
+
+    def describe(self, q: NDArray) -> FaceTangent:
+        """Returns the equilibrium of unknowns q (size,) and what unit loads at the rows do to it."""
+        model, count = self._model, 2 * self._count
+        responses, state = self._respond(q), model.linearize(q, tangent=False)
+        moves = self._average(model.project(self._probe, q, responses)).reshape(count, count)
+        moved = model.positions(self._probe, q) - model.positions(self._probe, np.zeros(model.size))
+        return FaceTangent(
+            load=self._find_load(q, state.force),
+            move=self._average(moved[:, :, None]).reshape(count),
+            compliance=0.5 * (moves + moves.T),
+            shape=self.basis.T @ q,
+            shape_compliance=self.basis.T @ responses,
+        )
+
+    def find_basis(self, states: NDArray, count: int) -> None:
+        """Sets the basis to the `count` shapes that say most of equilibria (m, size) and of what loads do to them."""
+        parts, largest = [], 0.0
+        for q in states[:: _EVERY**2]:
+            responses = self._respond(q)[:, ::_EVERY]
+            largest = max(largest, np.abs(responses).max())
+            parts.append(_condense(responses, _LEADING))
+        share = (np.abs(states).max() or 1.0) / largest / len(states)
+        samples = np.concatenate([states.T, share * np.concatenate(parts, axis=1)], axis=1)
+        self.basis = np.linalg.qr(_condense(samples, min(count, *samples.shape)))[0]
+
+    def _respond(self, q: NDArray) -> NDArray:
+        """Returns the changes (size, 2 n) of the unknowns by unit loads at the rows."""
+        model = self._model
+        return model.factorise(model.linearize(q).tangent).solve(self._unit_loads(q))
+
+    def _find_load(self, q: NDArray, force: NDArray) -> NDArray:
+        """Returns the load on the rows (2 n,) [N] that balances an internal force (size,), as far as it can."""
+        loads = sparse.csc_matrix(self._unit_loads(q))
+        normal = (loads.T @ loads).tocsc()
+        normal += _RIDGE * normal.diagonal().max() * sparse.eye(normal.shape[0], format="csc")
+        load = splu(normal).solve(loads.T @ force)
+        load[np.abs(load) < _NOTHING * np.abs(load).max()] = 0.0
+        return load
+
+    def _average(self, moves: NDArray) -> NDArray:
+        """Returns x and z motions (n, 2, k) of the rows, the mean across the face, of those of points (p, 3, k)."""
+        return moves.reshape(self._count, self._across, 3, -1).mean(1)[:, [0, 2]]
+
+    def _unit_loads(self, q: NDArray) -> NDArray:
+        """Returns the loads (size, 2 n) of unit forces along x and z at each row."""
+        columns = np.zeros((len(q), 2 * self._count))
+        for row in range(self._count):
+            for number, axis in enumerate((0, 2)):
+                forces = np.zeros((self._count * self._across, 3))
+                forces[row * self._across : (row + 1) * self._across, axis] = 1.0 / self._across
+                columns[:, 2 * row + number] = self._model.load(self._probe, q, forces)
+        return columns
+
+
+def _condense(samples: NDArray, count: int) -> NDArray:
+    """Returns the `count` orthogonal combinations (size, count) that say most of samples (size, m).
+
+    Their scalar products (m, m) take the place of the unknowns' (size, size), which a large mesh could not store.
+    """
+    m = samples.shape[1]
+    return samples @ eigh(samples.T @ samples, subset_by_index=(max(m - count, 0), m - 1))[1]
+
+
+DEPTHS, HEIGHTS, SHAPES, ROWS = 16, 33, 40, 56
+# As shares of the face: radius of the rod, largest depth, where the rod is first, and how far from the top it is last.
+_ROD, _DEEPEST, _LOWEST, _TOP = 0.2, 0.19, 0.11, 0.03
+# By so much the rods stand denser at base and tip than on the average: forces change fastest with height there.
+_DENSER = 0.5
+# So much of a course is divided by the square of the step's number: a jaw may stiffen early.
+_EARLY = 0.8
+# The rod stops where it needs this many times the force that it needs half way up at full depth.
+_HARDEST = 12.0
+_LONGEST, _SHORTEST = 0.5e-3, 0.02e-3
+# What is not stored need not be as exact.
+_ITERATIONS, _TOLERANCE, _PASSING = 30, 1e-9, 1e-6
+# Quarters of a course that are tried next where it cannot be divided.
+_KEPT = 3
+_ON_FACE = 1e-4
+_FEWEST_ROWS, _MOST_ROWS = 12, 84
+# Rows of nodes nearer together than this share of their mean distance are those of an unstructured mesh.
+_CLOSEST = 0.1
+# What the outcome depends on beside the jaw.
+GRID = (DEPTHS, HEIGHTS, SHAPES, ROWS, _ROD, _DEEPEST, _LOWEST, _TOP, _DENSER, _EARLY, _HARDEST)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Equilibrium:
+    depth: float
+    q: NDArray
+    state: PressedState
+
+
+def build_manifold(mechanics: Mechanics, young_modulus: float, progress: Callable[[float], None]) -> Manifold:
+    """Presses a rod into the jaw at every height and stores equilibria and compliances.
+
+    Args:
+        mechanics: of the jaw.
+        young_modulus: of its material [Pa].
+        progress: called with the share that is done.
+
+    Raises:
+        ContactError: the jaw cannot be pressed at enough heights.
+    """
+    grid = _press_everywhere(mechanics.contact, lambda share: progress(0.5 * share))
+    heights = _choose_rows(mechanics)
+    face, parts = Face(mechanics, heights[1:]), []
+    face.find_basis(grid.q.reshape(-1, grid.q.shape[-1]), SHAPES)
+    for number, row in enumerate(grid.q):
+        parts.append([face.describe(state) for state in row])
+        progress(0.5 + 0.5 * (number + 1) / len(grid.q))
+    return _store(young_modulus, grid, heights, parts, face)
+
+
+def build_rest(mechanics: Mechanics, young_modulus: float) -> Manifold:
+    """Stores the unloaded jaw alone, at all grid points; see `build_manifold`."""
+    heights, rest = _choose_rows(mechanics), np.zeros(mechanics.model.size)
+    face = Face(mechanics, heights[1:])
+    face.find_basis(rest[None], SHAPES)
+    grid = _Grid(rods=np.arange(STENCIL), depths=np.zeros(STENCIL), q=np.zeros((STENCIL, STENCIL, len(rest))))
+    return _store(young_modulus, grid, heights, [[face.describe(rest)] * STENCIL] * STENCIL, face)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Grid:
+    """Equilibria q (T, Z, size) under rods at heights (Z,) [m], pressed in up to depths (Z,) [m]."""
+
+    rods: NDArray
+    depths: NDArray
+    q: NDArray
+
+
+def _press_everywhere(contact: RollingContact, progress: Callable[[float], None]) -> _Grid:
+    """Returns the equilibria under rods at all heights."""
+    low, high = contact.surface.heights[[0, -1]]
+    share = np.linspace(0.0, 1.0, HEIGHTS)
+    share = share - _DENSER * np.sin(2.0 * np.pi * share) / (2.0 * np.pi)
+    heights = low + (_LOWEST + (1.0 - _TOP - _LOWEST) * share) * (high - low)
+    rods = [_Rod(contact, height) for height in heights]
+    hardest = _HARDEST * float(np.linalg.norm(rods[HEIGHTS // 2].press(np.inf)[-1].state.force))
+    depths, states = [], []
+    for number, rod in enumerate(rods):
+        course, divided = rod.press(hardest), None
+        while divided is None:
+            depth = _find_depth(course, hardest)
+            divided = rod.divide(course, depth, DEPTHS)
+            course = course[: _KEPT * len(course) // 4]
+            if divided is None and not course:
+                raise ContactError(f"the jaw cannot be pressed evenly at a height of {1e3 * heights[number]:.1f} mm")
+        depths.append(depth)
+        states.append(divided)
+        progress((number + 1) / HEIGHTS)
+    return _Grid(rods=heights, depths=np.array(depths), q=np.array(states).transpose(1, 0, 2))
+
+
+def _find_depth(course: list[_Equilibrium], hardest: float) -> float:
+    """Returns the depth [m] at which a course ends or, found between its steps, needs the largest force [N].
+
+    Depths that change smoothly with height make equilibria that do.
+    """
+    forces = [0.0, *(float(np.linalg.norm(item.state.force)) for item in course[-2:])]
+    if len(course) < 2 or not forces[-2] < hardest < forces[-1]:
+        return course[-1].depth
+    return float(np.interp(hardest, forces[-2:], [item.depth for item in course[-2:]]))
+
+
+def _choose_rows(mechanics: Mechanics) -> NDArray:
+    """Returns the heights (n + 1,) [m] of the rows, the clamp's first.
+
+    A solid moves linearly between its nodes: their own heights are best, divided where they are few. Where they are too
+    many or too close together, as in unstructured meshes, and of frames the rows divide the face evenly.
+    """
+    mesh, surface = mechanics.mesh, mechanics.contact.surface
+    on_face = np.abs(mesh.nodes[:, 0] - mechanics.contact.face_x) < _ON_FACE
+    held = np.isin(np.arange(len(mesh.nodes)), mesh.clamped)
+    own = np.unique(np.round(mesh.nodes[on_face & ~held, 2], 7))
+    base = mesh.nodes[on_face & held, 2].max(initial=-np.inf)
+    if base >= own[0] > -np.inf and np.isfinite(base):
+        raise ContactError("the inner face is held above its lower end, expected one that is held at its base or not")
+    if not np.isfinite(base):  # nothing holds the face: its lower end is a row of its own
+        base = surface.low[1] - (surface.high[1] - surface.low[1]) / ROWS
+    gaps = np.diff(np.r_[base, own])
+    even = gaps.min() > _CLOSEST * gaps.mean()
+    if not (isinstance(mechanics.model, SolidModel) and even and len(own) <= _MOST_ROWS):
+        return np.linspace(base, surface.high[1], ROWS + 1)
+    parts = 1 if len(own) >= _FEWEST_ROWS else -(-ROWS // len(own))
+    return np.interp(np.arange(parts * len(own) + 1) / parts, np.arange(len(own) + 1), np.r_[base, own])
+
+
+class _Rod:
+    """A rod at one height, pressed in deeper and deeper."""
+
+    def __init__(self, contact: RollingContact, height: float) -> None:
+        low, high = contact.surface.heights[[0, -1]]
+        self._contact, self._height = contact, height
+        self._radius, self._deepest = _ROD * (high - low), _DEEPEST * (high - low)
+        contact.indenter = RoundIndenter()
+
+    def press(self, hardest: float) -> list[_Equilibrium]:
+        """Returns equilibria at rising depths up to the largest, or to where the jaw gives way or resists."""
+        course, step = [], _LONGEST
+        while not course or course[-1].depth < self._deepest - 1e-9:
+            before = course[-1] if course else None
+            depth = min((before.depth if before else 0.0) + step, self._deepest)
+            found = self._settle(before, depth, _PASSING)
+            if found is None:
+                step *= 0.5
+                if step < _SHORTEST:
+                    break
+                continue
+            course.append(found)
+            if np.linalg.norm(found.state.force) > hardest:
+                break
+        if not course:
+            raise ContactError(f"the jaw cannot be pressed at a height of {1e3 * self._height:.1f} mm")
+        return course
+
+    def divide(self, course: list[_Equilibrium], largest: float, count: int) -> list[NDArray] | None:
+        """Returns the unknowns of equilibria that divide a course up to a depth [m], denser at its beginning.
+
+        The unloaded one comes first. None where one is not found: the jaw goes over to another shape there.
+        """
+        depths = np.array([item.depth for item in course])
+        states = [np.zeros(self._contact.model.size)]
+        share = np.arange(1, count + 1) / count
+        for depth in largest * ((1.0 - _EARLY) * share + _EARLY * share**2):
+            below = int(np.searchsorted(depths, depth + 1e-12)) - 1
+            found = self._settle(course[below] if below >= 0 else None, depth, _TOLERANCE)
+            if found is None:
+                return None
+            states.append(found.q)
+        return states
+
+    def _settle(self, start: _Equilibrium | None, depth: float, tolerance: float) -> _Equilibrium | None:
+        """Returns the equilibrium at a depth [m] of the rod, to a tolerance of the unknowns; or None."""
+        contact, model = self._contact, self._contact.model
+        place = np.array([depth, np.log(self._radius), self._height])
+        q = np.zeros(model.size)
+        if start is not None:
+            q = start.q + limit_step(model, start.state.modes[:, 0] * (depth - start.depth))
+        for _ in range(_ITERATIONS):
+            state = contact.linearize(q, place)
+            if not state.touches:
+                q = q + contact.approach(q, state.correction, place)
+                continue
+            step = limit_step(model, state.correction)
+            q = q + step
+            if not (np.isfinite(q).all() and state.smallest_det > 0):
+                return None
+            if np.abs(step).max() < tolerance:
+                return _Equilibrium(depth=depth, q=q, state=state)
+        return None
+
+
+def _store(young_modulus: float, grid: _Grid, heights: NDArray, parts: list[list[FaceTangent]], face: Face) -> Manifold:
+    """Returns the manifold of a grid of equilibria and their tangents (T, Z)."""
+
+    def collect(name: str, kind: type = np.float64) -> NDArray:
+        return np.array([[getattr(part, name) for part in row] for row in parts], kind)
+
+    return Manifold(
+        young_modulus=young_modulus,
+        heights=heights,
+        rods=grid.rods,
+        depths=grid.depths,
+        loads=collect("load"),
+        moves=collect("move"),
+        compliance=collect("compliance", np.float32),
+        shapes=collect("shape"),
+        shape_compliance=collect("shape_compliance", np.float32),
+        basis=face.basis,
+    )

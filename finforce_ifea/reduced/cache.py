@@ -1,0 +1,155 @@
+"""Manifolds that were built before: found again by a hash of everything that they depend on.
+
+The folder is `$FINFORCE_CACHE`, else `finforce` in the user's cache folder. What cannot be read is built anew.
+
+From a jaw's full mechanics to its stored equilibria, built once and found again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import fields, replace
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from finforce_ifea.fem.frame import FrameModel
+from finforce_ifea.fem.mechanics import Mechanics
+from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.reduced import build as manifold_build
+from finforce_ifea.reduced.build import build_manifold, build_rest
+from finforce_ifea.reduced.equilibria import Manifold
+from finforce_ifea.reduced.evaluation import ReducedContact, ReducedModel
+
+# To be raised when what is stored, or how it is found, changes.
+VERSION = 5
+# What reading a damaged archive raises, one or the other by where the damage is.
+_UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, struct.error, zlib.error)
+_LOG = logging.getLogger(__name__)
+
+
+def hash_parts(*parts: NDArray | str | float) -> str:
+    """Returns a name (32 hexadecimal digits) for arrays, texts and numbers, to the last bit."""
+    digest = hashlib.sha256(f"manifold {VERSION}".encode())
+    for part in parts:
+        array = np.ascontiguousarray(part) if isinstance(part, np.ndarray) else None
+        digest.update(f"|{part!r}|".encode() if array is None else f"|{array.dtype}{array.shape}|".encode())
+        if array is not None:
+            digest.update(array.tobytes())
+    return digest.hexdigest()[:32]
+
+
+def cache_folder() -> Path:
+    """Returns the folder of the cache, which may not exist yet."""
+    named = os.environ.get("FINFORCE_CACHE")
+    if named:
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "finforce"
+
+
+def fetch_manifold(key: str, build: Callable[[], Manifold]) -> Manifold:
+    """Returns the stored manifold of a key, or builds and stores it; of two processes one builds.
+
+    A folder that cannot be written costs a warning and the time to build anew.
+    """
+    path = cache_folder() / f"{key}.npz"
+    found = _read(path)
+    if found is not None:
+        return found
+    with _locked(path):
+        found = _read(path)
+        if found is None:
+            found = build()
+            _write(path, found)
+    return found
+
+
+def _read(path: Path) -> Manifold | None:
+    """Returns a stored manifold, None when there is none that can be read."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            values = {field.name: stored[field.name] for field in fields(Manifold)}
+    except FileNotFoundError:
+        return None
+    except _UNREADABLE as error:
+        _LOG.warning("the stored equilibria %s cannot be read (%s); they are built anew", path.name, error)
+        return None
+    values["young_modulus"] = float(values["young_modulus"])
+    return Manifold(**values)
+
+
+def _write(path: Path, manifold: Manifold) -> None:
+    """Stores a manifold, whole or not at all; what a killed process has left of it is removed."""
+    part = path.with_suffix(f".{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for left in path.parent.glob(f"{path.stem}.*.part"):
+            left.unlink(missing_ok=True)
+        with part.open("wb") as file:
+            np.savez(file, **{field.name: getattr(manifold, field.name) for field in fields(Manifold)})
+        os.replace(part, path)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        _LOG.warning("the equilibria cannot be stored in %s (%s); the next start builds them anew", path.parent, error)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Keeps other processes from building the same; where locks cannot be had, both build."""
+    with ExitStack() as stack:
+        with suppress(ImportError, OSError):
+            import fcntl
+
+            path.parent.mkdir(parents=True, exist_ok=True)
+            fcntl.flock(stack.enter_context(path.with_suffix(".lock").open("w")), fcntl.LOCK_EX)
+        yield
+
+
+def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mechanics:
+    """Returns the mechanics by stored equilibria.
+
+    Args:
+        full: the mechanics that is to be reduced.
+        jaw: what it describes.
+        linear: the unloaded jaw's compliance alone, without the equilibria.
+
+    Raises:
+        ContactError: The jaw cannot be pressed.
+    """
+    modulus = jaw.material.young_modulus
+    if linear:
+        manifold = build_rest(full, modulus)
+    else:
+        manifold = fetch_manifold(name_manifold(full, jaw), lambda: _build_watched(full, jaw))
+    model = ReducedModel(manifold, full.model, modulus, full.contact.face_x)
+    surface = full.contact.surface
+    middle = surface.points[:: surface.across].copy()
+    middle[:, 1] = 0.0
+    stiffness = surface.stiffness.reshape(-1, surface.across).sum(1)
+    surface = replace(surface, points=middle, across=1, stiffness=stiffness, probe=None)
+    return Mechanics(mesh=full.mesh, model=model, contact=ReducedContact(model, surface, full.contact.face_x))
+
+
+def name_manifold(full: Mechanics, jaw: Jaw) -> str:
+    """Returns the hash of all that the equilibria of a jaw depend on; its modulus is none of it."""
+    mesh = full.mesh
+    parts = [mesh.nodes, mesh.elements, mesh.clamped, jaw.material.poisson_ratio, full.contact.face_x]
+    if isinstance(full.model, FrameModel):
+        parts.append(repr(jaw.drawing))
+    return hash_parts(type(full.model).__name__, *map(str, manifold_build.GRID), *parts)
+
+
+def _build_watched(full: Mechanics, jaw: Jaw) -> Manifold:
+    """Builds the manifold under a progress bar."""
+    with tqdm(total=100, desc=f"equilibria of {jaw.name}, once", unit="%", disable=None, leave=False) as bar:
+        return build_manifold(full, jaw.material.young_modulus, lambda share: bar.update(int(100 * share) - bar.n))

@@ -1,0 +1,299 @@
+"""Depth, shape and height of the pressing object from key points, frame after frame, on the deformed jaw.
+
+The shape of an unknown object is its radius, that of a known outline its tilt. Depth changes fast and is tracked by a
+Kalman filter with constant velocity. Shape and height change slowly: the maximum a posteriori for the residuals
+averaged over the last frames, so that their priors count once and errors of the mechanics are no information.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
+from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RollingContact, limit_step
+from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
+from finforce_ifea.observation import Contact
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tare import PointNoise, Tare
+from finforce_ifea.tracking.place_update import Average, Forecast, PlaceUpdate, forecast_place, update_place
+from finforce_ifea.tracking.residuals import Residuals, Uncertainty, weigh_residuals
+from finforce_ifea.tracking.rest_response import measure_rest
+from finforce_ifea.tracking.track import Track, explain_offsets
+
+# The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
+_LEAST_DEPTH = 3e-5
+_TOUCH_DEPTH = 0.15e-3
+_LOADED_DEPTH = 0.5e-3
+_DEPTH_DRIFT = 0.01e-3
+_LARGEST_MOVE = 0.7e-3
+# A leap only has to come near. One that leaves the points as far as they were by all but this is in vain [m].
+_LARGEST_LEAP, _LEAST_APPROACH = 2e-3, 0.1e-3
+_LARGEST_SHIFT = 0.3e-3
+_SETTLED_MOVE = 1e-4
+# Of the model's reach, 0.1 mm.
+_SETTLED_CORRECTION = 0.05
+_UNDECIDED = 0.2
+_FRAMES_RELEASED = 15
+_LOST_STDDEV = 1e-3
+# The height may leave what was given by this many of its standard deviations; beyond, the contact is another one.
+_FARTHEST_HEIGHT = 8.0
+# Fewer points in agreement with the forecast than this share call for a leap; a forecast is never wider than this [m].
+_LEAST_AGREEMENT = 0.6
+_WIDEST_FORECAST = 1e-3
+
+
+class PlaceTracker:
+    """Tracks the place of the pressing object; holds the jaw in equilibrium with it."""
+
+    def __init__(self, contact: RollingContact, keypoints: NDArray, settings: EstimatorSettings) -> None:
+        """Attaches key points (K, 3) [m, undeformed] to the contact's model; raises MeshError when one is off it."""
+        self.contact = contact
+        self.settings = settings
+        self.probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
+        self._stiffness: float | None = None
+        self._rest = contact.model.positions(self.probe, np.zeros(contact.model.size))
+        self.response = measure_rest(contact, self.probe, len(keypoints))
+        self._outline: OutlineIndenter | None = None
+        self._face = contact.surface.heights[[0, -1]]
+        self.reset()
+
+    def reset(self, height: float | None = None) -> None:
+        """Starts anew, unloaded, with an unknown object that will first touch at `height` [m], the middle if None."""
+        settings = self.settings
+        self._given = height
+        height = float(np.median(self.contact.surface.heights)) if height is None else height
+        self.contact.indenter = RoundIndenter()
+        self._prior = np.array([np.log(settings.radius), height])
+        self._prior_variance = np.array([settings.radius_log_stddev, settings.height_stddev]) ** 2
+        self._begin()
+
+    def _begin(self) -> None:
+        """Starts with the undeformed jaw and an object that just touches."""
+        self.q = self.contact.begin(self._prior[1])
+        self._motion = np.array([self._find_touch(np.r_[0.0, self._prior]), 0.0])
+        self._motion_covariance = np.diag([0.1e-3, 1e-3]) ** 2
+        self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
+        self._released, self._jumped = 0, False
+        self._forget_place()
+
+    def _forget_place(self) -> None:
+        self._slow = self._prior.copy()
+        count = len(self._rest)
+        self._average = Average(np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros(count))
+
+    def update(self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None) -> Track | None:
+        """Takes the key points (K, 3) [m], NaN where unused, dt [s] after the last; None when too few agree.
+
+        `stddev` (K, 3) [m] are their stated standard deviations.
+        """
+        forecast, noise = self._predict(dt), tare.point_noise(stddev)
+        place = forecast.place
+        q = self.q + self._modes @ (self._reachable(place) - self._reached)
+        measured, unseen = points - tare.offsets, self.settings.offset_stddev
+        chance = self._expect_errors(noise, tare.offset_variance(unseen) + noise.standing, forecast)
+        update, settled, iteration, share, last = None, False, 0, 1.0, np.zeros(3)
+        far, in_vain = np.inf, 0
+        while not settled and iteration < self.settings.iterations and in_vain < 2:
+            iteration += 1
+            mechanical = self._reachable(place)
+            state = self.contact.linearize(q, mechanical)
+            if not state.touches:
+                q = q + self.contact.approach(q, state.correction, mechanical)
+                continue
+            q = q + state.correction
+            data = self._weigh(q, state, measured, place - forecast.place, place, chance)
+            if data.used < max(self.settings.minimum_keypoints, _LEAST_AGREEMENT * data.known):
+                place, q = self._leap(q, state, mechanical, place, data)
+                in_vain = in_vain + 1 if abs(data.jump) > far - _LEAST_APPROACH else 0
+                far = abs(data.jump)
+                continue
+            update = self._update_place(data, forecast)
+            aim = self._bound(update.place, place, share)
+            # between two corners of an object the linearisation changes its mind: meet in the middle
+            rocks = self.contact.indenter.has_corners and last[1:] @ (aim - place)[1:] < 0
+            share *= 0.5 if rocks else 1.0
+            missing = update.place - aim if share > _UNDECIDED else np.zeros(3)
+            last, moved, place = aim - place, self._reachable(aim) - mechanical, aim
+            q = q + limit_step(self.contact.model, state.modes @ moved)
+            settled = self._is_settled(state, moved, missing)
+        if update is None or not state.touches:
+            return self._lose()
+        self._keep(q, place, update, state.modes)
+        return self._report(state, place, moved, data, update, iteration, settled)
+
+    def _bound(self, asked: NDArray, place: NDArray, share: float) -> NDArray:
+        """Returns the place asked for, within a share of where the linearisation about the present one holds."""
+        bounds, reach = self.contact.indenter.shape_range, _FARTHEST_HEIGHT * self.settings.height_stddev
+        change = np.array([_LARGEST_MOVE, share * bounds.largest_change, share * _LARGEST_SHIFT])
+        aim = np.minimum(np.maximum(asked, place - change), place + change)
+        aim[SHAPE] = min(max(aim[SHAPE], bounds.low), bounds.high)
+        aim[HEIGHT] = min(max(aim[HEIGHT], self._prior[1] - reach), self._prior[1] + reach)
+        return aim
+
+    def _is_settled(self, state: PressedState, moved: NDArray, missing: NDArray) -> bool:
+        """Whether the last iteration changed nothing that matters."""
+        change = (_SETTLED_MOVE, self.contact.indenter.shape_range.settled_change, _SETTLED_MOVE)
+        small = all(max(abs(m), abs(k)) < c for m, k, c in zip(moved, missing, change, strict=True))
+        return small and state.size < _SETTLED_CORRECTION
+
+    def _find_touch(self, place: NDArray) -> float:
+        """Returns the depth [m] at which the object of a place (3,) first touches the undeformed jaw."""
+        return self.contact.indenter.find_touch(place, self._face[0], self._face[1])
+
+    def _reachable(self, place: NDArray) -> NDArray:
+        """Returns the place (3,) at which the mechanics stands for `place`."""
+        return np.array([max(place[DEPTH], self._find_touch(place) + _LEAST_DEPTH), place[SHAPE], place[HEIGHT]])
+
+    def significance(self, tare: Tare, stddev: float) -> float:
+        """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
+        return explain_offsets(self.rest_modes(), tare, stddev)
+
+    def rest_modes(self) -> NDArray:
+        """Returns how the key points of the undeformed jaw move in x and z by the depth (K, 2) [m/m]."""
+        q = np.zeros(self.contact.model.size)
+        state = self.contact.linearize(q, self._reachable(np.r_[-1.0, self._prior]))
+        return self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
+
+    def follow(self, contact: Contact) -> None:
+        """Takes over where a contact's object is: its outline, or its height as that of first touch."""
+        if contact.outline is not None:
+            self._follow_outline(contact)
+            return
+        height = float(expect_object(contact, self.settings).mean[1])
+        if self._given is None:
+            self.reset(height)
+        if abs(height - self._given) > _FARTHEST_HEIGHT * self.settings.height_stddev:
+            self._prior[1] = height
+            self._forget_place()  # another object
+        self._stiffness = self.response.stiffness_at(height)
+        self._given = self._prior[1] = height
+
+    def _follow_outline(self, contact: Contact) -> None:
+        """Takes the outline's tilt and height as what is to be expected; an outline cut anew keeps the place."""
+        before = self.contact.indenter
+        expected = expect_object(contact, self.settings, self._outline)
+        self._prior, self._prior_variance = expected.mean, expected.variance
+        self.contact.indenter = self._outline = after = expected.indenter
+        self._given, self._stiffness = None, self.response.stiffness_at(float(expected.mean[1]))
+        away = abs(self._slow[1] - expected.mean[1]) > _FARTHEST_HEIGHT * self.settings.height_stddev
+        if away or not isinstance(before, OutlineIndenter) or not after.resembles(before):
+            self._begin()
+        elif after is not before:
+            change = after.field.front - before.field.front
+            self._motion[0] += change
+            self._reached[DEPTH] += change
+
+    def _predict(self, dt: float) -> Forecast:
+        """Returns the place dt [s] later: constant speed of the depth under white acceleration."""
+        sudden = bool(self._released or self._jumped)
+        return forecast_place(
+            self._motion, self._motion_covariance, self._slow, dt, self.settings.acceleration, _DEPTH_DRIFT, sudden
+        )
+
+    def _expect_errors(self, noise: PointNoise, offset_variance: NDArray, forecast: Forecast) -> Uncertainty:
+        """Returns what is known of the errors of this frame's key points."""
+        return Uncertainty(
+            noise=noise.plane,
+            gain=noise.gain,
+            width_variance=noise.width_variance,
+            trust=noise.trust,
+            offset_variance=offset_variance,
+            depth_variance=float(min(forecast.spread[0, 0], _WIDEST_FORECAST**2)),
+            model_error=self.settings.model_error,
+            gate=self.settings.gate,
+        )
+
+    def _weigh(
+        self, q: NDArray, state: PressedState, measured: NDArray, moved: NDArray, place: NDArray, chance: Uncertainty
+    ) -> Residuals:
+        """Returns the residuals of a state at a place (3,) that has moved by `moved` (3,) since the forecast."""
+        model = self.contact.model
+        motions = model.project(self.probe, q, state.modes)
+        below = float(place[DEPTH] - self._reachable(place)[DEPTH])
+        positions = model.positions(self.probe, q)
+        return weigh_residuals(measured, positions, self._rest, motions, moved, below, chance)
+
+    def _update_place(self, data: Residuals, forecast: Forecast) -> PlaceUpdate:
+        """Returns the place that the residuals ask for."""
+        return update_place(
+            data,
+            self._average,
+            forecast,
+            self._prior,
+            self._prior_variance,
+            float(self.settings.memory),
+            np.array([self.contact.indenter.shape_range.largest_change, _LARGEST_SHIFT]),
+        )
+
+    def _leap(
+        self, q: NDArray, state: PressedState, mechanical: NDArray, place: NDArray, data: Residuals
+    ) -> tuple[NDArray, NDArray]:
+        """Returns place and unknowns moved towards the median depth when the points disagree with the forecast."""
+        jump = float(np.clip(data.jump, -_LARGEST_LEAP, _LARGEST_LEAP))
+        place = place + np.array([jump, 0.0, 0.0])
+        step = state.modes[:, DEPTH] * (self._reachable(place)[DEPTH] - mechanical[DEPTH])
+        return place, q + limit_step(self.contact.model, step)
+
+    def _lose(self) -> None:
+        """Widens the search for the next frame."""
+        self._motion[1] = 0.0
+        self._motion_covariance[0, 0] += _LOST_STDDEV**2
+
+    def _keep(self, q: NDArray, place: NDArray, update: PlaceUpdate, modes: NDArray) -> None:
+        """Keeps what the next frame starts from; a released jaw expects any object again."""
+        self.q, self._modes, self._reached = q, modes, self._reachable(place)
+        self._slow = place[1:].copy()
+        self._motion = np.array([place[DEPTH], update.speed])
+        self._motion_covariance, self._jumped = update.spread, update.jumped
+        self._average = update.average
+        pressed = place[DEPTH] - self._find_touch(place)
+        self._released = self._released + 1 if pressed < _TOUCH_DEPTH else 0
+        if self._released >= _FRAMES_RELEASED:
+            self._forget_place()
+
+    def _report(
+        self,
+        state: PressedState,
+        place: NDArray,
+        moved: NDArray,
+        data: Residuals,
+        update: PlaceUpdate,
+        iterations: int,
+        settled: bool,
+    ) -> Track:
+        force = state.force + state.force_modes @ moved
+        pressed = place[DEPTH] - self._find_touch(place)
+        if pressed < _LEAST_DEPTH:
+            force = force * max(0.0, pressed / _LEAST_DEPTH)
+        covariance = update.covariance * max(1.0, update.misfit**2)
+        covariance[DEPTH, DEPTH] += update.depth_variance * max(1.0, update.misfit**2)
+        finite = np.isfinite(force.sum() + update.covariance.sum() + self.q.sum())
+        return Track(
+            covariance=covariance,
+            force=force,
+            force_modes=state.force_modes,
+            pressure_point=state.pressure_point,
+            pressure_place=state.pressure_place,
+            weights=data.weights,
+            stiffening=self._stiffening(force, place),
+            residual=update.residual,
+            misfit=update.misfit,
+            kkt=update.kkt,
+            iterations=iterations,
+            converged=settled,
+            sound=bool(finite and state.smallest_det > 0),
+            quiet=bool(pressed < _TOUCH_DEPTH),
+            loaded=bool(pressed > _LOADED_DEPTH),
+            away=update.away,
+            extrapolation=state.extrapolation,
+            mistaken=update.mistaken,
+            agreement=data.agreed / data.known,
+            condition=update.condition,
+            place_stddev=float(np.sqrt(max(update.covariance[HEIGHT, HEIGHT], 0.0))),
+        )
+
+    def _stiffening(self, force: NDArray, place: NDArray) -> float:
+        """Returns how much stiffer the pressed jaw is than at first touch; 1 until it is surely pressed."""
+        pressed = place[DEPTH] - self._find_touch(place)
+        if self._stiffness is None or pressed < _LOADED_DEPTH:
+            return 1.0
+        return float(np.linalg.norm(force) / (self._stiffness * pressed))

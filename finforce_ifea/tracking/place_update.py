@@ -1,0 +1,410 @@
+"""How sure a place is: its covariance's condition, another contact, points that err together.
+
+Compiled update of an object's place by the key points of one frame.
+
+The depth is corrected by a Kalman filter on this frame's residuals. Log radius and height are the maximum a posteriori
+for the residuals averaged over the last frames, whose bias (errors of mechanics and of offsets) does not average out.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+# Beyond this many of its standard deviations the prior of a place lets go.
+PRIOR_REACH = 4.0
+# A height that is given is that of another contact once in so many times, and then anywhere within this [m].
+_MISTAKEN = 0.01
+_ANYWHERE = 0.03
+
+
+@njit(**_OPTIONS)
+def invert_symmetric(A):
+    """Returns the inverse of a symmetric 3 x 3 matrix."""
+    c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
+    c01 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
+    c02 = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
+    det = A[0, 0] * c00 + A[0, 1] * c01 + A[0, 2] * c02
+    out = np.empty((3, 3))
+    out[0, 0], out[0, 1], out[0, 2] = c00, c01, c02
+    out[1, 1] = A[0, 0] * A[2, 2] - A[0, 2] * A[0, 2]
+    out[1, 2] = A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2]
+    out[2, 2] = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
+    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
+    return out / det
+
+
+@njit(**_OPTIONS)
+def measure_condition(covariance):
+    """Returns the condition number of a covariance (3, 3) scaled to a unit diagonal, by its eigenvalues in closed form.
+
+    With C = 1 + O, O without diagonal: l = 1 + 2 p cos(t + 2 k pi / 3), p = sqrt(|O|^2 / 6), cos 3 t = det O / (2 p^3).
+    """
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    a, b = covariance[0, 1] / scale[0] / scale[1], covariance[0, 2] / scale[0] / scale[2]
+    c = covariance[1, 2] / scale[1] / scale[2]
+    p = np.sqrt((a * a + b * b + c * c) / 3.0)
+    if not p > 1e-12:
+        return 1.0
+    angle = np.arccos(min(max(a * b * c / p**3, -1.0), 1.0)) / 3.0
+    largest, least = 1.0 + 2.0 * p * np.cos(angle), 1.0 + 2.0 * p * np.cos(angle + 2.0 * np.pi / 3.0)
+    return largest / max(least, 1e-16)
+
+
+@njit(**_OPTIONS)
+def doubt_place(away, spread, prior_variance, offset):
+    """Returns the probability that a contact is not where it was said to be, and what that adds to its variance [m^2].
+
+    The key points alone have it D = away from there, with the variance s^2 = spread. It is another contact, N(0, R^2),
+    with the probability p:
+
+        p / (1 - p) = p0 N(D; 0, v + s^2 + R^2) / N(D; 0, v + s^2) / (1 - p0).
+
+    What exceeds p0 of it adds the distance of that contact from the place that was found, `offset` from the given one.
+
+    Args:
+        away: D [m].
+        spread: s^2 [m^2].
+        prior_variance: v, of the given place [m^2].
+        offset: of the place that was found [m].
+    """
+    near, far = prior_variance + spread, prior_variance + spread + _ANYWHERE**2
+    odds = 0.5 * away**2 * (1.0 / near - 1.0 / far) + 0.5 * np.log(near / far) + np.log(_MISTAKEN / (1.0 - _MISTAKEN))
+    mistaken = 1.0 / (1.0 + np.exp(-min(max(odds, -50.0), 50.0)))
+    shrunk = _ANYWHERE**2 / (_ANYWHERE**2 + spread)
+    variance = max(0.0, mistaken - _MISTAKEN) * ((shrunk * away - offset) ** 2 + shrunk * spread)
+    return mistaken, variance
+
+
+@njit(**_OPTIONS)
+def doubt_height(hessian, gradient, offset, prior_variance):
+    """Returns the height that the key points alone ask for [m], the probability of a mistake, and its variance [m^2].
+
+    Args:
+        hessian: of the log posterior (3, 3).
+        gradient: of the same (3,).
+        offset: of the reference height from the expected one [m].
+        prior_variance: of the height [m^2].
+    """
+    pull = 1.0 / (prior_variance + (offset / PRIOR_REACH) ** 2)
+    data, slope = hessian.copy(), gradient.copy()
+    # a millionth is left of the prior, for where the key points tell nothing
+    data[2, 2] -= (1.0 - 1e-6) * pull
+    slope[2] += (1.0 - 1e-6) * pull * offset
+    covariance = invert_symmetric(data)
+    away, spread = offset + (covariance[2] * slope).sum(), max(covariance[2, 2], 0.0)
+    mistaken, variance = doubt_place(away, spread, prior_variance, offset)
+    return away, mistaken, variance
+
+
+@njit(**_OPTIONS)
+def find_rift(data, deeper, information):
+    """Returns how far the depth would move if points that are half believed were not believed at all [m].
+
+    With w the weights, h the motions by depth, r what is left of the residuals and I the information,
+
+        rift = sum_k w_k (1 - w_k) h_k^T N_k^-1 r_k / I.
+
+    Chance cancels in it; points that are wrong together do not.
+
+    Args:
+        data: see `Residuals`.
+        deeper: change of the depth since the residuals [m].
+        information: on the depth [1/m^2].
+    """
+    rift = 0.0
+    for k in range(len(data.weights)):
+        n00, n11, n01 = data.noise[k, 0, 0], data.noise[k, 1, 1], data.noise[k, 0, 1]
+        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
+        r0, r1 = data.r[k, 0] - h0 * deeper, data.r[k, 1] - h1 * deeper
+        score = (h0 * (n11 * r0 - n01 * r1) + h1 * (n00 * r1 - n01 * r0)) / (n00 * n11 - n01 * n01)
+        rift += data.weights[k] * (1.0 - data.weights[k]) * score
+    return rift / information
+
+
+# Depth has no prior; this share of one frame's information keeps the posterior regular while nothing was averaged.
+_DEPTH_SHARE = 1e-3
+# Innovations beyond this many standard deviations are no chance: where the speed is known, and where it is not.
+_MANOEUVRE_SIGMA, _ONSET_SIGMA = 3.0, 2.5
+# No speed is believed for longer than this [s].
+_LONGEST_SIGHT = 0.2
+# Of a longer jump [m/s] the rest is taken for one of the place alone.
+_FASTEST = 0.05
+
+
+class Forecast(NamedTuple):
+    """The place that is expected in a frame.
+
+    Attributes:
+        place: depth [m], log radius, height [m].
+        speed: of the depth [m/s].
+        spread: covariance of depth and speed (2, 2).
+        unsure: time since the last frame if that did not show the speed, because nothing pressed or the depth jumped;
+            else 0 [s].
+    """
+
+    place: NDArray
+    speed: float
+    spread: NDArray
+    unsure: float
+
+
+class Average(NamedTuple):
+    """Residuals averaged over the last frames.
+
+    A frame in which the finger was hardly pressed tells hardly anything of radius and height: what the average says of
+    them are its own averaged derivatives, not those of the last frame.
+
+    Attributes:
+        residuals: (K, 2) [m].
+        modes: derivatives by depth, log radius and height, averaged alike (K, 2, 3).
+        count: frames that they stand for (K,).
+    """
+
+    residuals: NDArray
+    modes: NDArray
+    count: NDArray
+
+
+class PlaceUpdate(NamedTuple):
+    """The place after one frame.
+
+    Attributes:
+        place: depth [m], log radius, height [m].
+        speed: of the depth [m/s].
+        spread: covariance of depth and speed (2, 2).
+        jumped: whether the depth changed beyond what was expected.
+        average: of the residuals, about the new place.
+        covariance: of the place (3, 3).
+        depth_variance: of the depth, by this frame and what was before [m^2].
+        kkt: what is left of the objective's gradient, relative to the gradient before.
+        residual: weighted root mean square residual [m].
+        misfit: root mean square of the averaged residuals over their standard deviations; about 1 where the model fits.
+        away: height that the key points alone ask for beyond the expected one [m].
+        mistaken: probability that the height is not the expected one at all.
+        condition: of the covariance, scaled to a unit diagonal.
+    """
+
+    place: NDArray
+    speed: float
+    spread: NDArray
+    jumped: bool
+    average: Average
+    covariance: NDArray
+    depth_variance: float
+    kkt: float
+    residual: float
+    misfit: float
+    away: float
+    mistaken: float
+    condition: float
+
+
+@njit(**_OPTIONS)
+def _averaged_spread(data, count, k):
+    """Returns the entries 00, 11 and 01 of the covariance of point k's averaged residual [m^2]."""
+    share = 1.0 / max(count[k], 1.0)
+    noise = data.noise[k]
+    return noise[0, 0] * share + data.bias[k], noise[1, 1] * share + data.bias[k], noise[0, 1] * share
+
+
+@njit(**_OPTIONS)
+def _posterior(data, average, offset, prior_variance, information):
+    """Returns Hessian and gradient of the log posterior of the place for averaged residuals."""
+    hessian, gradient = np.zeros((3, 3)), np.zeros(3)
+    mean, modes, count = average
+    for k in range(len(count)):
+        if count[k] <= 0.5:
+            continue
+        s00, s11, s01 = _averaged_spread(data, count, k)
+        det = s00 * s11 - s01 * s01
+        for i in range(3):
+            a = (s11 * modes[k, 0, i] - s01 * modes[k, 1, i]) / det
+            b = (s00 * modes[k, 1, i] - s01 * modes[k, 0, i]) / det
+            gradient[i] += a * mean[k, 0] + b * mean[k, 1]
+            for j in range(3):
+                hessian[i, j] += a * modes[k, 0, j] + b * modes[k, 1, j]
+    for i in range(2):
+        # far from its mean the prior lets go (Cauchy), for an object may touch first elsewhere than it was said to
+        variance = prior_variance[i] + (offset[i] / PRIOR_REACH) ** 2
+        hessian[i + 1, i + 1] += 1.0 / variance
+        gradient[i + 1] -= offset[i] / variance
+    hessian[0, 0] += _DEPTH_SHARE * information
+    return hessian, gradient
+
+
+@njit(**_OPTIONS)
+def _weigh_depth(data, mean, count):
+    """Returns information on the depth, its weighted innovation, and the pull (3,) of radius and height on it.
+
+    The averaged residuals are taken off as each point's bias; what they have in common along the depth is no bias.
+    """
+    n00, n11, n01 = data.noise[:, 0, 0], data.noise[:, 1, 1], data.noise[:, 0, 1]
+    det = n00 * n11 - n01**2
+    p00, p11, p01 = n11 / det, n00 / det, -n01 / det
+    along, norm = 0.0, 1e-300
+    for k in range(len(count)):
+        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
+        along += count[k] * ((p00[k] * h0 + p01[k] * h1) * mean[k, 0] + (p01[k] * h0 + p11[k] * h1) * mean[k, 1])
+        norm += count[k] * (p00[k] * h0 * h0 + 2.0 * p01[k] * h0 * h1 + p11[k] * h1 * h1)
+    along /= norm
+    information, innovation, pull = 0.0, 0.0, np.zeros(3)
+    for k in range(len(count)):
+        h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
+        w0 = data.weights[k] * (p00[k] * h0 + p01[k] * h1)
+        w1 = data.weights[k] * (p01[k] * h0 + p11[k] * h1)
+        information += w0 * h0 + w1 * h1
+        innovation += w0 * (data.r[k, 0] - mean[k, 0] + along * h0) + w1 * (data.r[k, 1] - mean[k, 1] + along * h1)
+        for i in range(1, 3):
+            pull[i] += w0 * data.modes[k, 0, i] + w1 * data.modes[k, 1, i]
+    return information, innovation, pull
+
+
+@njit(**_OPTIONS)
+def _extend(average, data, deeper, memory):
+    """Returns the average with this frame's residuals, its depth changed by `deeper` [m]."""
+    mean, modes, count = average
+    n = len(count)
+    new_mean, new_modes, new_count = np.empty((n, 2)), np.empty((n, 2, 3)), np.empty(n)
+    for k in range(n):
+        share = data.weights[k] / (min(count[k], memory) + 1.0)
+        new_count[k] = min(count[k] * (1.0 - 1.0 / memory) + data.weights[k], memory)
+        for a in range(2):
+            new_mean[k, a] = mean[k, a] + share * (data.r[k, a] - data.modes[k, a, 0] * deeper - mean[k, a])
+            for i in range(3):
+                new_modes[k, a, i] = modes[k, a, i] + share * (data.modes[k, a, i] - modes[k, a, i])
+    return Average(new_mean, new_modes, new_count)
+
+
+@njit(**_OPTIONS)
+def _move_residuals(data, average, moved, deeper):
+    """Takes averaged residuals to the new place and returns this frame's weighted root mean square there [m].
+
+    The place has moved by `moved` (3,) since this frame's residuals, the depth by `deeper` [m] since the average.
+    """
+    mean, modes, _ = average
+    total, weight = 0.0, 0.0
+    for k in range(len(mean)):
+        weight += data.weights[k]
+        for a in range(2):
+            left = data.r[k, a]
+            mean[k, a] -= modes[k, a, 0] * deeper
+            for i in range(3):
+                left -= data.modes[k, a, i] * moved[i]
+                if i > 0:
+                    mean[k, a] -= modes[k, a, i] * moved[i]
+            total += data.weights[k] * left * left
+    return np.sqrt(total / (2.0 * weight))
+
+
+@njit(**_OPTIONS)
+def _allow_for_manoeuvre(forecast, innovation, noise):
+    """Returns the covariance of expected depth and speed (2, 2), widened where the innovation is beyond chance.
+
+    The depth is widened by what chance leaves of the innovation, g = innovation^2 - noise - spread. Where the last
+    frame did not show the speed, the way was made at a new one within the time dt since,
+
+        spread += g [[1, 1/dt], [1/dt, 1/dt^2]].
+
+    Args:
+        forecast: see `Forecast`.
+        innovation: of the depth [m].
+        noise: its variance by the key points of this frame [m^2].
+    """
+    spread = forecast.spread.copy()
+    limit = _ONSET_SIGMA if forecast.unsure > 0.0 else _MANOEUVRE_SIGMA
+    expected = max(spread[0, 0], 0.0) + noise
+    if innovation**2 > limit**2 * expected:
+        grown = innovation**2 - expected
+        spread[0, 0] += grown
+        if forecast.unsure > 0.0:
+            time = max(forecast.unsure, abs(innovation) / _FASTEST)
+            spread[0, 1] += grown / time
+            spread[1, 0] = spread[0, 1]
+            spread[1, 1] += grown / time**2
+    return spread
+
+
+@njit(**_OPTIONS)
+def forecast_place(motion, covariance, slow, dt, acceleration, drift, sudden):
+    """Returns the place dt [s] later: constant speed of the depth under white acceleration; see `Forecast`.
+
+    Args:
+        motion: depth [m] and speed [m/s] (2,).
+        covariance: of both (2, 2).
+        slow: log radius and height [m] (2,).
+        dt: [s].
+        acceleration: standard deviation [m/s^2].
+        drift: standard deviation of the depth beside that [m].
+        sudden: whether the last frame did not show the speed.
+    """
+    a, b, c, power = covariance[0, 0], covariance[0, 1], covariance[1, 1], acceleration**2
+    mixed = b + dt * c + power * dt**3 / 2.0
+    spread = np.array(
+        [[a + 2.0 * dt * b + dt**2 * c + power * dt**4 / 4.0 + drift**2, mixed], [mixed, c + power * dt**2]]
+    )
+    place = np.array([motion[0] + min(dt, _LONGEST_SIGHT) * motion[1], slow[0], slow[1]])
+    return Forecast(place, motion[1], spread, dt if sudden else 0.0)
+
+
+@njit(**_OPTIONS)
+def update_place(data, average, forecast, prior, prior_variance, memory, largest):
+    """Returns the place after one frame; see `PlaceUpdate`.
+
+    Args:
+        data: residuals about the reference place.
+        average: of the residuals so far.
+        forecast: predicted depth and speed, last log radius and height.
+        prior: of log radius and height (2,).
+        prior_variance: (2,).
+        memory: longest average [frames].
+        largest: changes of log radius and height allowed at once (2,).
+    """
+    information, innovation, pull = _weigh_depth(data, average.residuals, average.count)
+    innovation /= information
+    reference, spread = forecast.place, _allow_for_manoeuvre(forecast, innovation, 1.0 / information)
+    jumped = spread[0, 0] > forecast.spread[0, 0]
+    gain = spread[0] / (1.0 / information + max(spread[0, 0], 0.0))
+    depth = reference[0] + gain[0] * innovation
+    new = _extend(average, data, depth - reference[0], memory)
+    hessian, gradient = _posterior(data, new, reference[1:] - prior, prior_variance, information)
+    covariance = invert_symmetric(hessian)
+    away, mistaken, doubt = doubt_height(hessian, gradient, reference[2] - prior[1], prior_variance[1])
+    shift = covariance @ gradient
+    kkt = np.abs(hessian @ shift - gradient).max() / max(np.abs(gradient).max(), 1e-30)
+    place = reference.copy()
+    place[0] = depth
+    for i in range(1, 3):
+        step = min(max(shift[i], -largest[i - 1]), largest[i - 1])
+        place[i] += step
+        # radius and height leave the depth that this frame's key points ask for
+        place[0] -= pull[i] * step / information
+    residual = _move_residuals(data, new, place - reference, place[0] - depth)
+    condition = measure_condition(covariance)
+    covariance[2, 2] += doubt
+    misfit = _compute_misfit(data, new.residuals, new.count)
+    speed = forecast.speed + gain[1] * innovation
+    # what chance leaves of the innovation may be a motion that was not expected; the gain has followed a part of it
+    beyond = max(0.0, innovation**2 - 1.0 / information - max(forecast.spread[0, 0], 0.0))
+    known = gain[0] / information + (1.0 - gain[0]) ** 2 * beyond
+    known += find_rift(data, depth - reference[0], information) ** 2
+    spread = spread - np.outer(gain, spread[0])
+    return PlaceUpdate(
+        place, speed, spread, jumped, new, covariance, known, kkt, residual, misfit, away, mistaken, condition
+    )
+
+
+@njit(**_OPTIONS)
+def _compute_misfit(data, mean, count):
+    """Returns the root mean square of averaged residuals over their standard deviations."""
+    total, freedom = 0.0, -3.0
+    for k in range(len(count)):
+        if count[k] <= 0.5:
+            continue
+        s00, s11, s01 = _averaged_spread(data, count, k)
+        m0, m1 = mean[k, 0], mean[k, 1]
+        total += (s11 * m0 * m0 - 2.0 * s01 * m0 * m1 + s00 * m1 * m1) / (s00 * s11 - s01 * s01)
+        freedom += 2.0
+    return np.sqrt(total / max(freedom, 1.0))

@@ -1,0 +1,95 @@
+"""What a key point detector says about itself, in words for the diagnostics."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from finforce.health import Level, Outcome, Report
+
+if TYPE_CHECKING:
+    from finforce_keypoints.camera_feed import CameraFeed
+    from finforce_keypoints.detectors.build import FinderCard
+    from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
+
+LEAST_VISIBLE = 3  # key points; a solver gives no force with fewer
+
+
+def outcome_of_keypoints(found: JawKeypoints | None, side: str, warning: str = "") -> Outcome:
+    """Return how well a jaw was seen, None: it was not found; with what the detector warns of, "" for nothing."""
+    more = f"; {warning}" if warning else ""
+    if found is None:
+        return Outcome(level=Level.WARN, reason="lost", text=f"the {side} jaw was not found in the image{more}")
+    visible, total = int(np.sum(found.valid)), len(found.valid)
+    text = f"{visible} of {total} key points visible{more}"
+    enough = visible >= LEAST_VISIBLE
+    level = Level.OK if enough and not warning else Level.WARN
+    return Outcome(level=level, reason="visible" if enough else "hidden", text=text)
+
+
+def report_of_rest(alarms: Sequence[Outcome], values: Mapping[str, str]) -> Report:
+    """Return the state of a node that nobody listens to: standing faults, and values."""
+    level = max((alarm.level for alarm in alarms), default=Level.OK)
+    said = [alarm.text for alarm in alarms]
+    return Report(level=level, message="; ".join([*said, "rests: nobody subscribes to the key points"]), values=values)
+
+
+def describe(feed: CameraFeed, card: FinderCard, found: JawKeypoints | None) -> dict[str, str]:
+    """Return what is known of the camera, the finder and a jaw's last key points, as text."""
+    camera = feed.camera
+    known = {
+        "finder": card.name,
+        "colour images": feed.topic or "none yet",
+        "camera": "no camera_info yet" if camera is None else f"{camera.width} x {camera.height}",
+        "overtaken while waiting for depth": str(feed.passed),
+    }
+    return known if found is None else known | _describe_jaw(found)
+
+
+def _describe_jaw(found: JawKeypoints) -> dict[str, str]:
+    """Return the figures of a jaw's last key points."""
+    hidden = Counter(str(reason) for reason in found.reasons if reason)
+    spread = found.stddev[found.valid]
+    x, y, z = found.T_camera_jaw[:3, 3]
+    return {
+        "visible": f"{int(found.valid.sum())} of {len(found.valid)}",
+        "hidden": ", ".join(f"{count} {reason}" for reason, count in hidden.most_common()) or "none",
+        "likelihood median": f"{float(np.median(found.likelihood)):.2f}",
+        "stddev median [mm]": f"{1e3 * float(np.median(spread)):.2f}" if len(spread) else "-",
+        "jaw origin in the camera [mm]": f"{1e3 * x:.1f} {1e3 * y:.1f} {1e3 * z:.1f}",
+    }
+
+
+def describe_names(names: Sequence[str], card: FinderCard) -> str:
+    """Return, as JSON, what the rows of the key point clouds are, which of them to join, and who finds them."""
+    said: Mapping[str, object] = {
+        "names": list(names),
+        "skeleton": build_skeleton(names),
+        "model": card.name,
+        "sha256": card.sha256,
+    }
+    return json.dumps(said)
+
+
+def build_skeleton(names: Sequence[str]) -> list[list[int]]:
+    """Return pairs of rows to be joined in a picture: neighbours along a band, and the two ends of a rib.
+
+    Names end with their number along the band (inner_1, inner_2, outer_1, ...); `tip` ends every band.
+    """
+    bands: dict[str, dict[int, int]] = {}
+    for row, name in enumerate(names):
+        if match := re.fullmatch(r"(.+)_(\d+)", name):
+            bands.setdefault(match[1], {})[int(match[2])] = row
+    pairs = []
+    for band in bands.values():
+        rows = [band[number] for number in sorted(band)] + ([list(names).index("tip")] if "tip" in names else [])
+        pairs += [[one, other] for one, other in zip(rows, rows[1:], strict=False)]
+    if len(bands) == 2:
+        one, other = bands.values()
+        pairs += [[one[number], other[number]] for number in sorted(one.keys() & other.keys())]
+    return pairs

@@ -1,0 +1,171 @@
+"""Depth of the finger's side at its key points, from many pixels inside its outline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from finforce.camera import CameraIntrinsics, project
+from finforce_ifea.jaw.jaw import Jaw
+
+_SPACING = 0.15e-3  # of the raster on which the finger's side is drawn [m]
+_STRIDE = 3  # every so many points of it are sampled: a pixel is 0.25 to 0.5 mm
+_ON_SIDE = 0.2e-3  # a triangle's corners this near to the side plane are on it [m]
+_REFERENCE_RADIUS = 1.5e-3  # the reference point's holder is flat so far around it [m]
+_SMALLEST_RADIUS = 0.45e-3  # around a key point that is not on a flat side of the mesh [m]
+_INLIER_SIGMA = 3.0
+_MAD_TO_STDDEV = 1.4826
+_CORRELATED = 6.0  # neighbouring samples whose errors are alike
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SideSamples:
+    """Places on the finger's side around its key points, the reference point last.
+
+    Attributes:
+        offsets: (K + 1, S, 3) from the point, parallel to the side plane [m, jaw frame].
+        used: (K + 1, S) bool; the rest is padding.
+    """
+
+    offsets: NDArray
+    used: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DepthEvidence:
+    """What the depth image says about points on the finger's side.
+
+    Attributes:
+        excess: (n,) measured less expected depth [m]; NaN where there are no depths of the finger.
+        stddev: (n,) of `excess` without what all depths of the image share [m].
+        known: (n,) samples with depth.
+        count: (n,) samples that are the finger's.
+        share: (n,) of the samples with depth that are the finger's; 0 where none has depth.
+        nearer: (n,) share of the samples with depth that are before the finger.
+    """
+
+    excess: NDArray
+    stddev: NDArray
+    known: NDArray
+    count: NDArray
+    share: NDArray
+    nearer: NDArray
+
+
+def build_side_samples(jaw: Jaw, window: float, edge: float) -> SideSamples:
+    """Return places on the jaw's side, `edge` [m] inside its outline and at most `window` [m] from a key point.
+
+    Raises:
+        MeshError: the jaw's mesh is bad.
+    """
+    mesh = jaw.build_mesh("coarse" if jaw.drawing is not None else None)
+    triangles = mesh.nodes[mesh.surface]
+    steps = np.arange(-window - edge, window + edge + 0.5 * _SPACING, _SPACING)
+    raster = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
+    places = [_select_places(raster, point, triangles, window, edge) for point in jaw.keypoints]
+    places.append(_disc(raster, _REFERENCE_RADIUS))
+    offsets = np.zeros((len(places), max(map(len, places)), 3))
+    used = np.zeros(offsets.shape[:2], dtype=bool)
+    for row, place in enumerate(places):
+        offsets[row, : len(place), ::2] = place
+        used[row, : len(place)] = True
+    return SideSamples(offsets=offsets, used=used)
+
+
+def _select_places(raster: NDArray, point: NDArray, triangles: NDArray, window: float, edge: float) -> NDArray:
+    """Return the places x, z (s, 2) of a raster (a, a, 2) around a key point, well inside the side's outline."""
+    reach = np.abs(raster).max()
+    corners = triangles[(np.abs(triangles[:, :, 1] - point[1]) < _ON_SIDE).all(axis=1)][:, :, ::2] - point[::2]
+    corners = corners[(corners.min(axis=1) < reach).all(axis=1) & (corners.max(axis=1) > -reach).all(axis=1)]
+    inside = np.zeros(raster.shape[:2], dtype=bool)
+    for triangle in corners:
+        inside |= _covers(triangle, raster)
+    well_inside = (distance_transform_edt(inside) * _SPACING > edge) & (np.linalg.norm(raster, axis=-1) <= window)
+    places = raster[::_STRIDE, ::_STRIDE][well_inside[::_STRIDE, ::_STRIDE]]
+    return places if len(places) else _disc(raster, _SMALLEST_RADIUS)
+
+
+def _covers(triangle: NDArray, raster: NDArray) -> NDArray:
+    """Return which points (a, a) of a raster (a, a, 2) a triangle (3, 2) covers."""
+    along = np.roll(triangle, -1, axis=0) - triangle
+    relative = raster[:, :, None, :] - triangle
+    turn = along[:, 0] * relative[..., 1] - along[:, 1] * relative[..., 0]
+    slack = 1e-9
+    return (turn >= -slack).all(axis=-1) | (turn <= slack).all(axis=-1)
+
+
+def _disc(raster: NDArray, radius: float) -> NDArray:
+    """Return the places (s, 2) of a raster (a, a, 2) within a radius [m] of its middle."""
+    places = raster[::_STRIDE, ::_STRIDE].reshape(-1, 2)
+    return places[np.linalg.norm(places, axis=1) <= radius]
+
+
+def sample_depths(
+    depth: NDArray, camera: CameraIntrinsics, points: NDArray, samples: SideSamples, T_camera_jaw: NDArray
+) -> NDArray:
+    """Return measured less expected depths (n, S) [m] around points on a jaw's side, NaN where nothing was measured.
+
+    Args:
+        depth: (h, w) [m].
+        camera: of the depth image.
+        points: (n, 3) where the points would be on the expected side plane [m, jaw frame]; NaN: not to be sampled.
+        samples: places around them.
+        T_camera_jaw: (4, 4).
+    """
+    places = (points[:, None, :] + samples.offsets)[samples.used] @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3]
+    pixels = project(places, camera)
+    with np.errstate(invalid="ignore"):
+        inside = (pixels > -0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(axis=1)
+    measured = np.full(len(places), np.nan)
+    columns, rows = np.rint(pixels[inside]).astype(np.intp).T
+    measured[inside] = depth[rows, columns] - places[inside, 2]
+    excess = np.full(samples.used.shape, np.nan)
+    excess[samples.used] = measured
+    return excess
+
+
+def weigh_depths(excess: NDArray, centre: NDArray, gate: float, quantum: float) -> DepthEvidence:
+    """Return what sampled depths say, those of the finger being within `gate` [m] of the expectation.
+
+    The median of these and their median absolute deviation (MAD) choose the ones to average:
+    |excess - median| <= 3 max(1.4826 MAD, quantum / 2). The average's error is that of one depth, at least that of
+    rounding, quantum / sqrt 12, by the root of the number of samples whose errors are not alike.
+
+    Args:
+        excess: (n, S) measured less expected depths [m], NaN where nothing was measured.
+        centre: (n,) excess around which the finger is expected [m].
+        gate: [m].
+        quantum: step of the depths [m].
+    """
+    away = excess - centre[:, None]
+    with np.errstate(invalid="ignore"):
+        known, is_near, is_far = np.isfinite(away), away < -gate, away > gate
+    finger = known & ~is_near & ~is_far
+    median = _masked_median(away, finger)
+    spread = _MAD_TO_STDDEV * _masked_median(np.abs(away - median[:, None]), finger)
+    with np.errstate(invalid="ignore"):
+        finger &= np.abs(away - median[:, None]) <= _INLIER_SIGMA * np.maximum(spread, 0.5 * quantum)[:, None]
+    count, measured = finger.sum(axis=1), np.maximum(known.sum(axis=1), 1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(finger, away, 0.0).sum(axis=1) / count
+        stddev = np.maximum(spread, quantum / np.sqrt(12.0)) / np.sqrt(np.maximum(count / _CORRELATED, 1.0))
+    return DepthEvidence(
+        excess=mean + centre,
+        stddev=stddev,
+        known=known.sum(axis=1),
+        count=count,
+        share=count / measured,
+        nearer=is_near.sum(axis=1) / measured,
+    )
+
+
+def _masked_median(values: NDArray, mask: NDArray) -> NDArray:
+    """Return the medians (n,) of the chosen values in the rows (n, S), NaN in rows without any."""
+    ordered = np.sort(np.where(mask, values, np.inf), axis=1)
+    count = mask.sum(axis=1)
+    rows = np.arange(len(values))
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, values.shape[1] - 1)
+    return np.where(count > 0, 0.5 * (ordered[rows, low] + ordered[rows, high]), np.nan)

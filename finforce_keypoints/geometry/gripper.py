@@ -1,0 +1,82 @@
+"""Where a wrist camera sits and how the jaws slide before it.
+
+The gripper base has x along the closing axis, from the left to the right jaw, and z along the approach direction.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from finforce.transforms import invert_pose, pose_from_quaternion
+from finforce_keypoints.errors import GeometryError
+
+SIDES = ("left", "right")
+
+
+def jaw_in_gripper(side: str, origin_x: float) -> NDArray:
+    """Return T_gripper_jaw (4, 4) of a jaw whose origin is at `origin_x` [m] on the closing axis.
+
+    The left jaw has the orientation of the gripper base, the right jaw is that turned by 180 degrees about z.
+
+    Raises:
+        GeometryError: the side is neither "left" nor "right".
+    """
+    if side not in SIDES:
+        raise GeometryError(f"side: got {side!r}, expected 'left' or 'right'")
+    T = np.eye(4) if side == "left" else np.diag([-1.0, -1.0, 1.0, 1.0])
+    T[0, 3] = origin_x
+    return T
+
+
+def jaw_in_camera(T_gripper_camera: NDArray, side: str, origin_x: float) -> NDArray:
+    """Return T_camera_jaw (4, 4) = T_gripper_camera^-1 T_gripper_jaw(origin_x [m])."""
+    return invert_pose(T_gripper_camera) @ jaw_in_gripper(side, origin_x)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpeningRange:
+    """How far from the middle of the gripper a jaw's origin can be along the closing axis [m]."""
+
+    nearest: float = 0.010
+    farthest: float = 0.070
+
+    def place_jaw(self, T_gripper_camera: NDArray, side: str, step: float) -> list[NDArray]:
+        """Return T_camera_jaw (4, 4) at places from one end of the range to the other, at most `step` [m] apart."""
+        count = max(2, int(np.ceil((self.farthest - self.nearest) / step)) + 1)
+        sign = -1.0 if side == "left" else 1.0
+        places = np.linspace(self.nearest, self.farthest, count)
+        return [jaw_in_camera(T_gripper_camera, side, sign * place) for place in places]
+
+
+def look_at(position: ArrayLike, target: ArrayLike, right: ArrayLike) -> NDArray:
+    """Return the pose (4, 4) of a camera at a place that looks at a target.
+
+    z = (target - position) normed, x = the part of `right` normal to z, y = z x x; all in the frame of the result.
+
+    Args:
+        position: (3,) of the camera [m].
+        target: (3,) on the optical axis [m].
+        right: (3,) direction of the image's rows.
+    """
+    position = np.asarray(position, dtype=float)
+    z = np.asarray(target, dtype=float) - position
+    z /= np.linalg.norm(z)
+    x = np.asarray(right, dtype=float)
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack((x, np.cross(z, x), z))
+    T[:3, 3] = position
+    return T
+
+
+# On the wrist, above the fingers' side faces, both jaws in view from base to tip.
+ROBOT_CAMERA = look_at((0.0, 0.095, -0.045), (0.0, 0.010, 0.042), (1.0, 0.0, 0.0))
+
+# The bench has one jaw, held here on the closing axis [m]; its pose before the camera is that of the bench recordings.
+BENCH_ORIGIN_X = -0.055
+_BENCH_JAW = pose_from_quaternion(
+    (0.0293674, 0.02565352, 0.11204665), (-0.21179348, -0.35564507, 0.90650751, 0.08309176)
+)
+BENCH_CAMERA = jaw_in_gripper("left", BENCH_ORIGIN_X) @ invert_pose(_BENCH_JAW)

@@ -1,0 +1,286 @@
+"""One jaw in one image after another: its place, and its key points in its frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.camera import CameraIntrinsics, project
+from finforce_ifea.jaw.jaw import Jaw
+from finforce_keypoints.detectors.pixel_finder import PixelFinding
+from finforce_keypoints.geometry.depth import DepthEvidence, build_side_samples, sample_depths, weigh_depths
+from finforce_keypoints.geometry.jaw_pose import Origin, OriginFinder, OriginTrack
+from finforce_keypoints.geometry.reference_patch import ReferencePatch
+from finforce_keypoints.geometry.rest_check import RestCheck
+from finforce_keypoints.geometry.side_fit import (
+    DepthScale,
+    SideFit,
+    SideModel,
+    Sight,
+    compute_stddev,
+    fit_side,
+    look_along,
+    rays_through,
+)
+from finforce_keypoints.images import RgbdImage, lie_inside
+from finforce_keypoints.settings import DetectorSettings
+
+_LEAST_SEEN = 3  # points, or all there are: fewer likely ones are no jaw
+_LEAST_FOUND = 1 / 3  # share of the points that have to be likely where no jaw was known before
+REASONS = ("image", "likelihood", "depth", "workspace")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JawKeypoints:
+    """The key points of one jaw in one image.
+
+    Attributes:
+        stamp: image capture time [s].
+        points: (K, 3) [m], jaw frame, in the order of the jaw file; NaN where there is no depth.
+        likelihood: (K,) from 0 to 1; 0 where a point is not valid, so that whoever reads no `valid` drops it, too.
+        pixels: (K, 2) column and row in the raw image [px]; NaN where nothing was found.
+        valid: (K,) bool, whether a point may be used.
+        stddev: (K, 3) one standard deviation along the jaw's axes [m].
+        T_camera_jaw: (4, 4) where the jaw is.
+        reasons: (K,) str, "" for valid points, else what speaks against them, one of `REASONS`.
+    """
+
+    stamp: float
+    points: NDArray
+    likelihood: NDArray
+    pixels: NDArray
+    valid: NDArray
+    stddev: NDArray
+    T_camera_jaw: NDArray
+    reasons: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SideEvidence:
+    """Where a jaw's points are across its side, and which of them (K + 1,) bool the depth image confirms."""
+
+    fit: SideFit
+    has_depth: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Located:
+    """What one image says of a jaw: its key points, and how wrong the depth image's scale is."""
+
+    keypoints: JawKeypoints
+    scale: DepthScale
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Seen:
+    """One image, what was found in it, which points (K + 1,) are likely, their rays (K + 1, 3) and these' errors."""
+
+    image: RgbdImage
+    finding: PixelFinding
+    likely: NDArray
+    rays: NDArray
+    ray_stddev: NDArray
+
+
+class JawLocalizer:
+    """Follows one jaw; raises MeshError when the jaw's mesh is bad."""
+
+    def __init__(self, jaw: Jaw, T_gripper_camera: NDArray, settings: DetectorSettings) -> None:
+        """Prepare where to sample depth on the jaw."""
+        self._settings = settings
+        self._origin, self._track = OriginFinder(jaw, T_gripper_camera, settings), OriginTrack(settings)
+        self._patch, self._rest_check = ReferencePatch(jaw), RestCheck(jaw.keypoints)
+        self._unconfirmed = 0
+        self._samples = build_side_samples(jaw, settings.window, settings.edge)
+        self._rest = np.vstack((jaw.keypoints, jaw.reference_point))
+        self._model = SideModel(
+            places=self._rest[:, ::2],
+            offset=settings.offset_stddev,
+            tilt=settings.tilt_stddev,
+            bow=settings.bow_stddev,
+            relief=settings.relief_stddev,
+        )
+        self._box = np.array([settings.workspace_closing, settings.workspace_width, settings.workspace_length])
+
+    def reset(self) -> None:
+        """Forget where the jaw was."""
+        self._track.reset()
+        self._patch.reset()
+        self._rest_check.reset()
+        self._unconfirmed = 0
+
+    @property
+    def warning(self) -> str:
+        """What is suspicious about this jaw, in a sentence; "" for nothing."""
+        distance = self._rest_check.distance
+        if not distance > self._settings.rest_tolerance:
+            return ""
+        return (
+            f"the key points at rest lie {1e3 * distance:.1f} mm from the jaw file: are the camera's extrinsics right?"
+        )
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the jaw has to be looked for everywhere."""
+        return self._track.is_lost
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the jaw's place is no longer learnt, so that images in a row tell the same."""
+        return self._patch.is_learnt
+
+    def rest(self, stamp: float) -> None:
+        """Take it that the jaw has not moved from the last image to one of `stamp` [s]."""
+        self._track.rest(stamp)
+
+    @property
+    def middle(self) -> NDArray:
+        """T_camera_jaw (4, 4) in the middle of the opening range."""
+        return self._origin.place(self._origin.middle)
+
+    def imagine(self, camera: CameraIntrinsics) -> PixelFinding:
+        """Return the finding of a jaw at rest, seen without error in the middle of the opening range."""
+        T, count = self.middle, len(self._rest)
+        return PixelFinding(
+            pixels=project(self._rest @ T[:3, :3].T + T[:3, 3], camera),
+            likelihood=np.ones(count),
+            stddev=np.full(count, 0.5),
+        )
+
+    def expect(self, stamp: float) -> NDArray | None:
+        """Return T_camera_jaw (4, 4) where the jaw should be at a time [s]; None when it is lost."""
+        forecast = self._track.forecast(stamp)
+        return None if forecast is None else self._origin.place(forecast)
+
+    def locate(self, image: RgbdImage, finding: PixelFinding | None, scale: DepthScale) -> Located | None:
+        """Return the jaw's key points, None when nobody knows where the jaw is.
+
+        Args:
+            image: the image, checked.
+            finding: the pixels found; None when the finder saw nothing of the jaw.
+            scale: what is known of the depth image's scale beforehand.
+        """
+        if finding is None:
+            self._track.update(image.stamp, None)
+            return None
+        seen = self._look(image, finding)
+        origin = self._track.update(image.stamp, self._measure(seen))
+        if origin is None:
+            return None
+        located = self._describe(seen, scale, origin)
+        # without one key point that depth confirms, a picture of a jaw would do as well
+        self._unconfirmed = 0 if located.keypoints.valid.any() else self._unconfirmed + 1
+        if self._unconfirmed >= self._settings.lost_images:
+            self._track.reset()
+            return None
+        return located
+
+    def _look(self, image: RgbdImage, finding: PixelFinding) -> _Seen:
+        """Return the rays to the points that were found."""
+        inside = lie_inside(image, finding.pixels)
+        return _Seen(
+            image=image,
+            finding=finding,
+            likely=self._find_likely(image, finding),
+            rays=rays_through(np.where(inside[:, None], finding.pixels, np.nan), image.camera),
+            ray_stddev=finding.stddev / np.sqrt(image.camera.fx * image.camera.fy),
+        )
+
+    def _measure(self, seen: _Seen) -> Origin | None:
+        """Return where one image shows the jaw; None where it does not."""
+        measured = self._origin.measure(np.where(seen.likely[:, None], seen.rays, np.nan), seen.ray_stddev)
+        if measured is None or not self._is_there(seen.likely):
+            return None
+        if seen.likely[-1]:
+            return self._patch.refine(seen.image.color, seen.image.camera, measured, self._origin.place)
+        return measured
+
+    def _describe(self, seen: _Seen, scale: DepthScale, origin: Origin) -> Located:
+        """Return the key points of the jaw at an origin."""
+        T_camera_jaw = self._origin.place(origin)
+        sight = look_along(seen.rays, T_camera_jaw)
+        side = self._fit_side(seen.image, sight, seen.likely, scale, T_camera_jaw)
+        depths = sight.depths_at(self._rest[:, 1] + side.fit.y)
+        self._check_rest(seen, sight, side)
+        points = np.where(side.has_depth[:, None], sight.camera + depths[:, None] * sight.rays, np.nan)
+        stddev = compute_stddev(sight, depths, side.fit.stddev, seen.ray_stddev)
+        stddev[:, 0] = np.hypot(stddev[:, 0], origin.stddev)
+        reasons = self._judge(seen.image, seen.finding, side, points)
+        valid = reasons == ""
+        count = len(valid)
+        keypoints = JawKeypoints(
+            stamp=seen.image.stamp,
+            points=points[:count],
+            likelihood=np.where(valid, seen.finding.likelihood[:count], 0.0),
+            pixels=seen.finding.pixels[:count],
+            valid=valid,
+            stddev=stddev[:count],
+            T_camera_jaw=T_camera_jaw,
+            reasons=reasons,
+        )
+        return Located(keypoints=keypoints, scale=side.fit.scale)
+
+    def _check_rest(self, seen: _Seen, sight: Sight, side: SideEvidence) -> None:
+        """Compare the likely points with the jaw file: along the side where their rays meet it, across it by depth."""
+        points = sight.points_at(self._rest[:, 1])
+        points[:, 1] += side.fit.y
+        self._rest_check.take(np.where(seen.likely[:, None], points, np.nan)[:-1])
+
+    def _is_there(self, likely: NDArray) -> bool:
+        """Say whether enough of the points (K + 1,) bool are likely for a jaw, more of them for one that was lost."""
+        least = min(_LEAST_SEEN, len(likely))
+        return likely.sum() >= (max(least, _LEAST_FOUND * len(likely)) if self.is_lost else least)
+
+    def _find_likely(self, image: RgbdImage, finding: PixelFinding) -> NDArray:
+        """Return which points (K + 1,) bool the finder believes in."""
+        likely = finding.likelihood >= self._settings.likelihood
+        return likely & lie_inside(image, finding.pixels) & np.isfinite(finding.stddev)
+
+    def _fit_side(
+        self, image: RgbdImage, sight: Sight, likely: NDArray, scale: DepthScale, T_camera_jaw: NDArray
+    ) -> SideEvidence:
+        """Return where the points are across the jaw's side: first near the known plane, then near the one found."""
+        expected = sight.depths_at(self._rest[:, 1])
+        lever = expected * sight.rays[:, 1]
+        nothing = np.full(len(expected), np.nan)
+        if image.depth is None:
+            fit = fit_side(self._model, nothing, nothing, np.nan_to_num(lever), scale)
+            return SideEvidence(fit=fit, has_depth=np.full(len(expected), self._settings.plane_depth))
+        points = sight.camera + expected[:, None] * sight.rays
+        excess = sample_depths(image.depth, image.camera, points, self._samples, T_camera_jaw)
+        fit, settings = None, self._settings
+        for gate in (settings.wide_gate, settings.gate):
+            away = np.zeros(len(expected)) if fit is None else fit.y / sight.rays[:, 1]
+            error = scale.error if fit is None else fit.scale.error
+            evidence = weigh_depths(excess, away + error * expected, gate, settings.quantum)
+            measured = self._measures(evidence)
+            used = measured & likely
+            fit = fit_side(
+                self._model,
+                np.where(used, evidence.excess * sight.rays[:, 1], np.nan),
+                np.hypot(evidence.stddev, settings.depth_noise) * np.abs(sight.rays[:, 1]),
+                np.nan_to_num(lever),
+                scale,
+            )
+        with np.errstate(invalid="ignore"):
+            refused = np.abs(fit.misfit) > settings.misfit
+        hole = (evidence.known < settings.least_depths) & settings.plane_depth
+        return SideEvidence(fit=fit, has_depth=(measured & ~refused) | hole)
+
+    def _measures(self, evidence: DepthEvidence) -> NDArray:
+        """Return at which points (K + 1,) bool enough depths, and most of them, are the finger's."""
+        return (evidence.count >= self._settings.least_depths) & (evidence.share >= self._settings.least_share)
+
+    def _judge(self, image: RgbdImage, finding: PixelFinding, side: SideEvidence, points: NDArray) -> NDArray:
+        """Return what speaks against each key point (K,) str, the first reason that does; "" for nothing."""
+        with np.errstate(invalid="ignore"):
+            outside = (np.abs(points - self._rest) > self._box).any(axis=1)
+        against = (
+            ~lie_inside(image, finding.pixels),
+            ~(finding.likelihood >= self._settings.likelihood),
+            ~side.has_depth | ~np.isfinite(points).all(axis=1),
+            outside,
+        )
+        return np.select(against, REASONS, default="")[:-1]

@@ -1,0 +1,201 @@
+"""Where a jaw stands on the closing axis, from the rays to its rigid points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.jaw.jaw import Jaw
+from finforce_keypoints.geometry.gripper import jaw_in_camera
+from finforce_keypoints.settings import DetectorSettings
+
+_BENT_AT = 0.010  # height for which the bending is given [m]
+_HIGHEST_RIGID = 3.5e-3  # key points that bend more than this say nothing about the jaw's place [m]
+_LEAST_AGREEMENT = 0.6  # share of the points near the base that stand where the jaw is said to be: of a jaw, all do
+_SET_ASIDE = 3  # consecutive places off the course that are believed when they agree
+_LONGEST_STEP = 0.5  # [s] without an image, after which the course starts anew
+
+
+@dataclass(frozen=True, kw_only=True)
+class Origin:
+    """A jaw's place.
+
+    Attributes:
+        x: of the jaw's origin in the gripper base [m].
+        stddev: [m].
+    """
+
+    x: float
+    stddev: float
+
+
+class OriginFinder:
+    """Finds the origin of one jaw, whose rotation is known, from rays to its points.
+
+    A point of the rigid jaw moves on a line q(x) = p + x a, a the closing axis; it is where it comes nearest to the
+    ray r: the x for which r_xy q_z - q_xy, its distance from the ray [m], is least. All in the camera frame.
+    """
+
+    def __init__(self, jaw: Jaw, T_gripper_camera: NDArray, settings: DetectorSettings) -> None:
+        """Keep the lines on which the jaw's points move, the reference point last."""
+        self._tolerance = settings.reference_tolerance
+        self._T_camera_middle = jaw_in_camera(T_gripper_camera, jaw.side, 0.0)
+        points = np.vstack((jaw.keypoints, jaw.reference_point))
+        self._starts = points @ self._T_camera_middle[:3, :3].T + self._T_camera_middle[:3, 3]
+        self._axis = T_gripper_camera[0, :3].copy()
+        bent = settings.rigid_stddev * (jaw.keypoints[:, 2] / _BENT_AT) ** 2
+        self._bent = np.append(np.where(bent < _HIGHEST_RIGID, bent, np.inf), 0.0)
+        sign = -1.0 if jaw.side == "left" else 1.0
+        self._low, self._high = sorted((sign * settings.opening_min, sign * settings.opening_max))
+
+    @property
+    def middle(self) -> Origin:
+        """The middle of the opening range."""
+        return Origin(x=0.5 * (self._low + self._high), stddev=0.0)
+
+    def place(self, origin: Origin) -> NDArray:
+        """Return T_camera_jaw (4, 4) of an origin."""
+        T = self._T_camera_middle.copy()
+        T[:3, 3] += origin.x * self._axis
+        return T
+
+    def measure(self, rays: NDArray, stddev: NDArray) -> Origin | None:
+        """Return the origin that rays show, None when they show none within the opening range.
+
+        The reference point decides; without it, the key points near the clamped base do, less exactly as they bend.
+        What most of them contradict is no jaw.
+
+        Args:
+            rays: (K + 1, 3) through the jaw's points, camera frame, z = 1; NaN: not seen.
+            stddev: (K + 1,) of the rays' x and y [-]: that of the pixels by the focal length.
+        """
+        x, error, off = self._solve(rays, stddev)
+        with np.errstate(invalid="ignore"):
+            fits = (off <= self._tolerance) & (x >= self._low) & (x <= self._high) & np.isfinite(self._bent)
+        if fits[-1]:
+            origin = Origin(x=float(x[-1]), stddev=float(error[-1]))
+            return origin if self._agrees(origin, x, off) else None
+        if fits.sum() < 2:
+            return None
+        x, error, bent = x[fits], error[fits], self._bent[fits]
+        weights = 1.0 / (error**2 + bent**2 + (x - np.median(x)) ** 2)
+        # bent points do not err independently: what they share is no smaller than the least bending
+        spread = np.sqrt(1.0 / weights.sum() + bent.min() ** 2)
+        return Origin(x=float(weights @ x / weights.sum()), stddev=float(spread))
+
+    def _agrees(self, origin: Origin, x: NDArray, off: NDArray) -> bool:
+        """Say whether the points near the base, by origins (K + 1,) and distances (K + 1,), are of a jaw there."""
+        near = np.isfinite(x) & np.isfinite(self._bent)
+        near[-1] = False
+        bent = self._bent[near]
+        there = (np.abs(x[near] - origin.x) <= self._tolerance + 3.0 * bent) & (off[near] <= self._tolerance + bent)
+        return bool(there.sum() >= _LEAST_AGREEMENT * near.sum())
+
+    def _solve(self, rays: NDArray, stddev: NDArray) -> NDArray:
+        """Return rows (3, K + 1): origin, its standard deviation, distance of the line of motion from the ray [m]."""
+        slopes = rays[:, :2] * self._axis[2] - self._axis[:2]
+        apart = rays[:, :2] * self._starts[:, 2:] - self._starts[:, :2]
+        square = (slopes**2).sum(axis=1)
+        x = -(slopes * apart).sum(axis=1) / square
+        depth = self._starts[:, 2] + x * self._axis[2]
+        off = np.linalg.norm(apart + x[:, None] * slopes, axis=1)
+        return np.stack((x, depth * stddev / np.sqrt(square), off))
+
+
+class OriginTrack:
+    """Kalman filter of a jaw's place and speed that follows changes of speed at once.
+
+    Constant speed under white acceleration, P' = F P F^T + Q. An origin farther off the forecast than the gate means
+    that the speed has changed: position and speed are opened to what was seen.
+    """
+
+    def __init__(self, settings: DetectorSettings) -> None:
+        """Keep noise and gates."""
+        self._settings = settings
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the jaw."""
+        self._stamp: float | None = None
+        self._state, self._P = np.zeros(2), np.zeros((2, 2))
+        self._aside: list[tuple[float, float]] = []
+        self._missed = 0
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether nobody knows where the jaw is."""
+        return self._stamp is None
+
+    def forecast(self, stamp: float) -> Origin | None:
+        """Return where the jaw should be at a time [s]; None when it is lost."""
+        if self._stamp is None or stamp - self._stamp > _LONGEST_STEP:
+            return None
+        state, P = self._predict(stamp)
+        return Origin(x=float(state[0]), stddev=float(np.sqrt(P[0, 0])))
+
+    def update(self, stamp: float, origin: Origin | None) -> Origin | None:
+        """Take the origin seen in an image, None when it was not; return the best estimate, None when lost."""
+        forecast = self.forecast(stamp)
+        if origin is None:
+            return self._miss(stamp, forecast)
+        if forecast is None:
+            return self._begin(stamp, origin)
+        state, P = self._predict(stamp)
+        error, dt = origin.x - state[0], stamp - self._stamp
+        spread = np.sqrt(P[0, 0] + origin.stddev**2)
+        if abs(error) > self._settings.largest_speed * dt + self._settings.origin_gate * spread:
+            return self._set_aside(stamp, origin, forecast)
+        self._missed, self._aside = 0, []
+        if abs(error) > self._settings.origin_gate * spread:
+            P = P + np.diag([error**2, (error / dt) ** 2])
+        gain = P[:, 0] / (P[0, 0] + origin.stddev**2)
+        self._stamp, self._state = stamp, state + gain * error
+        self._P = P - np.outer(gain, P[0])
+        return self._estimate()
+
+    def rest(self, stamp: float) -> None:
+        """Take it that the jaw has not moved since the last image."""
+        if self._stamp is not None:
+            self._stamp, self._state[1] = stamp, 0.0
+
+    def _begin(self, stamp: float, origin: Origin, speed: float = 0.0) -> Origin:
+        """Start the course at an origin."""
+        self._stamp, self._state = stamp, np.array([origin.x, speed])
+        self._P = np.diag([origin.stddev**2, 0.01**2])
+        self._aside, self._missed = [], 0
+        return self._estimate()
+
+    def _miss(self, stamp: float, forecast: Origin | None) -> Origin | None:
+        """Go on without an origin for a few images."""
+        self._missed += 1
+        if forecast is None or self._missed >= self._settings.lost_images:
+            self.reset()
+            return None
+        self._state, self._P = self._predict(stamp)
+        self._stamp = stamp
+        return forecast if forecast.stddev <= self._settings.origin_stddev else None
+
+    def _set_aside(self, stamp: float, origin: Origin, forecast: Origin) -> Origin | None:
+        """Keep an origin that no jaw can reach; believe it once some in a row agree."""
+        if self._aside and abs(origin.x - self._aside[-1][1]) > self._settings.largest_speed * (
+            stamp - self._aside[-1][0]
+        ):
+            self._aside = []
+        self._aside.append((stamp, origin.x))
+        if len(self._aside) >= _SET_ASIDE:
+            (first, begin), (last, end) = self._aside[0], self._aside[-1]
+            return self._begin(stamp, origin, speed=(end - begin) / (last - first))
+        return self._miss(stamp, forecast)
+
+    def _predict(self, stamp: float) -> tuple[NDArray, NDArray]:
+        """Return position and speed (2,) at a time [s] and their covariance (2, 2)."""
+        dt, power = stamp - self._stamp, self._settings.acceleration**2
+        F = np.array([[1.0, dt], [0.0, 1.0]])
+        Q = power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+        return F @ self._state, F @ self._P @ F.T + Q
+
+    def _estimate(self) -> Origin:
+        """Return the jaw's place now."""
+        return Origin(x=float(self._state[0]), stddev=float(np.sqrt(self._P[0, 0])))

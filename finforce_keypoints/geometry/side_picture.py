@@ -1,0 +1,109 @@
+"""Pictures of a jaw's side plane, square to it and to scale whatever the camera's place and lens.
+
+The key points lie on the side of the jaw that looks at the camera, the plane y = const of the jaw frame. The column c
+and the row r of the picture are x = x_0 + c s and z = z_0 + r s on it; left and right jaw look alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.camera import CameraIntrinsics, project, rays_from_pixels
+
+if TYPE_CHECKING:
+    from finforce_ifea.jaw.jaw import Jaw
+
+COARSE = 4  # [px] between the places that are projected exactly; between them a line is right within 0.04 px
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneGrid:
+    """Where the pixels of a picture lie on the side plane.
+
+    Attributes:
+        scale: size of a pixel [m].
+        x: of the centre of the first column, jaw frame [m].
+        z: of the centre of the first row [m].
+        width: number of columns.
+        height: number of rows.
+    """
+
+    scale: float = 0.45e-3
+    x: float = -0.036
+    z: float = -0.012
+    width: int = 176
+    height: int = 224
+
+    def padded(self, margin: int) -> PlaneGrid:
+        """Return the grid with a margin [px] on every side."""
+        return PlaneGrid(
+            scale=self.scale,
+            x=self.x - margin * self.scale,
+            z=self.z - margin * self.scale,
+            width=self.width + 2 * margin,
+            height=self.height + 2 * margin,
+        )
+
+    def places(self, pixels: NDArray) -> NDArray:
+        """Return x and z (n, 2) [m] of pixels (n, 2) of the picture, column and row."""
+        return np.array([self.x, self.z]) + self.scale * np.asarray(pixels, dtype=float)
+
+    def pixels(self, places: NDArray) -> NDArray:
+        """Return the pixels (n, 2) of the picture at x and z (n, 2) [m]."""
+        return (np.asarray(places, dtype=float) - (self.x, self.z)) / self.scale
+
+
+def find_side(jaw: Jaw) -> float:
+    """Return the y [m] of a jaw's side plane: the mean of its key points'."""
+    return float(jaw.keypoints[:, 1].mean())
+
+
+def project_plane(places: NDArray, side_y: float, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
+    """Return the image pixels (n, 2) of places x, z (n, 2) [m] on the plane y = side_y [m]."""
+    points = np.column_stack((places[:, 0], np.full(len(places), side_y), places[:, 1]))
+    return project(points @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3], camera)
+
+
+def intersect_plane(pixels: NDArray, side_y: float, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
+    """Return x and z (n, 2) [m] where the rays of image pixels (n, 2) meet the plane y = side_y [m].
+
+    With n the plane's normal and o the jaw's origin in the camera frame, t = n . (o + side_y n) / n . ray.
+    """
+    rays = rays_from_pixels(pixels, camera)
+    R, origin = T_camera_jaw[:3, :3], T_camera_jaw[:3, 3]
+    normal = R[:, 1]
+    points = rays * ((normal @ origin + side_y) / (rays @ normal))[:, None]
+    return ((points - origin) @ R)[:, [0, 2]]
+
+
+def map_picture(grid: PlaneGrid, side_y: float, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray[np.float32]:
+    """Return the image column and row (height, width, 2) at which each pixel of a picture is taken.
+
+    Parts of the plane that the camera does not see come from outside the image.
+    """
+    columns = np.arange(0, grid.width + COARSE, COARSE)
+    rows = np.arange(0, grid.height + COARSE, COARSE)
+    knots = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    exact = project_plane(grid.places(knots), side_y, T_camera_jaw, camera)
+    exact = np.where(np.isfinite(exact), exact, -1e4).astype(np.float32).reshape(len(rows), len(columns), 2)
+    down = _interpolate(exact, grid.height)
+    return np.ascontiguousarray(_interpolate(down.swapaxes(0, 1), grid.width).swapaxes(0, 1))
+
+
+def _interpolate(knots: NDArray, count: int) -> NDArray:
+    """Return values (count, ...) between knots (k, ...) that are COARSE apart, linearly."""
+    at, share = np.divmod(np.arange(count), COARSE)
+    share = (share / COARSE).astype(np.float32).reshape(-1, *([1] * (knots.ndim - 1)))
+    return knots[at] + share * np.diff(knots, axis=0)[at]
+
+
+def take_picture(image: NDArray, mapping: NDArray) -> NDArray:
+    """Return the picture (height, width, 3) of an image (h, w, 3) uint8 by the map of `map_picture`; black outside."""
+    from finforce.optional import import_cv2
+
+    cv2 = import_cv2()
+    return cv2.remap(image, mapping, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0, 0, 0))

@@ -1,0 +1,1 @@
+"""Key point networks: files, metadata, decoding, names."""

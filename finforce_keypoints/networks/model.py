@@ -1,0 +1,297 @@
+"""A DeepLabCut network with its metadata: pictures to peaks."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_keypoints.errors import DetectionError, ModelError
+from finforce_keypoints.networks.decoding import DEFAULT_STDDEV, DecodingRule, Peaks, decode, stride_from_shapes
+from finforce_keypoints.networks.metadata import LARGEST_SIDE, METADATA_FILE, ModelMetadata, read_metadata
+from finforce_keypoints.networks.network import COLOURS, CPU, Network, OutputLayout, find_outputs
+
+# ImageNet's, which DeepLabCut takes off
+_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
+_STD = np.array([0.229, 0.224, 0.225], np.float32)
+_PROBE = 256  # px, of the picture that a network of any size is tried with
+# A border of up to one cell and a half is a network's habit; a stride off by a factor of two is an error.
+_STRIDE_TOLERANCE = 0.6  # of log2(H / h / stride)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOverrides:
+    """What is to hold instead of the metadata; None: as the metadata say.
+
+    Attributes:
+        stride: input pixels per heatmap cell.
+        locref_std: scale of the offset channels [px].
+        apply_sigmoid: whether the heatmaps are logits.
+        normalize: whether ImageNet's mean and standard deviation are taken off.
+        input_size: height and width of the training images [px].
+        sub_cell: whether peaks without offsets are placed between cells; they are when None.
+        pooled: whether the offsets around a peak are averaged; `finforce: pooled` in the metadata when None.
+    """
+
+    stride: float | None = None
+    locref_std: float | None = None
+    apply_sigmoid: bool | None = None
+    normalize: bool | None = None
+    input_size: tuple[int, int] | None = None
+    sub_cell: bool | None = None
+    pooled: bool | None = None
+
+    def __post_init__(self) -> None:
+        numbers = [value for value in (self.stride, self.locref_std, *(self.input_size or ())) if value is not None]
+        if not all(np.isfinite(value) and value > 0 for value in numbers):
+            raise ModelError(f"overrides {self}: expected positive stride, locref_std and input_size [px]")
+        if max(self.input_size or (0,)) > LARGEST_SIDE:
+            raise ModelError(f"input_size {self.input_size}: expected at most {LARGEST_SIDE} px each way")
+
+
+class KeypointModel:
+    """Any DeepLabCut network exported to ONNX, with its `pytorch_config.yaml`; not for several threads at once.
+
+    Attributes:
+        path: the .onnx file.
+        metadata: what stands beside it.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        overrides: ModelOverrides | None = None,
+        threads: int = 2,
+        providers: Sequence[str] = (CPU,),
+    ) -> None:
+        """Load a network and try it once.
+
+        Args:
+            path: the folder with one .onnx file and its metadata, or that .onnx file.
+            overrides: of the metadata.
+            threads: that one picture is computed with.
+            providers: onnxruntime's execution providers, best first.
+
+        Raises:
+            ModelError: files are missing, or network, metadata and overrides do not agree.
+            MissingDependencyError: onnxruntime is not installed.
+        """
+        self.path = find_network(path)
+        self.metadata: ModelMetadata = read_metadata(self.path.parent / METADATA_FILE)
+        self._overrides = overrides or ModelOverrides()
+        self._network = Network(self.path, threads, providers)
+        self._scale, self._shift = self._build_normalization()
+        self._buffer = np.empty(0)
+        self._rules: dict[tuple[int, ...], DecodingRule] = {}
+        self._check_sizes()
+        try:
+            self._outputs = self._probe()
+        except (ModelError, DetectionError) as error:
+            raise ModelError(f"{self.path.name}: {error}") from error
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names (K,) of the body parts, in the order of the peaks."""
+        return self.metadata.bodyparts
+
+    @property
+    def frozen_size(self) -> tuple[int | None, int | None]:
+        """Height and width that are frozen into the network [px]; None where any will do."""
+        return self._network.input.height, self._network.input.width
+
+    @property
+    def training_size(self) -> tuple[int, int] | None:
+        """Height and width of the images to be given [px]: overridden, frozen, or kept in the metadata; else None."""
+        frozen = self.frozen_size if None not in self.frozen_size else None
+        return self._overrides.input_size or frozen or self.metadata.training_size
+
+    def accepts(self, size: tuple[int, int]) -> bool:
+        """Tell whether pictures of some height and width [px] are such as the network was trained on."""
+        trained = self._overrides.input_size or self.metadata.training_size
+        return tuple(size) == tuple(trained) if trained else self._fits(self._pad_size(size))
+
+    @cached_property
+    def sha256(self) -> str:
+        """The network file's SHA-256, by which recordings tell what they were made with."""
+        return hashlib.sha256(self.path.read_bytes()).hexdigest()
+
+    def run(self, batch: NDArray) -> tuple[NDArray, NDArray | None]:
+        """Return the maps of a batch of pictures.
+
+        Args:
+            batch: (B, H, W, 3) uint8 RGB.
+
+        Returns:
+            Heatmaps (B, K, h, w) and offsets (B, 2K, h, w), None without; float32, as the network gives them.
+
+        Raises:
+            DetectionError: it is no batch of colour pictures, or the network is frozen to another size.
+        """
+        heatmap, locref = self._outputs.split(self._network.run(self.preprocess(batch)))
+        if len(heatmap) != len(batch):
+            raise DetectionError(
+                f"the network made maps {heatmap.shape} of {len(batch)} pictures; expected one set each"
+            )
+        return heatmap, locref if self.metadata.location_refinement else None
+
+    def locate(self, batch: NDArray) -> Peaks:
+        """Return the best place of every body part in a batch of pictures (B, H, W, 3) uint8 RGB.
+
+        Raises:
+            DetectionError: it is no batch of colour pictures, or the network is frozen to another size.
+            ModelError: the stride is not that of the network.
+        """
+        heatmap, locref = self.run(batch)
+        size = batch.shape[1:3]
+        return decode(heatmap, locref, self.find_rule(self._pad_size(size), heatmap.shape[2:]), size)
+
+    def preprocess(self, batch: NDArray) -> NDArray:
+        """Return the network's input for a batch of pictures: (RGB / 255 - mean) / std, padded, in its axes' order.
+
+        Args:
+            batch: (B, H, W, 3) uint8 RGB.
+
+        Returns:
+            (B, 3, H', W') or (B, H', W', 3), of the network's type; overwritten by the next call.
+
+        Raises:
+            DetectionError: it is no batch of colour pictures, or the network is frozen to another size.
+        """
+        if batch.ndim != 4 or batch.shape[3] != COLOURS or batch.dtype != np.uint8 or 0 in batch.shape:
+            raise DetectionError(f"got {batch.dtype} {batch.shape}, expected uint8 RGB (batch, height, width, 3)")
+        batch = self._pad(batch)
+        layout = self._network.input
+        if self.metadata.colormode == "BGR":
+            batch = batch[..., ::-1]
+        if layout.channel_axis == 1:
+            batch = batch.transpose(0, 3, 1, 2)
+        if layout.dtype == np.uint8:
+            return np.ascontiguousarray(batch)
+        if self._buffer.shape != batch.shape:
+            self._buffer = np.empty(batch.shape, np.float32)
+        np.multiply(batch, self._scale, out=self._buffer)
+        self._buffer += self._shift
+        return self._buffer.astype(layout.dtype, copy=False)
+
+    def find_rule(self, pixels: tuple[int, int], cells: tuple[int, int]) -> DecodingRule:
+        """Return how maps of some height and width are decoded, for an input of some height and width [px].
+
+        Raises:
+            ModelError: the stride of the metadata, or the override, is not that of the network.
+        """
+        key = (*pixels, *cells)
+        if key not in self._rules:
+            self._rules[key] = self._build_rule(pixels, cells)
+        return self._rules[key]
+
+    def _build_rule(self, pixels: tuple[int, int], cells: tuple[int, int]) -> DecodingRule:
+        chosen, metadata = self._overrides, self.metadata
+        stride = _first(chosen.stride, metadata.stride, stride_from_shapes(cells[0], pixels[0]))
+        off = np.log2(np.divide(pixels, cells) / stride)
+        if np.abs(off).max() > _STRIDE_TOLERANCE:
+            raise ModelError(
+                f"stride {stride:g}: the network makes {cells[0]}x{cells[1]} cells of {pixels[0]}x{pixels[1]} px; "
+                f"expected about {stride_from_shapes(cells[0], pixels[0]):g}, from the metadata or the override"
+            )
+        return DecodingRule(
+            stride=float(stride),
+            locref_std=_first(chosen.locref_std, metadata.locref_std),
+            apply_sigmoid=_first(chosen.apply_sigmoid, metadata.apply_sigmoid),
+            sub_cell=_first(chosen.sub_cell, True),
+            pooled=_first(chosen.pooled, metadata.pooled),
+            likelihood_stddev=_first(metadata.likelihood_stddev, DEFAULT_STDDEV),
+        )
+
+    def _probe(self) -> OutputLayout:
+        """Return the layout of the outputs after a try with a grey picture."""
+        height, width = self.training_size or (_PROBE, _PROBE)
+        size = self.frozen_size[0] or height, self.frozen_size[1] or width
+        if max(self._pad_size(size)) > LARGEST_SIDE:
+            raise ModelError(f"pictures of {size[0]}x{size[1]} px, expected at most {LARGEST_SIDE} px each way")
+        batch = np.full((1, *size, COLOURS), 128, np.uint8)
+        tensor = self.preprocess(batch)
+        arrays = self._network.run(tensor)
+        shapes = [(name, array.shape) for name, array in zip(self._network.output_names, arrays, strict=True)]
+        layout = find_outputs(shapes, len(self.names), self._network.input.channel_axis)
+        if layout.locref is None and self.metadata.has_locref and self.metadata.location_refinement:
+            raise ModelError(
+                f"outputs {shapes}: the metadata have a locref_config; export the offsets too, or set "
+                "predictor.location_refinement: false"
+            )
+        heatmap, _ = layout.split(arrays)
+        if len(heatmap) != 1:
+            raise ModelError(f"the network made maps {heatmap.shape} of one picture; expected one set for each picture")
+        self.find_rule(self._pad_size(batch.shape[1:3]), heatmap.shape[2:])
+        return layout
+
+    def _check_sizes(self) -> None:
+        """Refuse a training size that the network is not frozen to."""
+        wanted = self._overrides.input_size or self.metadata.training_size
+        if wanted is None:
+            return
+        if not self._fits(self._pad_size(wanted)):
+            raise ModelError(
+                f"{self.path.name}: the network is frozen to {self.frozen_size} (height, width); got an input_size of "
+                f"{tuple(wanted)} from the metadata or the override"
+            )
+
+    def _fits(self, padded: tuple[int, int]) -> bool:
+        """Tell whether the network can be computed for a padded height and width [px]."""
+        return all(frozen in (None, px) for frozen, px in zip(self.frozen_size, padded, strict=True))
+
+    def _pad_size(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Return the height and width [px] that pictures of some size are padded to."""
+        height, width = (-(-px // divisor) * divisor for px, divisor in zip(size, self.metadata.divisors, strict=True))
+        return height, width
+
+    def _pad(self, batch: NDArray) -> NDArray:
+        """Return pictures padded at the right and at the bottom by reflection, as the metadata ask for."""
+        size = batch.shape[1:3]
+        padded = self._pad_size(size)
+        if not self._fits(padded):
+            raise DetectionError(
+                f"picture of {size[0]}x{size[1]} px (height x width): the network is frozen to {self.frozen_size}; "
+                "give it pictures of its training's size, or allow resizing"
+            )
+        if padded == tuple(size):
+            return batch
+        return np.pad(batch, ((0, 0), (0, padded[0] - size[0]), (0, padded[1] - size[1]), (0, 0)), mode="reflect")
+
+    def _build_normalization(self) -> tuple[NDArray, NDArray]:
+        """Return factor and shift per colour, in the axes of the network's input."""
+        axes = (COLOURS, 1, 1) if self._network.input.channel_axis == 1 else (COLOURS,)
+        scale, shift = np.full(COLOURS, 1.0 / 255.0, np.float32), np.zeros(COLOURS, np.float32)
+        if _first(self._overrides.normalize, self.metadata.normalize):
+            scale, shift = scale / _STD, -_MEAN / _STD
+        return scale.reshape(axes), shift.reshape(axes)
+
+
+def find_network(path: str | Path) -> Path:
+    """Return the only .onnx file of a folder, or the file itself.
+
+    Raises:
+        ModelError: there is none, or there are several.
+    """
+    path = Path(path)
+    try:
+        if path.is_file():
+            return path
+        found = sorted(path.glob("*.onnx"))
+    except OSError as error:
+        raise ModelError(
+            f"model: cannot be looked for ({error.strerror}); expected a folder with one .onnx file"
+        ) from error
+    if len(found) != 1:
+        names = ", ".join(file.name for file in found) or "none"
+        raise ModelError(f"{path}: expected a folder with one .onnx file and {METADATA_FILE}, found {names}")
+    return found[0]
+
+
+def _first(*values):
+    """Return the first value that is not None."""
+    return next((value for value in values if value is not None), None)

@@ -1,0 +1,1 @@
+"""The synthetic gripper over time, alone or coupled to the emulated one."""

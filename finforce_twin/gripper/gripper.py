@@ -1,0 +1,105 @@
+"""The synthetic gripper at work: jaws, object and true wrenches image by image."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.jaw.meshing import MeshDensity
+from finforce_twin.mechanics.assembly import Assembly
+from finforce_twin.mechanics.material import RelaxedWrench, find_elastic_weight
+from finforce_twin.mechanics.pressed_jaw import TWIN_DENSITY, JawShape
+from finforce_twin.scenes.scenarios import Scenario
+from finforce_twin.scenes.script import RATE, Posture, write_script
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JawState:
+    """One jaw at one instant; all but its place in its own jaw frame.
+
+    Attributes:
+        origin_x: of its frame on the closing axis of `gripper_base` [m].
+        vertices: deformed (n, 3) [m], in mesh order.
+        keypoints: (K, 3) [m], in the order of the jaw file.
+        reference: of the reference point, which does not deform (3,) [m].
+        force: that the object applies to the jaw (3,) [N].
+        torque: of the same about the jaw frame's origin (3,) [N m].
+    """
+
+    origin_x: float
+    vertices: NDArray
+    keypoints: NDArray
+    reference: NDArray
+    force: NDArray
+    torque: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TwinState:
+    """The gripper at the time of one image.
+
+    Attributes:
+        stamp: [s] since the scenario began.
+        phase: as in `/bench/phase`, "cycle:load|unload:displacement_mm:ramp|settle|record".
+        jaws: by side.
+        T_gripper_object: (4, 4) of the object mesh's own frame in `gripper_base`; None without an object.
+        gravity: unit vector (3,) in `gripper_base`.
+    """
+
+    stamp: float
+    phase: str
+    jaws: Mapping[str, JawState]
+    T_gripper_object: NDArray | None
+    gravity: NDArray
+
+
+class TwinGripper(Assembly):
+    """A gripper that plays a scenario, with a material drawn from a seed."""
+
+    def __init__(self, scenario: Scenario, seed: int, density: MeshDensity | str = TWIN_DENSITY) -> None:
+        """Builds jaws and object and writes the script; see `Assembly`."""
+        super().__init__(scenario, seed, density)
+        self._script = write_script(scenario)
+
+    def __len__(self) -> int:
+        """Returns the number of states."""
+        return len(self._script.stamps)
+
+    def states(self) -> Iterator[TwinState]:
+        """Yields the states at `RATE`, always from the beginning.
+
+        Raises:
+            GraspError: A jaw buckles, or the object slips or falls.
+        """
+        script = self._script
+        weights = find_elastic_weight(script.weight, script.stamps, self.material.terms)
+        # set down, the object rests on the table, which also takes what the creep left
+        weights[~script.weight.any(axis=1)] = 0.0
+        held = self.hold_object()
+        wrenches = {side: RelaxedWrench(self.material.terms) for side in self._jaws}
+        posture, weight, shapes = None, None, self.rest_shapes()
+        for index, stamp in enumerate(script.stamps):
+            is_same = script.postures[index] == posture and np.array_equal(weights[index], weight)
+            posture, weight = script.postures[index], weights[index]
+            if held is not None and not is_same:
+                shapes = held.follow(self.setting_of(posture, weight))
+            x = held.x if held is not None else 0.0
+            yield TwinState(
+                stamp=float(stamp),
+                phase=script.phases[index],
+                jaws={side: self._jaw_state(side, posture, shapes[side], wrenches[side]) for side in self._jaws},
+                T_gripper_object=self.object_pose(posture, x),
+                gravity=script.gravity[index],
+            )
+
+    def _jaw_state(self, side: str, posture: Posture, shape: JawShape, wrench: RelaxedWrench) -> JawState:
+        force, torque = wrench.update(shape.force, shape.torque, 1.0 / RATE)
+        return JawState(
+            origin_x=self.origin_x(side, posture),
+            vertices=shape.vertices,
+            keypoints=shape.keypoints,
+            reference=self._jaws[side].jaw.reference_point,
+            force=force,
+            torque=torque,
+        )

@@ -1,0 +1,1 @@
+"""Jaws of drawn material in equilibrium with an object."""

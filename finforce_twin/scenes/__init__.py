@@ -1,0 +1,1 @@
+"""What happens in a synthetic recording: scenarios, scripts, objects."""

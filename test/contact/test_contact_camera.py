@@ -1,0 +1,256 @@
+"""Claims about the contact estimator that finds the object's pose itself, in depth images with masks."""
+
+from time import sleep, time_ns
+
+import numpy as np
+import pytest
+from contact_node_fakes import CAMERA, MESH, ContactBench, call, cylinder_before_jaw, header, pose
+from geometry_msgs.msg import PoseStamped
+from node_fakes import ros_domain
+from rclpy.qos import ReliabilityPolicy
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image
+
+from finforce.health import Level
+from finforce.ros import node as ros
+from finforce_contact.mesh.object_mesh import load_object_mesh
+from finforce_contact.mesh.views import MeshView
+from finforce_contact.messages import depth_from_image, mask_from_image
+from finforce_contact.subscriptions import CAMERA as CAMERA_TOPICS
+from finforce_twin.rendering.depth_camera import build_d405
+
+# from above and the side, 0.22 m away, so that the cylinder shows its wall and a lid
+T_CAMERA_JAW = np.eye(4)
+T_CAMERA_JAW[:3, :3] = Rotation.from_euler("x", 50.0, degrees=True).as_matrix()
+T_CAMERA_JAW[:3, 3] = -0.02, 0.0, 0.22
+BACKGROUND = 0.5
+MAX_AGE = 60.0  # s
+
+
+@pytest.fixture(scope="module")
+def camera():
+    return build_d405(step=2)
+
+
+@pytest.fixture(scope="module")
+def scene(camera):
+    """Depth [m] and mask of the cylinder before the jaw."""
+    view = MeshView(load_object_mesh(MESH)).render(T_CAMERA_JAW @ cylinder_before_jaw(), camera)
+    return np.where(np.isnan(view.depth), BACKGROUND, view.depth), np.isfinite(view.depth)
+
+
+def image(stamp, values, encoding, padding=0):
+    rows = np.pad(np.ascontiguousarray(values).view(np.uint8), ((0, 0), (0, padding)))
+    height, width = values.shape
+    return Image(
+        header=header(stamp, CAMERA),
+        height=height,
+        width=width,
+        encoding=encoding,
+        step=rows.shape[1],
+        data=rows.tobytes(),
+    )
+
+
+def depth_image(stamp, depth):
+    return image(stamp, np.round(1e3 * depth).astype(np.uint16), "16UC1")
+
+
+def mask_image(stamp, mask):
+    return image(stamp, 255 * mask.astype(np.uint8), "mono8")
+
+
+def camera_info(stamp, camera):
+    k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+    size = {"width": camera.width, "height": camera.height}
+    return CameraInfo(header=header(stamp, CAMERA), distortion_model="plumb_bob", k=k, d=[0.0] * 5, **size)
+
+
+class TrackingBench(ContactBench):
+    """A contact estimator that is fed with images."""
+
+    def __init__(self, probe, camera, *, qos=ros.RESULT, **parameters):
+        probe.hear("object_pose", PoseStamped)
+        # the first image loads libraries, which takes seconds where other programs have the processor
+        super().__init__(probe, pose_source="tracker", max_age=MAX_AGE, **parameters)
+        self.camera = camera
+        self.info = probe.speak(f"{CAMERA_TOPICS}/color/camera_info", CameraInfo)
+        self.depth = probe.speak(f"{CAMERA_TOPICS}/aligned_depth_to_color/image_raw", Image, qos)
+        self.mask = probe.speak("object_mask", Image, qos)
+        for out in (self.info, self.depth, self.mask):
+            probe.connected(out)
+        probe.wait_for(lambda: self.node.out.pose.get_subscription_count() == 1)
+
+    def see(self, scene, *, masked):
+        """Send one image, each part when the one before has come, the mask last; return its stamp."""
+        depth, mask = scene
+        feed, stamp = self.node.session._camera, time_ns()
+        self.info.publish(camera_info(stamp, self.camera))
+        self.probe.wait_for(lambda: feed._camera is not None)
+        self.depth.publish(depth_image(stamp, depth))
+        self.probe.wait_for(lambda: any(ros.nanoseconds(kept.header.stamp) == stamp for kept in feed._depths))
+        if masked:
+            self.mask.publish(mask_image(stamp, mask))
+        return stamp
+
+    @property
+    def poses(self):
+        return self.probe.got["object_pose"]
+
+
+@pytest.fixture
+def probe():
+    with ros_domain() as probe:
+        yield probe
+
+
+def test_the_object_is_found_with_a_mask_and_followed_without(probe, camera, scene):
+    bench = TrackingBench(probe, camera)
+    bench.see(scene, masked=False)
+    probe.spin(0.2)
+    assert not bench.poses
+    stamp = bench.see(scene, masked=True)
+    probe.wait_for(lambda: bench.poses, MAX_AGE)
+    found = bench.poses[0]
+    assert ros.nanoseconds(found.header.stamp) == stamp and found.header.frame_id == CAMERA
+    place = found.pose.position
+    expected = (T_CAMERA_JAW @ cylinder_before_jaw())[:3, 3]
+    np.testing.assert_allclose([place.x, place.y, place.z], expected, atol=1.5e-3)  # 1 mm steps of the depth
+    stamp = bench.see(scene, masked=False)
+    probe.wait_for(lambda: len(bench.poses) == 2)
+    assert ros.nanoseconds(bench.poses[1].header.stamp) == stamp
+    bench.jaw_out.publish(pose(stamp, T_CAMERA_JAW))
+    assert bench.wait_for_contacts().width > 0
+    values = {entry.key: entry.value for entry in bench.diagnosis(level=Level.OK).values}
+    assert values["pose source"] == "tracker" and 0.5 < float(values["pose fitness"]) <= 1.0
+
+
+def test_a_mask_with_nothing_in_it_is_named(probe, camera, scene):
+    bench = TrackingBench(probe, camera)
+    bench.see((scene[0], np.zeros_like(scene[1])), masked=True)
+    bench.diagnosis(level=Level.ERROR, word="mask")
+    assert not bench.poses and not bench.contacts
+
+
+def test_a_depth_image_of_zeros_is_named_and_the_next_one_serves(probe, camera, scene):
+    bench = TrackingBench(probe, camera)
+    bench.see((np.zeros_like(scene[0]), scene[1]), masked=True)
+    bench.diagnosis(level=Level.ERROR, word="depth")
+    assert not bench.poses
+    bench.see(scene, masked=True)
+    probe.wait_for(lambda: bench.poses, MAX_AGE)
+
+
+def test_an_object_that_left_gives_no_pose(probe, camera, scene):
+    bench = TrackingBench(probe, camera)
+    bench.see(scene, masked=True)
+    probe.wait_for(lambda: bench.poses, MAX_AGE)
+    bench.see((np.full_like(scene[0], BACKGROUND), scene[1]), masked=False)
+    bench.diagnosis(level=Level.ERROR, word="not found")
+    assert len(bench.poses) == 1
+
+
+def test_images_before_their_camera_are_named(probe, camera, scene):
+    bench = TrackingBench(probe, camera)
+    stamp = time_ns()
+    bench.depth.publish(depth_image(stamp, scene[0]))
+    probe.spin(0.1)
+    bench.mask.publish(mask_image(stamp, scene[1]))
+    bench.diagnosis(level=Level.ERROR, word="camera_info")
+
+
+def test_the_tracker_rests_while_the_grasp_does(probe, camera, scene):
+    bench = TrackingBench(probe, camera)
+    bench.see(scene, masked=True)
+    probe.wait_for(lambda: bench.poses, MAX_AGE)
+    jaw = bench.node.session.jaws["left"]
+    jaw.estimator = Resting(jaw.estimator)
+    bench.see(scene, masked=False)
+    probe.wait_for(lambda: bench.node.skips.describe()["skipped: grasp rests"] == "1")
+    probe.spin(0.3)
+    assert len(bench.poses) == 1
+    jaw.estimator.resting = False
+    bench.see(scene, masked=False)
+    probe.wait_for(lambda: len(bench.poses) == 2)
+
+
+class Resting:
+    """An estimator whose grasp holds still."""
+
+    resting = True
+
+    def __init__(self, estimator):
+        self._estimator = estimator
+
+    def __getattr__(self, name):
+        return getattr(self._estimator, name)
+
+
+def test_reconstruct_finds_the_object_in_the_image(probe, camera, scene):
+    bench = TrackingBench(probe, camera, object_mesh="")
+    answer = call(probe, "contact_estimator/reconstruct")
+    assert not answer.success and "no depth image" in answer.message
+    bench.see(scene, masked=True)
+    probe.wait_for(lambda: bench.node.session._camera._masks)
+    answer = call(probe, "contact_estimator/reconstruct")
+    assert answer.success and "primitive" in answer.message, answer.message
+    size = np.sort(np.ptp(bench.node.session.mesh.vertices, axis=0))
+    # the lid that is seen gives the diameter; the far end of the wall is beyond the outline
+    np.testing.assert_allclose(size[:2], 0.025, atol=3e-3)
+    bench.see(scene, masked=True)
+    probe.wait_for(lambda: bench.poses, MAX_AGE)
+
+
+def test_reconstruct_without_a_camera_says_so(probe):
+    ContactBench(probe)
+    answer = call(probe, "contact_estimator/reconstruct")
+    assert not answer.success and "pose_source" in answer.message
+
+
+def test_padded_rows_and_metres_decode_alike(camera, scene):
+    depth, mask = scene
+    plain = depth_from_image(depth_image(0, depth), CAMERA, 1e-3)
+    metres = depth_from_image(image(0, depth.astype(np.float32), "32FC1", padding=12), CAMERA, 1e-3)
+    np.testing.assert_allclose(plain, metres, atol=5.1e-4)  # half a step
+    padded = mask_from_image(image(0, 255 * mask.astype(np.uint8), "mono8", padding=5), CAMERA)
+    np.testing.assert_array_equal(padded, mask)
+
+
+@pytest.mark.parametrize(("encoding", "word"), [("rgb8", "rgb8"), ("mono8", "rows")])
+def test_a_mask_of_another_kind_is_refused(scene, encoding, word):
+    message = image(0, scene[1].astype(np.uint8), encoding)
+    message.height += 1
+    with pytest.raises(ValueError, match=word):
+        mask_from_image(message, CAMERA)
+
+
+def test_images_are_asked_for_reliably_and_those_of_best_effort_are_taken_too(probe, camera, scene):
+    bench = TrackingBench(probe, camera, qos=ros.SENSOR)
+    topics = (f"{CAMERA_TOPICS}/aligned_depth_to_color/image_raw", "/object_mask")
+
+    def reliability(topic):
+        return probe.get_subscriptions_info_by_topic(topic)[0].qos_profile.reliability
+
+    probe.wait_for(lambda: all(reliability(topic) == ReliabilityPolicy.BEST_EFFORT for topic in topics))
+    bench.see(scene, masked=True)
+    probe.wait_for(lambda: bench.poses, MAX_AGE)
+
+
+def test_large_images_come_again_where_their_publisher_keeps_them(probe, camera):
+    TrackingBench(probe, camera)
+    for topic in (f"{CAMERA_TOPICS}/aligned_depth_to_color/image_raw", "/object_mask"):
+        (heard,) = probe.get_subscriptions_info_by_topic(topic)
+        assert heard.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+
+def test_of_the_images_that_wait_only_the_newest_is_looked_at(probe, camera, scene):
+    bench = TrackingBench(probe, camera)
+    bench.see(scene, masked=True)
+    probe.wait_for(lambda: bench.poses, MAX_AGE)
+    stamps = [time_ns() + k * 1_000_000 for k in range(4)]
+    for stamp in stamps:
+        bench.depth.publish(depth_image(stamp, scene[0]))
+    sleep(0.5)  # until they have arrived
+    probe.wait_for(lambda: len(bench.poses) == 2)
+    probe.spin(0.2)
+    assert [ros.nanoseconds(found.header.stamp) for found in bench.poses[1:]] == stamps[-1:]

@@ -1,0 +1,43 @@
+"""Claims about the contact estimator as a process: it starts, says what is wrong, and ends cleanly."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+from contact_node_fakes import MESH
+from node_process_fakes import PATIENCE, command_of, run_node, stop_when_ready
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_node_cleanly(number):
+    status, text = stop_when_ready(command_of("contact_estimator", f"object_mesh:={MESH}", "object_mash:=x"), number)
+    assert status == 0, text
+    assert "Traceback" not in text
+    assert "there is no parameter 'object_mash'" in text
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ("jaws:=middle", "jaws is 'middle'"),
+        ("jaw_file:=no_such_jaw", "no_such_jaw"),
+        ("calibration_file:=no_such_file", "no_such_file"),
+        ("contact.mode:=guess", "contact.mode is 'guess'"),
+        ("tracker.least_fitness:=2.0", "tracker.least_fitness"),
+        ("pose_source:=detections", "ros-jazzy-vision-msgs"),
+    ],
+)
+def test_what_cannot_be_set_up_ends_with_two_and_one_reason(given, reason):
+    done = run_node(command_of("contact_estimator", given))
+    assert done.returncode == 2
+    assert reason in done.stderr.strip().splitlines()[-1] and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["ifea_solver", "contact_estimator"])
+def test_heavy_libraries_wait_until_they_are_needed(name):
+    heavy = "{'open3d', 'trimesh', 'manifold3d', 'small_gicp', 'coal'}"
+    load = f"from finforce.ros import start; __import__(start.NODES['{name}'])"
+    check = f"import sys; {load}; print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, timeout=PATIENCE, check=True)
+    assert done.stdout.strip() == "set()"

@@ -1,0 +1,160 @@
+"""A DDS domain of its own with a probe that talks to nodes, and an estimator that answers by rule."""
+
+import os
+import random
+from contextlib import contextmanager
+from dataclasses import dataclass
+from time import monotonic, time_ns
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import WrenchStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+
+from finforce.errors import ObservationError
+from finforce.ros import node as ros
+from finforce_ifea.errors import UnderLoadError
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.node import IfeaSolverNode
+
+KEYPOINTS = load_jaw("bench").keypoints
+PATIENCE = 10.0
+
+
+@dataclass
+class FakeSolution:
+    """A solution of one image."""
+
+    status: str = "ok"
+    message: str = ""
+    force: tuple = (-2.0, 0.0, 0.5)
+    torque: tuple = (0.0, -0.08, 0.0)
+    force_stddev: tuple = (0.05, 0.01, 0.02)
+    torque_stddev: tuple = (0.001, 0.002, 0.003)
+    magnitude_stddev: float = 0.05
+    contact_point: tuple = (0.013, 0.0, 0.04)
+    residual: float = 2e-4
+    kkt: float = 1e-9
+    iterations: int = 3
+    keypoints_used: np.ndarray = None
+
+    @property
+    def trusted(self):
+        return self.status in ("ok", "unloaded")
+
+
+class FakeEstimator:
+    """Answers every image with `answer`, after checking it as a real one does."""
+
+    surface_triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    tared = False
+
+    def __init__(self, **answer):
+        self.answer = answer
+        self.observations, self.contacts, self.resets = [], [], 0
+        self.under_load = False
+
+    def update(self, observation, contact):
+        if observation.points.shape != KEYPOINTS.shape:
+            raise ObservationError(f"{len(observation.points)} key points; expected {len(KEYPOINTS)}")
+        self.observations.append(observation)
+        self.contacts.append(contact)
+        used = np.isfinite(observation.points).all(axis=1)
+        return FakeSolution(keypoints_used=used, **self.answer)
+
+    def surface(self):
+        return np.array([[0.0, 0, 0], [0.01, 0, 0], [0.01, 0, 0.08], [0, 0, 0.08]])
+
+    def tare(self):
+        if self.under_load:
+            raise UnderLoadError("3.1 N press on the jaw; take the object away first")
+        return "15 key points tared over 30 images"
+
+    def reset(self):
+        self.resets += 1
+
+
+class Probe(Node):
+    """Publishes what a test says and keeps what comes back, by topic."""
+
+    def __init__(self, executor, **options):
+        super().__init__("probe", **options)
+        self.spinner = executor
+        executor.add_node(self)
+        self.got = {}
+
+    def hear(self, topic, kind=WrenchStamped, qos=ros.RESULT):
+        self.got[topic] = []
+        return self.create_subscription(kind, topic, self.got[topic].append, qos)
+
+    def speak(self, topic, kind=PointCloud2, qos=ros.RESULT):
+        return self.create_publisher(kind, topic, qos)
+
+    def spin(self, seconds):
+        until = monotonic() + seconds
+        while monotonic() < until:
+            self.spinner.spin_once(timeout_sec=0.02)
+
+    def wait_for(self, condition, seconds=PATIENCE):
+        until = monotonic() + seconds
+        while not condition():
+            assert monotonic() < until, f"waited {seconds} s in vain; heard {self.heard()}"
+            self.spinner.spin_once(timeout_sec=0.02)
+
+    def heard(self):
+        states = [status.message for array in self.got["/diagnostics"][-3:] for status in array.status]
+        return {topic: len(messages) for topic, messages in self.got.items()}, states
+
+    def connected(self, publisher, count=1):
+        self.wait_for(lambda: publisher.get_subscription_count() >= count)
+
+    def diagnosis(self, jaw="left", level=None, word=""):
+        """Wait for the state of a jaw at a level, with a word in its message."""
+        found = []
+
+        def matches():
+            states = [s for array in self.got["/diagnostics"] for s in array.status if f"{jaw} jaw" in s.name]
+            found[:] = [s for s in states if (level is None or s.level[0] == level) and word in s.message]
+            return bool(found)
+
+        self.wait_for(matches)
+        return found[-1]
+
+
+@contextmanager
+def ros_domain():
+    """Give a probe with an executor and a context of its own; solvers are added by `start_solver`."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=random.randint(1, 99))
+    executor = SingleThreadedExecutor(context=context)
+    probe = Probe(executor, context=context)
+    probe.hear("/diagnostics", DiagnosticArray)
+    try:
+        yield probe
+    finally:
+        for node in executor.get_nodes():
+            node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+def start_solver(probe, estimator=None, **parameters):
+    """Add a solver node around an estimator to the probe's executor."""
+    given = {"contact_height": 0.04, "diagnostics_period": 0.1, **parameters}
+    overrides = [Parameter(name, value=value) for name, value in given.items()]
+    estimator = estimator or FakeEstimator()
+    node = IfeaSolverNode(lambda *_: estimator, context=probe.context, parameter_overrides=overrides)
+    probe.spinner.add_node(node)
+    return node
+
+
+def keypoint_cloud(stamp=None, *, frame="left_jaw", points=KEYPOINTS, **columns):
+    """A cloud as the key point detector sends it; `stamp` [ns] is now by default."""
+    header = Header(stamp=ros.stamp_message(time_ns() if stamp is None else stamp), frame_id=frame)
+    likelihood = np.full(len(points), 0.9, dtype=np.float32)
+    return ros.cloud_message(header, {**ros.xyz_columns(points), "likelihood": likelihood, **columns})

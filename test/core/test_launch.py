@@ -1,0 +1,185 @@
+"""Claims about the launch files; those that run them need ROS 2's launch."""
+
+import runpy
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+from finforce.errors import MissingDependencyError
+from finforce.systems import launch as launch_module
+
+ROOT = Path(__file__).resolve().parents[2]
+FILES = sorted((ROOT / "launch").glob("*.launch.py"))
+ROBOT = ROOT / "launch" / "robot.launch.py"
+ACTIONS = ("DeclareLaunchArgument", "GroupAction", "IncludeLaunchDescription", "LogInfo", "OpaqueFunction")
+STAND_INS = {
+    "launch": (),
+    "launch.actions": (*ACTIONS, "SetEnvironmentVariable", "Shutdown"),
+    "launch.launch_description_sources": ("PythonLaunchDescriptionSource",),
+    "launch_ros": (),
+    "launch_ros.actions": ("Node",),
+    "launch_ros.parameter_descriptions": (),
+}
+
+
+class Recorder:
+    """Stands for a launch action and keeps what it was made of."""
+
+    def __init__(self, *args, **kwargs):
+        self.args, self.kwargs = args, kwargs
+
+
+class Text(str):
+    """Stands for a parameter's value whose type is beyond doubt."""
+
+    def __new__(cls, value, value_type):
+        return super().__new__(cls, value_type(value))
+
+
+@pytest.fixture
+def recorded_launch(monkeypatch):
+    """Put stand-ins in the place of launch and launch_ros, which only a full ROS 2 has."""
+    for name, members in STAND_INS.items():
+        module = ModuleType(name)
+        for member in members:
+            setattr(module, member, type(member, (Recorder,), {}))
+        monkeypatch.setitem(sys.modules, name, module)
+    sys.modules["launch"].LaunchDescription = list
+    sys.modules["launch_ros.parameter_descriptions"].ParameterValue = Text
+    monkeypatch.setattr(launch_module, "find_share", lambda package: Path("/share") / package)
+
+
+def act(path, **texts):
+    """Describe a launch file's system with arguments; its actions."""
+    *arguments, opaque = runpy.run_path(str(path))["generate_launch_description"]()
+    values = {action.args[0]: action.kwargs["default_value"] for action in arguments} | texts
+    return opaque.kwargs["function"](SimpleNamespace(launch_configurations=values))
+
+
+def start(path, **texts):
+    """Describe a launch file's system with arguments; the keyword arguments of its nodes, by name."""
+    return {action.kwargs["name"]: action.kwargs for action in act(path, **texts) if "name" in action.kwargs}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_a_launch_file_starts_a_solver_with_its_configuration(recorded_launch, path):
+    nodes = start(path)
+    solver = nodes["left_ifea_solver"]
+    configuration, parameters = solver["parameters"]
+    assert Path(configuration).is_file()
+    assert (solver["package"], solver["executable"]) == ("finforce", "ifea_solver")
+    assert parameters["use_sim_time"] is (path.name == "replay.launch.py")
+
+
+def test_an_argument_reaches_the_node_with_its_type(recorded_launch):
+    (solver,) = start(ROOT / "launch" / "bench.launch.py", contact_height="0.04", jaw="right").values()
+    assert solver["parameters"][1]["contact_height"] == 0.04
+    assert solver["name"] == "right_ifea_solver"
+
+
+def test_an_object_mesh_starts_the_contact_estimator(recorded_launch):
+    nodes = start(ROOT / "launch" / "bench.launch.py", object_mesh="can.stl", contact="paper", jaw="right")
+    estimator = nodes["contact_estimator"]
+    assert (estimator["package"], estimator["executable"]) == ("finforce", "contact_estimator")
+    assert estimator["parameters"][1]["object_mesh"] == "can.stl" and estimator["parameters"][1]["jaws"] == "right"
+
+
+def test_images_start_the_detector_with_the_configuration(recorded_launch):
+    nodes = start(ROOT / "launch" / "bench.launch.py", images="true", finder="dots", jaw="right")
+    detector = nodes["keypoint_detector"]
+    configuration, parameters = detector["parameters"]
+    assert (detector["package"], detector["executable"]) == ("finforce", "keypoint_detector")
+    assert Path(configuration).name == "bench.yaml"
+    assert (parameters["jaws"], parameters["finder"]) == ("right", "dots")
+
+
+def test_the_end_of_the_player_ends_the_launch(recorded_launch):
+    nodes = start(ROOT / "launch" / "replay.launch.py", bag="somewhere", jaws="both")
+    assert set(nodes) == {"left_ifea_solver", "right_ifea_solver", "recording_player"}
+    assert nodes["recording_player"]["on_exit"] is not None
+    assert nodes["left_ifea_solver"]["on_exit"] is None
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_every_argument_is_described(recorded_launch, path):
+    *arguments, _ = runpy.run_path(str(path))["generate_launch_description"]()
+    assert all(action.kwargs["description"] for action in arguments)
+
+
+def group_of(actions):
+    (group,) = [action for action in actions if type(action).__name__ == "GroupAction"]
+    return group
+
+
+def test_an_included_file_sees_its_own_arguments_only(recorded_launch):
+    group = group_of(act(ROBOT, camera_serial="0123"))
+    # an argument of ours, such as "gripper", means something else there
+    assert group.kwargs == {"scoped": True, "forwarding": False}
+    *_, included = group.args[0]
+    assert included.args[0].args[0] == "/share/realsense2_camera/launch/rs_launch.py"
+    assert dict(included.kwargs["launch_arguments"])["serial_no"] == "'0123'"
+
+
+def test_the_environment_of_an_included_file_is_set_in_its_scope(recorded_launch, monkeypatch):
+    monkeypatch.setattr("os.environ", {"PATH": ""})
+    variable, _ = group_of(act(ROBOT)).args[0]
+    assert type(variable).__name__ == "SetEnvironmentVariable"
+    assert variable.args[0] == "FASTRTPS_DEFAULT_PROFILES_FILE" and Path(variable.args[1]).is_file()
+
+
+def lack(monkeypatch, *packages):
+    monkeypatch.setattr(
+        launch_module, "find_share", lambda package: None if package in packages else Path("/share") / package
+    )
+
+
+@pytest.mark.parametrize(
+    ("texts", "package", "advice"),
+    [
+        ({}, "realsense2_camera", "ros-jazzy-realsense2-camera; or say camera:=false"),
+        ({"camera": "false", "arm": "true"}, "kortex_bringup", "ros-jazzy-kortex-bringup; or leave arm:=true out"),
+        ({"camera": "false", "rviz": "true"}, "rviz2", "ros-jazzy-rviz2; or leave rviz:=true out"),
+    ],
+)
+def test_a_package_that_is_asked_for_and_missing_is_one_line_with_advice(
+    recorded_launch, monkeypatch, texts, package, advice
+):
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    lack(monkeypatch, package)
+    with pytest.raises(MissingDependencyError) as caught:
+        act(ROBOT, **texts)
+    assert str(caught.value).startswith(f"{package} is not installed: sudo apt install {advice}")
+    assert "\n" not in str(caught.value)
+
+
+def test_without_xacro_the_arm_is_refused_before_it_starts(recorded_launch, monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda program: None)
+    with pytest.raises(MissingDependencyError, match="^xacro is not installed: sudo apt install ros-.*-xacro;"):
+        act(ROBOT, camera="false", arm="true")
+
+
+def test_without_publishers_of_frames_the_rest_starts(recorded_launch, monkeypatch):
+    lack(monkeypatch, "robot_state_publisher", "tf2_ros")
+    actions = act(ROBOT, sim="true")
+    lines = [action.kwargs["msg"] for action in actions if type(action).__name__ == "LogInfo"]
+    assert [line.split()[0] for line in lines] == ["robot_state_publisher", "tf2_ros"]
+    nodes = {action.kwargs.get("name") for action in actions}
+    assert {"left_ifea_solver", "gripper_driver", "twin_camera"} <= nodes
+
+
+def test_the_model_of_the_gripper_reaches_its_publisher_as_text(recorded_launch):
+    publisher = start(ROBOT, sim="true")["robot_state_publisher"]
+    (parameters,) = publisher["parameters"]
+    assert isinstance(parameters["robot_description"], Text)
+    assert parameters["robot_description"].startswith("<?xml")
+
+
+def test_a_simulated_robot_starts_twin_and_driver_with_the_simulations_configuration(recorded_launch):
+    nodes = start(ROBOT, sim="true")
+    for name in ("twin_camera", "gripper_driver", "keypoint_detector", "left_ifea_solver"):
+        assert Path(nodes[name]["parameters"][0]).name == "robot_sim.yaml"
+    assert nodes["twin_camera"]["parameters"][1]["scene"] == "grasp_cylinder"
+    bench = start(ROOT / "launch" / "bench.launch.py", sim="true")
+    assert bench["twin_camera"]["parameters"][1]["scene"] == "bench_cylinder"

@@ -1,0 +1,232 @@
+"""Claims about the processes of bench and robot, with hardware and without."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from finforce.systems.live import (
+    SIM_OBJECT,
+    TRANSPORT,
+    TRANSPORT_CHOICES,
+    bench_processes,
+    camera_pose,
+    robot_processes,
+)
+from finforce.systems.options import BenchOptions, RobotOptions
+from finforce.systems.processes import Include
+from finforce_contact.mesh.object_mesh import load_object_mesh
+from finforce_contact.parameters import ContactParameters
+from finforce_driver.parameters import DriverParameters
+from finforce_keypoints.geometry.gripper import ROBOT_CAMERA
+from finforce_keypoints.parameters import DetectorParameters
+from finforce_twin.parameters import TwinParameters
+
+ROOT = Path(__file__).resolve().parents[2]
+NODES = {
+    "gripper_driver": DriverParameters,
+    "twin_camera": TwinParameters,
+    "contact_estimator": ContactParameters,
+    "keypoint_detector": DetectorParameters,
+}
+HAND_EYE = "0.01 0.09 -0.04 0 0 0 1"
+
+
+def by_name(parts):
+    return {part.package if isinstance(part, Include) else part.name: part for part in parts}
+
+
+def robot(**options):
+    return by_name(robot_processes(RobotOptions(**options), ROOT))
+
+
+def test_a_robot_has_two_solvers_detector_contacts_gripper_camera_and_frames():
+    parts = robot()
+    assert list(parts) == [
+        "realsense2_camera",
+        "left_ifea_solver",
+        "right_ifea_solver",
+        "contact_estimator",
+        "keypoint_detector",
+        "gripper_driver",
+        "robot_state_publisher",
+        "static_transform_publisher",
+    ]
+    assert parts["left_ifea_solver"].parameters["peer"] == "right"
+    assert all(parts[name].parameters["jaws"] == "both" for name in ("contact_estimator", "keypoint_detector"))
+
+
+def test_what_was_not_asked_for_is_not_started():
+    parts = robot(gripper=False, camera=False, images=False, contact_height=0.04)
+    assert set(parts) == {"left_ifea_solver", "right_ifea_solver", "robot_state_publisher"}
+
+
+@pytest.mark.parametrize("options", [{}, {"sim": True}, {"camera_name": "", "camera": False}])
+def test_every_parameter_of_a_setup_is_one_of_its_node(options):
+    parts = robot(gripper_port="/dev/x", gripper_interface="slcan", **options)
+    for name in NODES.keys() & parts.keys():
+        known = {entry.name for entry in fields(NODES[name])} | {"use_sim_time"}
+        assert {key for key in parts[name].parameters if not key.startswith("contact.")} <= known
+
+
+def test_the_gripper_has_the_port_that_was_asked_for():
+    assert robot(gripper_port="/dev/ttyUSB1")["gripper_driver"].parameters["port"] == "/dev/ttyUSB1"
+    assert "port" not in robot()["gripper_driver"].parameters
+    can = robot(gripper_port="can0", gripper_interface="socketcan")["gripper_driver"].parameters
+    assert (can["port"], can["interface"]) == ("can0", "socketcan")
+
+
+def test_detector_and_contacts_read_the_camera_that_is_started():
+    parts = robot(camera_name="hand")
+    assert parts["realsense2_camera"].arguments["camera_name"] == "hand"
+    detector, contacts = parts["keypoint_detector"].parameters, parts["contact_estimator"]
+    assert detector["camera_frame"] == contacts.parameters["camera_frame"] == "hand_color_optical_frame"
+    assert detector["color_topics"] == ["/camera/hand/color/image_raw", "/camera/hand/color/image_rect_raw"]
+    assert detector["info_topic"] == "/camera/hand/color/camera_info"
+    depth = "/camera/hand/aligned_depth_to_color/image_raw"
+    assert detector["depth_topic"] == contacts.remappings["/camera/camera/aligned_depth_to_color/image_raw"] == depth
+
+
+def test_a_camera_without_a_name_leaves_topics_and_frame_to_the_parameter_file():
+    parts = robot(camera_name="", camera=False)
+    assert "camera_frame" not in parts["keypoint_detector"].parameters
+    assert not parts["contact_estimator"].remappings
+    with pytest.raises(ValueError, match="camera_name"):
+        robot(camera_name="")
+
+
+def test_the_cameras_frames_are_not_those_of_the_arms_own_camera():
+    names = {"camera_link", "camera_depth_frame", "camera_color_frame"}  # of kortex_description with vision
+    frame = robot()["keypoint_detector"].parameters["camera_frame"]
+    assert not any(frame.startswith(name.removesuffix("link")) for name in names)
+
+
+def test_the_camera_of_a_serial_number_is_text_for_its_launch_file():
+    assert yaml.safe_load(robot(camera_serial="012345")["realsense2_camera"].arguments["serial_no"]) == "012345"
+    assert "serial_no" not in robot()["realsense2_camera"].arguments
+
+
+def test_the_camera_gets_the_transport_of_our_nodes_unless_somebody_chose_one(monkeypatch):
+    for name in TRANSPORT_CHOICES:
+        monkeypatch.delenv(name, raising=False)
+    assert robot()["realsense2_camera"].environment == {TRANSPORT_CHOICES[0]: str(TRANSPORT)}
+    monkeypatch.setenv(TRANSPORT_CHOICES[2], "UDPv4")
+    assert not robot()["realsense2_camera"].environment
+
+
+def test_the_transport_is_that_of_our_nodes():
+    ros = pytest.importorskip("finforce.ros.node")
+    assert (TRANSPORT, TRANSPORT_CHOICES) == (ros.TRANSPORT, ros.CHOICES)
+
+
+def test_the_camera_is_a_d405_whose_images_belong_together():
+    (file,) = {robot()["realsense2_camera"].arguments["config_file"]}
+    told = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
+    assert told["depth_module.color_profile"] == told["depth_module.depth_profile"]
+    assert told["enable_sync"] is told["align_depth.enable"] is True
+    # the launch file takes names of parameters, no sections of nodes
+    assert not any(isinstance(value, dict) for value in told.values())
+    assert told["publish_tf"] is False
+
+
+def test_the_published_camera_is_where_the_detector_is_told_that_it_is(tmp_path):
+    words = robot(T_gripper_camera=HAND_EYE)["static_transform_publisher"].arguments
+    told = dict(zip(words[::2], words[1::2], strict=True))
+    assert [told[f"--{axis}"] for axis in "xyz"] == ["0.01", "0.09", "-0.04"]
+    assert (told["--qx"], told["--qw"]) == ("0.0", "1.0")
+    assert (told["--frame-id"], told["--child-frame-id"]) == ("gripper_base", "wrist_camera_color_optical_frame")
+    file = tmp_path / "lab.yaml"
+    file.write_text("keypoint_detector: {ros__parameters: {T_gripper_camera: [0, 0, 0.5, 0, 0, 0, 1]}}")
+    options = RobotOptions(parameter_file=str(file))
+    assert camera_pose(options)[2] == 0.5
+    assert camera_pose(replace(options, T_gripper_camera=HAND_EYE))[2] == -0.04
+    default = DetectorParameters(T_gripper_camera=tuple(camera_pose(RobotOptions(parameter_file=options_file()))))
+    np.testing.assert_allclose(default.camera_pose, ROBOT_CAMERA, atol=1e-12)
+
+
+def options_file():
+    return str(ROOT / "config" / "robot.yaml")
+
+
+def test_the_camera_of_somebody_else_publishes_its_own_frames():
+    assert "static_transform_publisher" not in robot(camera=False)
+
+
+def test_the_arm_comes_with_our_description_and_its_own_frames():
+    parts = robot(arm=True, robot_ip="10.0.0.2", dof=6)
+    told = parts["kortex_bringup"].arguments
+    assert (told["robot_ip"], told["dof"], told["gripper"], told["use_fake_hardware"]) == ("10.0.0.2", "6", "", "false")
+    assert Path(told["description_file"]).is_absolute() and Path(told["description_file"]).is_file()
+    # kortex_description stays the package, since controllers are looked for there, too
+    assert "description_package" not in told
+    assert "robot_state_publisher" not in parts
+
+
+def test_without_hardware_no_camera_and_no_arm_are_touched():
+    parts = robot(sim=True, arm=True)
+    assert "realsense2_camera" not in parts
+    assert parts["kortex_bringup"].arguments["use_fake_hardware"] == "true"
+
+
+@pytest.mark.parametrize("build", [robot, lambda **options: by_name(bench_processes(BenchOptions(**options), ROOT))])
+def test_without_hardware_the_driver_opens_the_port_that_the_twin_makes(build):
+    parts = build(sim=True)
+    twin = parts["twin_camera"].parameters
+    driver = parts["gripper_driver"].parameters
+    assert driver["port"] == twin["gripper_link"] != "" and driver["interface"] == "slcan"
+    assert build(sim=True, gripper_port="/tmp/p")["twin_camera"].parameters["gripper_link"] == "/tmp/p"
+
+
+@pytest.mark.parametrize("build", [robot, lambda **options: by_name(bench_processes(BenchOptions(**options), ROOT))])
+def test_without_hardware_the_twins_object_is_the_one_whose_contact_is_estimated(build):
+    parts = build(sim=True)
+    assert parts["twin_camera"].parameters["object"] == parts["contact_estimator"].parameters["object_mesh"]
+    assert parts["contact_estimator"].parameters["calibration_file"] == "twin"
+    other = build(sim=True, object_mesh="can.stl", calibration_file="c")
+    assert other["twin_camera"].parameters["object"] == "can.stl"
+    assert other["contact_estimator"].parameters["calibration_file"] == "c"
+    with pytest.raises(ValueError, match="meshes in m"):
+        build(sim=True, object_mesh="can.stl", object_mesh_unit="mm")
+
+
+def test_the_object_of_the_twin_is_a_cylinder_of_25_mm_along_y_in_metres():
+    vertices = load_object_mesh(SIM_OBJECT, unit="m").vertices
+    # 1e-6: the file holds single precision
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), [0.025, 0.060, 0.025], atol=1e-6)
+
+
+def test_the_twin_films_under_the_cameras_name():
+    twin = robot(sim=True)["twin_camera"]
+    assert twin.remappings["/camera/camera/color/image_raw"] == "/camera/wrist_camera/color/image_raw"
+    assert twin.parameters["camera_frame"] == "wrist_camera_color_optical_frame"
+
+
+def test_robot_and_twin_have_a_configuration_each():
+    assert Path(robot()["left_ifea_solver"].parameter_file).name == "robot.yaml"
+    parts = robot(sim=True).values()
+    assert {part.parameter_file for part in parts if part.package == "finforce"} == {
+        str(ROOT / "config" / "robot_sim.yaml")
+    }
+    assert robot(sim=True, parameter_file=options_file())["gripper_driver"].parameter_file == options_file()
+
+
+def test_the_gripper_of_a_bench_runs_when_it_has_a_port():
+    assert "gripper_driver" not in by_name(bench_processes(BenchOptions(), ROOT))
+    driver = by_name(bench_processes(BenchOptions(gripper_port="/dev/x"), ROOT))["gripper_driver"]
+    assert driver.parameters["port"] == "/dev/x"
+
+
+def test_the_simulated_bench_has_the_left_jaw_only():
+    with pytest.raises(ValueError, match="jaw:=right"):
+        bench_processes(BenchOptions(sim=True, jaw="right"), ROOT)
+
+
+def test_only_the_frames_can_be_done_without():
+    parts = robot(arm=True, rviz=True) | robot(sim=True)
+    assert {name for name, part in parts.items() if getattr(part, "optional", False)} == {
+        "robot_state_publisher",
+        "static_transform_publisher",
+    }
+    assert all(part.advice for part in parts.values() if part.package != "finforce")

@@ -1,0 +1,208 @@
+"""Claims about work that is left out: what stays the same without it, how to have it all done, and what is counted."""
+
+import re
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from estimator_fakes import BENCH, PERIOD, magnitudes, make_estimator, ramp, record
+from localization_fakes import JAW, cylinder
+
+from finforce import skipping as rules
+from finforce.health import Idling
+from finforce.skipping import ALL, EVERYWHERE, SkippingError, Skips
+from finforce_contact.estimator import ContactEstimator
+from finforce_ifea.contact_mechanics.outline import ObjectOutline
+from finforce_ifea.observation import Contact
+from finforce_ifea.tracking.clearance import AWAY, is_away
+from finforce_keypoints.settings import RULES as DETECTOR
+
+RADIUS, HEIGHT = 0.0125, 0.040
+DEPTHS = ramp(2, 0)
+FAR, NEAR = 0.020, 60  # m of gap; the frame from which the object stands at the jaw: the press begins
+TENTH = 100_000_000  # ns
+
+
+class TestRules:
+    def test_only_rules_that_exist_can_be_off(self):
+        with pytest.raises(SkippingError, match="no rule 'no object'; expected .*no object near"):
+            Skips(rules.SOLVER, ("no object",))
+        assert Skips(rules.SOLVER, ("",)).allows(rules.AWAY)
+
+    def test_one_rule_or_all_can_be_off(self):
+        one, everything = Skips(rules.SOLVER, (rules.AWAY,)), Skips(rules.SOLVER, (ALL,))
+        assert not one.allows(rules.AWAY) and one.allows(rules.IDLE)
+        assert not any(everything.allows(rule) for rule in (*rules.SOLVER, *EVERYWHERE))
+
+    def test_the_diagnostics_say_how_often_each_was_applied(self):
+        skips = Skips(rules.SOLVER, (rules.IDLE,))
+        skips.count(rules.AWAY)
+        skips.count(rules.AWAY, 2)
+        said = skips.describe()
+        assert (said["skipped: no object near"], said["skipped: idle image"]) == ("3", "off")
+        assert said["skipped: frame late"] == "0"
+
+    def test_the_page_lists_exactly_the_rules_that_nodes_count(self):
+        page = (Path(__file__).parents[2] / "docs" / "skipping.md").read_text(encoding="utf-8")
+        table = page.partition("\n## The rules")[2].partition("\n## ")[0]
+        listed = re.findall(r"^\| `([^`]+)` \|", table, flags=re.MULTILINE)
+        counted = {*EVERYWHERE, *rules.SOLVER, *rules.CONTACT, *DETECTOR}
+        assert sorted(listed) == sorted(counted)
+
+
+class TestIdling:
+    def test_of_every_tenth_of_a_second_one_image_is_answered(self):
+        idling, answered = Idling(), []
+        for stamp in range(0, 10 * TENTH, TENTH // 3):
+            if not idling.passes(stamp):
+                idling.note(stamp, True)
+                answered.append(stamp)
+        assert len(answered) == 10
+        assert max(np.diff(answered)) < 1.4 * TENTH
+
+    def test_two_nodes_answer_the_same_images_wherever_they_began(self):
+        def answered(first):
+            idling, chosen = Idling(), set()
+            for stamp in range(first, 40 * TENTH, TENTH // 3):
+                if not idling.passes(stamp):
+                    idling.note(stamp, True)
+                    chosen.add(stamp)
+            return {stamp for stamp in chosen if stamp > 10 * TENTH}
+
+        assert answered(0) == answered(7 * (TENTH // 3)) != set()
+
+    def test_nothing_is_passed_over_once_something_happens(self):
+        idling = Idling()
+        idling.note(0, True, 0)
+        assert idling.passes(TENTH // 3)
+        idling.note(TENTH // 2, False, 0)
+        assert not idling.passes(TENTH // 2 + 1) and idling.spare_time(0) == 0.0
+        idling.note(TENTH, True, TENTH)
+        idling.end()
+        assert not idling.passes(TENTH + 1)
+
+    @pytest.mark.parametrize(
+        ("now", "spare"), [(0.01, 0.09 + 0.02), (0.10, 0.02), (0.12, 0.0), (5.0, 0.0), (-9.0, 0.1)]
+    )
+    def test_a_node_may_sleep_until_the_next_image_that_counts_can_be_here(self, now, spare):
+        idling = Idling()
+        idling.note(-TENTH, True, -TENTH + 30_000_000)
+        idling.note(0, True, 20_000_000)
+        # never longer than the period, whatever the clocks say
+        assert idling.spare_time(round(now * 1e9)) == pytest.approx(min(spare, 0.1))
+
+
+def circle(gap):
+    """The contact of a cylinder along y with a gap [m] before the jaw."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
+    outline = ObjectOutline(
+        polygons=(RADIUS * np.stack([np.cos(angles), np.sin(angles)], axis=1),),
+        origin=np.array([BENCH.inner_face_x + RADIUS + gap, HEIGHT]),
+        tilt=0.0,
+        stddev=np.array([0.5e-3, 0.5e-3, 5e-3]),
+    )
+    place = np.array([[BENCH.inner_face_x, 0.0, HEIGHT]])
+    return Contact(points=place, weights=np.ones(1), touching=gap < 0.0, outline=outline)
+
+
+@cache
+def watched(*, spares, near=NEAR):
+    """Solutions of a press whose object stands far away at first, and which images were spared."""
+    recording, estimator = record(DEPTHS), make_estimator(solver="frame")
+    estimator.spares = spares
+    far, solutions, spared = circle(FAR), [], []
+    for frame, (observation, depth) in enumerate(zip(recording.observations, DEPTHS, strict=True)):
+        contact = far if frame < near else circle(-depth if depth > 0.0 else 1e-3)
+        solutions.append(estimator.update(observation, contact))
+        spared.append(estimator.spared)
+    return solutions, np.array(spared)
+
+
+class TestAnObjectOutOfReach:
+    @pytest.mark.parametrize(
+        ("change", "away"),
+        [
+            ({}, True),
+            ({"touching": True}, False),
+            ({"touching": None}, False),
+            ({"outline": None}, False),
+        ],
+    )
+    def test_only_an_outline_in_front_of_the_jaw_that_touches_nothing_is_away(self, change, away):
+        contact = circle(FAR)
+        for name, value in change.items():
+            object.__setattr__(contact, name, value)
+        assert is_away(contact, BENCH.inner_face_x) is away
+
+    @pytest.mark.parametrize(("gap", "away"), [(AWAY + 1.6e-3, True), (AWAY + 1.4e-3, False), (-FAR, False)])
+    def test_what_the_place_may_err_counts_as_near(self, gap, away):
+        contact = circle(gap)
+        object.__setattr__(contact, "touching", False)
+        assert is_away(contact, BENCH.inner_face_x) is away
+
+    def test_the_jaw_at_rest_is_left_alone_and_says_so(self):
+        solutions, spared = watched(spares=True)
+        assert spared[46:NEAR].all() and not spared[NEAR:].any()
+        first = solutions[50]
+        assert (first.status, first.trusted, first.converged) == ("unloaded", True, True)
+        assert "out of reach" in first.message and not first.force.any()
+
+    def test_no_rule_leaves_everything_to_the_mechanics(self):
+        solutions, spared = watched(spares=False)
+        assert not spared.any()
+        assert "out of reach" not in solutions[50].message
+
+    def test_the_force_is_the_same_within_what_the_key_points_can_tell(self):
+        with_rule, without = (magnitudes(watched(spares=spares)[0]) for spares in (True, False))
+        known = np.isfinite(with_rule) & np.isfinite(without)
+        assert known[46:].mean() > 0.98
+        difference = np.abs(with_rule - without)
+        # unloaded: what noise alone makes of the mechanics; pressed: how long a filter remembers where it began
+        assert difference[46:NEAR].max() < 0.02
+        assert np.nanmax(difference[NEAR:]) < 0.05
+        assert np.nanmax(without) > 0.5
+
+    def test_a_jaw_that_something_else_bends_is_solved_all_the_same(self):
+        with_rule, without = (watched(spares=spares, near=10**6) for spares in (True, False))
+        pressed = DEPTHS > 0.5e-3
+        assert not with_rule[1][pressed].any()
+        forces = [magnitudes(solutions)[pressed] for solutions, _ in (with_rule, without)]
+        assert np.nanmax(np.abs(forces[0] - forces[1])) < 0.05
+
+    def test_before_the_tare_nothing_is_spared(self):
+        _, spared = watched(spares=True)
+        assert not spared[:44].any()
+
+    def test_time_goes_on(self):
+        solutions, _ = watched(spares=True)
+        assert np.allclose(np.diff([solution.stamp for solution in solutions]), PERIOD)
+
+
+class TestContactThatNeedNotBeLookedFor:
+    def follow(self, off, gap, noise):
+        """Mean heights (n,) [m] and touch (n,) of a cylinder whose pose trembles before the undeformed jaw."""
+        estimator = ContactEstimator(JAW, mesh=cylinder())
+        estimator.skips = Skips(rules.CONTACT, off)
+        random, heights, touching = np.random.default_rng(3), [], []
+        for frame in range(40):
+            T = np.eye(4)
+            T[:3, 3] = [JAW.inner_face_x + RADIUS + gap, 0.0, HEIGHT] + noise * random.standard_normal(3)
+            estimator.take_pose(frame * PERIOD, T)
+            found = estimator.update(frame * PERIOD)
+            heights.append(np.average(found.points[:, 2], weights=found.weights))
+            touching.append(found.touching)
+        return estimator, np.array(heights), np.array(touching)
+
+    @pytest.mark.parametrize(
+        ("rule", "gap", "noise", "bound"),
+        # far away the object may move by 0.3 mm before its place is looked for anew, near by 0.02 mm
+        [(rules.AWAY, 0.015, 5e-5, 0.3e-3), (rules.STILL, 1e-3, 5e-6, 0.05e-3)],
+    )
+    def test_the_place_stays_within_what_may_move(self, rule, gap, noise, bound):
+        estimator, heights, touching = self.follow((), gap, noise)
+        looked, reference, known = self.follow((ALL,), gap, noise)
+        assert np.abs(heights - reference).max() < bound
+        assert (touching == known).all()
+        assert int(estimator.skips.describe()[f"skipped: {rule}"]) > 20
+        assert looked.counts["solved"] == 40 and looked.skips.describe()[f"skipped: {rule}"] == "off"

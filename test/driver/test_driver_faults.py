@@ -1,0 +1,40 @@
+"""Claims about the driver under random faults, against the emulator's truth."""
+
+import driver_rig_fakes  # noqa: F401  (finds the benchmarks)
+import pytest
+from driver_faults import FaultRun, choose_kinds
+
+from finforce_driver.emulator.faults import FaultKind
+from finforce_driver.machine.exchange import Exchange
+from finforce_driver.machine.reply_filter import ReplyFilter
+
+
+def total(tally):
+    return {
+        "wrong": dict(tally.wrong),
+        "motion": dict(tally.motion),
+        "crashes": dict(tally.crashes),
+        "hangs": tally.hangs,
+        "unrecovered": tally.unrecovered,
+    }
+
+
+CLEAN = {"wrong": {}, "motion": {}, "crashes": {}, "hangs": 0, "unrecovered": 0}
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5, 6])
+def test_faults_never_become_wrong_states_hangs_crashes_or_motion(seed):
+    tally = FaultRun(seed, 60, choose_kinds(seed)).run()
+    assert sum(tally.faults.values()) >= 60
+    assert tally.states > 500
+    assert total(tally) == CLEAN
+
+
+def test_a_driver_that_believes_every_reply_is_found_out(monkeypatch):
+    monkeypatch.setattr(ReplyFilter, "take", lambda _self, sample, _expected: sample.reply)
+    assert FaultRun(1, 60, (FaultKind.FLIPPED,)).run().wrong
+
+
+def test_a_driver_that_does_not_get_back_into_step_is_found_out(monkeypatch):
+    monkeypatch.setattr(Exchange, "in_step", True)
+    assert any(FaultRun(seed, 60, (FaultKind.LATE,)).run().wrong for seed in range(3))

@@ -1,0 +1,196 @@
+"""Claims about orders: when they leave, when they wait, and what hold sends."""
+
+import math
+
+import pytest
+from driver_rig_fakes import COUNT, VARIANTS, Rig
+
+from finforce_driver.can.protocol import Command, Flag
+from finforce_driver.emulator.faults import FaultKind
+from finforce_driver.errors import TargetError
+from finforce_driver.state import Outcome, Phase
+
+GO = Flag.ACTIVATE | Flag.GO
+both_variants = pytest.mark.parametrize("variant", VARIANTS)
+
+
+@pytest.fixture
+def rig(variant):
+    return Rig(variant)
+
+
+@both_variants
+def test_hold_stops_the_jaws_where_they_are(rig):
+    rig.gripper.move(0.0, 0.02)
+    rig.live(1.0)
+    place = rig.emulated.true_opening
+    rig.gripper.hold()
+    rig.live(0.3)
+    assert (rig.state.phase, rig.state.outcome) == (Phase.READY, Outcome.REPLACED)
+    assert rig.emulated.true_opening == pytest.approx(place, abs=0.02 * 0.03 + COUNT)
+    assert rig.emulated.order.current == 500
+
+
+@both_variants
+def test_hold_changes_nothing_for_jaws_that_hold(rig):
+    rig.emulated.jaws.object_opening = 0.025
+    rig.arrive(0.0, 0.05, 20.0)
+    begin = rig.clock.now()
+    rig.gripper.hold()
+    rig.live(0.3)
+    assert rig.orders(begin) == []
+    assert rig.state.force == pytest.approx(20.0, rel=0.02)
+
+
+@both_variants
+def test_hold_does_not_power_limp_jaws(rig):
+    rig.arrive(0.02)
+    rig.gripper.release_power()
+    rig.gripper.hold()
+    rig.live(0.3)
+    assert rig.orders()[-1].flags & GO == Flag.ACTIVATE
+    assert not rig.emulated.order.action
+
+
+@both_variants
+def test_an_order_after_an_interruption_differs_from_the_same_one_before(rig):
+    rig.arrive(0.02)
+    rig.gripper.estop()
+    rig.wait_for(Phase.FAULT)
+    rig.gripper.clear_errors()
+    rig.wait_for(Phase.READY)
+    rig.arrive(0.02)
+    first, second = (order for order in rig.orders() if order.drives)
+    assert (first.position, first.speed, first.current_mA) == (second.position, second.speed, second.current_mA)
+    assert first.flags != second.flags
+    assert rig.emulated.violations["stale latch"] == 0
+
+
+@pytest.mark.parametrize("kind", [FaultKind.LOST, FaultKind.REQUEST_LOST, FaultKind.TRUNCATED])
+@both_variants
+def test_an_order_whose_reply_is_lost_is_sent_again(rig, kind):
+    rig.live(0.005)
+    rig.adapter.inject(kind)
+    state = rig.arrive(0.02)
+    assert state.outcome is Outcome.REACHED
+    assert [order.position for order in rig.orders()] == [149, 149]
+
+
+@both_variants
+def test_a_late_reply_shifts_nothing(rig):
+    rig.gripper.move(0.0, 0.05)
+    rig.live(0.1)
+    for _ in range(6):
+        rig.adapter.inject(FaultKind.LATE)
+        for _ in range(10):
+            rig.gripper.turn()
+        age = rig.clock.now() - rig.state.stamp
+        assert rig.state.opening - rig.emulated.true_opening < 0.05 * (age + 0.055) + COUNT
+
+
+@both_variants
+def test_hold_after_a_gap_does_not_bring_the_jaws_back(rig):
+    rig.arrive(0.045)
+    rig.gripper.move(0.0, 0.1)
+    rig.live(0.1)
+    rig.adapter.inject(FaultKind.LOST, 4)
+    rig.live(0.16)
+    place = rig.emulated.true_opening
+    rig.gripper.hold()
+    rig.live(0.5)
+    assert rig.emulated.true_opening < place + COUNT
+    assert rig.emulated.true_opening > 0.005
+    assert rig.state.phase is Phase.READY
+
+
+@both_variants
+def test_hold_aims_at_where_the_jaws_are_by_now(rig):
+    rig.gripper.move(0.0, 0.1)
+    rig.live(0.2)
+    rig.clock.wait(0.018)
+    begin, place = rig.clock.now(), rig.gripper.scale.counts_of(rig.emulated.true_opening)
+    rig.gripper.hold()
+    rig.live(0.1)
+    # 0.1 m/s are 10 counts in the 18 ms that the last reply is old
+    assert [order.position for order in rig.orders(begin)] == [pytest.approx(place, abs=3)]
+
+
+@both_variants
+def test_an_order_waits_until_requests_and_replies_are_in_step(rig):
+    rig.live(0.5)
+    rig.adapter.inject(FaultKind.LOST)
+    turn = 0.0
+    while turn < 0.049:  # until one has waited for its reply in vain
+        begin = rig.clock.now()
+        rig.gripper.turn()
+        turn = rig.clock.now() - begin
+    begin = rig.clock.now()
+    rig.gripper.move(0.02, 0.1)
+    rig.live(0.1)
+    frames = rig.sent(begin)
+    assert frames[0].remote
+    assert len(rig.orders(begin)) == 1
+
+
+@both_variants
+def test_an_order_waits_for_a_link_that_gets_into_step_by_a_pause(variant):
+    rig = Rig(variant, reply_timeout=0.005)
+    send = rig.bus.send
+    rig.bus.send = lambda frame: None if frame.remote else send(frame)
+    rig.adapter.inject(FaultKind.LOST)
+    begin = rig.clock.now() + 0.02  # a reply and two markers were waited for, the last reply is still new
+    rig.at(begin, lambda: rig.gripper.move(0.02, 0.1))
+    rig.live(0.8)
+    assert rig.sent(begin)[0].data == b""
+    assert len(rig.orders(begin)) == 1
+
+
+@both_variants
+def test_an_order_waits_while_a_reply_is_in_doubt(variant):
+    rig = Rig(variant, latency=0.0)
+    rig.emulated.calibrated = False
+    count = len(rig.frames(Command.MOVE))
+    while len(rig.frames(Command.MOVE)) == count:
+        rig.gripper.turn()
+    assert rig.state.phase is Phase.READY  # not believed yet
+    rig.gripper.move(0.02, 0.1)
+    rig.live(0.3)
+    assert rig.state.phase is Phase.UNCALIBRATED
+    assert rig.orders() == []
+
+
+@both_variants
+def test_an_order_does_not_leave_on_the_word_of_an_old_reply(rig):
+    rig.clock.wait(0.3)  # something stopped the driver
+    begin = rig.clock.now()
+    rig.gripper.move(0.02, 0.1)
+    rig.live(0.1)
+    frames = rig.sent(begin)
+    assert frames[0].data == b""
+    assert len(rig.orders(begin)) == 1
+
+
+@both_variants
+def test_a_limit_may_be_given_as_a_current(rig):
+    begin = rig.clock.now()
+    rig.gripper.move(0.03, 0.02, current=0.7)
+    rig.wait_for(Phase.READY)
+    assert {order.current_mA for order in rig.orders(begin)} == {700}
+
+
+@both_variants
+@pytest.mark.parametrize(
+    ("limits", "text"),
+    [
+        ({"force": 10.0, "current": 0.5}, "expected one of them"),
+        ({"current": 0.1}, r"current: got 0.1 A, expected 0.15 to 1.3 A"),
+        ({"current": math.nan}, "current: got nan A"),
+        ({"current": "0.5"}, "current: got '0.5' A"),
+    ],
+)
+def test_a_current_that_cannot_be_a_limit_moves_nothing(rig, limits, text):
+    begin = rig.clock.now()
+    with pytest.raises(TargetError, match=text):
+        rig.gripper.move(0.03, 0.02, **limits)
+    rig.live(0.2)
+    assert rig.orders(begin) == []

@@ -1,0 +1,133 @@
+"""The parts of the driver that decide, one by one."""
+
+import math
+
+import pytest
+from driver_rig_fakes import reply
+
+from finforce_driver.can.bus import Frame
+from finforce_driver.can.protocol import Command, Flag, Move, encode_poll
+from finforce_driver.machine.calibration import CalibrationRun, CalibrationStep
+from finforce_driver.machine.exchange import MARKERS, Exchange, Request
+from finforce_driver.machine.knowledge import History
+from finforce_driver.machine.move import GRACE, Goal, MoveJob, MoveWatch
+from finforce_driver.machine.orders import Orders
+from finforce_driver.machine.telemetry import Telemetry
+from finforce_driver.state import Outcome
+from finforce_driver.units import Pace
+
+POLL = Request(frame=encode_poll(0), answer=Command.REPLY)
+REPLY = Frame(id=0x078, data=b"\x00\x00\x00\xf1")
+GO = Flag.ACTIVATE | Flag.GO
+
+
+def temperature(value):
+    return Frame(id=0x02E, data=value.to_bytes(2, "big"))
+
+
+def test_after_a_lost_reply_a_late_one_is_not_taken_for_the_next():
+    exchange = Exchange(0)
+    exchange.begin(POLL, 0.0)
+    exchange.miss()
+    assert not exchange.in_step
+    exchange.begin(exchange.marker(), 0.05)
+    assert not exchange.answers(REPLY)
+    assert exchange.answers(Frame(id=MARKERS[1] << 1, data=b"\x00\x00"))
+    exchange.end(0.06)
+    assert exchange.in_step and exchange.marker() is None
+
+
+def test_every_lost_marker_is_followed_by_another_one():
+    exchange = Exchange(0)
+    exchange.begin(Request(frame=Frame(id=0x14, remote=True), answer=Command.PING), 0.0)
+    exchange.end(0.0)
+    asked = []
+    for _ in range(6):
+        exchange.begin(POLL if not asked else exchange.marker(), 0.0)
+        exchange.miss()
+        asked.append(exchange.marker().answer)
+    assert len(set(asked)) == len(MARKERS)
+    assert all(before is not after for before, after in zip(asked, asked[1:], strict=False))
+
+
+@pytest.mark.parametrize("frame", [Frame(id=0x0F8, data=bytes(4)), Frame(id=0x078, data=bytes(3)), Frame(id=0x034)])
+def test_frames_of_other_nodes_lengths_and_commands_answer_nothing(frame):
+    exchange = Exchange(0)
+    exchange.begin(POLL, 0.0)
+    assert exchange.answers(REPLY)
+    assert not exchange.answers(frame)
+
+
+def test_a_single_odd_temperature_is_not_believed_and_a_repeated_one_is():
+    telemetry = Telemetry(1.0)
+    told = []
+    for time, value in enumerate((26, 26, 90, 27, 90, 91)):
+        telemetry.take(Command.TEMPERATURE, temperature(value), float(time))
+        told.append(telemetry.temperature)
+    assert told[1:] == [26.0, 26.0, 27.0, 27.0, 91.0]
+
+
+def test_a_doubted_answer_is_asked_for_again_at_once():
+    telemetry = Telemetry(1.0)
+    assert telemetry.question(0.0) is Command.TEMPERATURE
+    telemetry.take(Command.TEMPERATURE, temperature(26), 0.0)
+    assert telemetry.question(0.0) is Command.TEMPERATURE
+    telemetry.take(Command.TEMPERATURE, temperature(26), 0.0)
+    assert telemetry.question(0.0) is None
+    assert telemetry.question(1.0) is Command.SUPPLY
+
+
+def test_what_comes_soon_after_an_order_speaks_of_the_one_before():
+    watch = MoveWatch(position=100, closing=True, allowed=1.0, now=0.0)
+    early = [watch.take(reply(), GRACE * part, True) for part in (0.1, 0.5, 0.9)]
+    late = [watch.take(reply(), GRACE + time, True) for time in (0.01, 0.03)]
+    assert (early, late) == ([Outcome.NONE] * 3, [Outcome.NONE, Outcome.REACHED])
+
+
+def test_a_step_on_the_way_is_not_the_end():
+    watch = MoveWatch(position=100, closing=True, allowed=1.0, now=0.0)
+    assert {watch.take(reply(), 0.1 + 0.02 * index, False) for index in range(10)} == {Outcome.NONE}
+
+
+def test_a_slow_move_begins_where_the_jaws_are_not_where_they_were_thought_to_be():
+    pace = Pace(byte=3, speed=0.001, stepped=True)
+    goal = Goal(opening=0.035, position=67, pace=pace, current_mA=500)
+    job = MoveJob(goal, start=155.0, rate=5.0, now=0.0)
+    job.advance(0.05, 105.5, 0.04)
+    assert job.position in (105, 106)
+
+
+def test_the_first_reply_that_says_calibrated_does_not_end_a_calibration():
+    run = CalibrationRun(calibrated=False, reset=False)
+    run.start(0.0)
+    steps = []
+    for time, position, calibrated in ((0.5, 0, False), (1.0, 255, False), (2.0, 255, True), (2.02, 255, True)):
+        run.take(reply(position=position, calibrated=calibrated, current_mA=-400), time)
+        steps.append(run.step)
+    assert steps == [CalibrationStep.WATCH] * 3 + [CalibrationStep.DONE]
+
+
+def test_orders_are_pending_until_taken_and_differ_after_an_interruption():
+    orders = Orders(salt=5)
+    move = Move(position=100, speed=20, current_mA=500, flags=GO)
+    orders.want(move)
+    first = orders.wanted
+    assert orders.pending
+    orders.take(first)
+    orders.want(move)
+    assert not orders.pending
+    orders.drop()
+    orders.want(move)
+    assert orders.pending and orders.wanted != first
+    assert orders.wanted.flags & 0xF0 == GO
+
+
+def test_speed_and_place_come_from_the_last_tenth_of_a_second():
+    history = History()
+    assert history.speed() == 0.0 and math.isnan(history.last)
+    for index in range(20):
+        history.add(0.02 * index, 5.0 if index < 10 else 5.0 + (index - 10))
+    assert history.speed() == pytest.approx(50.0)
+    assert history.place_at(0.37, 0.0) == pytest.approx(13.5)
+    assert math.isnan(history.place_at(-0.01, 0.0))
+    assert history.place_at(0.40, 0.05) == 14.0

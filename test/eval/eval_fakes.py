@@ -1,0 +1,168 @@
+"""A small recording and an estimator that answers by rule, for the tests of the evaluation."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, PoseTrack, Recording, WrenchTrack, parse_phases
+from finforce_ifea.observation import Contact
+
+PERIOD = 33_333_333
+START = 1_000_000_000_000
+
+
+def make_phases(frames, *, cycles=2, name="case"):
+    """Two steps in and one step out per cycle, each with a settle and a record part."""
+    steps = [("load", 0), ("load", 2), ("unload", 0)]
+    stages = ("settle", "record")
+    parts = [(cycle, *step, stage) for cycle in range(cycles) for step in steps for stage in stages]
+    begins = START + PERIOD * (np.arange(len(parts)) * frames // len(parts))
+    texts = [f"{cycle}:{direction}:{depth}:{stage}" for cycle, direction, depth, stage in parts]
+    return parse_phases(begins.tolist(), texts, name)
+
+
+def make_recording(name="case", *, frames=60, keypoints=4, phases=True, truth=True, side="left", seed=0):
+    """A recording whose true force rises and falls twice between 0 and 2 N along -x."""
+    random = np.random.default_rng(seed)
+    stamps = START + PERIOD * np.arange(frames, dtype=np.int64)
+    points = random.uniform(-0.02, 0.08, (1, keypoints, 3)) + random.normal(0, 1e-4, (frames, keypoints, 3))
+    points[3, 1] = np.nan
+    force = np.zeros((frames, 3))
+    force[:, 0] = -np.abs(2.0 * np.sin(np.linspace(0, 2 * np.pi, frames)))
+    torque = np.cross([0.014, 0.0, 0.04], force)
+    track = JawTrack(
+        keypoints=KeypointTrack(
+            stamps=stamps,
+            points=points.astype(np.float32).astype(np.float64),
+            likelihood=random.uniform(0, 1, (frames, keypoints)).astype(np.float32).astype(np.float64),
+        ),
+        truth=WrenchTrack(stamps=stamps, force=force, torque=torque) if truth else None,
+        pose=make_poses(stamps[::3]),
+    )
+    return Recording(
+        name=name,
+        path=Path(name),
+        jaws={side: track},
+        object_pose=make_poses(stamps[::3]),
+        phases=make_phases(frames, name=name) if phases else None,
+        case={"object": {"kind": "cylinder", "diameter": 25, "z": 40.0}},
+    )
+
+
+def make_poses(stamps):
+    """Poses that do not move."""
+    count = len(stamps)
+    return PoseTrack(
+        stamps=stamps,
+        position=np.tile([0.03, 0.02, 0.11], (count, 1)),
+        quaternion=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        frame_id="camera_color_optical_frame",
+    )
+
+
+@dataclass(frozen=True)
+class FakeJaw:
+    """A jaw of four key points."""
+
+    name: str = "fake"
+    keypoint_names: tuple = ("a", "b", "c", "d")
+    keypoints: np.ndarray = None
+    inner_face_x: float = 0.014
+    side: str = "left"
+
+
+BOX = np.array([[x, y, z] for z in (0.0, 0.08) for y in (-0.01, 0.01) for x in (-0.014, 0.014)])
+BOX_TRIANGLES = np.array(
+    [
+        [0, 2, 3],
+        [0, 3, 1],
+        [4, 5, 7],
+        [4, 7, 6],
+        [0, 1, 5],
+        [0, 5, 4],
+        [2, 6, 7],
+        [2, 7, 3],
+        [0, 4, 6],
+        [0, 6, 2],
+        [1, 3, 7],
+        [1, 7, 5],
+    ]
+)
+
+
+@dataclass(frozen=True)
+class FakeSolution:
+    """What a step said."""
+
+    status: str
+    force: np.ndarray
+    keypoints_used: np.ndarray
+    message: str = ""
+    magnitude_stddev: float = 0.05
+    residual: float = 2e-4
+    contact_place: tuple = (0.014, 0.0, 0.04)
+    torque: tuple = (0.0, -0.04, 0.0)
+    contact_point: tuple = (0.013, 0.0, 0.04)
+
+    @property
+    def trusted(self):
+        return self.status in ("ok", "unloaded")
+
+
+class FakeEstimator:
+    """Answers with `forces[k]` at its k-th step; None is a step without a trusted answer."""
+
+    surface_triangles = BOX_TRIANGLES
+
+    def __init__(self, forces):
+        self.forces = list(forces)
+        self.observations = []
+        self.contacts = []
+
+    def update(self, observation, contact):
+        force = self.forces[len(self.observations)]
+        self.observations.append(observation)
+        self.contacts.append(contact)
+        used = np.isfinite(observation.points).all(axis=1)
+        if force is None:
+            return FakeSolution("not_enough_points", np.zeros(3), np.zeros_like(used), "all are hidden")
+        return FakeSolution("ok", np.asarray(force, dtype=float), used)
+
+    def warm_up(self):
+        """Nothing to compile."""
+
+    def surface(self):
+        return BOX + np.array([1e-3 * len(self.observations), 0, 0])
+
+
+@dataclass(frozen=True)
+class FakeEstimate:
+    """What a contact estimator said."""
+
+    contact: Contact | None
+    touching: bool
+    status: str
+    message: str = ""
+
+
+class FakeContactEstimator:
+    """Puts the contact at the height of the object it knows, from its first update on; notes every call in order."""
+
+    def __init__(self, touching=lambda update: True):
+        self.calls = []
+        self._touching, self._pose, self._updates = touching, None, 0
+
+    def take_pose(self, stamp, T_jaw_object, covariance=None, *, camera=None):
+        self.calls.append(("pose", stamp, T_jaw_object))
+        self._pose = T_jaw_object
+
+    def update(self, stamp, surface=None, wrench=None):
+        self.calls.append(("update", stamp, surface, wrench))
+        self._updates += 1
+        if self._pose is None:
+            return FakeEstimate(None, False, "no_pose", "no pose yet")
+        touching = self._touching(self._updates - 1)
+        points = np.array([[0.014, 0.0, self._pose[2, 3] - 1e-3], [0.014, 0.0, self._pose[2, 3] + 3e-3]])
+        contact = Contact(points=points, weights=np.array([0.75, 0.25]), touching=touching, free=True)
+        return FakeEstimate(contact, touching, "touching" if touching else "apart")

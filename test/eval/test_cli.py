@@ -1,0 +1,265 @@
+"""Claims about the `finforce` command: what it writes, and that bad input costs one line and status 2."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from eval_fakes import FakeEstimator, make_recording
+
+from finforce_eval.cli.main import main
+from finforce_eval.recordings.writer import MessageFactory, write_entries, write_recording
+
+BENCH_KEYPOINTS = 15
+ROOT = Path(__file__).resolve().parents[2]
+CYLINDER = ROOT / "finforce_eval" / "data" / "objects" / "cylinder_25.stl"
+
+
+def bench_recording(name="pressed", **options):
+    return make_recording(name, keypoints=BENCH_KEYPOINTS, **options)
+
+
+@pytest.fixture
+def bag(tmp_path):
+    return write_recording(bench_recording(), tmp_path / "pressed")
+
+
+@pytest.fixture
+def exact(monkeypatch):
+    """Estimates that are a tenth above the truth."""
+    forces = bench_recording().jaws["left"].truth.force * 1.1
+    monkeypatch.setattr("finforce_eval.cli.evaluate.JawEstimator", lambda *_, **__: FakeEstimator(forces))
+
+
+def assert_refused(capsys, arguments, reason):
+    """Status 2 and one line on stderr that gives the reason."""
+    try:
+        status = main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        status = stop.code
+    captured = capsys.readouterr()
+    assert status == 2
+    assert captured.err.count("\n") == 1, captured.err
+    assert captured.err.startswith("finforce")
+    assert reason in captured.err
+    assert captured.out == ""
+
+
+def test_evaluate_prints_the_table_and_writes_json_and_report(tmp_path, bag, exact, capsys):
+    out, report = tmp_path / "new" / "scores.json", tmp_path / "report"
+    assert main(["evaluate", str(bag), "--json", str(out), "--report", str(report)]) == 0
+    printed = capsys.readouterr().out
+    assert "pressed" in printed
+    assert "RMSE/N" in printed
+    content = json.loads(out.read_text())
+    assert content["cases"].keys() == {"pressed"}
+    assert content["cases"]["pressed"]["all"] == content["all"]["all"]
+    assert content["all"]["all"]["bias_N"] > 0
+    assert (report / "README.md").exists()
+
+
+def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path, exact, capsys):
+    for folder in ("monday", "tuesday"):
+        write_recording(bench_recording(), tmp_path / folder / "bag")
+    out = tmp_path / "scores.json"
+    bags = [str(tmp_path / folder / "bag") for folder in ("monday", "tuesday")]
+    assert main(["evaluate", *bags, "--json", str(out)]) == 0
+    names = list(json.loads(out.read_text())["cases"])
+    assert [name.split("/")[-2:] for name in names] == [["monday", "bag"], ["tuesday", "bag"]]
+
+
+def test_note_about_unknown_types_goes_to_stderr(tmp_path, exact, capsys, monkeypatch):
+    noted = replace(bench_recording(), notes=("/odd skipped: unknown type own_msgs/msg/Odd",))
+    monkeypatch.setattr("finforce_eval.cli.evaluate.read_recording", lambda *_: noted)
+    assert main(["evaluate", "pressed"]) == 0
+    assert capsys.readouterr().err == "note: pressed: /odd skipped: unknown type own_msgs/msg/Odd\n"
+
+
+def test_absent_recording_is_refused(capsys, tmp_path):
+    assert_refused(capsys, ["evaluate", tmp_path / "nowhere"], "no such recording")
+    assert_refused(capsys, ["calibrate", tmp_path / "nowhere", "-o", tmp_path / "c.yaml"], "no such recording")
+
+
+def test_empty_folder_is_refused(capsys, tmp_path):
+    assert_refused(capsys, ["evaluate", tmp_path], "the folder is no recording")
+
+
+def test_truncated_recording_is_refused(capsys, bag):
+    file = bag / "pressed.mcap"
+    file.write_bytes(file.read_bytes()[:5000])
+    assert_refused(capsys, ["evaluate", bag], "truncated or damaged")
+    assert_refused(capsys, ["evaluate", file], "truncated or damaged")
+
+
+def test_empty_recording_is_refused(capsys, tmp_path):
+    write_entries([], tmp_path / "bag", MessageFactory())
+    assert_refused(capsys, ["evaluate", tmp_path / "bag"], "empty")
+
+
+def test_recording_without_truth_is_refused(capsys, tmp_path):
+    bag = write_recording(bench_recording(truth=False), tmp_path / "bag")
+    assert_refused(capsys, ["evaluate", bag], "no ground truth")
+    assert_refused(capsys, ["calibrate", bag, "-o", tmp_path / "c.yaml"], "no ground truth")
+
+
+def test_recording_of_another_jaw_is_refused(capsys, tmp_path):
+    bag = write_recording(make_recording(keypoints=8), tmp_path / "bag")
+    assert_refused(capsys, ["evaluate", bag], "8 key points in /left/keypoints; the jaw 'bench' has 15")
+    assert_refused(capsys, ["calibrate", bag, "-o", tmp_path / "c.yaml"], "8 key points")
+
+
+def test_one_bad_recording_among_good_ones_is_named(capsys, bag, tmp_path, exact):
+    assert_refused(capsys, ["evaluate", bag, tmp_path / "nowhere"], "nowhere")
+
+
+def test_same_recording_twice_is_refused(capsys, bag):
+    assert_refused(capsys, ["evaluate", bag, bag], "given twice")
+
+
+def test_recording_without_height_is_refused(capsys, tmp_path):
+    bag = write_recording(replace(bench_recording(), case={}), tmp_path / "bag")
+    assert_refused(capsys, ["evaluate", bag], "give --contact fixed:Z_MM")
+
+
+def test_height_off_the_jaw_is_refused(capsys, bag):
+    assert_refused(capsys, ["evaluate", bag, "--contact", "fixed:400"], "400")
+
+
+@pytest.mark.parametrize("contact", ["somewhere", "fixed:x"])
+def test_contact_that_cannot_be_used_is_refused(capsys, bag, contact):
+    assert_refused(capsys, ["evaluate", bag, "--contact", contact], f"--contact {contact}")
+
+
+def test_estimate_without_mesh_or_poses_is_refused(capsys, bag, tmp_path):
+    assert_refused(capsys, ["evaluate", bag, "--contact", "estimate"], "no object mesh: no mesh in a case.json")
+    blind = write_recording(replace(bench_recording(), object_pose=None), tmp_path / "blind")
+    assert_refused(capsys, ["evaluate", blind, "--contact", "paper", "--object", CYLINDER], "no object poses")
+    track = bench_recording().jaws["left"]
+    still = replace(bench_recording(), jaws={"left": replace(track, pose=None)})
+    jawless = write_recording(still, tmp_path / "jawless")
+    assert_refused(
+        capsys, ["evaluate", jawless, "--contact", "closest", "--object", CYLINDER], "no jaw poses: /left/jaw_pose"
+    )
+    calibrate = ["calibrate", bag, "-o", tmp_path / "c.yaml", "--contact", "estimate"]
+    assert_refused(capsys, calibrate, "no object mesh")
+
+
+def test_object_that_cannot_be_used_is_refused(capsys, bag, tmp_path):
+    pytest.importorskip("trimesh")
+    assert_refused(capsys, ["evaluate", bag, "--object", tmp_path / "no.stl"], "no.stl")
+    assert_refused(capsys, ["evaluate", bag, "--object", CYLINDER, "--object-unit", "mm"], "unit")
+    assert_refused(capsys, ["evaluate", bag, "--object", CYLINDER, "--object-unit", "ell"], "--object-unit")
+    (tmp_path / "object.txt").write_text("")
+    assert_refused(capsys, ["evaluate", bag, "--object", tmp_path / "object.txt"], ".txt")
+
+
+def test_units_are_those_of_the_mesh_reader():
+    from finforce_contact.mesh.object_mesh import UNITS as READ
+    from finforce_eval.cli.main import UNITS
+
+    assert set(UNITS) == set(READ)
+
+
+def test_nan_pose_is_refused_with_its_message(capsys, tmp_path):
+    pytest.importorskip("trimesh")
+    recording = bench_recording()
+    recording.object_pose.position[4] = np.nan
+    bag = write_recording(recording, tmp_path / "bag")
+    assert_refused(capsys, ["evaluate", bag, "--object", CYLINDER], "/object_pose message 4")
+
+
+def test_absent_jaw_and_calibration_are_refused(capsys, bag, tmp_path):
+    assert_refused(capsys, ["evaluate", bag, "--jaw", tmp_path / "no.yaml"], "no.yaml")
+    assert_refused(capsys, ["evaluate", bag, "--calibration", tmp_path / "no.yaml"], "no.yaml")
+
+
+def test_unknown_solver_and_missing_bag_are_refused(capsys, bag):
+    assert_refused(capsys, ["evaluate", bag, "--solver", "magic"], "--solver")
+    assert_refused(capsys, ["evaluate"], "BAG")
+    assert_refused(capsys, [], "COMMAND")
+    assert_refused(capsys, ["calibrate", bag], "-o/--output")
+
+
+@pytest.mark.parametrize("change", ["magic=1", "iterations=many", "automatic_tare=perhaps", "iterations=0", "gate"])
+def test_setting_that_cannot_be_is_refused(capsys, bag, change):
+    assert_refused(capsys, ["evaluate", bag, "--set", change], change.split("=")[0])
+
+
+def test_settings_take_the_type_of_their_default():
+    from finforce_eval.cli.evaluate import parse_settings
+
+    settings = parse_settings("solid", "coarse", ["iterations=3", "gate=2", "automatic_tare=No"])
+    assert (settings.solver, settings.mesh) == ("solid", "coarse")
+    assert (settings.iterations, settings.gate, settings.automatic_tare) == (3, 2.0, False)
+    assert isinstance(settings.gate, float)
+
+
+def test_all_key_points_hidden_is_refused(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("finforce_eval.cli.evaluate.JawEstimator", lambda *_, **__: FakeEstimator([None] * 60))
+    bag = write_recording(bench_recording(), tmp_path / "bag")
+    assert_refused(capsys, ["evaluate", bag], "none of the frames to be scored was solved")
+
+
+def test_key_points_all_nan_are_refused_by_the_real_estimator(capsys, tmp_path):
+    recording = bench_recording()
+    track = recording.jaws["left"]
+    hidden = replace(track.keypoints, points=np.full_like(track.keypoints.points, np.nan))
+    blind = replace(recording, jaws={"left": replace(track, keypoints=hidden)})
+    bag = write_recording(blind, tmp_path / "bag")
+    assert_refused(capsys, ["evaluate", bag], "none of the frames to be scored was solved")
+
+
+def test_output_that_cannot_be_written_is_refused(capsys, bag, exact, tmp_path):
+    (tmp_path / "file").write_text("")
+    status = main(["evaluate", str(bag), "--json", str(tmp_path / "file" / "out.json")])
+    assert status == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_steel_measurement_is_converted(tmp_path, capsys):
+    assert main(["convert-steel", str(tmp_path / "steel")]) == 0
+    assert (tmp_path / "steel" / "metadata.yaml").exists()
+    assert_refused(capsys_cleared(capsys), ["convert-steel", tmp_path / "steel"], "exists already")
+    (tmp_path / "bad.json").write_text("{")
+    assert_refused(capsys, ["convert-steel", tmp_path / "x", "--source", tmp_path / "bad.json"], "not JSON")
+
+
+def capsys_cleared(capsys):
+    capsys.readouterr()
+    return capsys
+
+
+def run_command(*arguments):
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "finforce_eval.cli.main", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+def test_process_exits_with_two_one_line_and_no_traceback(tmp_path):
+    done = run_command("evaluate", str(tmp_path / "nowhere"))
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+
+
+def test_help_needs_no_heavy_import():
+    code = (
+        "import sys\nfrom finforce_eval.cli.main import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "heavy = {'numpy', 'scipy', 'numba', 'rosbags', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    for command in ("evaluate", "calibrate", "replay", "demo", "bench", "convert-steel", "version"):
+        assert command in done.stdout
+
+
+def test_version_is_printed(capsys):
+    assert main(["version"]) == 0
+    assert capsys.readouterr().out.startswith("finforce ")

@@ -1,0 +1,120 @@
+"""Claims about the order in which contact estimator and solver are fed offline."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, make_recording
+
+from finforce.errors import PoseError
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.contact_source import EstimatedContact
+from finforce_eval.evaluation.evaluate import evaluate_recording
+from finforce_eval.recordings.objects import ObjectTrack, track_object
+
+
+def make_track(*frames):
+    """One pose per frame, 40 mm above the clamp and a millimetre higher each."""
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, 2, 3] = 0.04 + 1e-3 * np.arange(len(frames))
+    return ObjectTrack(stamps=START + PERIOD * np.array(frames), poses=poses)
+
+
+def run(track, *, lost=(), touching=lambda update: True):
+    recording = make_recording()
+    forces = [None if k in lost else force for k, force in enumerate(recording.jaws["left"].truth.force)]
+    solver, fake = FakeEstimator(forces), FakeContactEstimator(touching)
+    jaw = FakeJaw(keypoints=np.zeros((4, 3)))
+    source = EstimatedContact(fake, track, "estimate")
+    result = evaluate_recording(recording, jaw, source, factory=lambda: solver)
+    return result, solver, fake
+
+
+def kinds(calls):
+    return [name for name, *_ in calls]
+
+
+def test_poses_up_to_an_image_come_before_its_first_contact_and_later_ones_wait():
+    _, _, fake = run(make_track(-2, 0, 2))
+    assert kinds(fake.calls)[:6] == ["pose", "pose", "update", "update", "update", "pose"]
+    assert len(fake.calls) == 3 + 1 + 60
+
+
+def test_first_update_knows_no_surface_and_the_others_that_of_the_image_just_solved():
+    _, solver, fake = run(make_track(0))
+    updates = [call for call in fake.calls if call[0] == "update"]
+    assert updates[0][2] is None
+    assert updates[0][1] == updates[1][1] == pytest.approx(START * 1e-9)
+    for count, (_, stamp, surface, _) in enumerate(updates[1:], 1):
+        assert stamp == pytest.approx((START + PERIOD * (count - 1)) * 1e-9, abs=1e-6)
+        # the fake's surface moves by 1 mm with every image that it has seen
+        np.testing.assert_allclose(surface[:, 0].max(), 0.014 + 1e-3 * count)
+    assert len(solver.contacts) == 60
+
+
+def test_image_is_solved_with_the_contact_of_the_image_before():
+    _, solver, _ = run(make_track(0, 5))
+    heights = [float(np.average(c.points[:, 2], weights=c.weights)) for c in solver.contacts]
+    # the pose of image 5 is known to the update after it, and so to image 6
+    np.testing.assert_allclose(heights[:7], [0.04] * 6 + [0.041])
+
+
+def test_wrench_is_given_only_when_it_is_trusted():
+    _, _, fake = run(make_track(0), lost=[3])
+    wrenches = [call[3] for call in fake.calls if call[0] == "update"]
+    assert wrenches[0] is None
+    assert [k for k, wrench in enumerate(wrenches[1:]) if wrench is None] == [3]
+    force, torque = wrenches[10]
+    np.testing.assert_array_equal(force, make_recording().jaws["left"].truth.force[9])
+    np.testing.assert_array_equal(torque, [0.0, -0.04, 0.0])
+
+
+def test_nothing_is_given_to_the_solver_before_the_first_pose():
+    result, solver, _ = run(make_track(10))
+    assert solver.contacts[:11] == [None] * 11
+    assert solver.contacts[11] is not None
+    assert result.contact.status[9:11].tolist() == ["no_pose", "touching"]
+    assert np.isnan(result.contact.given[:11]).all()
+    assert np.isfinite(result.contact.given[11:]).all()
+
+
+def test_touching_is_that_of_the_contact_found_on_the_image():
+    # update 0 comes before image 0, update k + 1 after image k
+    result, *_ = run(make_track(0), touching=lambda update: update > 20)
+    assert result.contact.touching.tolist() == [False] * 20 + [True] * 40
+
+
+def test_times_of_solver_and_contact_are_kept_apart():
+    result, *_ = run(make_track(0))
+    assert (result.contact.step_ms > 0).all()
+    assert (result.step_ms > 0).all()
+
+
+def test_late_poses_are_taken_in_their_place():
+    recording = make_recording()
+    order = np.r_[1, 0, 2 : len(recording.object_pose.stamps)]
+    poses = recording.object_pose
+    late = replace(
+        poses,
+        stamps=poses.stamps[order],
+        position=poses.position[order] + 1e-3 * order[:, None],
+        quaternion=poses.quaternion,
+    )
+    track = track_object(replace(recording, object_pose=late), "left")
+    _, _, fake = run(track)
+    stamps = [call[1] for call in fake.calls if call[0] == "pose"]
+    assert stamps == sorted(stamps)
+    given = [call[2][2, 3] for call in fake.calls if call[0] == "pose"]
+    np.testing.assert_allclose(given, 1e-3 * np.arange(len(given)), atol=1e-12)
+
+
+def test_pose_that_the_estimator_refuses_is_named():
+    class Strict(FakeContactEstimator):
+        def take_pose(self, stamp, T_jaw_object, covariance=None, *, camera=None):
+            raise PoseError(f"the camera at {camera} is inside")
+
+    recording = make_recording()
+    source = EstimatedContact(Strict(), track_object(recording, "left"), "estimate")
+    jaw = FakeJaw(keypoints=np.zeros((4, 3)))
+    with pytest.raises(RecordingError, match=r"case: object pose at 1000.000 s: the camera at \[.*\] is inside"):
+        evaluate_recording(recording, jaw, source, factory=lambda: FakeEstimator([]))

@@ -1,0 +1,168 @@
+"""Claims about the demo: its recording, and the few figures with which it ends."""
+
+import json
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from eval_fakes import FakeEstimator, FakeJaw
+from rgbd_fakes import FakeDetector, FakeGripper, make_footage
+
+from finforce_eval.cli import demo
+from finforce_eval.cli import twin as twin_commands
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.contact_source import GivenContact
+from finforce_eval.evaluation.detection import detect_keypoints
+from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.scoring import score_grasp
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.twin_writer import write_footage
+from finforce_eval.replay.replay import Replay
+from finforce_keypoints.images import ImageWatch
+
+
+@pytest.fixture
+def rendered(monkeypatch):
+    """What was asked of the renderer, which answers with footage by rule."""
+    calls = []
+
+    def build(scenario, seed, camera, *, finger, depth_step):
+        calls.append((scenario.name, seed, finger))
+        return make_footage(seed=seed)
+
+    monkeypatch.setattr(twin_commands, "build_footage", build)
+    return calls
+
+
+@pytest.fixture
+def folder(rendered, tmp_path):
+    """The demo's recording, rendered once."""
+    folder = tmp_path / "report" / "recording"
+    assert demo.prepare_recording(folder).name == demo.SCENE
+    assert rendered == [("grasp_cylinder", 4, 0)]
+    return folder
+
+
+def test_a_whole_recording_of_the_scene_is_used_again(folder, rendered):
+    again = demo.prepare_recording(folder)
+    assert len(rendered) == 1 and len(again.images) == 12 and again.path == folder
+
+
+@pytest.mark.parametrize("change", [{"scene": "hold"}, {"seed": 5}, {"finger": 1}])
+def test_a_recording_of_something_else_is_rendered_anew(folder, rendered, change):
+    case = json.loads((folder / "case.json").read_text())
+    (folder / "case.json").write_text(json.dumps(case | change))
+    demo.prepare_recording(folder)
+    assert len(rendered) == 2 and json.loads((folder / "case.json").read_text()) == case
+
+
+@pytest.mark.parametrize("missing", [("case.json", "metadata.yaml", "object.stl", "preview.jpg"), ("metadata.yaml",)])
+def test_a_recording_that_was_broken_off_is_rendered_anew(folder, rendered, missing):
+    for name in missing:
+        (folder / name).unlink()
+    bag = folder / "recording.mcap"
+    bag.write_bytes(bag.read_bytes()[:5000])
+    assert len(demo.prepare_recording(folder).images) == 12 and len(rendered) == 2
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "metadata.yaml"])
+def test_what_the_demo_has_not_made_is_left_alone(rendered, tmp_path, name):
+    (tmp_path / "recording").mkdir()
+    (tmp_path / "recording" / name).write_text("{}")
+    (tmp_path / "recording" / "recording.mcap").write_bytes(b"mine")
+    with pytest.raises(RecordingError, match="something else than a recording of a synthetic scene"):
+        demo.prepare_recording(tmp_path / "recording")
+    assert (tmp_path / "recording" / "recording.mcap").read_bytes() == b"mine" and not rendered
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory):
+    """A recording from images; the force rises by 0.1 N an image from image 20 on."""
+    path = write_footage(make_footage(FakeGripper(count=40, onset=20)), tmp_path_factory.mktemp("bags") / "twin")
+    recording = read_recording(path)
+    return detect_keypoints(recording, FakeDetector(recording), watch=ImageWatch())
+
+
+def grasp_of(recording, error):
+    """Grasp forces that are all wrong by as much, and come 50 ms after their images."""
+    stamps = recording.images.stamps.tolist()
+    truth = np.linalg.norm(recording.truth("left").force, axis=1)
+    return dict(zip(stamps, truth + error, strict=True)), dict.fromkeys(stamps, 0.05)
+
+
+def test_the_grasp_force_is_scored_against_the_smaller_true_force(played):
+    score = score_grasp(played, *grasp_of(played, 0.03))
+    assert score.error.rmse_N == pytest.approx(0.03) and score.error.n == 40
+    assert score.largest == pytest.approx(2.0) and score.frames == 40
+    # 0.02 N a fifth of a period after image 19; 0.13 N with image 20, 0.8 periods later, and 50 ms on the way
+    assert score.delay.n == 1 and score.delay.median_ms == pytest.approx(0.8e3 / 30 + 50, abs=0.1)
+    left = played.jaws["left"]
+    weaker = replace(left, truth=replace(left.truth, force=0.5 * left.truth.force))
+    both = replace(played, jaws={"left": left, "right": weaker})
+    assert score_grasp(both, *grasp_of(played, 0.0)).largest == pytest.approx(1.0)
+
+
+def test_without_the_truth_of_a_jaw_nothing_is_said_of_the_grasp(played):
+    left = played.jaws["left"]
+    both = replace(played, jaws={"left": left, "right": replace(left, truth=None)})
+    score = score_grasp(both, *grasp_of(played, 0.0))
+    assert score.error.rmse_N is None and not score.delay.n
+
+
+def replay_of(recording):
+    forces = recording.truth("left").force
+    jaw = FakeJaw(keypoints=np.zeros((4, 3)))
+    result = evaluate_recording(recording, jaw, GivenContact(contact=None), factory=lambda: FakeEstimator(forces))
+    grasp, lag = grasp_of(recording, 0.03)
+    return Replay(
+        evaluation=score_results([result], [recording]),
+        grasp=grasp,
+        health={},
+        grasp_score=score_grasp(recording, grasp, lag),
+        recording=recording,
+    )
+
+
+def test_the_figures_that_matter_are_error_pixels_and_delay(played):
+    assert demo.format_summary(replay_of(played)).splitlines() == [
+        "Grasp force: 0.030 N RMSE, 0.030 N largest error, of 2.00 N at most; "
+        "40 of 40 images in the record phases answered",
+        "Key points: 1.00 px off in the median, 1.00 px at the 95th percentile",
+        "Delay: the grasp force shows 77 ms after its true onset",
+    ]
+
+
+def test_images_without_an_answer_are_counted_and_not_forgiven(played):
+    grasp, lag = grasp_of(played, 0.03)
+    late = {stamp: value for stamp, value in grasp.items() if stamp > played.images.stamps[9]}
+    score = score_grasp(played, late, lag)
+    assert (score.error.n, score.frames) == (30, 40)
+
+
+def test_a_force_that_never_shows_is_said(played):
+    silent = replace(replay_of(played), grasp_score=score_grasp(played, {}, {}))
+    assert "did not show" in demo.format_summary(silent) and "Grasp force" not in demo.format_summary(silent)
+
+
+def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered, played, tmp_path, monkeypatch, capsys):
+    asked = {}
+
+    def play(recording, setup, *, calibration_file, keypoints):
+        asked.update(recording=recording, calibration=calibration_file, source=keypoints.source, about=setup.about)
+        return replay_of(played)
+
+    def report(evaluation, folder, **given):
+        asked.update(given)
+        return Path(folder) / "README.md"
+
+    monkeypatch.setattr(demo, "replay", play)
+    monkeypatch.setattr(demo, "write_report", report)
+    demo.run_demo(Namespace(source="images", contact=[], report=str(tmp_path / "report")))
+    assert asked["recording"].path == tmp_path / "report" / "recording"
+    assert (asked["calibration"], asked["source"], asked["about"]["contact"]) == ("twin", "images", "estimate")
+    assert asked["recordings"] == [played]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == f"Report: {tmp_path / 'report' / 'README.md'}"
+    assert [line.split(":")[0] for line in lines[-4:-1]] == ["Grasp force", "Key points", "Delay"]

@@ -1,0 +1,93 @@
+"""Films: the messages of one rate and no others, and what follows when they are played again."""
+
+import struct
+
+import numpy as np
+import pytest
+from rgbd_fakes import CAMERA, MESH, FakeGripper, FakePhotographer
+
+from finforce_eval.bench.film import MASK_TOPIC, OBJECT_TOPIC, film_images, film_keypoints, film_mask, thin_messages
+from finforce_eval.bench.scenes import EVERY_RATE, FINE_RATE, START, SmoothGripper, slot_of
+from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.image_messages import IMAGE
+from finforce_eval.recordings.twin_writer import write_footage
+from finforce_eval.replay.playback import RawMessage
+from finforce_ifea.messages import read_stamp
+from finforce_keypoints.geometry.gripper import BENCH_CAMERA
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce_twin.footage import Footage
+from finforce_twin.rendering.photographer import Setting
+
+
+def message(slot, topic="/left/keypoints"):
+    stamp = START + round(slot * 1e9 / FINE_RATE)
+    data = b"\0\1\0\0" + struct.pack("<iI", *divmod(stamp, 10**9)) + b"rest"
+    return RawMessage(stamp, topic, "sensor_msgs/msg/PointCloud2", data, True)
+
+
+SLOTS = [6 * cycle + slot for cycle in range(10) for slot in EVERY_RATE]
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    """A recording of seven states of the script, in images of 30, 60 and 90 Hz."""
+    gripper = SmoothGripper(FakeGripper(count=7), EVERY_RATE)
+    setting = Setting(shapes={}, mesh=MESH, camera=CAMERA, T_gripper_camera=BENCH_CAMERA)
+    footage = Footage(gripper, FakePhotographer(), setting, 0)
+    return write_footage(footage, tmp_path_factory.mktemp("bags") / "twin")
+
+
+@pytest.mark.parametrize("rate", [30, 60, 90])
+def test_film_holds_every_image_of_its_rate_and_no_other(rate):
+    film = thin_messages([message(slot) for slot in SLOTS], {"/left/keypoints"}, rate)
+    step = FINE_RATE // rate
+    assert [slot_of(kept.stamp) for kept in film] == list(range(0, 60, step))
+
+
+def test_object_is_tracked_at_ten_hertz_whatever_the_camera_does():
+    messages = [message(slot, topic) for slot in SLOTS for topic in ("/left/keypoints", OBJECT_TOPIC)]
+    film = thin_messages(messages, {"/left/keypoints", OBJECT_TOPIC}, 90)
+    assert [slot_of(kept.stamp) for kept in film if kept.topic == OBJECT_TOPIC] == [0, 18, 36, 54]
+
+
+def test_topics_that_nobody_asked_for_are_left_out():
+    messages = [message(slot, topic) for slot in SLOTS for topic in ("/left/keypoints", "/left/ground_truth_wrench")]
+    assert set(thin_messages(messages, {"/left/keypoints"}, 30).types) == {"/left/keypoints"}
+
+
+@pytest.mark.parametrize(("slots", "rate"), [([0, 6, 18], 30), (range(0, 60, 6), 90), ([], 30), (SLOTS, 50)])
+def test_a_scene_without_all_images_of_the_rate_is_refused(slots, rate):
+    with pytest.raises(RecordingError, match=f"{rate} Hz"):
+        thin_messages([message(slot) for slot in slots], {"/left/keypoints"}, rate)
+
+
+def test_a_film_that_is_played_twice_goes_on_where_it_ended():
+    film = thin_messages([message(slot) for slot in SLOTS], {"/left/keypoints"}, 60)
+    twice = type(film)(messages=film.messages, repeats=2, period=film.period)
+    stamps = np.array([kept.stamp for kept in twice])
+    assert len(twice) == len(stamps) == 40
+    # rounding to whole nanoseconds
+    np.testing.assert_allclose(np.diff(stamps), 1e9 / 60.0, atol=2)
+    assert [read_stamp(kept.data) for kept in twice] == stamps.tolist() == [kept.time for kept in twice]
+
+
+def test_images_of_a_recording_come_decoded_with_their_camera(bag):
+    film = film_images(bag, 60)
+    topics = [kept.topic for kept in film]
+    assert topics.count(COLOR_TOPIC) == topics.count(DEPTH_TOPIC) == topics.count(INFO_TOPIC) == 13
+    assert {kept.msgtype for kept in film if kept.topic in (COLOR_TOPIC, DEPTH_TOPIC)} == {IMAGE}
+    assert OBJECT_TOPIC in film.types and OBJECT_TOPIC not in film_images(bag, 60, poses=False).types
+
+
+def test_true_key_points_of_a_recording_come_at_every_image(bag):
+    topics = [kept.topic for kept in film_keypoints(bag, 90)]
+    assert topics.count("/left/keypoints") == topics.count("/left/jaw_pose") == 19
+    assert COLOR_TOPIC not in topics
+
+
+def test_mask_has_the_stamp_of_the_first_image_and_is_played_with_it(bag):
+    mask = film_mask(bag)
+    film = film_images(bag, 30, poses=False)
+    assert mask.stamp == film.begin and mask.msgtype == IMAGE
+    joined = film.joined([mask])
+    assert [kept.topic for kept in joined].index(MASK_TOPIC) < 4 and len(joined) == len(film) + 1

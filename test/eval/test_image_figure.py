@@ -1,0 +1,168 @@
+"""Claims about the pictures of what was found in images."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from eval_fakes import FakeEstimator, FakeJaw, make_recording
+from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
+
+from finforce_eval.evaluation.contact_source import GivenContact
+from finforce_eval.evaluation.detection import detect_keypoints
+from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.report import write_report
+from finforce_eval.recordings.images import ImageTrack
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.twin_writer import write_footage
+from finforce_keypoints.images import ImageWatch
+from finforce_keypoints.overlay import COLORS
+
+pytest.importorskip("matplotlib")
+
+from finforce_eval.figures.images import (
+    RADIUS,
+    choose_images,
+    describe_image,
+    draw_detection,
+    draw_images,
+    enlarge,
+    find_region,
+    place_pixels,
+)
+
+STAMPS = 1_000 + 10 * np.arange(100)
+LOST = (3,)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Twelve images: two key points used, two refused, one of them hidden; the jaw is lost in the fourth."""
+    read = read_recording(write_footage(make_footage(FakeGripper()), tmp_path_factory.mktemp("bags") / "twin"))
+    return detect_keypoints(read, FakeDetector(read, lost=LOST), watch=ImageWatch())
+
+
+@pytest.fixture(scope="module")
+def result(recording):
+    jaw, forces = FakeJaw(keypoints=np.zeros((4, 3))), list(recording.truth("left").force)
+    forces[0] = None
+    return evaluate_recording(recording, jaw, GivenContact(contact=None), factory=lambda: FakeEstimator(forces))
+
+
+@pytest.fixture(scope="module")
+def drawn(recording, result):
+    return draw_images(recording, [result])
+
+
+def test_six_images_are_spread_evenly():
+    np.testing.assert_array_equal(choose_images(STAMPS), STAMPS[[8, 25, 41, 58, 75, 91]])
+    np.testing.assert_array_equal(choose_images(STAMPS[:2]), STAMPS[:2])
+
+
+@pytest.mark.parametrize("row", [0, 41, 60, 99])
+def test_the_image_at_the_largest_force_is_one_of_the_six(row):
+    chosen = choose_images(STAMPS, int(STAMPS[row]) + 3)
+    assert STAMPS[row] in chosen and len(set(chosen)) == 6 and (np.diff(chosen) > 0).all()
+
+
+def test_the_region_holds_all_pixels_of_the_image_and_a_margin():
+    pixels = np.array([[200.0, 100.0], [300.0, 250.0], [np.nan, 3.0], [900.0, 5.0]])
+    left, top, width, height = find_region(pixels, 640, 480)
+    assert (left, top) == (188, 88) and (left + width, top + height) == (313, 263)
+    # cut at the border
+    assert find_region(np.array([[1.0, 2.0], [639.0, 470.0]]), 640, 480) == (0, 0, 640, 480)
+    assert find_region(np.full((3, 2), np.nan), 640, 480) == (0, 0, 640, 480)
+
+
+def test_a_pixel_stays_where_it_is_in_the_enlarged_part():
+    color = np.zeros((60, 80, 3), dtype=np.uint8)
+    color[31, 52] = 255
+    region = find_region(np.array([[45.0, 25.0], [60.0, 40.0]]), 80, 60)
+    picture, scale = enlarge(color, region)
+    assert scale > 10
+    weights = picture[:, :, 0].astype(float)
+    center = [np.average(axis, weights=weights) for axis in np.indices(weights.shape)[::-1]]
+    np.testing.assert_allclose(place_pixels(np.array([[52.0, 31.0]]), region, scale)[0], center, atol=0.05)
+
+
+def test_what_was_found_is_coloured_by_why_it_is_not_used(recording, drawn):
+    region, scale = whole_region(recording)
+    row = int(np.flatnonzero(recording.images.stamps == choose_images(recording.images.stamps)[0])[0])
+    picture = np.asarray(drawn.axes[0].get_images()[0].get_array())
+    pixels = place_pixels(recording.jaws["left"].detection.pixels[row], region, scale)
+    for pixel, reason in zip(pixels, ("", "", "likelihood", "likelihood"), strict=True):
+        column, line = np.rint(pixel + [0.6 * RADIUS, 0.0]).astype(int)
+        assert tuple(picture[line, column]) == COLORS[reason]
+
+
+def whole_region(recording):
+    """The region of the fake images and its scale, from the picture of the true key points."""
+    sight = recording.jaws["left"].sight
+    chosen = np.isin(sight.stamps, choose_images(recording.images.stamps, int(recording.images.stamps[-1])))
+    region = find_region(sight.pixels[chosen][sight.visible[chosen]], CAMERA.width, CAMERA.height)
+    return region, enlarge(np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), region)[1]
+
+
+def test_a_cross_stands_at_each_true_key_point_and_tells_the_hidden_ones(recording, drawn):
+    region, scale = whole_region(recording)
+    sight = recording.jaws["left"].sight
+    row = int(np.flatnonzero(recording.images.stamps == choose_images(recording.images.stamps)[0])[0])
+    expected = place_pixels(sight.pixels[row], region, scale)
+    visible, hidden = drawn.axes[0].get_lines()
+    np.testing.assert_allclose(np.transpose(visible.get_data()), expected[:3])
+    np.testing.assert_allclose(np.transpose(hidden.get_data()), expected[3:])
+    assert visible.get_color() != hidden.get_color()
+
+
+def test_a_caption_tells_time_estimate_and_truth(recording, result, drawn):
+    stamps = recording.images.stamps
+    assert describe_image(recording, [result], int(stamps[9])) == "t = 0.30 s,  0.40 N (true 0.40 N)"
+    assert describe_image(recording, [result], int(stamps[0])) == "t = 0.00 s,  no estimate (true 0.00 N)"
+    assert "left 0.40 N" in describe_image(recording, [result, result], int(stamps[9]))
+    titles = [axes.get_title(loc="left") for axes in drawn.axes]
+    assert len(titles) == 6 and titles[-1] == "t = 0.37 s,  0.60 N (true 0.60 N)  (largest)"
+
+
+def test_only_the_images_that_are_shown_are_kept(recording):
+    chosen = recording.images.at(recording.images.stamps[[2, 7]])
+    assert isinstance(chosen, ImageTrack) and [taken.stamp for taken in chosen] == chosen.stamps.tolist()
+    assert chosen.stamps.tolist() == recording.images.stamps[[2, 7]].tolist()
+
+
+def test_error_and_counts_over_time_are_those_of_the_images(recording):
+    error, counts, likelihood = draw_detection(recording).axes
+    found = np.arange(12) != LOST[0]
+    for line in error.get_lines():
+        # 0.6 and 0.8 px off; a jaw that is lost has no error
+        np.testing.assert_allclose(line.get_ydata(), np.where(found, 1.0, np.nan), atol=1e-3)
+    visible, used = (line.get_ydata() for line in counts.get_lines())
+    assert visible.tolist() == [3] * 12 and used.tolist() == np.where(found, 2, 0).tolist()
+    for line in likelihood.get_lines():
+        np.testing.assert_allclose(line.get_ydata(), np.where(found, 0.9, np.nan))
+
+
+def test_the_curves_of_the_error_are_median_and_95th_percentile_of_what_was_visible(recording):
+    shift = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 5.0], [99.0, 0.0]])  # the last is hidden
+    found = detect_keypoints(recording, FakeDetector(recording, pixel_shift=shift), watch=ImageWatch())
+    drawn = {line.get_label(): line.get_ydata() for line in draw_detection(found).axes[0].get_lines()}
+    np.testing.assert_allclose(drawn["median of the visible"], 1.0, atol=1e-3)
+    np.testing.assert_allclose(drawn["95th percentile"], 1.0 + 0.9 * 4.0, atol=1e-3)
+
+
+def test_the_page_shows_the_pictures_of_images_only_where_there_are_any(recording, result, tmp_path):
+    evaluation = score_results([result], [recording])
+    keywords = {"keypoint_names": "abcd", "about": {}}
+    plain = make_recording("twin")
+    for folder, given in (("with", [recording]), ("without", [plain]), ("none", [])):
+        page = write_report(evaluation, tmp_path / folder, recordings=given, **keywords)
+        named = re.findall(r"!\[.*?\]\((.*?)\)", page.read_text())
+        assert sorted(named) == sorted(path.name for path in page.parent.glob("*.png"))
+        pictures = {"twin_images.png", "twin_detection.png"}
+        assert pictures & set(named) == (pictures if folder == "with" else set())
+
+
+def test_a_recording_without_truth_is_drawn_without_crosses(recording, result):
+    track = replace(recording.jaws["left"], sight=None)
+    blind = replace(recording, jaws={"left": track})
+    assert not draw_images(blind, [result]).axes[0].get_lines()
+    assert len(draw_detection(blind).axes) == 2

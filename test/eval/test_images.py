@@ -1,0 +1,259 @@
+"""Claims about RGB-D recordings: what is written comes back, image by image, and what is wrong is named."""
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rgbd_fakes import CAMERA, FakeGripper, make_footage
+from scipy.spatial.transform import Rotation
+
+from finforce.camera import ImageError
+from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.image_messages import compress_depth, depth_from_message, depth_steps, encode_color
+from finforce_eval.recordings.objects import find_mesh
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.twin_writer import ImageFactory, RecordingForm, _footage_entries, write_footage
+from finforce_eval.recordings.writer import MessageFactory, write_entries
+from finforce_eval.replay.playback import read_playback
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce_twin.rendering.encoding import encode_depth
+
+FORMS = {
+    "jpeg": RecordingForm(),
+    "raw": RecordingForm(compressed=False),
+    "sqlite3": RecordingForm(compressed=False, storage="sqlite3"),
+}
+
+
+class Message:
+    def __init__(self, **fields):
+        vars(self).update(fields)
+
+
+@pytest.fixture(scope="module", params=FORMS)
+def written(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bags") / "twin"
+    return request.param, write_footage(make_footage(), folder, form=FORMS[request.param], case={"scene": "fake"})
+
+
+def write_without(folder, *topics, footage=None, edit=lambda entry: entry):
+    """Write plain footage without some topics, each message after an edit."""
+    factory = MessageFactory()
+    entries = _footage_entries(footage or make_footage(), ImageFactory(factory, FORMS["raw"]), lambda frame: None)
+    kept = [edit(entry) for entry in entries if entry.topic not in topics]
+    return write_entries([entry for entry in kept if entry is not None], folder, factory)
+
+
+def test_images_come_back_as_they_were_taken(written):
+    form, folder = written
+    frames = list(make_footage())
+    images = read_recording(folder).images
+    assert len(images) == len(frames) and images.unpaired == 0
+    for frame, (stamp, image) in zip(frames, images, strict=True):
+        assert stamp == frame.stamp and image.stamp == pytest.approx(1e-9 * stamp, abs=1e-9)
+        # a depth of 16 bits is in millimetres: half a step
+        np.testing.assert_allclose(image.depth, frame.depth, atol=0.51e-3)
+        assert np.isnan(image.depth[:4]).all()
+        if form != "jpeg":
+            np.testing.assert_array_equal(image.color, frame.color)
+        else:  # saturated patches: a jpeg halves the resolution of their colours, not of their brightness
+            assert np.abs(image.color.mean(axis=2) - frame.color.mean(axis=2)).mean() < 6.0
+    assert vars(images.camera).keys() == vars(CAMERA).keys()
+    for name, value in vars(CAMERA).items():
+        np.testing.assert_array_equal(getattr(images.camera, name), value)
+
+
+def test_truth_comes_back_exactly(written):
+    _, folder = written
+    recording = read_recording(folder)
+    track, frames = recording.jaws["left"], list(make_footage())
+    assert track.is_awaited and track.pose is None and track.keypoints.stamps.size == 0
+    np.testing.assert_array_equal(track.sight.stamps, [frame.stamp for frame in frames])
+    truths = [frame.jaws["left"] for frame in frames]
+    np.testing.assert_allclose(track.sight.points, [truth.points for truth in truths], atol=1e-8)  # single precision
+    np.testing.assert_allclose(track.sight.pixels, [truth.pixels for truth in truths], atol=1e-4)
+    np.testing.assert_array_equal(track.sight.visible, [truth.visible for truth in truths])
+    np.testing.assert_array_equal(track.truth.force, [truth.force for truth in truths])
+    np.testing.assert_allclose(track.true_pose.position, [truth.T_camera_jaw[:3, 3] for truth in truths])
+    assert recording.phases.displacement_mm.tolist() == [0.0, 1.0, 2.0]
+
+
+def test_the_object_is_tracked_at_a_third_of_the_images_with_the_noise_of_the_bench():
+    frames = list(make_footage(FakeGripper(count=3000)))
+    tracked = [frame for frame in frames if frame.T_camera_object is not None]
+    assert [frame.stamp for frame in tracked] == [frame.stamp for frame in frames[::3]]
+    positions = np.array([frame.T_camera_object[:3, 3] for frame in tracked])
+    np.testing.assert_allclose(positions.std(axis=0), 0.3e-3, rtol=0.12)  # four sigma of 1000 samples
+    turns = Rotation.from_matrix([frame.T_camera_object[:3, :3] for frame in tracked])
+    angles = np.degrees((turns * turns.mean().inv()).as_rotvec())
+    np.testing.assert_allclose(angles.std(axis=0), 0.3, rtol=0.12)
+    assert list(make_footage(FakeGripper(has_object=False)))[0].T_camera_object is None
+
+
+def test_footage_is_the_same_twice_and_another_with_another_seed():
+    first, second, other = make_footage(), make_footage(), make_footage(seed=1)
+    for one, two in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.color, two.color)
+        np.testing.assert_array_equal(one.T_camera_object is None, two.T_camera_object is None)
+    np.testing.assert_array_equal(next(iter(first)).T_camera_object, next(iter(second)).T_camera_object)
+    assert not np.array_equal(next(iter(first)).T_camera_object, next(iter(other)).T_camera_object)
+
+
+def test_the_mesh_is_found_and_found_again_when_the_folder_was_renamed(tmp_path):
+    folder = write_footage(make_footage(), tmp_path / "twin")
+    assert find_mesh(read_recording(folder)) == folder / "object.stl"
+    moved = folder.rename(tmp_path / "another")
+    assert find_mesh(read_recording(moved)) == moved / "object.stl"
+
+
+def test_reading_holds_few_images_at_a_time(tmp_path):
+    folder = write_footage(make_footage(FakeGripper(count=900)), tmp_path / "long", form=FORMS["raw"])
+    whole = 900 * (64 * 48 * 5)
+    images = read_recording(folder).images
+    tracemalloc.start()
+    for _ in images:
+        pass
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 0.5 * whole  # a chunk of the file, 1 MB, is read at once, and its index is kept
+
+
+def test_a_part_in_time_has_the_images_of_that_time(written):
+    _, folder = written
+    images = read_recording(folder).images
+    part = read_recording(folder).between(int(images.stamps[2]), int(images.stamps[5])).images
+    assert [stamp for stamp, _ in part] == images.stamps[2:5].tolist()
+
+
+@pytest.mark.parametrize(("topic", "reason"), [(DEPTH_TOPIC, "aligned_depth_to_color"), (INFO_TOPIC, "camera_info")])
+def test_images_without_depth_or_camera_info_are_refused(tmp_path, topic, reason):
+    with pytest.raises(RecordingError, match=reason):
+        read_recording(write_without(tmp_path / "bag", topic))
+
+
+def test_depth_that_is_always_late_is_refused_and_some_lost_depth_leaves_its_images_out(tmp_path):
+    def late(entry):
+        if entry.topic == DEPTH_TOPIC:
+            entry.message.header.stamp.nanosec += 9_000_000
+        return entry
+
+    def lost(entry):
+        is_fifth = entry.topic == DEPTH_TOPIC and entry.stamp == list(make_footage())[5].stamp
+        return None if is_fifth else entry
+
+    folder = write_without(tmp_path / "late", edit=separate_headers(late))
+    with pytest.raises(RecordingError, match="no depth image .* within 8 ms"):
+        read_recording(folder)
+    assert len(read_recording(folder, pairing=9_000_000).images) == 12
+    images = read_recording(write_without(tmp_path / "lost", edit=lost)).images
+    assert images.unpaired == 1 and len(list(images)) == 11
+
+
+def test_images_without_any_topic_of_a_jaw_are_refused_with_what_would_do(tmp_path):
+    own = [f"/left/{name}" for name in ("ground_truth_wrench", "ground_truth_keypoints", "ground_truth_jaw_pose")]
+    with pytest.raises(RecordingError, match="no topic tells which jaws.*/left/ground_truth_wrench.*images:=true"):
+        read_recording(write_without(tmp_path / "bag", *own))
+    assert set(read_recording(write_without(tmp_path / "measured", *own[1:])).jaws) == {"left"}
+
+
+def separate_headers(edit):
+    """Give the depth image a header of its own before an edit."""
+    factory = MessageFactory()
+
+    def edited(entry):
+        if entry.topic == DEPTH_TOPIC:
+            entry.message.header = factory.header(entry.stamp, entry.message.header.frame_id)
+        return edit(entry)
+
+    return edited
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "reason"),
+    [("encoding", "yuv422", "encoding"), ("height", 40, "bytes"), ("step", 10, "bytes")],
+)
+def test_a_colour_image_that_cannot_be_read_is_named_with_its_time(tmp_path, field, value, reason):
+    def edit(entry):
+        if entry.topic == COLOR_TOPIC:
+            setattr(entry.message, field, value)
+        return entry
+
+    images = read_recording(write_without(tmp_path / "bag", edit=edit)).images
+    with pytest.raises(RecordingError, match=rf"1000\.000 s.*{reason}"):
+        list(images)
+
+
+def test_a_camera_that_changes_is_refused(tmp_path):
+    seen = []
+
+    def edit(entry):
+        if entry.topic == INFO_TOPIC:
+            seen.append(entry)
+            entry.message.k[0] += 1.0 if len(seen) > 5 else 0.0
+        return entry
+
+    with pytest.raises(RecordingError, match="changes"):
+        read_recording(write_without(tmp_path / "bag", edit=edit))
+
+
+def test_depth_images_survive_packing_and_others_are_refused():
+    depth = np.array([[0.0704, 0.5, np.nan], [65.535, 70.0, -1.0]])
+    steps = encode_depth(depth)
+    assert steps.tolist() == [[70, 500, 0], [65535, 0, 0]]
+    packed = Message(format="16UC1; compressedDepth png", data=compress_depth(steps))
+    np.testing.assert_array_equal(depth_steps(packed), steps)
+    bare = Message(format="png", data=compress_depth(steps)[12:])
+    np.testing.assert_allclose(depth_from_message(bare), [[0.07, 0.5, np.nan], [65.535, np.nan, np.nan]])
+    grey = Message(format="png", data=encode_color(np.zeros((2, 2, 3), np.uint8), "png"))
+    with pytest.raises(ImageError, match="16 bits"):
+        depth_from_message(grey)
+    with pytest.raises(ImageError, match="no png"):
+        depth_from_message(Message(format="16UC1; compressedDepth rvl", data=b"\0" * 64))
+
+
+def test_compressed_images_are_played_as_plain_ones_under_the_names_the_nodes_listen_to(tmp_path):
+    from rclpy.serialization import deserialize_message
+    from sensor_msgs.msg import Image
+
+    folder = write_footage(make_footage(), tmp_path / "twin")
+    played = list(read_playback(folder))
+    color = [deserialize_message(message.data, Image) for message in played if message.topic == COLOR_TOPIC]
+    depth = [deserialize_message(message.data, Image) for message in played if message.topic == DEPTH_TOPIC]
+    frames = list(make_footage())
+    assert len(color) == len(depth) == len(frames)
+    assert {(image.encoding, image.width, image.height, image.step) for image in depth} == {("16UC1", 64, 48, 128)}
+    assert {(image.encoding, image.step) for image in color} == {("rgb8", 192)}
+    np.testing.assert_array_equal(np.frombuffer(depth[3].data, "<u2").reshape(48, 64), encode_depth(frames[3].depth))
+    assert {message.msgtype for message in played if message.topic in (COLOR_TOPIC, DEPTH_TOPIC)} == {
+        "sensor_msgs/msg/Image"
+    }
+
+
+def test_footage_that_breaks_off_leaves_no_recording(tmp_path):
+    class Breaking(FakeGripper):
+        def states(self):
+            yield from list(super().states())[:3]
+            raise RuntimeError("buckled")
+
+    with pytest.raises(RuntimeError, match="buckled"):
+        write_footage(make_footage(Breaking()), tmp_path / "half")
+    assert not (tmp_path / "half").exists()
+    folder = write_footage(make_footage(), tmp_path / "whole")
+    with pytest.raises(RecordingError, match="exists already"):
+        write_footage(make_footage(), folder)
+    assert folder.exists()
+
+
+def test_key_points_that_were_recorded_do_not_need_whole_images(tmp_path):
+    from eval_fakes import make_recording
+
+    from finforce_eval.recordings.writer import recording_entries
+
+    recording = replace(make_recording(frames=6), case={})
+    factory = MessageFactory()
+    entries = sorted(recording_entries(recording, factory), key=lambda entry: entry.stamp)
+    footage = _footage_entries(make_footage(), ImageFactory(factory, FORMS["raw"]), lambda frame: None)
+    colors = [entry for entry in footage if entry.topic == COLOR_TOPIC]
+    read = read_recording(write_entries([*entries, *colors], tmp_path / "bag", factory))
+    assert read.images is None and any("aligned_depth" in note for note in read.notes)

@@ -1,0 +1,225 @@
+"""Claims about a replay through the real nodes, and about the stop of its processes."""
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from time import monotonic, sleep
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from finforce.transforms import pose_from_quaternion, quaternion_from_pose
+from finforce_eval.bench.live import with_both_jaws
+from finforce_eval.cli.evaluate import make_setup
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.writer import write_recording
+from finforce_eval.replay import replay as replaying
+from finforce_eval.replay.live import JawLog, ReplayLog, live_result, point_of_application
+
+SHIPPED = Path(replaying.__file__).parents[1] / "data" / "bench_cyl25_middle"
+MESH = SHIPPED.parent / "objects" / "cylinder_25.stl"
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """The first seconds of the shipped recording."""
+    recording = read_recording(SHIPPED)
+    start = recording.jaws["left"].keypoints.stamps[0]
+    folder = tmp_path_factory.mktemp("bags") / "short"
+    return write_recording(recording.between(start, start + 4 * SECOND), folder)
+
+
+def run(*words, timeout=240):
+    environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    command = [sys.executable, "-m", "finforce_eval.cli.main", "replay", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, env=environment, check=False)
+
+
+def solvers_of(domain):
+    """The solver processes on a DDS domain."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (folder / "cmdline").read_bytes()
+            variables = (folder / "environ").read_bytes()
+        except OSError:
+            continue
+        if b"finforce.ros.start\0ifea_solver" in words and f"ROS_DOMAIN_ID={domain}\0".encode() in variables:
+            found.append(int(folder.name))
+    return found
+
+
+@pytest.mark.parametrize("clock", [[], ["--rate", "2"]], ids=["shifted stamps", "clock"])
+def test_every_image_of_a_recording_comes_back_as_a_wrench_with_its_stamp(short, tmp_path, clock):
+    out = tmp_path / "scores.json"
+    done = run(short, "--json", out, *clock)
+    assert done.returncode == 0, done.stderr
+    case = json.loads(out.read_text())["cases"]["short"]
+    # the first images are silent until the offsets of the key points are known
+    assert case["frames"] == 120 and case["solved"] > 60
+    assert 0.0 < case["step_ms"]["p50"] < 200.0
+    assert "grasp_wrench" in done.stdout
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_replay_and_its_nodes(number):
+    domain = 50 + number
+    words = [sys.executable, "-m", "finforce_eval.cli.main", "replay", str(SHIPPED), "--domain", str(domain)]
+    replay = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    until = monotonic() + 120.0
+    while not solvers_of(domain) and monotonic() < until:
+        sleep(0.05)
+    assert solvers_of(domain)
+    sleep(1.0)
+    replay.send_signal(number)
+    output, _ = replay.communicate(timeout=30)
+    assert replay.returncode == 130
+    assert "Traceback" not in output
+    assert not solvers_of(domain)
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["no_such_bag"], "no such recording"),
+        ([SHIPPED, "--rate", "0"], "--rate 0"),
+        ([SHIPPED, "--domain", "500"], "--domain 500"),
+        ([SHIPPED, "--jaw", "no_such_jaw"], "no_such_jaw"),
+        ([SHIPPED, "--jaw", "steel"], "key points"),
+        ([SHIPPED, "--params", "no_such_file"], "no_such_file"),
+    ],
+)
+def test_what_cannot_be_played_ends_with_two_and_one_line(words, reason):
+    done = run(*words)
+    assert done.returncode == 2
+    assert reason in done.stderr and len(done.stderr.strip().splitlines()) == 1
+
+
+def test_contacts_are_estimated_on_the_way_from_mesh_and_poses(short, tmp_path):
+    out = tmp_path / "scores.json"
+    done = run(short, "--contact", "estimate", "--object", MESH, "--json", out)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(out.read_text())["cases"]["short"]["solved"] > 60
+    (said,) = [line for line in done.stdout.splitlines() if "left contact" in line]
+    assert "apart" in said or "touching" in said
+
+
+def test_estimated_contacts_without_a_mesh_are_refused(short):
+    done = run(short, "--contact", "estimate")
+    assert done.returncode == 2 and "no object mesh" in done.stderr
+
+
+class FakeEstimator:
+    """A jaw of four vertices."""
+
+    surface_triangles = np.array([[0, 1, 2], [0, 2, 3]])
+
+    class jaw:  # noqa: N801
+        keypoints = np.zeros((15, 3))
+
+    def surface(self):
+        return np.zeros((4, 3))
+
+
+def test_the_time_series_has_a_gap_where_no_wrench_came():
+    recording = read_recording(SHIPPED)
+    stamps = recording.jaws["left"].keypoints.stamps
+    log = JawLog()
+    for stamp in stamps[::2]:
+        log.force[int(stamp)], log.torque[int(stamp)] = np.array([-2.0, 0, 0]), np.array([0.0, -0.08, 0])
+        log.stddev[int(stamp)], log.latency[int(stamp)] = np.array([0.1, 0.5, 0.5]), 0.002
+    result = live_result(recording, "left", log, likelihood_threshold=0.6, estimator=FakeEstimator())
+    assert result.solved[::2].all() and not result.solved[1::2].any()
+    np.testing.assert_allclose(result.stddev[::2], 0.1)
+    np.testing.assert_allclose(result.step_ms[::2], 2.0)
+    assert np.isnan(result.step_ms[1::2]).all()
+    assert result.scored.any() and not result.scored.all()
+
+
+def test_the_point_of_application_lies_on_the_line_of_action_where_it_enters_the_surface():
+    points = np.stack(np.meshgrid([0.0, 0.014], [0.0], np.linspace(0, 0.08, 81)), -1).reshape(-1, 3)
+    place = np.array([0.014, 0.0, 0.0413])
+    force = np.array([-3.0, 0.0, 0.2])
+    found = point_of_application(force, np.cross(place, force), points)
+    np.testing.assert_allclose(found, place, atol=6e-4)  # half a vertex distance
+
+
+def test_no_force_has_no_point_of_application():
+    assert np.isnan(point_of_application(np.zeros(3), np.zeros(3), np.zeros((4, 3)))).all()
+
+
+@pytest.fixture(scope="module")
+def two_jaws(tmp_path_factory):
+    """A few seconds under load, seen on both jaws: the right one is the left one's mirror image."""
+    folder = tmp_path_factory.mktemp("bags") / "both"
+    return write_recording(with_both_jaws(read_recording(SHIPPED), 6.0), folder)
+
+
+def test_two_solvers_answer_alike_and_complete_the_grasp(two_jaws, tmp_path):
+    recording = read_recording(two_jaws)
+    names = argparse.Namespace(jaw="bench", solver="default", mesh="default", contact=[], calibration=None, object=None)
+    result = replaying.replay(recording, make_setup(names))
+    left, right = (result.evaluation.results[f"both/{side}"] for side in ("left", "right"))
+    held = left.solved & right.solved
+    assert held.sum() > 0.5 * len(held)
+    np.testing.assert_allclose(right.force[held], left.force[held] * [1, -1, 1], atol=0.02)
+    # a loaded machine may make one of them drop an image, after which they differ a little
+    weaker = np.minimum(left.magnitude, right.magnitude)
+    for stamp, magnitude in zip(left.stamps[held], weaker[held], strict=True):
+        assert result.grasp[int(stamp)] == pytest.approx(magnitude, abs=1e-6)
+
+
+def with_opposite_jaw(recording):
+    """Give the right jaw the pose from which it sees the object as the left one does, turned by 180 degrees about z."""
+    left, right, poses = recording.jaws["left"], recording.jaws["right"], recording.object_pose
+    position, quaternion = [], []
+    for T_object, T_left in zip(matrices(poses), matrices(left.pose), strict=True):
+        T_left_right = np.diag([-1.0, -1.0, 1.0, 1.0])
+        T_left_right[0, 3] = 2.0 * (np.linalg.inv(T_left) @ T_object)[0, 3]
+        T = T_left @ T_left_right
+        position.append(T[:3, 3])
+        quaternion.append(quaternion_from_pose(T))
+    pose = replace(left.pose, position=np.array(position), quaternion=np.array(quaternion))
+    return replace(recording, jaws={"left": left, "right": replace(right, pose=pose)})
+
+
+def matrices(track):
+    return [pose_from_quaternion(*pair) for pair in zip(track.position, track.quaternion, strict=True)]
+
+
+def test_one_contact_estimator_serves_both_jaws(tmp_path):
+    recording = with_opposite_jaw(with_both_jaws(read_recording(SHIPPED), 6.0))
+    recording = read_recording(write_recording(recording, tmp_path / "both"))
+    names = argparse.Namespace(
+        jaw="bench", solver="default", mesh="default", contact=["estimate"], calibration=None, object=str(MESH)
+    )
+    result = replaying.replay(recording, make_setup(names))
+    left, right = (result.evaluation.results[f"both/{side}"] for side in ("left", "right"))
+    held = left.solved & right.solved
+    assert held.sum() > 0.5 * len(held)
+    # the same object, the same noise; each solver gets its contact a little earlier or later than the other
+    np.testing.assert_allclose(right.magnitude[held], left.magnitude[held], atol=0.1)
+    assert result.health["finforce: right contact"]["status"] == result.health["finforce: left contact"]["status"]
+
+
+def test_silence_after_the_end_of_a_recording_is_no_state_of_a_node():
+    def report(name, text):
+        return SimpleNamespace(status=[SimpleNamespace(name=name, message=text, values=[])])
+
+    log = ReplayLog(("left",))
+    log.take_diagnostics(report("jaw", "loaded"))
+    log.take_diagnostics(report("jaw", "touching"))
+    log.ended = True
+    log.take_diagnostics(report("jaw", "nothing has arrived"))
+    log.take_diagnostics(report("late", "never heard before"))
+    assert {name: state["message"] for name, state in log.health.items()} == {
+        "jaw": "touching",
+        "late": "never heard before",
+    }

@@ -1,0 +1,158 @@
+"""Claims about the score, against numbers computed by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.evaluation.scoring import compute_stats, force_range, match_truth, score_case
+from finforce_eval.recordings.tracks import WrenchTrack
+
+
+def make_result(name="case", *, truth, force, **changes):
+    """A result with forces along -x given by their magnitudes; NaN = not solved."""
+    frames = len(truth)
+    direction = np.array([-1.0, 0.0, 0.0])
+    values = {
+        "stamps": np.arange(frames) * 33_333_333,
+        "truth": np.asarray(truth, float)[:, None] * direction,
+        "force": np.asarray(force, float)[:, None] * direction,
+        "stddev": np.zeros(frames),
+        "place": np.zeros((frames, 3)),
+        "residual": np.zeros(frames),
+        "used": np.ones((frames, 4), dtype=bool),
+        "status": np.full(frames, "ok"),
+        "step_ms": np.arange(1.0, frames + 1),
+        "cycle": np.zeros(frames, dtype=int),
+        "direction": np.full(frames, "load"),
+        "scored": np.ones(frames, dtype=bool),
+    }
+    return CaseResult(name=name, side="left", **(values | changes))
+
+
+def test_errors_are_estimate_minus_truth():
+    stats = compute_stats(np.array([0.3, -0.1, 0.1]), span=10.0)
+    assert stats.n == 3
+    assert stats.rmse_N == pytest.approx(np.sqrt(0.11 / 3))
+    assert stats.nrmsd_pct == pytest.approx(10 * np.sqrt(0.11 / 3))
+    assert stats.max_error_N == pytest.approx(0.3)
+    assert stats.bias_N == pytest.approx(0.1)
+
+
+def test_estimate_that_is_too_small_has_negative_bias_and_positive_maximum():
+    score = score_case(make_result(truth=[2.0, 2.0], force=[1.5, 1.9]), span=2.0)
+    assert score.all.bias_N == pytest.approx(-0.3)
+    assert score.all.max_error_N == pytest.approx(0.5)
+
+
+def test_only_magnitudes_are_compared():
+    result = make_result(truth=[2.0], force=[2.0])
+    turned = replace(result, force=np.array([[0.0, 0.0, 2.0]]))
+    assert score_case(turned, span=1.0).all.rmse_N == 0.0
+
+
+def test_loading_and_unloading_are_told_apart_and_all_is_both():
+    result = make_result(
+        truth=[1.0, 1.0, 2.0, 2.0],
+        force=[1.1, 1.1, 1.6, 1.6],
+        direction=np.array(["load", "load", "unload", "unload"]),
+    )
+    score = score_case(result, span=4.0)
+    assert (score.load.n, score.unload.n, score.all.n) == (2, 2, 4)
+    assert score.load.rmse_N == pytest.approx(0.1)
+    assert score.unload.rmse_N == pytest.approx(0.4)
+    assert score.unload.nrmsd_pct == pytest.approx(10.0)
+    assert score.all.rmse_N == pytest.approx(np.sqrt((0.01 + 0.16) / 2))
+    assert score.all.bias_N == pytest.approx(-0.15)
+
+
+def test_only_scored_frames_count():
+    result = make_result(truth=[1.0, 1.0], force=[1.2, 9.0], scored=np.array([True, False]))
+    assert score_case(result, span=1.0).all.rmse_N == pytest.approx(0.2)
+
+
+def test_unsolved_frames_are_skipped_and_never_a_zero_error():
+    solved = make_result(truth=[1.0, 1.0], force=[1.4, 1.4])
+    gaps = make_result(truth=[1.0] * 4, force=[1.4, np.nan, np.nan, 1.4])
+    score = score_case(gaps, span=1.0)
+    assert (score.frames, score.solved, score.skipped) == (4, 2, 2)
+    assert (score.record_frames, score.record_skipped) == (4, 2)
+    assert score.all == score_case(solved, span=1.0).all
+
+
+def test_nothing_solved_gives_no_number_instead_of_zero():
+    score = score_case(make_result(truth=[1.0], force=[np.nan]), span=1.0)
+    assert score.all.n == 0
+    assert score.all.rmse_N is score.all.nrmsd_pct is score.all.max_error_N is score.all.bias_N is None
+
+
+def test_zero_range_gives_no_nrmsd():
+    assert compute_stats(np.array([0.1]), span=0.0).nrmsd_pct is None
+
+
+def test_variation_over_cycles_is_the_sample_standard_deviation():
+    result = make_result(truth=[1.0] * 3, force=[1.1, 1.2, 1.6], cycle=np.array([0, 1, 2]))
+    cycles = score_case(result, span=1.0).cycles
+    assert cycles["all"].n == 3
+    assert cycles["all"].rmse_N.mean == pytest.approx(0.3)
+    assert cycles["all"].rmse_N.std == pytest.approx(np.sqrt((0.04 + 0.01 + 0.09) / 2))
+    assert cycles["unload"].n == 0
+    assert cycles["unload"].rmse_N.mean is None
+
+
+def test_single_cycle_has_no_standard_deviation():
+    assert score_case(make_result(truth=[1.0], force=[1.1]), span=1.0).cycles["all"].rmse_N.std is None
+
+
+def test_cases_together_pool_their_frames_and_average_their_rmse():
+    first = make_result("first", truth=[1.0] * 3, force=[1.1] * 3)
+    second = make_result("second", truth=[1.0], force=[1.5])
+    total = score_case([first, second], span=1.0)
+    assert (total.frames, total.all.n) == (4, 4)
+    assert total.all.rmse_N == pytest.approx(np.sqrt((3 * 0.01 + 0.25) / 4))
+    assert total.mean_rmse_N == pytest.approx(0.3)
+    assert total.cycles["all"].n == 2
+
+
+def test_step_times_are_percentiles_of_all_steps():
+    times = score_case(make_result(truth=np.ones(101), force=np.ones(101)), span=1.0).step_ms
+    assert (times.p50, times.p95, times.p99, times.max) == pytest.approx((51, 96, 100, 101))
+
+
+def test_steps_that_were_not_timed_are_left_out():
+    times = score_case(make_result(truth=[1.0] * 3, force=[1.0] * 3, step_ms=np.array([np.nan, 2, 4])), span=1.0)
+    assert times.step_ms.p50 == pytest.approx(3.0)
+    untimed = make_result(truth=[1.0], force=[1.0], step_ms=np.array([np.nan]))
+    assert score_case(untimed, span=1.0).step_ms.max is None
+
+
+def test_range_is_that_of_all_recordings_of_the_call():
+    truths = [np.array([[0.0, 0, 0], [-3, 0, 4]]), np.array([[0, 0, -6.0], [np.nan, 0, 0]])]
+    assert force_range(truths) == pytest.approx(6.0)
+    assert force_range([]) == 0.0
+
+
+def truth_at(stamps, magnitudes):
+    force = np.asarray(magnitudes, float)[:, None] * np.array([-1.0, 0.0, 0.0])
+    return WrenchTrack(stamps=np.asarray(stamps), force=force, torque=np.zeros_like(force))
+
+
+def test_truth_at_the_same_stamp_is_taken_as_it_is():
+    matched = match_truth(truth_at([0, 10, 20], [1, 2, 4]), np.array([10, 20]))
+    np.testing.assert_array_equal(matched[:, 0], [-2, -4])
+
+
+def test_truth_between_stamps_is_interpolated():
+    matched = match_truth(truth_at([0, 10, 20], [1, 2, 4]), np.array([5, 12]))
+    np.testing.assert_allclose(matched[:, 0], [-1.5, -2.4])
+
+
+def test_truth_is_never_extrapolated_nor_carried_over_a_gap():
+    matched = match_truth(truth_at([0, 10, 20, 90, 100], np.ones(5)), np.array([-1, 5, 50, 100, 101]))
+    np.testing.assert_array_equal(matched[:, 0], [np.nan, -1, np.nan, -1, np.nan])
+
+
+def test_single_truth_matches_only_its_own_stamp():
+    matched = match_truth(truth_at([10], [3]), np.array([9, 10, 11]))
+    np.testing.assert_array_equal(matched[:, 0], [np.nan, -3, np.nan])

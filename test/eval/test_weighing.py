@@ -1,0 +1,96 @@
+"""Claims about the stiffness that a kitchen scale tells."""
+
+from dataclasses import replace
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from finforce_eval.calibration.weighing import GRAVITY, Hold, find_holds, weigh
+from finforce_eval.cli.main import main
+from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.recording import read_recording
+from finforce_ifea.jaw.calibration import load_calibration, save_calibration
+
+RECORDING = resources.files("finforce_eval").joinpath("data", "bench_cyl25_middle")
+RATE = 30.0
+
+
+def staircase(levels, hold=4.0, ramp=0.5, noise=0.01):
+    """Force [N] at 30 Hz: ramps between levels that are held, with a decay of 5 % while held."""
+    pieces, last = [], 0.0
+    for level in levels:
+        pieces.append(np.linspace(last, level, int(ramp * RATE), endpoint=False))
+        time = np.arange(int(hold * RATE)) / RATE
+        pieces.append(level * (0.95 + 0.05 * np.exp(-time)))
+        last = pieces[-1][-1]
+    force = np.concatenate(pieces)
+    return np.arange(len(force)) / RATE, force + np.random.default_rng(3).normal(0.0, noise, len(force))
+
+
+def test_each_held_force_is_found_once_and_read_at_its_end():
+    holds = find_holds(*staircase([1.0, 3.0, 0.0, 2.0]))
+    # the decay has ended but for e^-3.5 of 5 %; the noise of 30 images is 2 mN
+    np.testing.assert_allclose([hold.force for hold in holds], [0.95, 2.85, 1.90], rtol=0.01)
+    assert [hold.start for hold in holds] == sorted(hold.start for hold in holds)
+
+
+def test_ramps_rest_and_short_stops_are_no_holds():
+    times = np.arange(0.0, 20.0, 1.0 / RATE)
+    assert find_holds(times, 0.2 * times) == []
+    assert find_holds(times, np.full_like(times, 0.02)) == []
+    assert find_holds(*staircase([1.0, 2.0], hold=1.0)) == []
+
+
+def test_images_without_a_force_do_not_hide_a_hold():
+    times, force = staircase([2.0])
+    force[::7] = np.nan
+    assert len(find_holds(times, force)) == 1
+
+
+def held(forces):
+    return [Hold(start=10.0 * i, end=10.0 * i + 4.0, force=force) for i, force in enumerate(forces)]
+
+
+def test_the_factor_is_that_of_the_scale_over_the_estimate():
+    weighing = weigh(held([0.8, 1.6, 2.4]), [100.0, 200.0, 300.0])
+    assert weighing.factor == pytest.approx(0.1 * GRAVITY / 0.8)
+    assert weighing.misfit == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_reading_that_does_not_fit_shows_in_the_misfit_and_widens_the_uncertainty():
+    good, bad = (weigh(held([1.0, 2.0, 3.0]), grams) for grams in ([102, 204, 306], [102, 150, 306]))
+    assert bad.misfit > 0.1 > 10 * good.misfit
+    assert bad.stddev > 2 * good.stddev
+
+
+def test_another_number_of_readings_names_the_holds():
+    with pytest.raises(RecordingError, match=r"2 readings for 1 holds; holds found: 0.0-4.0 s \(1.00 N\)"):
+        weigh(held([1.0]), [100.0, 200.0])
+
+
+@pytest.mark.parametrize("grams", [[], [0.0], [-5.0], [float("nan")]])
+def test_readings_that_no_scale_shows_are_refused(grams):
+    with pytest.raises(RecordingError, match="expected grams above zero"):
+        weigh(held([1.0] * len(grams)), grams)
+
+
+def test_a_wrong_modulus_is_mended_by_weights(tmp_path, capsys):
+    base = load_calibration("bench")
+    wrong, mended = tmp_path / "wrong.yaml", tmp_path / "mended.yaml"
+    save_calibration(replace(base, young_modulus=1.5 * base.young_modulus), wrong)
+    options = ["weigh", str(RECORDING), "--contact", "fixed:case", "--calibration", str(wrong)]
+    assert main(options) == 0
+    spans = [line.split()[2:5:2] for line in capsys.readouterr().out.splitlines() if line.startswith("hold ")]
+    track, truth = (getattr(read_recording(RECORDING).jaw("left"), name) for name in ("keypoints", "truth"))
+    ends = track.stamps[0] * 1e-9 + np.array([float(end) for _, end in spans])
+    weights = [np.interp(end - 0.5, truth.stamps * 1e-9, np.abs(truth.force[:, 0])) for end in ends]
+    grams = [f"{1e3 * weight / GRAVITY:.0f}" for weight in weights]
+    assert main([*options, "--grams", *grams, "-o", str(mended)]) == 0
+    # the estimates of this recording are 2 % off
+    assert load_calibration(mended).young_modulus == pytest.approx(base.young_modulus, rel=0.04)
+
+
+def test_an_output_without_readings_is_refused(tmp_path, capsys):
+    assert main(["weigh", str(RECORDING), "-o", str(tmp_path / "none.yaml")]) == 2
+    assert "-o needs --grams" in capsys.readouterr().err

@@ -1,0 +1,115 @@
+"""Claims about quadratic programs: none is returned that is not optimal, beside two other solvers."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from finforce_eval.stress.mechanics_programs import KINDS, draw_program, judge_program, run_programs
+from finforce_eval.stress.stress import Plan
+from finforce_ifea import quadratic_program as program_module
+from finforce_ifea.errors import UnobservableError
+from finforce_ifea.quadratic_program import KKT_LIMIT, UNBOUNDED, solve_by_active_set, solve_program
+
+
+def enumerate_active_sets(H, g, bounded):
+    """The least objective over every choice of bounds that hold, each solved directly (m small)."""
+    best, least = None, np.inf
+    for choice in product(*[(False, True) if b else (False,) for b in bounded]):
+        free = ~np.array(choice)
+        x = np.zeros(len(g))
+        if free.any():
+            x[free] = np.linalg.solve(H[np.ix_(free, free)], -g[free])
+        value = 0.5 * x @ H @ x + g @ x
+        if (x[bounded] >= -1e-12).all() and value < least:
+            best, least = x, value
+    return best
+
+
+def test_thousands_of_hard_programs_meet_their_conditions_and_agree_with_a_second_solver():
+    """Badly scaled, nearly singular, bounded and free, 1 to 42 forces: the residual of each answer below 1e-8."""
+    trials = list(run_programs(Plan(seed=1, count=1200)))
+    answers = [trial for trial in trials if trial.outcome == "answer"]
+    assert {trial.outcome for trial in trials} <= {"answer", "refused"}
+    assert len(answers) > 0.95 * len(trials)
+    assert max(trial.kkt for trial in answers) <= 1e-8
+    assert all(trial.sigmas <= 3.0 for trial in answers)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 7))
+def test_small_programs_agree_with_every_choice_of_bounds(seed, size):
+    random = np.random.default_rng(seed)
+    A = random.normal(size=(size + 3, size)) * 10.0 ** random.uniform(-2, 2, size)
+    g, bounded = A.T @ random.normal(size=size + 3), random.random(size) < 0.7
+    expected = enumerate_active_sets(A.T @ A, g, bounded)
+    found = solve_program(A.T @ A, g, np.where(bounded, 0.0, -UNBOUNDED)).multipliers
+    scale = np.linalg.norm(A, axis=0)
+    # conditions reach some 1e6 here: 1e-8 of the pull is far above rounding
+    np.testing.assert_allclose(scale * found, scale * expected, atol=1e-8 * np.abs(g / scale).max())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_second_solver_sees_an_answer_that_is_off(kind):
+    """The opposite: an answer moved by a thousandth of the least curved direction is not taken for optimal."""
+    program = draw_program(np.random.default_rng(3), kind)
+    H, g = program.A.T @ program.A, program.A.T @ program.b
+    good = solve_program(H, g, program.lower)
+    assert judge_program(good, program).sigmas <= 3.0
+    largest = np.argmax(np.abs(good.multipliers) * np.linalg.norm(program.A, axis=0))
+    moved = good.multipliers.copy()
+    moved[largest] *= 1.03
+    off = program_module.ProgramSolution(multipliers=moved, kkt=good.kkt)
+    assert judge_program(off, program).sigmas > 3.0
+
+
+def test_a_wrong_answer_is_solved_again(monkeypatch):
+    """Whatever the first solver says, the active set mends it."""
+    program = draw_program(np.random.default_rng(5), "on its bounds")
+    H, g = program.A.T @ program.A, program.A.T @ program.b
+    right = solve_program(H, g, program.lower)
+    monkeypatch.setattr(program_module, "_solve_by_daqp", lambda H, g, bound: np.maximum(np.zeros(len(g)), bound))
+    again = solve_program(H, g, program.lower)
+    assert again.kkt <= KKT_LIMIT
+    scale = np.linalg.norm(program.A, axis=0)
+    np.testing.assert_allclose(scale * again.multipliers, scale * right.multipliers, atol=1e-9)
+
+
+def test_an_answer_that_nothing_mends_is_refused(monkeypatch):
+    monkeypatch.setattr(program_module, "_solve_by_daqp", lambda H, g, bound: np.zeros(len(g)))
+    monkeypatch.setattr(program_module, "solve_by_active_set", lambda H, g, bound, x: x)
+    with pytest.raises(UnobservableError, match="optimality is missed by 1"):
+        solve_program(np.eye(2), np.array([-1.0, -1.0]), np.zeros(2))
+
+
+def test_active_set_holds_and_lets_go():
+    H, bound = np.array([[1.0, 0.9], [0.9, 1.0]]), np.zeros(2)
+    # from the wrong bounds: the first is held although it should be free, the second free although it should be held
+    found = solve_by_active_set(H, np.array([-1.0, -0.5]), bound, np.array([0.0, 1.0]))
+    np.testing.assert_allclose(found, [1.0, 0.0], atol=1e-15)
+
+
+@pytest.mark.parametrize("gradient", [np.zeros(3), np.full(3, 1e-300)])
+def test_a_program_without_pull_has_no_force(gradient):
+    found = solve_program(np.eye(3), gradient, np.array([0.0, 0.0, -UNBOUNDED]))
+    assert np.abs(found.multipliers).max() <= 1e-300
+    assert found.kkt <= 1e-12
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_gradient_that_is_not_finite_is_refused(bad):
+    with pytest.raises(UnobservableError, match="not finite"):
+        solve_program(np.eye(2), np.array([bad, 1.0]), np.zeros(2))
+
+
+def test_no_answer_is_below_its_bound():
+    """Not by rounding either: a contact cannot pull at all."""
+    for seed in range(60):
+        program = draw_program(np.random.default_rng(seed), "nearly singular")
+        try:
+            found = solve_program(program.A.T @ program.A, program.A.T @ program.b, program.lower).multipliers
+        except UnobservableError:
+            continue
+        assert (found >= program.lower).all()

@@ -1,0 +1,154 @@
+"""Claims about stored equilibria of jaws on disk: built once, found again, never believed when they are not whole."""
+
+import logging
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from mechanics_fakes import BENCH, bench_mechanics
+
+from finforce_ifea.fem.mechanics import build_mechanics
+from finforce_ifea.jaw.drawing import Drawing
+from finforce_ifea.reduced import cache as manifold_cache
+from finforce_ifea.reduced.cache import cache_folder, fetch_manifold, hash_parts, name_manifold
+from finforce_ifea.reduced.equilibria import Manifold
+from finforce_ifea.settings import EstimatorSettings
+
+KEY = "0123"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("FINFORCE_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+class Builder:
+    """Counts how often it builds."""
+
+    def __init__(self):
+        self.count = 0
+
+    def __call__(self):
+        self.count += 1
+        names = [field.name for field in fields(Manifold) if field.name != "young_modulus"]
+        return Manifold(young_modulus=2.5e7, **{name: np.full((2, 3), float(self.count)) for name in names})
+
+
+def test_second_request_finds_what_the_first_has_built(folder):
+    build = Builder()
+    first, second = fetch_manifold(KEY, build), fetch_manifold(KEY, build)
+    assert build.count == 1
+    assert second.young_modulus == first.young_modulus == 2.5e7
+    np.testing.assert_array_equal(second.loads, first.loads)
+    fetch_manifold("other", build)
+    assert build.count == 2
+
+
+def test_any_damaged_byte_costs_a_build_at_most(folder):
+    build, random = Builder(), np.random.default_rng(0)
+    fetch_manifold(KEY, build)
+    path = folder / f"{KEY}.npz"
+    whole = path.read_bytes()
+    for _ in range(300):
+        damaged = bytearray(whole)
+        damaged[random.integers(len(whole))] ^= 1 << random.integers(8)
+        path.write_bytes(damaged)
+        assert fetch_manifold(KEY, build).young_modulus == 2.5e7
+    assert build.count > 100
+
+
+def test_what_a_killed_builder_left_is_removed_and_a_full_disk_leaves_nothing(folder, monkeypatch, caplog):
+    folder.mkdir()
+    (folder / f"{KEY}.99.part").write_bytes(b"half")
+    fetch_manifold(KEY, Builder())
+    assert not list(folder.glob("*.part"))
+
+    def fill(file, **_):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", fill)
+    with caplog.at_level(logging.WARNING):
+        fetch_manifold("other", Builder())
+    assert "cannot be stored" in caplog.text
+    assert not list(folder.glob("*.part")) and not (folder / "other.npz").exists()
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[: len(data) // 2], lambda data: b"", lambda data: b"no archive"])
+def test_damaged_file_is_built_anew_and_said_so(folder, caplog, damage):
+    build = Builder()
+    fetch_manifold(KEY, build)
+    path = folder / f"{KEY}.npz"
+    path.write_bytes(damage(path.read_bytes()))
+    with caplog.at_level(logging.WARNING):
+        fetch_manifold(KEY, build)
+    assert build.count == 2
+    assert "cannot be read" in caplog.text
+    fetch_manifold(KEY, build)
+    assert build.count == 2
+
+
+def test_folder_that_cannot_be_written_costs_a_warning_only(tmp_path, monkeypatch, caplog):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("FINFORCE_CACHE", str(tmp_path / "file" / "cache"))
+    build = Builder()
+    with caplog.at_level(logging.WARNING):
+        assert fetch_manifold(KEY, build).young_modulus == 2.5e7
+    assert "cannot be stored" in caplog.text
+
+
+def test_failed_build_leaves_nothing_behind(folder):
+    def fail():
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        fetch_manifold(KEY, fail)
+    assert not list(folder.glob("*.npz")) and not list(folder.glob("*.part"))
+
+
+def test_folder_is_the_users_unless_another_is_named(monkeypatch, tmp_path):
+    monkeypatch.delenv("FINFORCE_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "finforce"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert cache_folder().parts[-2:] == (".cache", "finforce")
+
+
+def test_hash_tells_the_last_bit_types_and_shapes_apart(monkeypatch):
+    values = np.arange(6.0)
+    names = [
+        hash_parts(values),
+        hash_parts(np.nextafter(values, 9.0)),
+        hash_parts(values.reshape(2, 3)),
+        hash_parts(values.astype(np.float32)),
+        hash_parts(values, "solid"),
+        hash_parts(values, 0.45),
+    ]
+    assert len(set(names)) == len(names)
+    assert hash_parts(values.copy()) == names[0]
+    monkeypatch.setattr(manifold_cache, "VERSION", -1)
+    assert hash_parts(values) != names[0]
+
+
+def thicker(jaw, factor):
+    drawing: Drawing = jaw.drawing
+    return replace(
+        jaw, drawing=replace(drawing, inner=replace(drawing.inner, thickness=factor * drawing.inner.thickness))
+    )
+
+
+@pytest.mark.parametrize("solver", ["solid", "frame"])
+def test_name_depends_on_geometry_and_poissons_ratio_but_not_on_the_modulus(solver):
+    def name(jaw):
+        return name_manifold(build_mechanics(jaw, EstimatorSettings(solver=solver, mesh="coarse")), jaw)
+
+    stiff = replace(BENCH, material=replace(BENCH.material, young_modulus=1e9))
+    squashy = replace(BENCH, material=replace(BENCH.material, poisson_ratio=0.3))
+    assert name(stiff) == name(BENCH)
+    assert len({name(BENCH), name(squashy), name(thicker(BENCH, 1.001))}) == 3
+
+
+def test_models_and_meshes_have_equilibria_of_their_own():
+    names = {name_manifold(bench_mechanics(*which), BENCH) for which in (("coarse", "solid"), ("default", "solid"))}
+    assert len(names | {name_manifold(bench_mechanics("coarse", "frame"), BENCH)}) == 3

@@ -1,0 +1,406 @@
+"""Claims about the solver node: what it publishes, when it is silent, and what it says about it."""
+
+import array
+from time import time_ns
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import WrenchStamped
+from node_fakes import KEYPOINTS, FakeEstimator, keypoint_cloud, ros_domain, start_solver
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import Marker, MarkerArray
+
+from finforce.health import Level
+from finforce.ros import node as ros
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture
+def probe():
+    with ros_domain() as probe:
+        yield probe
+
+
+def one_jaw(probe, estimator=None, **parameters):
+    """A left solver with a publisher of its key points, both ends of every topic found."""
+    node = start_solver(probe, estimator, **parameters)
+    probe.hear("left/wrench")
+    out = probe.speak("left/keypoints")
+    probe.connected(out)
+    probe.wait_for(lambda: node.out.wrench.get_subscription_count() == 1)
+    return node, out
+
+
+def force_of(message):
+    return [message.wrench.force.x, message.wrench.force.y, message.wrench.force.z]
+
+
+def test_the_image_stamp_travels_unchanged(probe):
+    _, out = one_jaw(probe)
+    for topic, kind in (("left/wrench_stddev", WrenchStamped), ("left/surface", PointCloud2)):
+        probe.hear(topic, kind)
+    probe.spin(0.3)
+    stamp = time_ns() // 1000 * 1000 + 123
+    out.publish(keypoint_cloud(stamp))
+    for topic in ("left/wrench", "left/wrench_stddev", "left/surface"):
+        probe.wait_for(lambda topic=topic: probe.got[topic])
+        header = probe.got[topic][0].header
+        assert ros.nanoseconds(header.stamp) == stamp
+        assert header.frame_id == "left_jaw"
+
+
+def test_force_and_its_deviation_are_the_estimators(probe):
+    _, out = one_jaw(probe)
+    probe.hear("left/wrench_stddev")
+    probe.spin(0.3)
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: probe.got["left/wrench"] and probe.got["left/wrench_stddev"])
+    assert force_of(probe.got["left/wrench"][0]) == [-2.0, 0.0, 0.5]
+    assert probe.got["left/wrench"][0].wrench.torque.y == -0.08
+    assert force_of(probe.got["left/wrench_stddev"][0]) == [0.05, 0.01, 0.02]
+
+
+def test_the_estimator_sees_points_and_likelihood_whatever_their_layout(probe):
+    estimator = FakeEstimator()
+    _, out = one_jaw(probe, estimator)
+    other = {"v": np.zeros(15), "valid": np.ones(15, dtype=np.uint8), "likelihood": np.full(15, 0.25)}
+    out.publish(keypoint_cloud(**other))
+    probe.wait_for(lambda: estimator.observations)
+    np.testing.assert_allclose(estimator.observations[0].points, KEYPOINTS, atol=1e-8)
+    assert set(estimator.observations[0].likelihood) == {0.25}
+
+
+def two_rows(cloud):
+    cloud.height, cloud.width = 3, 5
+    return cloud
+
+
+def cut_short(cloud):
+    cloud.data = array.array("B", bytes(cloud.data)[:-10])
+    return cloud
+
+
+def without_z(cloud):
+    cloud.fields = [field for field in cloud.fields if field.name != "z"]
+    return cloud
+
+
+MALFORMED = {
+    "frame": (lambda: keypoint_cloud(frame="camera"), "camera"),
+    "rows": (lambda: two_rows(keypoint_cloud()), "height"),
+    "short": (lambda: cut_short(keypoint_cloud()), "buffer"),
+    "field": (lambda: without_z(keypoint_cloud()), "no field z"),
+    "count": (lambda: keypoint_cloud(points=KEYPOINTS[:9]), "9 key points"),
+    "empty": (lambda: keypoint_cloud(points=KEYPOINTS[:0]), "0 key points"),
+    "ahead": (lambda: keypoint_cloud(time_ns() + 5 * SECOND), "ahead of the node's clock"),
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_a_bad_cloud_gives_an_error_that_names_the_fault_and_no_wrench(probe, name):
+    make, word = MALFORMED[name]
+    _, out = one_jaw(probe, max_age=1.0)
+    out.publish(make())
+    probe.diagnosis(level=Level.ERROR, word=word)
+    assert not probe.got["left/wrench"]
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: probe.got["left/wrench"])
+
+
+def test_old_data_are_stale_and_give_no_wrench(probe):
+    _, out = one_jaw(probe, max_age=0.2)
+    out.publish(keypoint_cloud(time_ns() - SECOND // 2))
+    state = probe.diagnosis(level=Level.STALE, word="old")
+    assert "0.2 s" in state.message
+    assert not probe.got["left/wrench"]
+
+
+def test_a_result_that_comes_too_late_is_not_published(probe):
+    estimator = FakeEstimator()
+    update = estimator.update
+
+    def slow(*observed):
+        probe_time = time_ns()
+        while time_ns() - probe_time < 0.15 * SECOND:
+            pass
+        return update(*observed)
+
+    estimator.update = slow
+    _, out = one_jaw(probe, estimator, max_age=0.1)
+    out.publish(keypoint_cloud())
+    probe.diagnosis(level=Level.STALE, word="old")
+    assert estimator.observations and not probe.got["left/wrench"]
+
+
+def test_silence_is_stale(probe):
+    start_solver(probe)
+    probe.diagnosis(level=Level.STALE, word="nothing has arrived on left/keypoints")
+
+
+def test_stamps_that_stand_still_or_go_back_give_no_wrench(probe):
+    _, out = one_jaw(probe, max_age=10.0)
+    stamp = time_ns()
+    out.publish(keypoint_cloud(stamp))
+    probe.wait_for(lambda: probe.got["left/wrench"])
+    out.publish(keypoint_cloud(stamp))
+    probe.diagnosis(level=Level.ERROR, word="stand still")
+    out.publish(keypoint_cloud(stamp - SECOND // 10))
+    probe.diagnosis(level=Level.ERROR, word="go back")
+    assert len(probe.got["left/wrench"]) == 1
+
+
+def test_a_restarted_recording_resets_the_estimator(probe):
+    estimator = FakeEstimator()
+    _, out = one_jaw(probe, estimator, max_age=30.0)
+    stamp = time_ns()
+    out.publish(keypoint_cloud(stamp))
+    probe.wait_for(lambda: len(probe.got["left/wrench"]) == 1)
+    out.publish(keypoint_cloud(stamp - 10 * SECOND))
+    probe.wait_for(lambda: len(probe.got["left/wrench"]) == 2)
+    assert estimator.resets == 1
+
+
+@pytest.mark.parametrize(("status", "level"), [("not_enough_points", Level.WARN), ("diverged", Level.ERROR)])
+def test_an_untrusted_solution_is_not_published_but_explained(probe, status, level):
+    _, out = one_jaw(probe, FakeEstimator(status=status, message="3 of 15 key points, 5 are needed"))
+    out.publish(keypoint_cloud())
+    state = probe.diagnosis(level=level, word="3 of 15")
+    assert f"1 {status}" in {entry.key: entry.value for entry in state.values}["refused"]
+    assert not probe.got["left/wrench"]
+
+
+def test_a_nan_never_leaves_in_a_wrench(probe):
+    _, out = one_jaw(probe, FakeEstimator(force=(np.nan, 0.0, 0.0)))
+    out.publish(keypoint_cloud())
+    probe.diagnosis(level=Level.ERROR, word="not finite")
+    assert not probe.got["left/wrench"]
+
+
+def test_only_the_newest_waiting_image_is_solved(probe):
+    estimator = FakeEstimator()
+    _, out = one_jaw(probe, estimator, max_age=5.0)
+    stamps = [time_ns() + k for k in range(4)]
+    for stamp in stamps:
+        out.publish(keypoint_cloud(stamp))
+    probe.wait_for(lambda: probe.got["left/wrench"])
+    probe.spin(0.2)
+    assert ros.nanoseconds(probe.got["left/wrench"][-1].header.stamp) == stamps[-1]
+    state = probe.diagnosis(word="")
+    counts = {entry.key: entry.value for entry in state.values}
+    assert int(counts["arrived"]) == 4
+    assert len(estimator.observations) == int(counts["published"]) < 4
+    assert "superseded" in counts["refused"]
+
+
+def test_rate_and_latency_are_in_the_diagnostics(probe):
+    _, out = one_jaw(probe)
+    for _ in range(5):
+        out.publish(keypoint_cloud())
+        probe.spin(0.05)
+    probe.got["/diagnostics"].clear()
+    values = {entry.key: entry.value for entry in probe.diagnosis(level=Level.OK).values}
+    assert 5.0 < float(values["rate [Hz]"]) < 40.0
+    for measure in ("callback to published", "image to published"):
+        assert 0.0 < float(values[f"{measure} p50 [ms]"]) <= float(values[f"{measure} p95 [ms]"]) < 200.0
+    assert values["key points used"] == "15 of 15"
+
+
+def two_jaws(probe, right_force=(-3.0, 0.0, 0.5)):
+    """A left solver that completes the grasp, and a right one; ready."""
+    left = start_solver(probe, peer="right")
+    right = start_solver(probe, FakeEstimator(force=right_force), jaw_name="right")
+    for topic in ("grasp_wrench", "manipulation_wrench", "left/wrench", "right/wrench"):
+        probe.hear(topic)
+    outs = {side: probe.speak(f"{side}/keypoints") for side in ("left", "right")}
+    for out in outs.values():
+        probe.connected(out)
+    probe.wait_for(
+        lambda: left.out.grasp.get_subscription_count() == 1 and right.out.wrench.get_subscription_count() == 2
+    )
+    return outs
+
+
+@pytest.mark.parametrize("order", [("left", "right"), ("right", "left")])
+def test_the_peer_completes_the_grasp_whoever_comes_first(probe, order):
+    outs = two_jaws(probe)
+    stamp = time_ns()
+    for side in order:
+        outs[side].publish(keypoint_cloud(stamp, frame=f"{side}_jaw"))
+        probe.wait_for(lambda side=side: probe.got[f"{side}/wrench"])
+    probe.wait_for(lambda: probe.got["grasp_wrench"] and probe.got["manipulation_wrench"])
+    grasp, net = probe.got["grasp_wrench"][0], probe.got["manipulation_wrench"][0]
+    assert force_of(grasp) == [pytest.approx(np.hypot(2.0, 0.5)), 0.0, 0.0]
+    # (-2, 0, 0.5) of the left jaw and (-3, 0, 0.5) of the right one, turned by 180 degrees about z
+    assert force_of(net) == pytest.approx([1.0, 0.0, 1.0])
+    for message in (grasp, net):
+        assert message.header.frame_id == "gripper_base"
+        assert ros.nanoseconds(message.header.stamp) == stamp
+
+
+def test_forces_of_different_images_make_no_grasp(probe):
+    outs = two_jaws(probe)
+    stamp = time_ns()
+    outs["left"].publish(keypoint_cloud(stamp))
+    outs["right"].publish(keypoint_cloud(stamp + 1000, frame="right_jaw"))
+    probe.wait_for(lambda: probe.got["left/wrench"] and probe.got["right/wrench"])
+    probe.spin(0.3)
+    assert not probe.got["grasp_wrench"]
+
+
+def test_a_silent_peer_is_named(probe):
+    _, out = one_jaw(probe, peer="right")
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: probe.got["left/wrench"])
+    probe.diagnosis(word="no wrench of the right jaw")
+
+
+def test_one_jaw_alone_completes_the_grasp_only_when_told_to(probe):
+    _, out = one_jaw(probe, completes_grasp=True)
+    probe.hear("grasp_wrench")
+    probe.spin(0.3)
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: probe.got["grasp_wrench"])
+    assert force_of(probe.got["grasp_wrench"][0]) == [pytest.approx(np.hypot(2.0, 0.5)), 0.0, 0.0]
+
+
+def test_without_being_told_one_jaw_offers_no_grasp(probe):
+    one_jaw(probe)
+    assert not probe.count_publishers("grasp_wrench")
+
+
+def contact_cloud(points, *, stamp=None, frame="left_jaw", touching=1):
+    header = Header(stamp=ros.stamp_message(time_ns() if stamp is None else stamp), frame_id=frame)
+    count = len(points)
+    columns = {
+        "weight": np.ones(count, dtype=np.float32),
+        "candidate": np.arange(count, dtype=np.uint16),
+        "touching": np.full(count, touching, dtype=np.uint8),
+        **ros.xyz_columns(points),
+    }
+    return ros.cloud_message(header, columns)
+
+
+def contact_jaw(probe, **parameters):
+    estimator = FakeEstimator()
+    node, out = one_jaw(probe, estimator, contact_height=float("nan"), **parameters)
+    contact = probe.speak("left/contact")
+    probe.connected(contact)
+    return estimator, node, out, contact
+
+
+def test_a_contact_by_topic_reaches_the_estimator(probe):
+    estimator, node, out, contact = contact_jaw(probe)
+    contact.publish(contact_cloud([[0.014, 0.0, 0.038], [0.014, 0.0, 0.043]]))
+    probe.wait_for(lambda: node.contacts._contact is not None)
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: estimator.contacts)
+    np.testing.assert_allclose(estimator.contacts[0].points[:, 2], [0.038, 0.043], atol=1e-8)
+    assert estimator.contacts[0].touching is True
+
+
+def test_no_rows_say_that_there_is_no_object(probe):
+    estimator, node, out, contact = contact_jaw(probe)
+    contact.publish(contact_cloud(np.empty((0, 3))))
+    probe.wait_for(lambda: node.contacts._contact is not None)
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: estimator.contacts)
+    assert estimator.contacts[0].points.shape == (0, 3)
+    assert estimator.contacts[0].touching is False
+
+
+def test_an_old_contact_is_none(probe):
+    estimator, node, out, contact = contact_jaw(probe)
+    contact.publish(contact_cloud([[0.014, 0.0, 0.038]], stamp=time_ns() - SECOND))
+    probe.wait_for(lambda: node.contacts._contact is not None)
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: estimator.contacts)
+    assert estimator.contacts[0] is None
+
+
+def test_a_contact_that_is_not_finite_is_refused(probe):
+    estimator, node, out, contact = contact_jaw(probe)
+    contact.publish(contact_cloud([[0.014, 0.0, 0.038]]))
+    probe.wait_for(lambda: node.contacts._contact is not None)
+    contact.publish(contact_cloud([[0.014, np.nan, 0.038]]))
+    probe.diagnosis(level=Level.ERROR, word="contact has coordinates")
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: estimator.contacts)
+    assert estimator.contacts == [None]
+
+
+def test_a_fixed_contact_needs_no_topic(probe):
+    estimator = FakeEstimator()
+    _, out = one_jaw(probe, estimator)
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: estimator.contacts)
+    assert estimator.contacts[0].points[0, 2] == pytest.approx(0.04)
+    assert probe.count_subscribers("left/contact") == 0
+
+
+def test_markers_show_jaw_key_points_contact_and_force_to_listeners_only(probe):
+    node, out = one_jaw(probe)
+    sent = []
+    markers = node.out.markers
+    publish, markers.publish = markers.publish, sent.append
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: probe.got["left/wrench"])
+    assert not sent
+    markers.publish = publish
+    probe.hear("left/markers", MarkerArray)
+    probe.wait_for(lambda: markers.get_subscription_count() == 1)
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: probe.got["left/markers"])
+    shown = {marker.ns: marker for marker in probe.got["left/markers"][0].markers}
+    assert shown["surface"].type == Marker.TRIANGLE_LIST and len(shown["surface"].points) == 6
+    assert len(shown["keypoints"].points) == len(shown["keypoints"].colors) == 15
+    assert len(shown["contact"].points) == 1
+    start, end = shown["force"].points
+    assert end.x - start.x < 0.0 < end.z - start.z  # along the force, (-2, 0, 0.5)
+
+
+def call(probe, name):
+    client = probe.create_client(Trigger, name)
+    probe.wait_for(client.service_is_ready)
+    future = client.call_async(Trigger.Request())
+    probe.wait_for(future.done)
+    return future.result()
+
+
+def test_tare_answers_with_what_was_done_or_why_not(probe):
+    estimator = FakeEstimator()
+    start_solver(probe, estimator)
+    answer = call(probe, "left/tare")
+    assert answer.success and "15 key points" in answer.message
+    estimator.under_load = True
+    answer = call(probe, "left/tare")
+    assert not answer.success and "3.1 N" in answer.message
+
+
+def test_reset_is_a_service(probe):
+    estimator = FakeEstimator()
+    start_solver(probe, estimator)
+    assert call(probe, "left/reset").success
+    assert estimator.resets == 1
+
+
+def test_a_listener_that_asks_for_other_service_is_named_until_it_leaves(probe):
+    start_solver(probe)
+    asks_too_much = QoSProfile(
+        depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+    )
+    listener = probe.hear("left/wrench", qos=asks_too_much)
+    state = probe.diagnosis(level=Level.ERROR, word="quality of service of /left/wrench")
+    assert "probe" in state.message
+    probe.destroy_subscription(listener)
+    probe.got["/diagnostics"].clear()
+    probe.diagnosis(level=Level.STALE)
+
+
+def test_a_best_effort_peer_is_named(probe):
+    start_solver(probe, peer="right")
+    probe.speak("right/wrench", WrenchStamped, QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    probe.diagnosis(level=Level.ERROR, word="quality of service of /right/wrench")

@@ -1,0 +1,86 @@
+"""Claims about points of a solid and about the factorisations of its tangent."""
+
+import numpy as np
+import pytest
+from mechanics_fakes import BENCH, EDGE, TPU, bench_mechanics, bench_press, block, unknowns_from_displacements, wobble
+
+from finforce_ifea.fem.factorisation import SparseFactor
+from finforce_ifea.fem.solid import SolidModel
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    """The coarse bench finger with a cylinder of 25 mm pressed 8 mm into its middle, and its unknowns."""
+    return bench_mechanics("coarse").model, bench_press("coarse", "solid", 25, 40, (2, 8))[-1].q
+
+
+@pytest.fixture(scope="module")
+def wide():
+    """A block that is taken to be so wide that its tangent is stored sparse."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("finforce_ifea.fem.solid._BANDED_COST_LIMIT", 1e7)
+        model = SolidModel(block((8, 8, 8), EDGE), TPU, symmetric=False)
+    assert not model.banded
+    return model
+
+
+def test_banded_and_sparse_factorisations_agree(pressed):
+    model, q = pressed
+    assert model.banded
+    tangent = model.linearize(q).tangent
+    b = np.random.default_rng(0).normal(size=(model.size, 3))
+    banded = model.factorise(tangent).solve(b)
+    sparse = SparseFactor(model.sparse_tangent(tangent)).solve(b)
+    np.testing.assert_allclose(banded, sparse, atol=1e-8 * np.abs(sparse).max())
+    np.testing.assert_allclose(model.factorise(tangent).solve(b[:, 1]), banded[:, 1], atol=1e-12 * np.abs(banded).max())
+
+
+def test_factor_solves_with_the_tangent(pressed, wide):
+    for model, q in (pressed, (wide, unknowns_from_displacements(wide, wobble(wide, 2e-5)))):
+        tangent = model.linearize(q).tangent
+        b = np.random.default_rng(1).normal(size=model.size)
+        left = model.sparse_tangent(tangent) @ model.factorise(tangent).solve(b) - b
+        assert np.abs(left).max() < 1e-7
+
+
+def test_tangent_beyond_a_buckling_point_is_still_factorised(pressed):
+    model, q = pressed
+    tangent = model.linearize(q).tangent
+    softest = np.linalg.eigvalsh(model.sparse_tangent(tangent).toarray())[0]
+    tangent[0] -= 3.0 * softest
+    b = np.random.default_rng(1).normal(size=model.size)
+    left = model.sparse_tangent(tangent) @ model.factorise(tangent).solve(b) - b
+    assert np.linalg.eigvalsh(model.sparse_tangent(tangent).toarray())[0] < 0
+    assert np.abs(left).max() < 1e-7
+
+
+def probe_points():
+    """Points in the block: inside, on its surface, and on its clamped base."""
+    return np.array([[0.0013, 0.0011, 0.0035], [0.0039, -0.0029, 0.0078], [0.002, 0.0, 0.0], [0.001, -0.002, 0.0002]])
+
+
+@pytest.mark.parametrize("which", ["half", "whole", "wide"])
+def test_load_is_the_transpose_of_project_and_springs_are_their_product(which, wide):
+    model = wide if which == "wide" else SolidModel(block((3, 2, 4), EDGE), TPU, symmetric=which == "half")
+    probe, q = model.attach(probe_points(), 1e-4), np.zeros(model.size)
+    J = model.project(probe, q, np.eye(model.size)).reshape(-1, model.size)
+    forces = np.random.default_rng(0).normal(size=(4, 3))
+    np.testing.assert_allclose(model.load(probe, q, forces), J.T @ forces.ravel(), atol=1e-14)
+    moved = model.positions(probe, 1e-4 * np.arange(model.size)) - model.positions(probe, q)
+    np.testing.assert_allclose(moved.ravel(), J @ (1e-4 * np.arange(model.size)), atol=1e-12)
+    blocks = np.random.default_rng(1).normal(size=(4, 3, 3))
+    blocks = 1e3 * blocks @ blocks.transpose(0, 2, 1)
+    tangent = model.linearize(q).tangent
+    before = model.sparse_tangent(tangent.copy()).toarray()
+    model.stiffen(tangent, probe, q, blocks)
+    D = np.zeros((12, 12))
+    for p in range(4):
+        D[3 * p : 3 * p + 3, 3 * p : 3 * p + 3] = blocks[p]
+    added = model.sparse_tangent(tangent).toarray() - before
+    np.testing.assert_allclose(added, J.T @ D @ J, atol=1e-9 * np.abs(before).max())
+
+
+def test_points_of_a_probe_lie_where_they_are_attached():
+    model = bench_mechanics("coarse").model
+    probe = model.attach(BENCH.keypoints, 1e-3)
+    np.testing.assert_allclose(model.positions(probe, np.zeros(model.size)), BENCH.keypoints, atol=1e-12)

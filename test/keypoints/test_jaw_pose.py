@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+from keypoint_scene_fakes import CAMERA, FakeScene
+
+from finforce.camera import project
+from finforce_keypoints.geometry.gripper import jaw_in_camera
+from finforce_keypoints.geometry.jaw_pose import Origin, OriginFinder, OriginTrack
+from finforce_keypoints.geometry.side_fit import rays_through
+from finforce_keypoints.settings import DetectorSettings
+
+SETTINGS = DetectorSettings()
+STDDEV = np.full(16, 0.4 / 430.6)
+RATE = 30.0
+
+
+@pytest.fixture(scope="module", params=["left", "right"])
+def seen(request):
+    """A finder of one jaw's origin, and the pixels of its points for an origin."""
+    scene, side = FakeScene("robot"), request.param
+
+    def look(x):
+        T = jaw_in_camera(scene.T_gripper_camera, side, x)
+        return project(scene.keypoints(side) @ T[:3, :3].T + T[:3, 3], CAMERA)
+
+    sign = -1.0 if side == "left" else 1.0
+    return OriginFinder(scene.jaws[side], scene.T_gripper_camera, SETTINGS), look, sign
+
+
+def measure(finder, pixels):
+    return finder.measure(rays_through(pixels, CAMERA), STDDEV)
+
+
+def only(rows, pixels):
+    kept = np.full_like(pixels, np.nan)
+    kept[rows] = pixels[rows]
+    return kept
+
+
+@pytest.mark.parametrize("opening", [0.012, 0.04, 0.075])
+def test_the_reference_point_alone_gives_the_origin(seen, opening):
+    finder, look, sign = seen
+    origin = measure(finder, only([15], look(sign * opening)))
+    assert origin.x == pytest.approx(sign * opening, abs=1e-9)
+
+
+def test_its_standard_deviation_is_that_of_the_errors(seen):
+    finder, look, sign = seen
+    rng, pixels = np.random.default_rng(0), only([15], look(sign * 0.04))
+    found = [measure(finder, pixels + 0.4 * rng.standard_normal((16, 2))) for _ in range(400)]
+    assert np.std([origin.x for origin in found]) == pytest.approx(found[0].stddev, rel=0.12)  # 400 samples: 3.5 %
+
+
+def test_without_the_reference_point_the_base_says_less_exactly_where_the_jaw_is(seen):
+    finder, look, sign = seen
+    pixels = look(sign * 0.04)
+    pixels[:14] += 1.0  # bent by some 0.2 mm
+    origin = measure(finder, only(range(15), pixels))
+    assert abs(origin.x - sign * 0.04) < 3.0 * origin.stddev
+    assert origin.stddev > 0.24e-3 > measure(finder, look(sign * 0.04)).stddev  # what the lowest point may bend
+
+
+def test_the_tip_alone_says_nothing(seen):
+    finder, look, sign = seen
+    assert measure(finder, only([6, 13, 14], look(sign * 0.04))) is None
+    assert measure(finder, np.full((16, 2), np.nan)) is None
+
+
+def test_a_reference_point_out_of_the_opening_range_or_off_its_line_is_refused(seen):
+    finder, look, sign = seen
+    assert measure(finder, only([15], look(sign * 0.09))) is None
+    aside = look(sign * 0.04) + [0.0, 40.0]
+    assert measure(finder, only([15], aside)) is None
+    assert measure(finder, only([15], aside - [0.0, 35.0])) is not None
+
+
+def follow(speeds, seed=0, noise=0.08e-3):
+    """Errors [m] of a tracked place and the true speeds [m/s]."""
+    rng, track, speeds = np.random.default_rng(seed), OriginTrack(SETTINGS), np.asarray(speeds)
+    places = -0.06 + np.cumsum(speeds) / RATE
+    found = [
+        track.update(n / RATE, Origin(x=x + noise * rng.standard_normal(), stddev=noise)) for n, x in enumerate(places)
+    ]
+    return np.array([origin.x for origin in found]) - places
+
+
+CLOSING = np.repeat([0.0, 0.03, 0.01, 0.0, -0.02, 0.0], 20)
+
+
+def test_a_closing_gripper_is_followed_without_lag_though_its_speed_changes():
+    errors = np.array([follow(CLOSING, seed) for seed in range(20)])
+    moving = CLOSING != 0.0
+    lag = (errors[:, moving] * np.sign(CLOSING[moving])).mean()
+    assert abs(lag) < 0.02e-3  # 0.7 ms at 30 mm/s
+    assert np.abs(errors).max() < 0.4e-3  # five standard deviations of one image
+    assert np.abs(errors.mean(axis=0)).max() < 0.12e-3  # no image after a change of speed stands out
+
+
+def test_a_jaw_at_rest_is_better_known_than_from_one_image():
+    errors = np.array([follow(np.zeros(60), seed) for seed in range(20)])[:, 20:]
+    assert errors.std() < 0.7 * 0.08e-3
+
+
+def test_one_impossible_origin_is_not_believed_and_three_that_agree_are():
+    track = OriginTrack(SETTINGS)
+    for n in range(10):
+        track.update(n / RATE, Origin(x=-0.05, stddev=1e-4))
+    found = [track.update((10 + n) / RATE, Origin(x=-0.03, stddev=1e-4)).x for n in range(3)]
+    np.testing.assert_allclose(found, [-0.05, -0.05, -0.03], atol=1e-3)
+
+
+def test_a_jaw_is_lost_after_some_images_without_it_and_found_again_at_once():
+    track = OriginTrack(SETTINGS)
+    for n in range(30):
+        track.update(n / RATE, Origin(x=-0.05, stddev=1e-4))
+    places = [track.update((30 + n) / RATE, None) for n in range(SETTINGS.lost_images)]
+    assert places[0] is not None and places[-1] is None and track.is_lost
+    assert track.forecast(40 / RATE) is None
+    assert track.update(40 / RATE, Origin(x=-0.02, stddev=1e-4)).x == -0.02
+
+
+def test_a_forecast_goes_on_at_the_speed_and_ends_with_a_long_gap():
+    track = OriginTrack(SETTINGS)
+    for n in range(20):
+        track.update(n / RATE, Origin(x=-0.05 + 0.03 * n / RATE, stddev=1e-5))
+    assert track.forecast(20 / RATE).x == pytest.approx(-0.05 + 0.03 * 20 / RATE, abs=2e-5)
+    assert track.forecast(19 / RATE + 2.0) is None
+
+
+def test_reset_forgets_the_jaw():
+    track = OriginTrack(SETTINGS)
+    track.update(0.0, Origin(x=-0.05, stddev=1e-4))
+    track.reset()
+    assert track.is_lost and track.forecast(0.1) is None

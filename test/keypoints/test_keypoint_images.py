@@ -1,0 +1,107 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from keypoint_scene_fakes import CAMERA, bare_image
+
+from finforce.camera import ImageError, ImageLayout
+from finforce_keypoints.errors import BlackImageError, FrozenImageError
+from finforce_keypoints.images import ImageWatch, check_image, decode_color, lie_inside
+
+RGB = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+ENCODED = {
+    "rgb8": RGB,
+    "bgr8": RGB[:, :, ::-1],
+    "rgba8": np.concatenate((RGB, np.full((2, 3, 1), 255, np.uint8)), axis=2),
+    "bgra8": np.concatenate((RGB[:, :, ::-1], np.full((2, 3, 1), 255, np.uint8)), axis=2),
+}
+
+
+@pytest.mark.parametrize("encoding", ENCODED)
+@pytest.mark.parametrize("padding", [0, 5])
+def test_every_encoding_gives_the_same_picture_with_and_without_padding(encoding, padding):
+    rows = np.ascontiguousarray(ENCODED[encoding]).reshape(2, -1)
+    step = rows.shape[1] + padding
+    data = np.pad(rows, ((0, 0), (0, padding)), constant_values=7).tobytes()
+    decoded = decode_color(data, encoding, ImageLayout(height=2, width=3, step=step))
+    np.testing.assert_array_equal(decoded, RGB)
+    np.testing.assert_array_equal(decode_color(ENCODED[encoding], encoding), RGB)
+
+
+def test_grey_pictures_become_three_equal_channels():
+    grey = np.array([[1, 2], [3, 4]], dtype=np.uint8)
+    np.testing.assert_array_equal(decode_color(grey.tobytes(), "mono8", ImageLayout(height=2, width=2))[..., 2], grey)
+    assert decode_color(grey, "mono8").shape == (2, 2, 3)
+
+
+@pytest.mark.parametrize("encoding", ["yuv422", "16UC1", "", "RGB8"])
+def test_an_unknown_encoding_is_refused_by_name(encoding):
+    with pytest.raises(ImageError, match=f"'{encoding}'.*rgb8"):
+        decode_color(RGB, encoding)
+
+
+@pytest.mark.parametrize(
+    "layout", [ImageLayout(height=2, width=4), ImageLayout(height=2, width=3, step=8), ImageLayout(height=0, width=3)]
+)
+def test_bytes_that_do_not_fill_the_layout_are_refused(layout):
+    with pytest.raises(ImageError, match="18 bytes"):
+        decode_color(RGB.tobytes(), "rgb8", layout)
+    with pytest.raises(ImageError, match="at least 9 bytes"):
+        decode_color(bytes(16), "rgb8", ImageLayout(height=2, width=3, step=8))
+
+
+def test_an_array_of_another_shape_or_type_is_refused():
+    for wrong in (RGB[:, :, :2], RGB.astype(float), RGB[0]):
+        with pytest.raises(ImageError, match="uint8"):
+            decode_color(wrong, "rgb8")
+
+
+def test_an_image_whose_parts_agree_passes_and_others_are_refused():
+    good = bare_image(0.0, np.ones((480, 640), np.float32))
+    check_image(good)
+    check_image(replace(good, depth=None))
+    for change, message in (
+        ({"depth": good.depth[1:]}, "depth image"),
+        ({"depth": np.ones((480, 640), np.uint16)}, "expected metres"),
+        ({"color": good.color[:, 1:]}, "colour image"),
+        ({"color": good.color.astype(float)}, "colour image"),
+        ({"stamp": float("nan")}, "stamp"),
+        ({"camera": replace(CAMERA, width=848)}, "camera_info"),
+    ):
+        with pytest.raises(ImageError, match=message):
+            check_image(replace(good, **change))
+
+
+def noisy(rng, level):
+    return replace(bare_image(0.0, None), color=rng.poisson(level, (480, 640, 3)).clip(0, 255).astype(np.uint8))
+
+
+def test_a_black_picture_is_refused_and_a_dim_one_is_not():
+    rng, watch = np.random.default_rng(0), ImageWatch()
+    with pytest.raises(BlackImageError, match="lens"):
+        watch.check(noisy(rng, 1.0))
+    watch.check(noisy(rng, 12.0))
+
+
+def test_a_frozen_camera_is_noticed_after_a_few_pictures_and_forgiven_when_it_goes_on():
+    rng, watch = np.random.default_rng(0), ImageWatch(frozen_after=3)
+    still = noisy(rng, 90.0)
+    for _ in range(3):
+        watch.check(still)
+    for _ in range(2):
+        with pytest.raises(FrozenImageError, match="identical"):
+            watch.check(still)
+    watch.check(noisy(rng, 90.0))
+    watch.check(still)
+
+
+def test_pictures_of_a_scene_at_rest_are_not_frozen():
+    rng, watch = np.random.default_rng(0), ImageWatch(frozen_after=1)
+    for _ in range(5):
+        watch.check(noisy(rng, 90.0))
+
+
+def test_pixels_lie_inside_up_to_the_border_of_the_outer_pixels():
+    image = bare_image(0.0, None)
+    pixels = np.array([[-0.4, -0.4], [639.4, 479.4], [640.0, 3.0], [3.0, -0.6], [np.nan, 3.0]])
+    np.testing.assert_array_equal(lie_inside(image, pixels), [True, True, False, False, False])

@@ -1,0 +1,152 @@
+"""Claims about what a key point detector node leaves out, and that it says so."""
+
+from dataclasses import replace
+from time import time_ns
+
+import numpy as np
+import pytest
+from keypoint_node_fakes import HEIGHT, JAW, MILLISECOND, WIDTH, CameraBench, FakeKeypoints, image_of
+from node_fakes import ros_domain
+from sensor_msgs.msg import PointCloud2
+
+from finforce.health import Level
+from finforce.ros import node as ros
+from finforce.skipping import IDLE, LATE, UNHEARD
+from finforce_keypoints.settings import ANNOTATED
+
+PERIOD = 100 * MILLISECOND  # of the answers while nothing moves
+
+
+@pytest.fixture
+def probe():
+    with ros_domain() as probe:
+        yield probe
+
+
+def counted(bench, rule):
+    """How often a rule has saved its work."""
+    return bench.node.skips.describe()[f"skipped: {rule}"]
+
+
+def next_period():
+    """The stamp of an image that begins a period, within reach of the clock."""
+    return time_ns() // PERIOD * PERIOD
+
+
+def test_without_a_listener_images_are_not_looked_at_and_with_the_first_they_are(probe):
+    bench = CameraBench(probe, heard=False, skip_off=[LATE])
+    for _ in range(3):
+        bench.shoot()
+    probe.wait_for(lambda: counted(bench, UNHEARD) == "3")
+    assert not bench.node.detector.images
+    state = bench.diagnosis(level=Level.OK, word="rests: nobody subscribes")
+    assert int({entry.key: entry.value for entry in state.values}[f"skipped: {UNHEARD}"]) > 0
+    probe.hear("left/keypoints", PointCloud2)
+    probe.wait_for(lambda: bench.node.out.are_heard)
+    bench.shoot()
+    probe.wait_for(lambda: bench.clouds())
+    assert len(bench.node.detector.images) == 1
+
+
+def test_a_node_that_is_told_to_looks_at_images_that_nobody_asks_for(probe):
+    bench = CameraBench(probe, heard=False, skip_off=[UNHEARD])
+    bench.shoot()
+    probe.wait_for(lambda: bench.node.detector.images)
+    assert counted(bench, UNHEARD) == "off"
+
+
+def test_a_resting_node_that_hears_no_images_any_more_is_stale(probe):
+    bench = CameraBench(probe, heard=False)
+    bench.shoot()
+    bench.diagnosis(level=Level.OK, word="rests")
+    bench.diagnosis(level=Level.STALE, word="nothing has arrived")
+
+
+def test_an_image_in_which_nothing_moved_is_answered_with_its_own_stamp_and_without_its_depth(probe):
+    bench = CameraBench(probe, max_age=2.0, skip_off=[LATE])
+    bench.node.detector.is_still = True
+    stamps = [next_period() + number * PERIOD for number in (-1, 0)]
+    for stamp in stamps:
+        bench.color(stamp)
+    bench.wait_for_clouds(2)
+    assert [ros.nanoseconds(cloud.header.stamp) for cloud in bench.clouds()] == stamps
+    assert [ros.nanoseconds(pose.header.stamp) for pose in bench.poses("right")] == stamps
+    first, second = (np.frombuffer(cloud.data, dtype=np.uint8) for cloud in bench.clouds())
+    assert np.array_equal(first, second) and not bench.node.detector.images
+
+
+def test_other_key_points_are_sent_at_once(probe):
+    bench = CameraBench(probe, max_age=2.0, skip_off=[LATE, IDLE])
+    bench.node.detector.is_still = True
+    bench.color(next_period())
+    bench.wait_for_clouds()
+    bench.node.detector.answer["left"] = replace(FakeKeypoints(), points=JAW.keypoints + 1e-3)
+    bench.color(next_period() + 1)
+    bench.wait_for_clouds(2)
+    first, second = (np.frombuffer(cloud.data, dtype=np.uint8) for cloud in bench.clouds())
+    assert not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize(("off", "answered"), [([LATE], 1), ([LATE, IDLE], 3)])
+def test_while_nothing_moves_one_image_of_a_period_is_answered_unless_told(probe, off, answered):
+    bench = CameraBench(probe, max_age=2.0, skip_off=off)
+    bench.node.detector.is_still = True
+    begin = next_period() - PERIOD
+    for number in range(3):
+        bench.color(begin + number * 33 * MILLISECOND)
+    bench.color(begin + PERIOD)
+    bench.wait_for_clouds(answered + 1)
+    assert len(bench.clouds()) == answered + 1
+
+
+def test_the_image_that_shows_a_motion_is_answered_though_its_depth_came_first(probe):
+    bench = CameraBench(probe, max_age=2.0)
+    bench.node.detector.is_still = True
+    begin = next_period() - 2 * PERIOD
+    for number in range(8):  # more depth images than the node's middleware keeps
+        bench.color(begin + number)
+        bench.depth(begin + number)
+    assert not bench.node.detector.images
+    bench.node.detector.is_still = False
+    stamp = begin + PERIOD + 1
+    bench.depth(stamp)
+    bench.color(stamp)
+    probe.wait_for(lambda: bench.node.detector.images)
+    probe.wait_for(lambda: ros.nanoseconds(bench.clouds()[-1].header.stamp) == stamp)
+
+
+def test_a_depth_image_that_comes_after_the_motion_is_taken_too(probe):
+    bench = CameraBench(probe, max_age=2.0)
+    bench.node.detector.is_still = True
+    stamp = next_period() - PERIOD
+    bench.shoot(stamp)
+    bench.node.detector.is_still = False
+    bench.shoot(stamp + 1)
+    probe.wait_for(lambda: bench.node.detector.images)
+    bench.wait_for_clouds(2)
+
+
+@pytest.mark.parametrize(("off", "answered"), [([""], 1), ([LATE], 3)])
+def test_an_image_that_came_late_is_passed_over_unless_told(probe, off, answered):
+    bench = CameraBench(probe, max_age=5.0, skip_off=off)
+    now = time_ns()
+    for number in range(3):
+        bench.depth(now + number * 40 * MILLISECOND)
+    for number in range(3):
+        picture = bench.rng.integers(90, 160, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        bench.color_out.publish(image_of(now + number * 40 * MILLISECOND, picture, "rgb8"))
+    probe.spin(0.3)
+    bench.wait_for_clouds(answered)
+    assert (len(bench.clouds()) == answered) or (not off[0] and len(bench.clouds()) < 3)
+    assert counted(bench, LATE) == ("off" if off[0] else str(3 - len(bench.clouds())))
+
+
+@pytest.mark.parametrize("off", [[""], [ANNOTATED]])
+def test_the_annotated_image_that_nobody_wants_is_counted_or_drawn(probe, off, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("finforce_keypoints.publishers.draw_keypoints", lambda color, *_: drawn.append(1) or color)
+    bench = CameraBench(probe, skip_off=off)
+    bench.shoot()
+    bench.wait_for_clouds()
+    probe.spin(0.1)
+    assert (counted(bench, ANNOTATED), len(drawn)) == (("off", 1) if off[0] else ("1", 0))

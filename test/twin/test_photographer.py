@@ -1,0 +1,83 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from finforce.camera import project
+from finforce_keypoints.geometry.gripper import ROBOT_CAMERA
+from finforce_twin.gripper.gripper import TwinGripper
+from finforce_twin.rendering.bodies import DrawnJaw
+from finforce_twin.rendering.depth_camera import build_d405_vga
+from finforce_twin.rendering.photographer import Photographer, Setting
+from finforce_twin.scenes.scenarios import build_scenario
+
+
+@pytest.fixture(scope="module")
+def gripper():
+    return TwinGripper(build_scenario("grasp_cylinder"), 3, density="coarse")
+
+
+@pytest.fixture(scope="module")
+def setting(gripper):
+    shapes = {
+        side: DrawnJaw(jaw=jaw, rest=gripper.rest_vertices(side), triangles=gripper.triangles(side))
+        for side, jaw in gripper.jaws.items()
+    }
+    return Setting(
+        shapes=shapes, mesh=gripper.object_mesh, camera=build_d405_vga(), T_gripper_camera=ROBOT_CAMERA, light="bright"
+    )
+
+
+@pytest.fixture(scope="module")
+def pressed(gripper):
+    return next(state for state in gripper.states() if np.linalg.norm(state.jaws["left"].force) > 1.0)
+
+
+@pytest.fixture(scope="module")
+def shot(setting, pressed):
+    return Photographer(setting, 3).shoot(pressed)
+
+
+def test_true_pixels_are_the_projected_key_points(shot, setting):
+    for truth in shot.truth.values():
+        points = truth.points @ truth.T_camera_jaw[:3, :3].T + truth.T_camera_jaw[:3, 3]
+        np.testing.assert_allclose(truth.pixels, project(points, setting.camera), atol=1e-9)
+
+
+def test_depth_at_visible_key_points_is_that_of_the_finger(shot):
+    for truth in shot.truth.values():
+        points = truth.points @ truth.T_camera_jaw[:3, :3].T + truth.T_camera_jaw[:3, 3]
+        at = np.round(truth.pixels).astype(int)
+        error = shot.depth[at[:, 1], at[:, 0]] - points[:, 2]
+        assert np.nanmedian(np.abs(error[truth.visible])) < 1e-3  # noise and millimetre steps
+
+
+def test_what_the_object_covers_is_not_visible(shot, setting, pressed):
+    bare = Photographer(replace(setting, mesh=None), 3).shoot(pressed)
+    for side, truth in bare.truth.items():
+        assert truth.visible.all()
+        assert not shot.truth[side].visible.all()
+        assert shot.truth[side].visible.sum() >= 10
+
+
+def test_the_same_seed_gives_the_same_image_and_another_one_another(shot, setting, pressed):
+    again = Photographer(setting, 3).shoot(pressed)
+    np.testing.assert_array_equal(again.color, shot.color)
+    np.testing.assert_array_equal(again.depth, shot.depth)
+    assert (Photographer(setting, 4).shoot(pressed).color != shot.color).mean() > 0.5
+
+
+def test_the_dot_on_the_holder_is_where_the_reference_point_is(shot):
+    for truth in shot.truth.values():
+        column, row = np.round(truth.pixels[-1]).astype(int)
+        dot = shot.color[row - 1 : row + 2, column - 1 : column + 2].mean()
+        around = shot.color[row - 14 : row + 15, column - 14 : column + 15].astype(float)
+        assert abs(dot - np.median(around)) > 20.0  # grey levels
+
+
+def test_depth_comes_in_the_steps_that_were_asked_for(setting, pressed):
+    for step in (1e-3, 1e-4):
+        depth = Photographer(replace(setting, depth_step=step), 3).shoot(pressed).depth
+        depth = depth[np.isfinite(depth)].astype(float)
+        np.testing.assert_allclose(depth / step, np.round(depth / step), atol=1e-3)  # float32 metres
+        assert len(np.unique(np.round(depth / step))) > (50 if step == 1e-3 else 500)
