@@ -1,13 +1,10 @@
-"""Fields of nodes' parameters, what all nodes have of them, and their values against their bounds.
-
-Fields of settings records with unit, bounds, choices and meaning, and the check of their values.
-"""
+"""Settings as frozen dataclasses: fields with unit, bounds and meaning, declared and checked in one way."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from typing import Any, TypeVar
 
 from finforce.errors import FinforceError
@@ -19,20 +16,35 @@ class ParameterError(FinforceError, ValueError):
     """A ROS parameter has a value or a type that its record does not allow."""
 
 
-def parameter(default: Any, description: str, **metadata: Any) -> Any:
-    """Return a dataclass field that says what it is; `metadata` are unit, min, max, choices, topic and settable."""
-    return field(default=default, metadata={"description": description, **metadata})
+def setting(
+    default: Any = MISSING,
+    description: str = "",
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    **flags: Any,
+) -> Any:
+    """Return a dataclass field of a value in a unit, from `low` to `high` unless these are None.
+
+    Args:
+        default: the default value; without one the field has to be given.
+        description: what it means, for `ros2 param describe` and error messages.
+        unit: of value and bounds.
+        low: least value.
+        high: largest value.
+        flags: `choices` (one of several words), `topic` (names one, or several), `settable` (while a node runs).
+    """
+    bounds = {"min": low, "max": high}
+    return field(default=default, metadata={"description": description, "unit": unit, **bounds, **flags})
 
 
 @dataclass(frozen=True, kw_only=True)
 class TimeParameters:
     """What every node that answers images is told about time; units stand in the metadata."""
 
-    max_age: float = parameter(0.2, "greatest age of data at the time of publishing", unit="s", min=0.001, max=60.0)
-    restart_gap: float = parameter(
-        1.0, "stamps that go back by more than this begin a new recording", unit="s", min=0.001, max=3600.0
-    )
-    diagnostics_period: float = parameter(1.0, "time between diagnostics", unit="s", min=0.05, max=60.0)
+    max_age: float = setting(0.2, "greatest age of data at the time of publishing", "s", 0.001, 60.0)
+    restart_gap: float = setting(1.0, "stamps that go back by more than this begin a new recording", "s", 0.001, 3600.0)
+    diagnostics_period: float = setting(1.0, "time between diagnostics", "s", 0.05, 60.0)
 
 
 def describe(entry: Field) -> str:
@@ -42,7 +54,7 @@ def describe(entry: Field) -> str:
 
 
 def constraints(entry: Field) -> str:
-    """Return in words what a range cannot say of a field; empty when there is no such thing."""
+    """Return in words what a range of ROS cannot say of a field; empty when there is no such thing."""
     choices, low, high = (entry.metadata.get(key) for key in ("choices", "min", "max"))
     if choices:
         return f"one of {', '.join(map(repr, choices))}"
@@ -63,17 +75,28 @@ def _may_be_nan(entry: Field) -> bool:
     return entry.default != entry.default
 
 
-def check_value(name: str, value: Any, entry: Field) -> None:
-    """Refuse what a ROS range cannot: other choices, and numbers out of bounds where NaN is allowed.
+def check_value(entry: Field, value: Any, error: type[Exception] = ParameterError, name: str = "") -> None:
+    """Refuse a value that is not among a field's choices or outside its bounds.
 
     Raises:
-        ParameterError: the value is one of these.
+        error: the value is one of these; NaN is allowed where it is the default.
     """
     choices, low, high = (entry.metadata.get(key) for key in ("choices", "min", "max"))
+    name = name or entry.name
     if choices and value not in choices:
-        raise ParameterError(f"parameter {name} is {value!r}; expected one of {choices}")
-    if (low is not None and value < low) or (high is not None and value > high):
-        raise ParameterError(f"parameter {name} is {value!r}; expected {low} to {high}")
+        raise error(f"{name}: got {value!r}, expected one of {', '.join(choices)}")
+    if value != value and _may_be_nan(entry):
+        return
+    if (low is not None and not value >= low) or (high is not None and not value <= high):
+        unit = f" {entry.metadata['unit']}" if entry.metadata.get("unit") else ""
+        bounds = f"at least {low:g}" if high is None else f"at most {high:g}" if low is None else f"{low:g} to {high:g}"
+        raise error(f"{name}: got {value!r}, expected {bounds}{unit}")
+
+
+def check_bounds(record: Any, error: type[Exception]) -> None:
+    """Refuse a record with a value that `check_value` refuses, by raising `error`."""
+    for entry in fields(record):
+        check_value(entry, getattr(record, entry.name), error)
 
 
 def refresh_record(record: RecordT, read: Callable[[str], Any]) -> RecordT:
@@ -86,26 +109,5 @@ def refresh_record(record: RecordT, read: Callable[[str], Any]) -> RecordT:
     for entry in fields(record):
         if entry.metadata.get("settable"):
             values[entry.name] = read(entry.name)
-            check_value(entry.name, values[entry.name], entry)
+            check_value(entry, values[entry.name])
     return replace(record, **values)
-
-
-def setting(default: Any, unit: str, low: float | None, high: float | None, description: str) -> Any:
-    """Returns a dataclass field of a value in a unit, from low to high unless these are None."""
-    return field(default=default, metadata={"unit": unit, "min": low, "max": high, "description": description})
-
-
-def choice(default: str, choices: tuple[str, ...], description: str) -> Any:
-    """Returns a dataclass field of one of several words."""
-    return field(default=default, metadata={"unit": "", "choices": choices, "description": description})
-
-
-def check_bounds(record: Any, error: type[Exception]) -> None:
-    """Refuses a record with a value that is not among its field's choices or outside its bounds, by raising `error`."""
-    for item in fields(record):
-        value, rule = getattr(record, item.name), item.metadata
-        if "choices" in rule and value not in rule["choices"]:
-            raise error(f"{item.name}: got {value!r}, expected one of {', '.join(rule['choices'])}")
-        low, high = rule.get("min"), rule.get("max")
-        if low is not None and not low <= value <= high:
-            raise error(f"{item.name}: got {value!r}, expected {low:g} to {high:g} {rule['unit']}")

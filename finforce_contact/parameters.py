@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from finforce.settings import TimeParameters, parameter
+from finforce.settings import TimeParameters, setting
 
 if TYPE_CHECKING:
     from finforce_contact.reconstruction.result import GeneratedMesh
@@ -19,45 +19,45 @@ IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 class ContactParameters(TimeParameters):
     """What a contact estimator node is told beside the settings of its parts; units stand in the metadata."""
 
-    jaws: str = parameter("left", "the jaws whose contacts are estimated", choices=("left", "right", "both"))
-    jaw_file: str = parameter("bench", "jaw file, or the name of a shipped jaw")
-    calibration_file: str = parameter(
+    jaws: str = setting("left", "the jaws whose contacts are estimated", choices=("left", "right", "both"))
+    jaw_file: str = setting("bench", "jaw file, or the name of a shipped jaw")
+    calibration_file: str = setting(
         "", "calibration file, or a shipped name, as the solvers have it: it shapes the mesh of the jaw; empty: none"
     )
-    camera_frame: str = parameter("camera_color_optical_frame", "frame of the poses and images")
-    object_mesh: str = parameter(
+    camera_frame: str = setting("camera_color_optical_frame", "frame of the poses and images")
+    object_mesh: str = setting(
         "", "mesh file of the object; empty: the object is unknown; read again by load_mesh", settable=True
     )
-    object_mesh_unit: str = parameter(
+    object_mesh_unit: str = setting(
         "m", "unit of the object's mesh file", choices=("m", "cm", "mm", "inch"), settable=True
     )
-    pose_source: str = parameter(
+    pose_source: str = setting(
         "topic",
         "object poses: PoseStamped on object_pose, Detection3DArray on object_detections, or the built-in tracker",
         choices=("topic", "detections", "tracker"),
     )
-    pose_tolerance: float = parameter(
-        0.017, "greatest distance between the stamps of a jaw pose and its object pose", unit="s", min=0.0, max=1.0
+    pose_tolerance: float = setting(
+        0.017, "greatest distance between the stamps of a jaw pose and its object pose", "s", 0.0, 1.0
     )
-    depth_scale: float = parameter(0.001, "one step of a 16-bit depth image", unit="m", min=1e-6, max=0.01)
-    reconstruct_method: str = parameter(
+    depth_scale: float = setting(0.001, "one step of a 16-bit depth image", "m", 1e-6, 0.01)
+    reconstruct_method: str = setting(
         "",
         "how reconstruct finds the object; empty: robust with a generated mesh; without, a primitive where that fits, "
         "else completion",
         choices=("", "robust", "paper", "primitive", "completion"),
         settable=True,
     )
-    generated_mesh: str = parameter(
+    generated_mesh: str = setting(
         "", "mesh file for reconstruct, made by a generator; empty: there is none", settable=True
     )
-    generated_pose: tuple[float, ...] = parameter(
+    generated_pose: tuple[float, ...] = setting(
         IDENTITY, "x, y, z [m], qx, qy, qz, qw of the generated mesh in the camera frame", settable=True
     )
-    generated_scale: float = parameter(
-        1.0, "metres per unit of the generated mesh, as far as it is known", unit="m", min=1e-6, max=1e6, settable=True
+    generated_scale: float = setting(
+        1.0, "metres per unit of the generated mesh, as far as it is known", "m", 1e-6, 1e6, settable=True
     )
 
-    skip_off: tuple[str, ...] = parameter(
+    skip_off: tuple[str, ...] = setting(
         ("",), "rules that are not applied, by their names in the diagnostics after `skipped:`, or all"
     )
 

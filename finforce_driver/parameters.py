@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from finforce.settings import ParameterError, TimeParameters, parameter
+from finforce.settings import ParameterError, TimeParameters, setting
 from finforce_driver.grasp.settings import GraspGoal
 
 if TYPE_CHECKING:
@@ -18,27 +18,21 @@ if TYPE_CHECKING:
 class DriverParameters(TimeParameters):
     """What a gripper driver node is told beside the settings of gripper and grasp; units stand in the metadata."""
 
-    port: str = parameter("/dev/ttyACM0", "serial port of the CAN adapter, or python-can's channel, such as can0")
-    interface: str = parameter("slcan", "slcan: a serial adapter; any other word: python-can's interface of that name")
-    baud_rate: int = parameter(115200, "of the serial port; of no effect on USB", unit="1/s", min=1200, max=10_000_000)
-    bit_rate: int = parameter(1_000_000, "of the CAN bus", unit="bit/s", min=10_000, max=1_000_000)
-    joint_names: tuple[str, ...] = parameter(
+    port: str = setting("/dev/ttyACM0", "serial port of the CAN adapter, or python-can's channel, such as can0")
+    interface: str = setting("slcan", "slcan: a serial adapter; any other word: python-can's interface of that name")
+    baud_rate: int = setting(115200, "of the serial port; of no effect on USB", "1/s", 1200, 10_000_000)
+    bit_rate: int = setting(1_000_000, "of the CAN bus", "bit/s", 10_000, 1_000_000)
+    joint_names: tuple[str, ...] = setting(
         ("left_jaw_joint", "right_jaw_joint"), "of the two jaws in joint_states; the value of each is half the opening"
     )
-    gripper_frame: str = parameter("gripper_base", "frame of grasp_wrench")
-    grasp_force: float = parameter(1.0, "that grasp holds until grasp_goal says another", unit="N", min=0.1, max=30.0)
-    grasp_speed: float = parameter(0.004, "of the opening while a grasp closes", unit="m/s", min=1e-4, max=0.1)
-    grasp_least_opening: float = parameter(
-        0.0, "at which a grasp that has met nothing gives up", unit="m", min=0.0, max=0.5
-    )
-    grasp_time_limit: float = parameter(20.0, "for a grasp to reach its force", unit="s", min=0.1, max=3600.0)
-    motor_force: float = parameter(
-        10.0, "grip force by the motor's current, of grasp_without_vision", unit="N", min=1.0, max=100.0
-    )
-    release_opening: float = parameter(
-        math.nan, "to which release opens; NaN: as far as it goes", unit="m", min=0.0, max=0.5
-    )
-    release_speed: float = parameter(0.02, "of the opening while release opens", unit="m/s", min=1e-4, max=0.37)
+    gripper_frame: str = setting("gripper_base", "frame of grasp_wrench")
+    grasp_force: float = setting(1.0, "that grasp holds until grasp_goal says another", "N", 0.1, 30.0)
+    grasp_speed: float = setting(0.004, "of the opening while a grasp closes", "m/s", 1e-4, 0.1)
+    grasp_least_opening: float = setting(0.0, "at which a grasp that has met nothing gives up", "m", 0.0, 0.5)
+    grasp_time_limit: float = setting(20.0, "for a grasp to reach its force", "s", 0.1, 3600.0)
+    motor_force: float = setting(10.0, "grip force by the motor's current, of grasp_without_vision", "N", 1.0, 100.0)
+    release_opening: float = setting(math.nan, "to which release opens; NaN: as far as it goes", "m", 0.0, 0.5)
+    release_speed: float = setting(0.02, "of the opening while release opens", "m/s", 1e-4, 0.37)
 
     def __post_init__(self) -> None:
         """Refuses names that are none, and joints that are not two.

@@ -12,20 +12,20 @@ from finforce_driver.errors import TargetError
 class GripperSettings:
     """Settings of `Gripper`; each field's metadata says unit, bounds and meaning."""
 
-    node_id: int = setting(0, "", 0, 15, "CAN node of the gripper")
-    poll_rate: float = setting(50.0, "Hz", 5.0, 200.0, "how often the gripper is asked for its state")
-    reply_timeout: float = setting(0.05, "s", 0.005, 1.0, "longest wait for a reply")
-    missed_replies: int = setting(25, "", 2, 1000, "requests in a row without a reply after which the port is reopened")
-    stroke: float = setting(0.048, "m", 0.001, 0.5, "opening of the mechanism between its end stops")
-    closed_opening: float = setting(0.0, "m", 0.0, 0.2, "between the jaws' inner faces when the mechanism is closed")
-    pinion_radius: float = setting(0.006, "m", 0.001, 0.1, "of the pinion between the two racks")
-    force_per_current: float = setting(47.7, "N/A", 1.0, 500.0, "slope of the maker's curve of grip force")
-    least_current: float = setting(0.15, "A", 0.05, 1.0, "below it the gripper is unstable")
-    largest_current: float = setting(1.3, "A", 0.15, 1.5, "greatest current limit that may be asked for")
-    default_speed: float = setting(0.02, "m/s", 1e-4, 0.37, "of the opening, where a command names none")
-    default_current: float = setting(0.5, "A", 0.15, 1.5, "current limit where a command names no force")
-    telemetry_period: float = setting(1.0, "s", 0.05, 3600.0, "between two questions for temperature, supply or errors")
-    release_on_stop: bool = setting(False, "", None, None, "let go when the driver ends; else it goes on holding")
+    node_id: int = setting(0, "CAN node of the gripper", "", 0, 15)
+    poll_rate: float = setting(50.0, "how often the gripper is asked for its state", "Hz", 5.0, 200.0)
+    reply_timeout: float = setting(0.05, "longest wait for a reply", "s", 0.005, 1.0)
+    missed_replies: int = setting(25, "requests in a row without a reply after which the port is reopened", "", 2, 1000)
+    stroke: float = setting(0.048, "opening of the mechanism between its end stops", "m", 0.001, 0.5)
+    closed_opening: float = setting(0.0, "between the jaws' inner faces when the mechanism is closed", "m", 0.0, 0.2)
+    pinion_radius: float = setting(0.006, "of the pinion between the two racks", "m", 0.001, 0.1)
+    force_per_current: float = setting(47.7, "slope of the maker's curve of grip force", "N/A", 1.0, 500.0)
+    least_current: float = setting(0.15, "below it the gripper is unstable", "A", 0.05, 1.0)
+    largest_current: float = setting(1.3, "greatest current limit that may be asked for", "A", 0.15, 1.5)
+    default_speed: float = setting(0.02, "of the opening, where a command names none", "m/s", 1e-4, 0.37)
+    default_current: float = setting(0.5, "current limit where a command names no force", "A", 0.15, 1.5)
+    telemetry_period: float = setting(1.0, "between two questions for temperature, supply or errors", "s", 0.05, 3600.0)
+    release_on_stop: bool = setting(False, "let go when the driver ends; else it goes on holding", "")
 
     @property
     def largest_opening(self) -> float:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from finforce.errors import ObservationError
-from finforce.settings import TimeParameters, parameter
+from finforce.settings import TimeParameters, setting
 from finforce_ifea.contact_mechanics.outline import ObjectOutline
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_ifea.observation import Contact
@@ -25,31 +25,31 @@ if TYPE_CHECKING:
 class NodeParameters(TimeParameters):
     """What a solver node is told beside the estimator's own settings; units stand in the metadata."""
 
-    jaw_name: str = parameter("left", "the jaw that this node solves", choices=("left", "right"))
-    jaw_file: str = parameter("bench", "jaw file, or the name of a shipped jaw")
-    calibration_file: str = parameter("", "calibration file, or a shipped name; empty: the material of the jaw file")
-    jaw_frame: str = parameter("", "frame of key points, contact and wrench; empty: <jaw_name>_jaw")
-    gripper_frame: str = parameter("gripper_base", "frame of grasp_wrench and manipulation_wrench")
-    contact_height: float = parameter(
+    jaw_name: str = setting("left", "the jaw that this node solves", choices=("left", "right"))
+    jaw_file: str = setting("bench", "jaw file, or the name of a shipped jaw")
+    calibration_file: str = setting("", "calibration file, or a shipped name; empty: the material of the jaw file")
+    jaw_frame: str = setting("", "frame of key points, contact and wrench; empty: <jaw_name>_jaw")
+    gripper_frame: str = setting("gripper_base", "frame of grasp_wrench and manipulation_wrench")
+    contact_height: float = setting(
         math.nan,
         "height of first touch above the clamped base; NaN: contacts come on <jaw_name>/contact",
-        unit="m",
-        min=0.0,
-        max=1.0,
+        "m",
+        0.0,
+        1.0,
     )
-    contact_free: bool = parameter(False, "the solver may move a contact that came on the topic")
-    peer: str = parameter(
+    contact_free: bool = setting(False, "the solver may move a contact that came on the topic")
+    peer: str = setting(
         "",
         "the other jaw, whose wrenches complete grasp_wrench and manipulation_wrench here; empty: none",
         choices=("", "left", "right"),
     )
-    completes_grasp: bool = parameter(False, "without a peer: publish this jaw's force as grasp_wrench")
-    publish_surface: bool = parameter(True, "publish the deformed mesh vertices with every solved image")
-    skip_off: tuple[str, ...] = parameter(
+    completes_grasp: bool = setting(False, "without a peer: publish this jaw's force as grasp_wrench")
+    publish_surface: bool = setting(True, "publish the deformed mesh vertices with every solved image")
+    skip_off: tuple[str, ...] = setting(
         ("",), "rules that are not applied, by their names in the diagnostics after `skipped:`, or all"
     )
-    marker_rate: float = parameter(
-        10.0, "greatest rate of the markers, which are sent only to listeners", unit="Hz", min=0.1, max=60.0
+    marker_rate: float = setting(
+        10.0, "greatest rate of the markers, which are sent only to listeners", "Hz", 0.1, 60.0
     )
 
     @property

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
-from finforce.settings import TimeParameters, check_bounds, parameter
+from finforce.settings import TimeParameters, check_bounds, setting
 from finforce.transforms import pose_from_quaternion, pose_numbers
 from finforce_keypoints.errors import DetectorSettingsError
 from finforce_keypoints.geometry.gripper import ROBOT_CAMERA
@@ -26,59 +26,53 @@ INFO_TOPIC = f"{CAMERA}/color/camera_info"
 class DetectorParameters(TimeParameters):
     """What a key point detector node is told beside the settings of its parts; units stand in the metadata."""
 
-    jaws: str = parameter("both", "the jaws that are looked for", choices=("left", "right", "both"))
-    jaw_file: str = parameter("bench", "jaw file, or the name of a shipped jaw")
-    camera_frame: str = parameter("camera_color_optical_frame", "frame of the images and of the jaws' poses")
-    T_gripper_camera: tuple[float, ...] = parameter(
+    jaws: str = setting("both", "the jaws that are looked for", choices=("left", "right", "both"))
+    jaw_file: str = setting("bench", "jaw file, or the name of a shipped jaw")
+    camera_frame: str = setting("camera_color_optical_frame", "frame of the images and of the jaws' poses")
+    T_gripper_camera: tuple[float, ...] = setting(
         pose_numbers(ROBOT_CAMERA), "x, y, z [m], qx, qy, qz, qw of the colour camera in the gripper's frame"
     )
-    color_topics: tuple[str, ...] = parameter(
+    color_topics: tuple[str, ...] = setting(
         (COLOR_TOPIC, OLD_COLOR_TOPIC),
         "colour images; the first topic that brings one is used, until it is silent",
         topic=True,
     )
-    depth_topic: str = parameter(DEPTH_TOPIC, "depth images, aligned to the colour images", topic=True)
-    info_topic: str = parameter(INFO_TOPIC, "intrinsics of the colour camera", topic=True)
-    finder: str = parameter(
+    depth_topic: str = setting(DEPTH_TOPIC, "depth images, aligned to the colour images", topic=True)
+    info_topic: str = setting(INFO_TOPIC, "intrinsics of the colour camera", topic=True)
+    finder: str = setting(
         "network",
         "what finds the key points: a network that sees the jaws' side planes (the shipped one), any DeepLabCut "
         "network that sees the image, or printed dots without a network",
         choices=("network", "frame", "dots"),
     )
-    model: str = parameter("", "folder of a network and its pytorch_config.yaml; empty: the shipped network")
-    names: tuple[str, ...] = parameter(
+    model: str = setting("", "folder of a network and its pytorch_config.yaml; empty: the shipped network")
+    names: tuple[str, ...] = setting(
         ("",),
         "body parts of a frame network whose names are not those of key points, each as BODYPART=NAME, as in "
         "'finger one=left_inner_1'; '-' for what is on no jaw",
     )
-    stride: int = parameter(0, "image pixels per heatmap cell; 0: as the network's files say", unit="px", min=0, max=64)
-    locref_std: float = parameter(
-        0.0, "scale of the network's offsets; 0: as the network's files say", unit="px", min=0.0, max=1000.0
-    )
-    apply_sigmoid: str = parameter(
+    stride: int = setting(0, "image pixels per heatmap cell; 0: as the network's files say", "px", 0, 64)
+    locref_std: float = setting(0.0, "scale of the network's offsets; 0: as the network's files say", "px", 0.0, 1000.0)
+    apply_sigmoid: str = setting(
         "auto", "whether heatmaps go through a sigmoid; auto: as the files say", choices=("auto", "yes", "no")
     )
-    normalize: str = parameter(
+    normalize: str = setting(
         "auto", "whether pictures are normalised; auto: as the files say", choices=("auto", "yes", "no")
     )
-    input_size: tuple[int, ...] = parameter(
+    input_size: tuple[int, ...] = setting(
         (0, 0), "height and width of the training's images [px]; zeros: as the network's files say"
     )
-    allow_resize: bool = parameter(False, "let a network see images of another size than its training's, letterboxed")
-    threads: int = parameter(2, "threads of the network", unit="1", min=1, max=64)
-    depth_scale: float = parameter(0.001, "one step of a 16-bit depth image", unit="m", min=1e-6, max=0.01)
-    sync_tolerance: float = parameter(
-        0.008,
-        "greatest distance between the stamps of a colour and a depth image that belong together",
-        unit="s",
-        min=0.0,
-        max=0.1,
+    allow_resize: bool = setting(False, "let a network see images of another size than its training's, letterboxed")
+    threads: int = setting(2, "threads of the network", "1", 1, 64)
+    depth_scale: float = setting(0.001, "one step of a 16-bit depth image", "m", 1e-6, 0.01)
+    sync_tolerance: float = setting(
+        0.008, "greatest distance between the stamps of a colour and a depth image that belong together", "s", 0.0, 0.1
     )
-    skip_off: tuple[str, ...] = parameter(
+    skip_off: tuple[str, ...] = setting(
         ("",), "rules that are not applied, by their names in the diagnostics after `skipped:`, or all"
     )
-    frozen_after: int = parameter(
-        2, "repetitions of a picture, to the bit, after which the camera counts as frozen", unit="1", min=1, max=1000
+    frozen_after: int = setting(
+        2, "repetitions of a picture, to the bit, after which the camera counts as frozen", "1", 1, 1000
     )
 
     def __post_init__(self) -> None:

@@ -14,47 +14,47 @@ from finforce_keypoints.errors import DetectorSettingsError
 class DetectorSettings:
     """Settings of `KeypointDetector`; each field's metadata says unit, bounds and meaning."""
 
-    likelihood: float = setting(0.6, "1", 0.0, 1.0, "a key point less likely than this is not there")
+    likelihood: float = setting(0.6, "a key point less likely than this is not there", "1", 0.0, 1.0)
     plane_depth: bool = setting(
-        False, "", None, None, "believe key points without depth, too, on the plane that the jaw's side is known to be"
+        False, "believe key points without depth, too, on the plane that the jaw's side is known to be", ""
     )
-    window: float = setting(3e-3, "m", 5e-4, 0.02, "around a key point, depth is taken from the finger's side this far")
-    edge: float = setting(0.4e-3, "m", 0.0, 5e-3, "and no nearer than this to an edge, where depths are mixed")
-    wide_gate: float = setting(5e-3, "m", 1e-3, 0.05, "depth farther off the known side plane is not the finger's")
-    gate: float = setting(2e-3, "m", 5e-4, 0.02, "the same, once the plane is found in the image")
-    least_depths: int = setting(6, "1", 1, 1000, "samples of the finger's side with depth that a key point needs")
-    least_share: float = setting(0.4, "1", 0.0, 1.0, "share of a key point's depths that must be the finger's")
-    quantum: float = setting(1e-3, "m", 0.0, 0.01, "step of the depth image")
-    depth_noise: float = setting(0.06e-3, "m", 0.0, 0.01, "error of the depth that the samples of one point share")
-    scale_stddev: float = setting(0.015, "1", 0.0, 0.1, "relative error that all depths of a camera share")
-    scale_drift: float = setting(1e-3, "1/s^0.5", 0.0, 0.1, "random walk of this error")
-    offset_stddev: float = setting(0.2e-3, "m", 0.0, 0.01, "of the jaw's side from where it should be, at its base")
-    tilt_stddev: float = setting(0.02, "1", 0.0, 0.5, "of the slopes of the jaw's side, bent or ill calibrated")
-    bow_stddev: float = setting(0.2, "1/m", 0.0, 10.0, "of the side's curvature, bent sideways: y = bow z^2")
-    relief_stddev: float = setting(0.06e-3, "m", 0.0, 0.01, "of single key points off the plane of the jaw's side")
-    misfit: float = setting(5.0, "sigma", 1.0, 100.0, "a key point whose depth is farther off than this is not there")
-    workspace_closing: float = setting(0.025, "m", 1e-3, 0.5, "how far a key point may leave its place along x")
-    workspace_width: float = setting(4e-3, "m", 1e-4, 0.5, "the same along y")
-    workspace_length: float = setting(0.012, "m", 1e-3, 0.5, "the same along z")
-    opening_min: float = setting(0.010, "m", 0.0, 0.5, "least distance of a jaw's origin from the middle of the grasp")
-    opening_max: float = setting(0.080, "m", 1e-3, 0.5, "largest distance of a jaw's origin from there")
+    window: float = setting(3e-3, "around a key point, depth is taken from the finger's side this far", "m", 5e-4, 0.02)
+    edge: float = setting(0.4e-3, "and no nearer than this to an edge, where depths are mixed", "m", 0.0, 5e-3)
+    wide_gate: float = setting(5e-3, "depth farther off the known side plane is not the finger's", "m", 1e-3, 0.05)
+    gate: float = setting(2e-3, "the same, once the plane is found in the image", "m", 5e-4, 0.02)
+    least_depths: int = setting(6, "samples of the finger's side with depth that a key point needs", "1", 1, 1000)
+    least_share: float = setting(0.4, "share of a key point's depths that must be the finger's", "1", 0.0, 1.0)
+    quantum: float = setting(1e-3, "step of the depth image", "m", 0.0, 0.01)
+    depth_noise: float = setting(0.06e-3, "error of the depth that the samples of one point share", "m", 0.0, 0.01)
+    scale_stddev: float = setting(0.015, "relative error that all depths of a camera share", "1", 0.0, 0.1)
+    scale_drift: float = setting(1e-3, "random walk of this error", "1/s^0.5", 0.0, 0.1)
+    offset_stddev: float = setting(0.2e-3, "of the jaw's side from where it should be, at its base", "m", 0.0, 0.01)
+    tilt_stddev: float = setting(0.02, "of the slopes of the jaw's side, bent or ill calibrated", "1", 0.0, 0.5)
+    bow_stddev: float = setting(0.2, "of the side's curvature, bent sideways: y = bow z^2", "1/m", 0.0, 10.0)
+    relief_stddev: float = setting(0.06e-3, "of single key points off the plane of the jaw's side", "m", 0.0, 0.01)
+    misfit: float = setting(5.0, "a key point whose depth is farther off than this is not there", "sigma", 1.0, 100.0)
+    workspace_closing: float = setting(0.025, "how far a key point may leave its place along x", "m", 1e-3, 0.5)
+    workspace_width: float = setting(4e-3, "the same along y", "m", 1e-4, 0.5)
+    workspace_length: float = setting(0.012, "the same along z", "m", 1e-3, 0.5)
+    opening_min: float = setting(0.010, "least distance of a jaw's origin from the middle of the grasp", "m", 0.0, 0.5)
+    opening_max: float = setting(0.080, "largest distance of a jaw's origin from there", "m", 1e-3, 0.5)
     acceleration: float = setting(
-        2e-3, "m/s^1.5", 1e-6, 10.0, "random walk of the closing speed; what is more is noticed and followed"
+        2e-3, "random walk of the closing speed; what is more is noticed and followed", "m/s^1.5", 1e-6, 10.0
     )
-    origin_gate: float = setting(3.0, "sigma", 1.0, 100.0, "an origin farther off means that the speed changed")
-    largest_speed: float = setting(0.3, "m/s", 1e-3, 10.0, "a jaw never moves faster")
+    origin_gate: float = setting(3.0, "an origin farther off means that the speed changed", "sigma", 1.0, 100.0)
+    largest_speed: float = setting(0.3, "a jaw never moves faster", "m/s", 1e-3, 10.0)
     reference_tolerance: float = setting(
-        5e-3, "m", 1e-4, 0.1, "a reference point farther off its line of motion is another thing"
+        5e-3, "a reference point farther off its line of motion is another thing", "m", 1e-4, 0.1
     )
     rigid_stddev: float = setting(
-        0.3e-3, "m", 1e-5, 0.01, "bending of the jaw 10 mm above its base, more with the square of the height"
+        0.3e-3, "bending of the jaw 10 mm above its base, more with the square of the height", "m", 1e-5, 0.01
     )
-    origin_stddev: float = setting(0.6e-3, "m", 1e-5, 0.02, "a jaw whose place is less well known is not found")
+    origin_stddev: float = setting(0.6e-3, "a jaw whose place is less well known is not found", "m", 1e-5, 0.02)
     rest_tolerance: float = setting(
-        1.1e-3, "m", 1e-4, 0.1, "key points at rest that lie farther from the jaw file, root mean square, are warned of"
+        1.1e-3, "key points at rest that lie farther from the jaw file, root mean square, are warned of", "m", 1e-4, 0.1
     )
     lost_images: int = setting(
-        5, "images", 1, 1000, "after so many images without it, or without a valid key point, a jaw is lost"
+        5, "after so many images without it, or without a valid key point, a jaw is lost", "images", 1, 1000
     )
 
     def __post_init__(self) -> None:

@@ -12,19 +12,19 @@ from training.errors import RecipeError
 class Recipe:
     """How a network is trained; a run ends after its minutes, whatever it has seen by then."""
 
-    minutes: float = setting(80.0, "min", 0.01, 10_000.0, "time that training may take, evaluation included")
-    steps: int = setting(0, "", 0, 10**9, "batches until the end; 0: until the minutes are over, not repeatable")
-    seed: int = setting(0, "", 0, 2**31, "of weights, order and augmentation")
-    batch: int = setting(48, "", 1, 4096, "pictures per step")
-    rate: float = setting(3e-3, "", 1e-6, 1.0, "largest learning rate of AdamW")
-    warm_up: float = setting(0.04, "-", 0.0, 0.5, "part of the time in which the rate rises")
-    decay: float = setting(1e-2, "", 0.0, 1.0, "weight decay of AdamW")
-    clip: float = setting(5.0, "", 1e-3, 1e6, "largest norm of the gradient")
-    average: float = setting(0.998, "", 0.0, 0.99999, "part of the averaged weights that stays in each step")
-    threads: int = setting(1, "", 1, 256, "threads of the network's arithmetic")
-    workers: int = setting(1, "", 0, 256, "processes that make batches")
-    evaluate_every: float = setting(5.0, "min", 0.01, 10_000.0, "time between evaluations and checkpoints")
-    validation: int = setting(1000, "", 1, 1_000_000, "pictures that an evaluation uses")
+    minutes: float = setting(80.0, "time that training may take, evaluation included", "min", 0.01, 10_000.0)
+    steps: int = setting(0, "batches until the end; 0: until the minutes are over, not repeatable", "", 0, 10**9)
+    seed: int = setting(0, "of weights, order and augmentation", "", 0, 2**31)
+    batch: int = setting(48, "pictures per step", "", 1, 4096)
+    rate: float = setting(3e-3, "largest learning rate of AdamW", "", 1e-6, 1.0)
+    warm_up: float = setting(0.04, "part of the time in which the rate rises", "-", 0.0, 0.5)
+    decay: float = setting(1e-2, "weight decay of AdamW", "", 0.0, 1.0)
+    clip: float = setting(5.0, "largest norm of the gradient", "", 1e-3, 1e6)
+    average: float = setting(0.998, "part of the averaged weights that stays in each step", "", 0.0, 0.99999)
+    threads: int = setting(1, "threads of the network's arithmetic", "", 1, 256)
+    workers: int = setting(1, "processes that make batches", "", 0, 256)
+    evaluate_every: float = setting(5.0, "time between evaluations and checkpoints", "min", 0.01, 10_000.0)
+    validation: int = setting(1000, "pictures that an evaluation uses", "", 1, 1_000_000)
 
     def __post_init__(self) -> None:
         check_bounds(self, RecipeError)

@@ -79,7 +79,7 @@ def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> Recor
     for entry in fields(record):
         name = f"{prefix}.{entry.name}" if prefix else entry.name
         value = _read_value(node, name, entry)
-        check_value(name, value, entry)
+        check_value(entry, value, name=name)
         if entry.metadata.get("topic"):
             for topic in (value,) if isinstance(value, str) else value:
                 _check_topic(node, name, topic)

@@ -81,21 +81,21 @@ VARIANTS = {
 class EmulatorSettings:
     """Settings of `EmulatedGripper`; each field's metadata says unit, bounds and meaning."""
 
-    stop_open: int = setting(10329, "ticks", 0, 16383, "of the motor at the open end stop")
-    stop_closed: int = setting(-229, "ticks", -16384, 0, "of the motor at the closed end stop")
-    stroke: float = setting(0.048, "m", 0.001, 0.5, "opening of the mechanism between its end stops")
-    closed_opening: float = setting(0.0, "m", 0.0, 0.2, "between the jaws' inner faces when the mechanism is closed")
-    start_opening: float = setting(0.048, "m", 0.0, 0.7, "between the jaws when the emulation begins")
-    force_per_current: float = setting(47.7, "N/A", 1.0, 500.0, "grip force per motor current")
-    current_lag: float = setting(0.02, "s", 0.001, 1.0, "time constant of the current")
-    free_current: float = setting(0.06, "A", 0.0, 0.5, "that moves the unloaded jaws, at most a fifth of the limit")
-    limp_force: float = setting(0.0, "N", 0.0, 100.0, "grip force below which jaws without power stay where they are")
-    hold_speed: float = setting(80_000.0, "ticks/s", 1000.0, 800_000.0, "of the drive's own position control")
-    rest_error: int = setting(0, "ticks", -4, 4, "that the position control leaves, positive on the open side")
-    boot_time: float = setting(0.3, "s", 0.0, 10.0, "of silence after a reset")
-    save_time: float = setting(0.5, "s", 0.0, 10.0, "of deafness while the configuration is written")
-    resets_integrators: bool = setting(False, "", None, None, "each order of five bytes lets the current start anew")
-    supply_limit: float = setting(29.0, "V", 9.0, 30.0, "supply above which a fault is latched")
+    stop_open: int = setting(10329, "of the motor at the open end stop", "ticks", 0, 16383)
+    stop_closed: int = setting(-229, "of the motor at the closed end stop", "ticks", -16384, 0)
+    stroke: float = setting(0.048, "opening of the mechanism between its end stops", "m", 0.001, 0.5)
+    closed_opening: float = setting(0.0, "between the jaws' inner faces when the mechanism is closed", "m", 0.0, 0.2)
+    start_opening: float = setting(0.048, "between the jaws when the emulation begins", "m", 0.0, 0.7)
+    force_per_current: float = setting(47.7, "grip force per motor current", "N/A", 1.0, 500.0)
+    current_lag: float = setting(0.02, "time constant of the current", "s", 0.001, 1.0)
+    free_current: float = setting(0.06, "that moves the unloaded jaws, at most a fifth of the limit", "A", 0.0, 0.5)
+    limp_force: float = setting(0.0, "grip force below which jaws without power stay where they are", "N", 0.0, 100.0)
+    hold_speed: float = setting(80_000.0, "of the drive's own position control", "ticks/s", 1000.0, 800_000.0)
+    rest_error: int = setting(0, "that the position control leaves, positive on the open side", "ticks", -4, 4)
+    boot_time: float = setting(0.3, "of silence after a reset", "s", 0.0, 10.0)
+    save_time: float = setting(0.5, "of deafness while the configuration is written", "s", 0.0, 10.0)
+    resets_integrators: bool = setting(False, "each order of five bytes lets the current start anew", "")
+    supply_limit: float = setting(29.0, "supply above which a fault is latched", "V", 9.0, 30.0)
 
     def __post_init__(self) -> None:
         """Refuses values out of bounds.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from finforce.settings import check_bounds, setting
 from finforce_driver.errors import TargetError
@@ -19,10 +19,10 @@ class GraspGoal:
         time_limit: to reach the force in [s]; holding has none.
     """
 
-    force: float = field(metadata={"unit": "N", "min": 0.1, "max": 30.0, "description": "to be reached and held"})
-    speed: float = setting(0.004, "m/s", 1e-4, 0.1, "greatest speed of the opening while closing")
-    least_opening: float = setting(0.0, "m", 0.0, 0.5, "opening below which the jaws never go")
-    time_limit: float = setting(20.0, "s", 0.1, 3600.0, "to reach the force in; holding has none")
+    force: float = setting(description="to be reached and held", unit="N", low=0.1, high=30.0)
+    speed: float = setting(0.004, "greatest speed of the opening while closing", "m/s", 1e-4, 0.1)
+    least_opening: float = setting(0.0, "opening below which the jaws never go", "m", 0.0, 0.5)
+    time_limit: float = setting(20.0, "to reach the force in; holding has none", "s", 0.1, 3600.0)
 
     def __post_init__(self) -> None:
         """Refuses what no grasp can be.
@@ -37,27 +37,27 @@ class GraspGoal:
 class GraspSettings:
     """Settings of `ForceGrasp`; each field's metadata says unit, bounds and meaning."""
 
-    force_limit: float = setting(8.0, "N", 0.2, 30.0, "force that ends a grasp; no goal may be above it")
-    tolerance: float = setting(0.08, "N", 0.0, 1.0, "by which the set force may be passed to come nearer to it")
+    force_limit: float = setting(8.0, "force that ends a grasp; no goal may be above it", "N", 0.2, 30.0)
+    tolerance: float = setting(0.08, "by which the set force may be passed to come nearer to it", "N", 0.0, 1.0)
     largest_stiffness: float = setting(
         1400.0,
+        "of fingers and object per metre of opening, the greatest expected before it is learnt",
         "N/m",
         50.0,
         1e5,
-        "of fingers and object per metre of opening, the greatest expected before it is learnt",
     )
     approach_share: float = setting(
-        0.7, "", 0.05, 1.0, "of the set force that may build up before an image can show the contact"
+        0.7, "of the set force that may build up before an image can show the contact", "", 0.05, 1.0
     )
-    onset_force: float = setting(0.25, "N", 0.05, 2.0, "above what was seen without load, it says that jaws are loaded")
-    noise: float = setting(0.05, "N", 0.005, 1.0, "standard deviation of the force that is expected at first")
-    jump: float = setting(1.0, "N", 0.1, 10.0, "change of the force between two images that motion does not explain")
-    stale_after: float = setting(0.25, "s", 0.05, 2.0, "age of the newest image with a force at which a grasp ends")
-    touch_timeout: float = setting(1.0, "s", 0.1, 10.0, "wait for a force once the jaws are said to touch")
-    silence_timeout: float = setting(2.0, "s", 0.1, 60.0, "wait for the first word of the camera")
-    relaxation: float = setting(0.4, "", 0.05, 1.0, "share of the force that holding may make up for by closing")
+    onset_force: float = setting(0.25, "above what was seen without load, it says that jaws are loaded", "N", 0.05, 2.0)
+    noise: float = setting(0.05, "standard deviation of the force that is expected at first", "N", 0.005, 1.0)
+    jump: float = setting(1.0, "change of the force between two images that motion does not explain", "N", 0.1, 10.0)
+    stale_after: float = setting(0.25, "age of the newest image with a force at which a grasp ends", "s", 0.05, 2.0)
+    touch_timeout: float = setting(1.0, "wait for a force once the jaws are said to touch", "s", 0.1, 10.0)
+    silence_timeout: float = setting(2.0, "wait for the first word of the camera", "s", 0.1, 60.0)
+    relaxation: float = setting(0.4, "share of the force that holding may make up for by closing", "", 0.05, 1.0)
     motor_force: float = setting(
-        20.0, "N", 7.0, 62.0, "grip force by the maker's curve that the motor is limited to; 3 set forces if more"
+        20.0, "grip force by the maker's curve that the motor is limited to; 3 set forces if more", "N", 7.0, 62.0
     )
 
     def __post_init__(self) -> None:

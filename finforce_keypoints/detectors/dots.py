@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.optional import import_cv2
-from finforce.settings import check_bounds, choice, setting
+from finforce.settings import check_bounds, setting
 from finforce_keypoints.detectors.pixel_finder import PixelFinding
 from finforce_keypoints.errors import DetectorSettingsError
 from finforce_keypoints.geometry.gripper import ROBOT_CAMERA, OpeningRange
@@ -28,22 +28,22 @@ _DIMMEST = 8  # of 255: darker pixels have no colour
 class DotSettings:
     """How the dots look; one dot on every key point and on the reference point, on the side that the camera sees."""
 
-    kind: str = choice(
+    kind: str = setting(
         "colored",
-        ("colored", "light", "dark"),
         "dots of one colour on any jaw, light dots on a dark one, or dark on light",
+        choices=("colored", "light", "dark"),
     )
     hue: float = setting(
-        120.0, "deg", 0.0, 360.0, "of colored dots: 0 red, 60 yellow, 120 green, 240 blue, 300 magenta"
+        120.0, "of colored dots: 0 red, 60 yellow, 120 green, 240 blue, 300 magenta", "deg", 0.0, 360.0
     )
-    hue_tolerance: float = setting(30.0, "deg", 1.0, 60.0, "a dot's hue may be off by this")
+    hue_tolerance: float = setting(30.0, "a dot's hue may be off by this", "deg", 1.0, 60.0)
     least_saturation: float = setting(
-        0.3, "1", 0.05, 1.0, "of a colored dot: (strongest - weakest) / strongest channel"
+        0.3, "of a colored dot: (strongest - weakest) / strongest channel", "1", 0.05, 1.0
     )
-    least_contrast: float = setting(0.25, "1", 0.01, 1.0, "of a light or dark dot: relative to its surroundings")
-    diameter: float = setting(0.003, "m", 5e-4, 0.02, "of a dot")
-    size_tolerance: float = setting(2.5, "1", 1.1, 10.0, "a dot's area may be larger or smaller by this factor")
-    gate: float = setting(0.006, "m", 5e-4, 0.05, "how far a dot may be from where its neighbours let expect it")
+    least_contrast: float = setting(0.25, "of a light or dark dot: relative to its surroundings", "1", 0.01, 1.0)
+    diameter: float = setting(0.003, "of a dot", "m", 5e-4, 0.02)
+    size_tolerance: float = setting(2.5, "a dot's area may be larger or smaller by this factor", "1", 1.1, 10.0)
+    gate: float = setting(0.006, "how far a dot may be from where its neighbours let expect it", "m", 5e-4, 0.05)
 
     def __post_init__(self) -> None:
         """Refuse values out of bounds.

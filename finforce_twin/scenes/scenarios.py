@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from finforce.settings import check_bounds, choice, setting
+from finforce.settings import check_bounds, setting
 from finforce_twin.errors import ScenarioError
 
 CAMERAS = ("robot", "bench")
@@ -22,35 +22,33 @@ class Scenario:
     """
 
     name: str
-    jaw: str = setting("bench", "", None, None, "a shipped jaw's name or a jaw file")
-    object: str = setting(
-        "rod25", "", None, None, "a name of finforce_twin.scenes.objects or a mesh file; empty for none"
-    )
-    unit: str = choice("m", ("m", "mm", "cm", "inch"), "of the coordinates of a mesh file")
-    scale: float = setting(1.0, "", 0.05, 20.0, "by which the object is enlarged")
-    turn_x: float = setting(0.0, "rad", -np.pi, np.pi, "turn of the object about the gripper's x, before y and z")
-    turn_y: float = setting(0.0, "rad", -np.pi, np.pi, "turn of the object about the gripper's y")
-    turn_z: float = setting(0.0, "rad", -np.pi, np.pi, "turn of the object about the gripper's z")
-    height: float = setting(0.042, "m", 0.0, 0.2, "z of the object's middle at first")
-    offset: float = setting(0.0, "m", -0.05, 0.05, "x of the object's middle at first, between two jaws")
-    shift: float = setting(0.0, "m", -0.05, 0.05, "y of the object's middle")
-    camera: str = choice("robot", CAMERAS, "two jaws before the wrist camera, or one before that of the bench")
-    light: str = choice("bright", LIGHTS, "how the scene is lit")
-    clearance: float = setting(0.008, "m", 5e-4, 0.06, "from each jaw to first touch while open")
-    closing_speed: float = setting(0.020, "m/s", 5e-4, 0.3, "of each jaw")
-    displacement: float = setting(0.006, "m", 0.0, 0.02, "of each jaw beyond first touch, at most")
-    levels: int = setting(1, "", 1, 20, "equal steps up to the displacement, and down again")
-    cycles: int = setting(1, "", 1, 20, "how often the object is grasped")
-    tare: float = setting(1.7, "s", 1.7, 60.0, "of stillness without load at the beginning")
-    settle: float = setting(0.5, "s", 0.0, 60.0, "of rest at each level before it is recorded")
-    record: float = setting(0.7, "s", 0.1, 60.0, "of record at each level")
-    mass: float = setting(0.0, "kg", 0.0, 2.0, "of the object that is lifted")
-    turn_angle: float = setting(0.0, "rad", -2.0 * np.pi, 2.0 * np.pi, "by which the wrist turns with the object")
-    turn_rate: float = setting(0.8, "rad/s", 0.05, 10.0, "at which it does")
-    turn_heading: float = setting(0.0, "rad", -np.pi, np.pi, "of the wrist's axis in the x-y plane, from x to y")
-    slide: float = setting(0.0, "m", -0.03, 0.03, "by which a hand draws the held object along z, and back")
-    rock: float = setting(0.0, "rad", -0.4, 0.4, "by which a hand tilts the held object from x to z, and back")
-    shift_time: float = setting(1.5, "s", 0.1, 60.0, "which each way of that takes")
+    jaw: str = setting("bench", "a shipped jaw's name or a jaw file", "")
+    object: str = setting("rod25", "a name of finforce_twin.scenes.objects or a mesh file; empty for none", "")
+    unit: str = setting("m", "of the coordinates of a mesh file", choices=("m", "mm", "cm", "inch"))
+    scale: float = setting(1.0, "by which the object is enlarged", "", 0.05, 20.0)
+    turn_x: float = setting(0.0, "turn of the object about the gripper's x, before y and z", "rad", -np.pi, np.pi)
+    turn_y: float = setting(0.0, "turn of the object about the gripper's y", "rad", -np.pi, np.pi)
+    turn_z: float = setting(0.0, "turn of the object about the gripper's z", "rad", -np.pi, np.pi)
+    height: float = setting(0.042, "z of the object's middle at first", "m", 0.0, 0.2)
+    offset: float = setting(0.0, "x of the object's middle at first, between two jaws", "m", -0.05, 0.05)
+    shift: float = setting(0.0, "y of the object's middle", "m", -0.05, 0.05)
+    camera: str = setting("robot", "two jaws before the wrist camera, or one before that of the bench", choices=CAMERAS)
+    light: str = setting("bright", "how the scene is lit", choices=LIGHTS)
+    clearance: float = setting(0.008, "from each jaw to first touch while open", "m", 5e-4, 0.06)
+    closing_speed: float = setting(0.020, "of each jaw", "m/s", 5e-4, 0.3)
+    displacement: float = setting(0.006, "of each jaw beyond first touch, at most", "m", 0.0, 0.02)
+    levels: int = setting(1, "equal steps up to the displacement, and down again", "", 1, 20)
+    cycles: int = setting(1, "how often the object is grasped", "", 1, 20)
+    tare: float = setting(1.7, "of stillness without load at the beginning", "s", 1.7, 60.0)
+    settle: float = setting(0.5, "of rest at each level before it is recorded", "s", 0.0, 60.0)
+    record: float = setting(0.7, "of record at each level", "s", 0.1, 60.0)
+    mass: float = setting(0.0, "of the object that is lifted", "kg", 0.0, 2.0)
+    turn_angle: float = setting(0.0, "by which the wrist turns with the object", "rad", -2.0 * np.pi, 2.0 * np.pi)
+    turn_rate: float = setting(0.8, "at which it does", "rad/s", 0.05, 10.0)
+    turn_heading: float = setting(0.0, "of the wrist's axis in the x-y plane, from x to y", "rad", -np.pi, np.pi)
+    slide: float = setting(0.0, "by which a hand draws the held object along z, and back", "m", -0.03, 0.03)
+    rock: float = setting(0.0, "by which a hand tilts the held object from x to z, and back", "rad", -0.4, 0.4)
+    shift_time: float = setting(1.5, "which each way of that takes", "s", 0.1, 60.0)
 
     def __post_init__(self) -> None:
         """Refuses numbers beyond their bounds, and what cannot be together.

@@ -9,7 +9,7 @@ from finforce_contact.settings import MODES, ContactSettings
 from finforce_ifea.errors import ContactError
 
 NAMES = [item.name for item in fields(ContactSettings)]
-NUMBERS = [item for item in fields(ContactSettings) if "min" in item.metadata]
+NUMBERS = [item for item in fields(ContactSettings) if item.metadata["min"] is not None]
 
 
 def test_every_setting_says_what_it_is():

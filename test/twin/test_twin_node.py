@@ -176,7 +176,7 @@ def test_rendering_ends_with_the_node(probe, grasp, tmp_path):
 
 
 def test_a_gripper_s_firmware_that_there_is_not_is_a_start_up_error(probe, grasp, tmp_path):
-    with pytest.raises(ParameterError, match="gripper_firmware is 'newest'; expected one of"):
+    with pytest.raises(ParameterError, match="gripper_firmware: got 'newest', expected one of"):
         start_live(probe, grasp, tmp_path / "gripper", gripper_firmware="newest")
 
 
