@@ -192,7 +192,7 @@ def decode_depth(
     if encoding not in DEPTH_TYPES:
         raise ImageError(f"depth image: encoding '{encoding}'; expected 16UC1 [mm] or 32FC1 [m]")
     if layout is not None:
-        data = _unpack_rows(data, DEPTH_TYPES[encoding], layout)
+        data = unpack_rows("depth image", data, DEPTH_TYPES[encoding], layout)
     image = np.asarray(data)
     if image.ndim != 2:
         raise ImageError(f"depth image: shape {image.shape}; expected (height, width)")
@@ -205,17 +205,23 @@ def decode_depth(
     return depth
 
 
-def _unpack_rows(data: NDArray | bytes, dtype: np.dtype, layout: ImageLayout) -> NDArray:
-    """Return the image (h, w) of bytes that may have padding at the end of their rows."""
+def unpack_rows(what: str, data: NDArray | bytes, dtype: np.dtype, layout: ImageLayout, channels: int = 1) -> NDArray:
+    """Return the image (h, w), or (h, w, channels), of bytes that may have padding at the end of their rows.
+
+    Raises:
+        ImageError: the data do not fill the layout; `what` names them.
+    """
     raw = np.frombuffer(data, dtype=np.uint8)
-    used = layout.width * dtype.itemsize
+    used = layout.width * channels * dtype.itemsize
     step = layout.step or used
-    if step < used or len(raw) != step * layout.height:
+    if min(layout.width, layout.height) < 1 or step < used or len(raw) != step * layout.height:
         raise ImageError(
-            f"depth image: {len(raw)} bytes with {step} a row; expected {layout.height} rows of at least {used} bytes"
+            f"{what}: {len(raw)} bytes with {step} a row; expected {layout.height} rows of at least {used} bytes"
         )
-    rows = np.ascontiguousarray(raw.reshape(layout.height, step)[:, :used])
-    return rows.view(dtype.newbyteorder(">" if layout.is_bigendian else "<"))
+    rows = raw.reshape(layout.height, step)[:, :used]
+    if dtype.itemsize > 1:
+        rows = np.ascontiguousarray(rows).view(dtype.newbyteorder(">" if layout.is_bigendian else "<"))
+    return rows if channels == 1 else rows.reshape(layout.height, layout.width, channels)
 
 
 def check_depth(depth: NDArray, camera: CameraIntrinsics) -> None:
@@ -254,3 +260,38 @@ def _check_size(image: NDArray, camera: CameraIntrinsics, what: str = "depth ima
         raise ImageError(
             f"{what}: shape {np.shape(image)}; the intrinsics are of {camera.height} rows and {camera.width} columns"
         )
+
+
+COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
+
+
+_PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
+
+
+def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | None = None) -> NDArray:
+    """Return a colour image as RGB.
+
+    Args:
+        data: the image (h, w, channels), or (h, w) when mono8, or its bytes together with their layout.
+        encoding: rgb8, bgr8, rgba8, bgra8 or mono8, as in sensor_msgs/Image.
+        layout: how the bytes lie.
+
+    Returns:
+        (h, w, 3) uint8, contiguous; a view of the data where nothing has to move.
+
+    Raises:
+        ImageError: the encoding is another one, or the data do not fill the layout.
+    """
+    if encoding not in COLOR_CHANNELS:
+        raise ImageError(f"colour image: encoding {encoding!r}; expected one of {', '.join(COLOR_CHANNELS)}")
+    depth = _PIXEL_BYTES[encoding]
+    image = np.asarray(data) if layout is None else unpack_rows("colour image", data, np.dtype(np.uint8), layout, depth)
+    if image.ndim == 2 and depth == 1:
+        image = image[:, :, None]
+    if image.ndim != 3 or image.shape[2] != depth or image.dtype != np.uint8:
+        raise ImageError(
+            f"colour image: {image.dtype} of shape {image.shape}; expected uint8 (h, w, {depth}) for {encoding}"
+        )
+    if encoding != "rgb8":
+        image = image[:, :, COLOR_CHANNELS[encoding]]
+    return np.ascontiguousarray(image)

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, ImageError
+from finforce.messages import camera_from_info, depth_from_image, mask_from_image, same_camera, stamp_of
+from finforce.stamps import SECOND
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.messages import camera_from_info, depth_from_image, mask_from_image, same_camera, stamp_of
 from finforce_contact.parameters import ContactParameters
 from finforce_contact.pose.source import ObjectPose
 from finforce_contact.pose.tracker import PoseTracker
 from finforce_contact.settings import TrackerSettings
 
-SECOND = 1e-9  # s/ns
 DEPTH = 32  # images that may wait for their mask, which a segmentation takes a while to find
 
 

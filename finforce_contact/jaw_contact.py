@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
+from finforce.stamps import SECOND
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.pose.pairing import DEPTH, PosePairing, Step
 from finforce_ifea.tracking.clearance import is_away
 
-SECOND = 1e-9  # s/ns
 AWAY_FOR = 10  # images in a row, after which the object is taken to stay away: a second, of the ten that are looked at
 ValueT = TypeVar("ValueT")
 

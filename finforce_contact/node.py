@@ -15,10 +15,12 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
 from finforce.errors import FinforceError
-from finforce.health import Health, Idling, Outcome, Report, StampGate
+from finforce.health import Health, Outcome, Report
+from finforce.messages import read_stamp, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import refresh_record
 from finforce.skipping import CONTACT, IDLE, UNNEEDED, Skips
+from finforce.stamps import Idling, StampGate
 from finforce_contact.camera_feed import StampedPose
 from finforce_contact.diagnostics import describe, object_alarms, outcome_of_estimate
 from finforce_contact.jaw_contact import TimedEstimate
@@ -27,7 +29,6 @@ from finforce_contact.publishers import ContactOutputs
 from finforce_contact.session import ContactSession
 from finforce_contact.settings import ContactSettings, TrackerSettings
 from finforce_contact.subscriptions import subscribe
-from finforce_ifea.messages import read_stamp
 
 
 class ContactEstimatorNode(Node):
@@ -144,7 +145,7 @@ class ContactEstimatorNode(Node):
     def _check_ahead(self, message: Any) -> None:
         """Refuse a stamp ahead of the clock before anything is kept that all later stamps would be behind."""
         now = self._now()
-        self.gates[self.parameters.sides[0]].check_age(max(ros.nanoseconds(message.header.stamp), now), now)
+        self.gates[self.parameters.sides[0]].check_age(max(stamp_of(message), now), now)
 
     def _hand_on(self, found: StampedPose | None) -> None:
         """Give the jaws a pose of the object, if it was found."""

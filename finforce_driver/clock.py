@@ -9,7 +9,7 @@ from threading import Event
 from time import monotonic
 from typing import Protocol
 
-from finforce.health import NANOSECONDS, StampError, StampGate
+from finforce.stamps import NANOSECONDS, StampError, StampGate
 
 
 class Clock(Protocol):

@@ -18,6 +18,7 @@ from sensor_msgs.msg import JointState, PointCloud2
 
 from finforce.errors import FinforceError, MissingDependencyError
 from finforce.health import Level, Outcome, Report
+from finforce.messages import stamp_of
 from finforce.optional import import_library
 from finforce.ros import node as ros
 from finforce_driver.actions import GripperCommandAction
@@ -164,7 +165,7 @@ class GripperDriverNode(Node):
 
     def _enter(self, source: str, message: Any) -> float:
         """Return the stamp of a fresh message on the gripper's clock [s]."""
-        return self.times.enter(source, ros.nanoseconds(message.header.stamp), self._now())
+        return self.times.enter(source, stamp_of(message), self._now())
 
     @contextmanager
     def _refusals(self, what: str, stream: bool = True) -> Iterator[None]:

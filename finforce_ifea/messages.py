@@ -5,7 +5,6 @@ An object's outline to and from the columns of a point cloud, one row per corner
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,38 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
-from finforce.health import NANOSECONDS
+from finforce.messages import check_cloud, check_frame
 from finforce.pointcloud import decode_columns, decode_keypoints
 from finforce_ifea.contact_mechanics.outline import ObjectOutline, are_same_polygons
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, Observation
-
-
-def read_stamp(data: bytes) -> int:
-    """Return the stamp [ns] of a message with a header from its CDR bytes, of which nothing else is read."""
-    seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-    return NANOSECONDS * seconds + rest
-
-
-def check_frame(message: Any, frame: str, what: str) -> None:
-    """Refuse a message of another coordinate frame.
-
-    Raises:
-        ObservationError: `header.frame_id` is not `frame`.
-    """
-    if message.header.frame_id != frame:
-        raise ObservationError(f"{what} came in the frame '{message.header.frame_id}'; expected '{frame}'")
-
-
-def check_cloud(cloud: Any, frame: str, what: str) -> None:
-    """Refuse a cloud of another frame, or one of several rows.
-
-    Raises:
-        ObservationError: the frame or the height is wrong.
-    """
-    check_frame(cloud, frame, what)
-    if cloud.height != 1:
-        raise ObservationError(f"{what} came as {cloud.height} x {cloud.width} points; expected height 1")
 
 
 def observation_from_cloud(cloud: Any, frame: str) -> Observation:

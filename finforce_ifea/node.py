@@ -15,12 +15,14 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from finforce.errors import FinforceError
-from finforce.health import Health, Idling, Outcome, Report, StampGate
+from finforce.health import Health, Outcome, Report
+from finforce.messages import read_stamp, stamp_of
 from finforce.ros import node as ros
 from finforce.skipping import AWAY, IDLE, LATE, SOLVER, Skips
+from finforce.stamps import Idling, StampGate
 from finforce_ifea.diagnostics import describe_solution, outcome_of_solution, peer_alarms
 from finforce_ifea.grasp_force import ForcePairing, single_jaw_grasp
-from finforce_ifea.messages import force_from_wrench, observation_from_cloud, read_stamp
+from finforce_ifea.messages import force_from_wrench, observation_from_cloud
 from finforce_ifea.observation import Solution
 from finforce_ifea.parameters import NodeParameters, build_contact_feed, build_estimator, load_parameter_jaw
 from finforce_ifea.publishers import SolverOutputs
@@ -103,7 +105,7 @@ class IfeaSolverNode(Node):
         if passed:
             return
         cloud = deserialize_message(data, PointCloud2)
-        header, stamp = cloud.header, ros.nanoseconds(cloud.header.stamp)
+        header, stamp = cloud.header, stamp_of(cloud)
         with self._refusals():
             observation = observation_from_cloud(cloud, self.parameters.frame)
             if self.gate.enter(stamp, self._now()):
@@ -138,16 +140,16 @@ class IfeaSolverNode(Node):
     def _on_contact(self, cloud: PointCloud2) -> None:
         """Keep the newest contact."""
         with self._refusals():
-            self.contacts.take(cloud, ros.nanoseconds(cloud.header.stamp))
+            self.contacts.take(cloud, stamp_of(cloud))
 
     def _on_outline(self, cloud: PointCloud2) -> None:
         """Keep the newest outline of the object."""
         with self._refusals():
-            self.contacts.take_outline(cloud, ros.nanoseconds(cloud.header.stamp))
+            self.contacts.take_outline(cloud, stamp_of(cloud))
 
     def _on_peer(self, wrench: WrenchStamped) -> None:
         """Complete the grasp with the other jaw's force."""
-        stamp, peer = ros.nanoseconds(wrench.header.stamp), self.parameters.peer
+        stamp, peer = stamp_of(wrench), self.parameters.peer
         with self._refusals():
             force = force_from_wrench(wrench, f"{peer}_jaw", f"the wrench of the {peer} jaw")
             self.gate.check_age(stamp, self._now())

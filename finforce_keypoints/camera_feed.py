@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics, ImageError, ImageLayout
-from finforce_contact.messages import camera_from_info, depth_from_image, same_camera, stamp_of
-from finforce_ifea.messages import check_frame
+from finforce.camera import CameraIntrinsics, ImageError
+from finforce.messages import camera_from_info, check_frame, color_from_image, depth_from_image, same_camera, stamp_of
+from finforce.stamps import SECOND
 from finforce_keypoints.errors import SyncError
-from finforce_keypoints.images import ImagePair, ImageWatch, RgbdImage, check_image, decode_color
+from finforce_keypoints.images import ImagePair, ImageWatch, RgbdImage, check_image
 from finforce_keypoints.parameters import DetectorParameters
 
-SECOND = 1e-9  # s/ns
 SILENCE = 1.0  # s without an image, after which another colour topic may be the camera's
 WAITING = 3  # colour images that may wait for their depth: a tenth of a second at 30 Hz
 
@@ -160,18 +159,6 @@ class CameraFeed:
             f"no depth image within {limit} of the colour image at {SECOND * stamp:.3f} s, the nearest lies "
             f"{1e3 * SECOND * nearest:.1f} ms away; start the camera with enable_sync:=true or raise sync_tolerance"
         )
-
-
-def color_from_image(message: Any) -> NDArray[np.uint8]:
-    """Return the colours (h, w, 3), red green blue, of a sensor_msgs/Image, without a copy where its bytes lie so.
-
-    Raises:
-        ImageError: the encoding is not known, or the data do not fill the image.
-    """
-    layout = ImageLayout(
-        height=message.height, width=message.width, step=message.step, is_bigendian=bool(message.is_bigendian)
-    )
-    return decode_color(np.frombuffer(message.data, dtype=np.uint8), message.encoding, layout)
 
 
 def _distance(message: Any, stamp: int) -> int:

@@ -8,11 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics, ImageError, ImageLayout
+from finforce.camera import CameraIntrinsics, ImageError
 from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError
 
-COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
-_PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
 _WATCHED_STEP = 8  # every so many rows and columns are looked at
 _DARKEST = 10  # of 255: a picture whose brightest hundredth is below this shows nothing
 _BRIGHTEST_PERCENT = 99.0
@@ -44,47 +42,6 @@ class ImagePair(NamedTuple):
     stamp: int
     color: Any
     depth: Any
-
-
-def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | None = None) -> NDArray:
-    """Return a colour image as RGB.
-
-    Args:
-        data: the image (h, w, channels), or (h, w) when mono8, or its bytes together with their layout.
-        encoding: rgb8, bgr8, rgba8, bgra8 or mono8, as in sensor_msgs/Image.
-        layout: how the bytes lie.
-
-    Returns:
-        (h, w, 3) uint8, contiguous; a view of the data where nothing has to move.
-
-    Raises:
-        ImageError: the encoding is another one, or the data do not fill the layout.
-    """
-    if encoding not in COLOR_CHANNELS:
-        raise ImageError(f"colour image: encoding {encoding!r}; expected one of {', '.join(COLOR_CHANNELS)}")
-    depth = _PIXEL_BYTES[encoding]
-    image = np.asarray(data) if layout is None else _unpack_rows(data, depth, layout)
-    if image.ndim == 2 and depth == 1:
-        image = image[:, :, None]
-    if image.ndim != 3 or image.shape[2] != depth or image.dtype != np.uint8:
-        raise ImageError(
-            f"colour image: {image.dtype} of shape {image.shape}; expected uint8 (h, w, {depth}) for {encoding}"
-        )
-    if encoding != "rgb8":
-        image = image[:, :, COLOR_CHANNELS[encoding]]
-    return np.ascontiguousarray(image)
-
-
-def _unpack_rows(data: NDArray | bytes, depth: int, layout: ImageLayout) -> NDArray:
-    """Return the image (h, w, depth) of bytes that may have padding at the end of their rows."""
-    raw = np.frombuffer(data, dtype=np.uint8)
-    used = layout.width * depth
-    step = layout.step or used
-    if min(layout.width, layout.height) < 1 or step < used or len(raw) != step * layout.height:
-        raise ImageError(
-            f"colour image: {len(raw)} bytes with {step} a row; expected {layout.height} rows of at least {used} bytes"
-        )
-    return raw.reshape(layout.height, step)[:, :used].reshape(layout.height, layout.width, depth)
 
 
 def check_image(image: RgbdImage) -> None:

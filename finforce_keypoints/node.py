@@ -17,12 +17,13 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image
 
 from finforce.errors import FinforceError
-from finforce.health import Health, Idling, Outcome, Report, StampGate
+from finforce.health import Health, Outcome, Report
+from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce.ros.heap import keep_heap
 from finforce.ros.raw_image import read_image
 from finforce.skipping import IDLE, LATE, UNHEARD, Skips
-from finforce_contact.messages import stamp_of
+from finforce.stamps import Idling, StampGate
 from finforce_keypoints.camera_feed import SECOND, CameraFeed
 from finforce_keypoints.detectors.build import BuiltDetector, build_detector
 from finforce_keypoints.detectors.dots import DotSettings

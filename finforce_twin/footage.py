@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics
+from finforce.stamps import NANOSECONDS
 from finforce.transforms import invert_pose
 from finforce_keypoints.geometry.gripper import BENCH_CAMERA, ROBOT_CAMERA
 from finforce_twin.errors import ScenarioError
@@ -22,7 +23,6 @@ from finforce_twin.rendering.depth_camera import build_d405_vga
 from finforce_twin.rendering.photographer import Photographer, Setting, Shot
 from finforce_twin.scenes.scenarios import Scenario
 
-NANOSECONDS = 1_000_000_000
 FINGER = 0  # seed of the material for which the package has a calibration, `twin`
 START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
 TRACKED_EVERY = 3  # images: the object is tracked at 10 Hz

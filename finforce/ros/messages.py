@@ -20,16 +20,13 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
 from finforce.errors import ObservationError
-from finforce.health import NANOSECONDS, Report
+from finforce.health import Report
+from finforce.messages import check_frame
 from finforce.pointcloud import encode_cloud
-from finforce_ifea.messages import check_frame, contact_from_cloud
+from finforce.stamps import NANOSECONDS
+from finforce_ifea.messages import contact_from_cloud
 
 MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
-
-
-def nanoseconds(stamp: Any) -> int:
-    """Return a builtin_interfaces/Time as exact integer nanoseconds."""
-    return stamp.sec * NANOSECONDS + stamp.nanosec
 
 
 def stamp_message(stamp: int) -> Time:

@@ -32,7 +32,7 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who publish
 
 from finforce.errors import FinforceError
-from finforce.health import NANOSECONDS, Level, Outcome, Report  # noqa: F401 - for those with stamps
+from finforce.health import Level, Outcome, Report
 from finforce.ros.executor import KeepingExecutor, is_wanted  # noqa: F401 - for those who publish
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     KeptMessage,
@@ -41,7 +41,6 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
     image_message,
     is_touching,
     joint_state_message,
-    nanoseconds,
     points_marker,
     pose_message,
     stamp_message,
@@ -51,6 +50,7 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
 )
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
 from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe
+from finforce.stamps import NANOSECONDS  # noqa: F401 - for those with stamps
 
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.stamps import NANOSECONDS
 from finforce.systems.options import ReplayOptions
 from finforce.systems.processes import Process, replay_processes
 from finforce_eval.bench.film import Film, film_images, film_keypoints
@@ -24,7 +25,7 @@ from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.figures.time_error import ErrorPoint, ErrorSeries, TimeStats, draw_time_error, time_stats
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import NANOSECONDS, Recording
+from finforce_eval.recordings.tracks import Recording
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import QUIET, NodeRun, describe_load, run_nodes
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC

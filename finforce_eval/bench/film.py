@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from finforce.stamps import NANOSECONDS
 from finforce.transforms import pose_from_quaternion
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.views import MeshView
@@ -21,7 +22,6 @@ from finforce_eval.evaluation.keypoint_source import TRUTH, KeypointSource
 from finforce_eval.recordings.image_messages import IMAGE
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import NANOSECONDS
 from finforce_eval.recordings.twin_writer import FRAME
 from finforce_eval.recordings.writer import MessageFactory, write_recording
 from finforce_eval.replay.playback import Playback, RawMessage, read_playback

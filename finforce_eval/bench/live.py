@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.stamps import NANOSECONDS
 from finforce_eval.bench.bench import Row, format_rows, row_from_times
 from finforce_eval.bench.process import child_processes, resident_bytes
 from finforce_eval.cli.demo import RECORDING
 from finforce_eval.cli.evaluate import make_setup
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import NANOSECONDS, JawTrack, Recording
+from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.replay import replay
 

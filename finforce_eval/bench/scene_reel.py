@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
 
+from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.image_messages import CAMERA_INFO, IMAGE
 from finforce_eval.recordings.recording import POSE
-from finforce_eval.recordings.tracks import NANOSECONDS
 from finforce_eval.replay.playback import Playback, RawMessage
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 

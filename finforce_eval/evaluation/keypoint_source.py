@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from finforce.errors import FinforceError
+from finforce.stamps import NANOSECONDS
 from finforce_eval.cli.main import SOURCES
 from finforce_eval.cli.options import parse_changes
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.detection import Detector, detect_keypoints
 from finforce_eval.recordings.images import PAIRED
-from finforce_eval.recordings.tracks import NANOSECONDS, JawTrack, KeypointTrack, Recording
+from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording
 
 if TYPE_CHECKING:
     from finforce_keypoints.detectors.dots import DotSettings

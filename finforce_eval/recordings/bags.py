@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from finforce.errors import FinforceError, MissingDependencyError
+from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.tracks import NANOSECONDS
 
 
 class Sample(NamedTuple):

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import MILLIMETRE, ImageError, ImageLayout, decode_depth
+from finforce.camera import MILLIMETRE, ImageError, decode_color, decode_depth
 from finforce.errors import MissingDependencyError
-from finforce_keypoints.images import decode_color
+from finforce.messages import layout_of
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -36,7 +36,7 @@ def color_from_message(message: Any) -> NDArray[np.uint8]:
         ImageError: the encoding is not known, or the data are damaged.
     """
     if not is_compressed(message):
-        return decode_color(message.data, message.encoding, _layout(message))
+        return decode_color(message.data, message.encoding, layout_of(message))
     picture = _open_picture(bytes(message.data), f"colour image {message.format!r}")
     return np.array(picture.convert("RGB"))
 
@@ -50,7 +50,7 @@ def depth_from_message(message: Any, scale: float = MILLIMETRE) -> NDArray[np.fl
         ImageError: the encoding is not known, or the data are damaged.
     """
     if not is_compressed(message):
-        return decode_depth(message.data, message.encoding, _layout(message), scale)
+        return decode_depth(message.data, message.encoding, layout_of(message), scale)
     return decode_depth(depth_steps(message), "16UC1", scale=scale)
 
 
@@ -91,12 +91,6 @@ def compress_depth(steps: NDArray[np.uint16]) -> bytes:
     buffer = io.BytesIO()
     _pillow().fromarray(steps).save(buffer, format="png", compress_level=LEVEL)
     return bytes(DEPTH_HEADER) + buffer.getvalue()
-
-
-def _layout(message: Any) -> ImageLayout:
-    return ImageLayout(
-        height=message.height, width=message.width, step=message.step, is_bigendian=bool(message.is_bigendian)
-    )
 
 
 def _open_picture(data: bytes, what: str) -> Any:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, IntrinsicsError
 from finforce.errors import ObservationError
-from finforce_contact.messages import camera_from_info, same_camera
+from finforce.messages import camera_from_info, read_stamp, same_camera
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, check_types, open_bag
 from finforce_eval.recordings.image_messages import (
@@ -22,7 +22,6 @@ from finforce_eval.recordings.image_messages import (
     color_from_message,
     depth_from_message,
 )
-from finforce_ifea.messages import read_stamp
 from finforce_keypoints.images import RgbdImage, check_image
 
 # the ends of topics by which the images are found, whatever the camera is called; the first that is there counts

@@ -11,12 +11,12 @@ import numpy as np
 
 from finforce.errors import ObservationError
 from finforce.pointcloud import Keypoints, decode_columns, decode_keypoints
+from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import Sample, bag_source, check_types, open_bag
 from finforce_eval.recordings.images import PAIRED, ImageTrack, find_images
 from finforce_eval.recordings.tracks import (
     JAWS,
-    NANOSECONDS,
     JawTrack,
     KeypointTrack,
     PoseTrack,

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 JAWS = ("left", "right")
 DIRECTIONS = ("load", "unload")
 STAGES = ("ramp", "settle", "record")
-NANOSECONDS = 1_000_000_000
 
 TrackT = TypeVar("TrackT", "KeypointTrack", "WrenchTrack", "PoseTrack", "PhaseTrack", "SightTrack", "DetectionTrack")
 

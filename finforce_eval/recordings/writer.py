@@ -11,9 +11,10 @@ import numpy as np
 
 from finforce.errors import MissingDependencyError
 from finforce.pointcloud import STDDEV_COLUMNS, encode_cloud
+from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, WRENCH
-from finforce_eval.recordings.tracks import NANOSECONDS, KeypointTrack, PhaseTrack, PoseTrack, Recording, WrenchTrack
+from finforce_eval.recordings.tracks import KeypointTrack, PhaseTrack, PoseTrack, Recording, WrenchTrack
 
 
 class Entry(NamedTuple):

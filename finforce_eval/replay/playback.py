@@ -6,11 +6,11 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from finforce.messages import read_stamp
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, RawSample, bag_source, open_bag, restamp
 from finforce_eval.recordings.image_messages import COMPRESSED, IMAGE, color_from_message, depth_steps
 from finforce_eval.recordings.images import COLOR_ENDS, DEPTH_ENDS, INFO_ENDS
-from finforce_ifea.messages import read_stamp
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 HEADER = "std_msgs/msg/Header"

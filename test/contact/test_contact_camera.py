@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 
 from finforce.health import Level
+from finforce.messages import depth_from_image, mask_from_image, stamp_of
 from finforce.ros import node as ros
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.views import MeshView
-from finforce_contact.messages import depth_from_image, mask_from_image
 from finforce_contact.subscriptions import CAMERA as CAMERA_TOPICS
 from finforce_twin.rendering.depth_camera import build_d405
 
@@ -88,7 +88,7 @@ class TrackingBench(ContactBench):
         self.info.publish(camera_info(stamp, self.camera))
         self.probe.wait_for(lambda: feed._camera is not None)
         self.depth.publish(depth_image(stamp, depth))
-        self.probe.wait_for(lambda: any(ros.nanoseconds(kept.header.stamp) == stamp for kept in feed._depths))
+        self.probe.wait_for(lambda: any(stamp_of(kept) == stamp for kept in feed._depths))
         if masked:
             self.mask.publish(mask_image(stamp, mask))
         return stamp
@@ -112,13 +112,13 @@ def test_the_object_is_found_with_a_mask_and_followed_without(probe, camera, sce
     stamp = bench.see(scene, masked=True)
     probe.wait_for(lambda: bench.poses, MAX_AGE)
     found = bench.poses[0]
-    assert ros.nanoseconds(found.header.stamp) == stamp and found.header.frame_id == CAMERA
+    assert stamp_of(found) == stamp and found.header.frame_id == CAMERA
     place = found.pose.position
     expected = (T_CAMERA_JAW @ cylinder_before_jaw())[:3, 3]
     np.testing.assert_allclose([place.x, place.y, place.z], expected, atol=1.5e-3)  # 1 mm steps of the depth
     stamp = bench.see(scene, masked=False)
     probe.wait_for(lambda: len(bench.poses) == 2)
-    assert ros.nanoseconds(bench.poses[1].header.stamp) == stamp
+    assert stamp_of(bench.poses[1]) == stamp
     bench.jaw_out.publish(pose(stamp, T_CAMERA_JAW))
     assert bench.wait_for_contacts().width > 0
     values = {entry.key: entry.value for entry in bench.diagnosis(level=Level.OK).values}
@@ -253,4 +253,4 @@ def test_of_the_images_that_wait_only_the_newest_is_looked_at(probe, camera, sce
     sleep(0.5)  # until they have arrived
     probe.wait_for(lambda: len(bench.poses) == 2)
     probe.spin(0.2)
-    assert [ros.nanoseconds(found.header.stamp) for found in bench.poses[1:]] == stamps[-1:]
+    assert [stamp_of(found) for found in bench.poses[1:]] == stamps[-1:]

@@ -24,6 +24,7 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
 from finforce.health import Level
+from finforce.messages import stamp_of
 from finforce.pointcloud import decode_cloud
 from finforce.ros import node as ros
 from finforce_ifea.jaw.jaw import load_jaw
@@ -54,7 +55,7 @@ def test_a_cylinder_before_the_jaw_gives_its_place_of_first_touch(probe):
     bench = ContactBench(probe)
     stamp = bench.image(cylinder_before_jaw())
     cloud = bench.wait_for_contacts()
-    assert cloud.header.frame_id == "left_jaw" and ros.nanoseconds(cloud.header.stamp) == stamp
+    assert cloud.header.frame_id == "left_jaw" and stamp_of(cloud) == stamp
     x, y, z, candidate, touching, weight = columns(cloud, "x", "y", "z", "candidate", "touching", "weight")
     jaw = load_jaw("bench")
     # half a millimetre: the spacing of the heights that are looked at
@@ -191,7 +192,7 @@ def test_an_image_without_a_jaw_pose_is_due_with_its_surface(probe):
     probe.connected(out)
     vertices = load_jaw("bench").build_mesh("default").nodes
     out.publish(ros.cloud_message(header(stamp + SECOND // 30, "left_jaw"), ros.xyz_columns(vertices)))
-    assert ros.nanoseconds(bench.wait_for_contacts(2).header.stamp) == stamp + SECOND // 30
+    assert stamp_of(bench.wait_for_contacts(2)) == stamp + SECOND // 30
     # the surface of an image that was answered already asks for nothing
     out.publish(ros.cloud_message(header(stamp, "left_jaw"), ros.xyz_columns(vertices)))
     probe.spin(0.3)
@@ -205,7 +206,7 @@ def test_stamps_that_go_back_begin_anew(probe):
     bench.jaw_out.publish(pose(stamp - 10 * SECOND, T_CAMERA_JAW))
     bench.diagnosis(level=Level.WARN, word="no pose")
     bench.image(cylinder_before_jaw(), stamp - 9 * SECOND)
-    assert ros.nanoseconds(bench.wait_for_contacts(2).header.stamp) == stamp - 9 * SECOND
+    assert stamp_of(bench.wait_for_contacts(2)) == stamp - 9 * SECOND
 
 
 def set_parameter(bench, name, value):

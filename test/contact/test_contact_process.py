@@ -20,10 +20,10 @@ def test_a_signal_ends_the_node_cleanly(number):
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        ("jaws:=middle", "jaws is 'middle'"),
+        ("jaws:=middle", "jaws: got 'middle'"),
         ("jaw_file:=no_such_jaw", "no_such_jaw"),
         ("calibration_file:=no_such_file", "no_such_file"),
-        ("contact.mode:=guess", "contact.mode is 'guess'"),
+        ("contact.mode:=guess", "contact.mode: got 'guess'"),
         ("tracker.least_fitness:=2.0", "tracker.least_fitness"),
         ("pose_source:=detections", "ros-jazzy-vision-msgs"),
     ],

@@ -3,7 +3,8 @@
 import pytest
 
 from finforce.errors import ObservationError
-from finforce.health import Health, Level, Outcome, StaleError, StampError, StampGate
+from finforce.health import Health, Level, Outcome
+from finforce.stamps import StaleError, StampError, StampGate
 
 SECOND = 1_000_000_000
 GOOD = Outcome(level=Level.OK, reason="ok", text="ok")

@@ -10,8 +10,8 @@ from estimator_fakes import BENCH, PERIOD, magnitudes, make_estimator, ramp, rec
 from localization_fakes import JAW, cylinder
 
 from finforce import skipping as rules
-from finforce.health import Idling
 from finforce.skipping import ALL, EVERYWHERE, SkippingError, Skips
+from finforce.stamps import Idling
 from finforce_contact.estimator import ContactEstimator
 from finforce_ifea.contact_mechanics.outline import ObjectOutline
 from finforce_ifea.observation import Contact

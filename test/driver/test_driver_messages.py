@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import pytest
 from driver_node_fakes import READY, FakeGripper
 
-from finforce.health import NANOSECONDS, Level, StampError
+from finforce.health import Level
 from finforce.settings import ParameterError
+from finforce.stamps import NANOSECONDS, StampError
 from finforce_driver.clock import MessageTimes
 from finforce_driver.diagnostics import describe_state, news_of_state, outcome_of_state
 from finforce_driver.errors import TargetError

@@ -22,7 +22,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from finforce.health import Level
-from finforce.ros import node as ros
+from finforce.messages import stamp_of
 from finforce_driver.state import GripperState, Outcome, Phase
 
 SECOND = 1_000_000_000
@@ -45,7 +45,7 @@ def test_joint_states_have_half_the_opening_and_the_time_of_the_reply(probe):
     assert list(joints.velocity) == [-0.002] * 2
     assert list(joints.effort) == [5.0] * 2
     # the stamp is taken from two clocks, one after the other
-    assert before - SECOND // 1000 < ros.nanoseconds(joints.header.stamp) < time_ns()
+    assert before - SECOND // 1000 < stamp_of(joints) < time_ns()
 
 
 def test_the_stamp_is_that_of_the_reply_and_not_of_its_publication(probe):
@@ -53,7 +53,7 @@ def test_the_stamp_is_that_of_the_reply_and_not_of_its_publication(probe):
     before = time_ns()
     gripper.reply(stamp=gripper.clock.now() - 0.5)
     probe.wait_for(lambda: probe.got["joint_states"])
-    stamp = ros.nanoseconds(probe.got["joint_states"][0].header.stamp)
+    stamp = stamp_of(probe.got["joint_states"][0])
     # half a second before, to what the two clocks and the machine's load allow
     assert stamp == pytest.approx(before - SECOND // 2, abs=0.2 * SECOND)
 

@@ -12,6 +12,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from finforce.health import Level
+from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce_driver.can.bus import Frame
 
@@ -36,7 +37,7 @@ def bench():
 def test_joint_states_follow_the_gripper_with_the_times_of_its_replies(bench):
     bench = bench()
     bench.wait_for_joints(10)
-    stamps = [ros.nanoseconds(message.header.stamp) for message in bench.joints]
+    stamps = [stamp_of(message) for message in bench.joints]
     assert all(later > earlier for earlier, later in zip(stamps, stamps[1:], strict=False))
     # none from the future, none older than the test's patience
     assert 0 < time_ns() - stamps[-1] < 10 * ros.NANOSECONDS

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from finforce.stamps import NANOSECONDS
 from finforce_eval.bench import chain as bench
 from finforce_eval.bench.chain import IMAGES, KEYPOINTS, TrueGrasp, error_now, make_row
-from finforce_eval.recordings.tracks import NANOSECONDS
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import NodeRun
 

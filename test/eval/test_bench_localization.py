@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from finforce.errors import MissingDependencyError
+from finforce.stamps import NANOSECONDS
 from finforce_eval.bench import localization as bench
 from finforce_eval.bench.localization import Frame, build_cylinder, measure_methods, summarise
 from finforce_eval.bench.localization_methods import METHODS
 from finforce_eval.cli.demo import RECORDING
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import NANOSECONDS
 
 MESH = build_cylinder(0.0125, 0.06, 16, 2)
 

@@ -14,6 +14,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from finforce.health import Level
+from finforce.messages import stamp_of
 from finforce.ros import node as ros
 
 SECOND = 1_000_000_000
@@ -48,9 +49,9 @@ def test_the_image_stamp_travels_unchanged(probe):
     out.publish(keypoint_cloud(stamp))
     for topic in ("left/wrench", "left/wrench_stddev", "left/surface"):
         probe.wait_for(lambda topic=topic: probe.got[topic])
-        header = probe.got[topic][0].header
-        assert ros.nanoseconds(header.stamp) == stamp
-        assert header.frame_id == "left_jaw"
+        message = probe.got[topic][0]
+        assert stamp_of(message) == stamp
+        assert message.header.frame_id == "left_jaw"
 
 
 def test_force_and_its_deviation_are_the_estimators(probe):
@@ -188,7 +189,7 @@ def test_only_the_newest_waiting_image_is_solved(probe):
         out.publish(keypoint_cloud(stamp))
     probe.wait_for(lambda: probe.got["left/wrench"])
     probe.spin(0.2)
-    assert ros.nanoseconds(probe.got["left/wrench"][-1].header.stamp) == stamps[-1]
+    assert stamp_of(probe.got["left/wrench"][-1]) == stamps[-1]
     state = probe.diagnosis(word="")
     counts = {entry.key: entry.value for entry in state.values}
     assert int(counts["arrived"]) == 4
@@ -238,7 +239,7 @@ def test_the_peer_completes_the_grasp_whoever_comes_first(probe, order):
     assert force_of(net) == pytest.approx([1.0, 0.0, 1.0])
     for message in (grasp, net):
         assert message.header.frame_id == "gripper_base"
-        assert ros.nanoseconds(message.header.stamp) == stamp
+        assert stamp_of(message) == stamp
 
 
 def test_forces_of_different_images_make_no_grasp(probe):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from keypoint_scene_fakes import CAMERA, bare_image
 
-from finforce.camera import ImageError, ImageLayout
+from finforce.camera import ImageError, ImageLayout, decode_color
 from finforce_keypoints.errors import BlackImageError, FrozenImageError
-from finforce_keypoints.images import ImageWatch, check_image, decode_color, lie_inside
+from finforce_keypoints.images import ImageWatch, check_image, lie_inside
 
 RGB = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
 ENCODED = {

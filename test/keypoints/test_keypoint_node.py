@@ -28,9 +28,9 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 from finforce.health import Level
+from finforce.messages import pose_from_message, stamp_of
 from finforce.pointcloud import decode_cloud
 from finforce.ros import node as ros
-from finforce_contact.messages import pose_from_message
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.node import KeypointDetectorNode
 
@@ -54,7 +54,7 @@ def test_key_points_and_pose_carry_the_stamp_of_the_image_and_all_columns(probe)
     keypoints.valid[3], keypoints.reasons[3], keypoints.points[4] = False, "workspace", np.nan
     stamp = bench.shoot(time_ns() - 3)  # odd: seconds in a float would lose it
     cloud = bench.wait_for_clouds()
-    assert ros.nanoseconds(cloud.header.stamp) == stamp and cloud.header.frame_id == "left_jaw"
+    assert stamp_of(cloud) == stamp and cloud.header.frame_id == "left_jaw"
     assert (cloud.height, cloud.width, [entry.name for entry in cloud.fields]) == (1, COUNT, list(COLUMNS))
     found = columns(cloud)
     np.testing.assert_array_equal(np.stack([found[name] for name in "xyz"], axis=1), np.float32(keypoints.points))
@@ -64,7 +64,7 @@ def test_key_points_and_pose_carry_the_stamp_of_the_image_and_all_columns(probe)
     assert found["valid"].dtype == np.uint8 and found["valid"].tolist() == [int(k != 3) for k in range(COUNT)]
     assert found["reason"].dtype == np.uint8 and found["reason"].tolist() == [4 * (k == 3) for k in range(COUNT)]
     pose = bench.poses()[-1]
-    assert ros.nanoseconds(pose.header.stamp) == stamp
+    assert stamp_of(pose) == stamp
     # 1e-9: of a quaternion in double precision
     np.testing.assert_allclose(pose_from_message(pose, FRAME, "pose"), keypoints.T_camera_jaw, atol=1e-9)
 
@@ -107,7 +107,7 @@ def test_stamps_within_the_tolerance_belong_together_and_others_do_not(probe):
     bench.color(stamp)
     assert not bench.clouds()
     bench.depth(stamp + 4 * MILLISECOND)
-    assert ros.nanoseconds(bench.wait_for_clouds().header.stamp) == stamp
+    assert stamp_of(bench.wait_for_clouds()) == stamp
 
 
 def test_depth_that_is_an_image_late_is_waited_for(probe):
@@ -118,7 +118,7 @@ def test_depth_that_is_an_image_late_is_waited_for(probe):
     for stamp in stamps:
         bench.depth(stamp)
     bench.wait_for_clouds(2)
-    assert [ros.nanoseconds(cloud.header.stamp) for cloud in bench.clouds()] == stamps
+    assert [stamp_of(cloud) for cloud in bench.clouds()] == stamps
 
 
 def test_a_newer_whole_image_passes_over_those_that_wait(probe):
@@ -128,7 +128,7 @@ def test_a_newer_whole_image_passes_over_those_that_wait(probe):
     new = bench.shoot()
     bench.depth(old)
     bench.wait_for_clouds()
-    assert [ros.nanoseconds(cloud.header.stamp) for cloud in bench.clouds()] == [new]
+    assert [stamp_of(cloud) for cloud in bench.clouds()] == [new]
     assert bench.node.feed.passed == 1
     values = {entry.key: entry.value for entry in bench.diagnosis(level=Level.OK).values}
     assert values["overtaken while waiting for depth"] == "1" and values["refused"] == "none"
@@ -139,7 +139,7 @@ def test_of_a_queue_only_the_newest_image_is_looked_at_and_the_others_are_counte
     stamps = [time_ns() + k * MILLISECOND for k in range(4)]
     bench.burst(stamps)
     bench.wait_for_clouds()
-    assert [ros.nanoseconds(cloud.header.stamp) for cloud in bench.clouds()] == stamps[-1:]
+    assert [stamp_of(cloud) for cloud in bench.clouds()] == stamps[-1:]
     assert len(bench.node.detector.images) == 1
     values = {entry.key: entry.value for entry in bench.diagnosis(level=Level.OK).values}
     assert values["refused"] == "3 superseded" and values["arrived"] == "4"
@@ -197,7 +197,7 @@ def test_an_annotated_image_is_made_only_for_those_who_listen(probe, monkeypatch
     probe.wait_for(lambda: probe.got["/keypoint_detector/annotated"])
     (image,) = probe.got["/keypoint_detector/annotated"]
     shown = np.frombuffer(image.data, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3)
-    assert (image.encoding, image.step, ros.nanoseconds(image.header.stamp)) == ("rgb8", 3 * WIDTH, stamp)
+    assert (image.encoding, image.step, stamp_of(image)) == ("rgb8", 3 * WIDTH, stamp)
     changed = (shown != color).any(axis=2)
     assert changed.any() and not changed[:, -5:].any()
 

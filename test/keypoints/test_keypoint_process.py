@@ -19,9 +19,9 @@ def test_a_signal_ends_the_node_cleanly(number):
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        ("jaws:=middle", "jaws is 'middle'"),
+        ("jaws:=middle", "jaws: got 'middle'"),
         ("jaw_file:=no_such_jaw", "no_such_jaw"),
-        ("finder:=guess", "finder is 'guess'"),
+        ("finder:=guess", "finder: got 'guess'"),
         ("model:=no_such_folder", "no_such_folder"),
         ("T_gripper_camera:=[0.0, 0.0, 0.1]", "quaternion of shape"),
         ("T_gripper_camera:=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0]", "norm"),

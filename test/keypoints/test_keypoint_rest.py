@@ -10,7 +10,7 @@ from node_fakes import ros_domain
 from sensor_msgs.msg import PointCloud2
 
 from finforce.health import Level
-from finforce.ros import node as ros
+from finforce.messages import stamp_of
 from finforce.skipping import IDLE, LATE, UNHEARD
 from finforce_keypoints.settings import ANNOTATED
 
@@ -69,8 +69,8 @@ def test_an_image_in_which_nothing_moved_is_answered_with_its_own_stamp_and_with
     for stamp in stamps:
         bench.color(stamp)
     bench.wait_for_clouds(2)
-    assert [ros.nanoseconds(cloud.header.stamp) for cloud in bench.clouds()] == stamps
-    assert [ros.nanoseconds(pose.header.stamp) for pose in bench.poses("right")] == stamps
+    assert [stamp_of(cloud) for cloud in bench.clouds()] == stamps
+    assert [stamp_of(pose) for pose in bench.poses("right")] == stamps
     first, second = (np.frombuffer(cloud.data, dtype=np.uint8) for cloud in bench.clouds())
     assert np.array_equal(first, second) and not bench.node.detector.images
 
@@ -112,7 +112,7 @@ def test_the_image_that_shows_a_motion_is_answered_though_its_depth_came_first(p
     bench.depth(stamp)
     bench.color(stamp)
     probe.wait_for(lambda: bench.node.detector.images)
-    probe.wait_for(lambda: ros.nanoseconds(bench.clouds()[-1].header.stamp) == stamp)
+    probe.wait_for(lambda: stamp_of(bench.clouds()[-1]) == stamp)
 
 
 def test_a_depth_image_that_comes_after_the_motion_is_taken_too(probe):

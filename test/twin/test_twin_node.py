@@ -15,6 +15,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import String
 from twin_fakes import FakeLens
 
+from finforce.messages import stamp_of
 from finforce.pointcloud import decode_columns
 from finforce.ros import node as ros
 from finforce.settings import ParameterError
@@ -86,9 +87,7 @@ def test_the_parts_of_an_image_have_one_stamp_and_stamps_are_those_of_now(probe)
     node = start(probe, loop=False)
     play(probe, node)
     probe.wait_for(lambda: node.is_over and len(probe.got[INFO]) == 6)
-    stamps = {
-        topic: [ros.nanoseconds(message.header.stamp) for message in probe.got[topic]] for topic in (COLOR, DEPTH, INFO)
-    }
+    stamps = {topic: [stamp_of(message) for message in probe.got[topic]] for topic in (COLOR, DEPTH, INFO)}
     assert stamps[COLOR] == stamps[DEPTH] == stamps[INFO]
     assert (np.diff(stamps[COLOR]) > 0).all()
     now = node.get_clock().now().nanoseconds
@@ -154,7 +153,7 @@ def test_images_of_a_gripper_are_stamped_as_those_of_a_script_and_never_alike(pr
     node = start_live(probe, grasp, tmp_path / "gripper")
     node.film()
     probe.wait_for(lambda: min(len(probe.got[topic]) for topic in (COLOR, DEPTH, INFO)) >= 8)
-    stamps = [[ros.nanoseconds(message.header.stamp) for message in probe.got[topic][:8]] for topic in (COLOR, DEPTH)]
+    stamps = [[stamp_of(message) for message in probe.got[topic][:8]] for topic in (COLOR, DEPTH)]
     assert stamps[0] == stamps[1] and (np.diff(stamps[0]) > 0).all()
     for topic in (COLOR, DEPTH):  # nor when some images between are lost
         assert len({message.data.tobytes() for message in probe.got[topic]}) == len(probe.got[topic])
@@ -186,7 +185,7 @@ def test_a_scene_begins_again(probe):
     probe.wait_for(lambda: len(probe.got[COLOR]) > 7)
     assert not node.is_over
     assert probe.got[COLOR][6].data == probe.got[COLOR][0].data
-    assert ros.nanoseconds(probe.got[COLOR][6].header.stamp) > ros.nanoseconds(probe.got[COLOR][5].header.stamp)
+    assert stamp_of(probe.got[COLOR][6]) > stamp_of(probe.got[COLOR][5])
 
 
 @pytest.mark.parametrize(
