@@ -19,6 +19,7 @@ test: .venv/.$(ROS)-test
 lint: .venv/.$(ROS)-lint
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
+	.venv/bin/lint-imports
 
 bench: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main bench --json report/bench.json

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,14 +10,15 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, ImageError
 from finforce.messages import camera_from_info, depth_from_image, mask_from_image, same_camera, stamp_of
-from finforce.stamps import SECOND
+from finforce.stamps import SECOND, Synchronizer
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.parameters import ContactParameters
 from finforce_contact.pose.source import ObjectPose
 from finforce_contact.pose.tracker import PoseTracker
 from finforce_contact.settings import TrackerSettings
 
-DEPTH = 32  # images that may wait for their mask, which a segmentation takes a while to find
+DEPTH, MASK = "depth images", "masks"
+KEPT = 32  # images that may wait for their mask, which a segmentation takes a while to find
 
 
 class StampedPose(NamedTuple):
@@ -68,8 +68,7 @@ class CameraFeed:
         self.latest: ObjectPose | None = None
         self._tracker: PoseTracker | None = None
         self._lost = True
-        self._depths: deque[Any] = deque(maxlen=DEPTH)
-        self._masks: deque[Any] = deque(maxlen=DEPTH)
+        self._images = Synchronizer({DEPTH: KEPT, MASK: KEPT}, self._tolerance)
 
     def set_object(self, mesh: ObjectMesh | None, guesses: Sequence[NDArray] = ()) -> None:
         """Look for another object from now on, at first near the given poses (4, 4)."""
@@ -96,16 +95,16 @@ class CameraFeed:
             PoseLostError: the object was not found again.
         """
         stamp = stamp_of(image)
-        self._depths.append(image)
-        mask = self._find(self._masks, stamp)
+        self._images.add(DEPTH, stamp, image)
+        mask = self._images.find(MASK, stamp)
         if rests or self._mesh is None:
             return None
         if self._lost and mask is not None:
-            return self._locate(image, mask)
+            return self._locate(image, mask.value)
         if self._tracker is None or self.latest is None:
             return None
         self._lost = True  # until it was found again
-        found = None if mask is None else self._decode_mask(mask)
+        found = None if mask is None else self._decode_mask(mask.value)
         self.latest = self._tracker.track(SECOND * stamp, self._decode_depth(image), found)
         self._lost = False
         return StampedPose(stamp, self.latest)
@@ -118,10 +117,11 @@ class CameraFeed:
             ImageError: one of the images cannot be used.
             PoseLostError: the object was not found.
         """
-        self._masks.append(image)
-        depth = self._find(self._depths, stamp_of(image))
+        stamp = stamp_of(image)
+        self._images.add(MASK, stamp, image)
+        depth = self._images.find(DEPTH, stamp)
         wanted = self._lost and self._mesh is not None and depth is not None
-        return self._locate(depth, image) if wanted else None
+        return self._locate(depth.value, image) if wanted else None
 
     def view(self) -> MaskedView:
         """Return the newest depth image that has a mask.
@@ -129,17 +129,17 @@ class CameraFeed:
         Raises:
             ImageError: there is none.
         """
-        for depth in reversed(self._depths):
-            mask = self._find(self._masks, stamp_of(depth))
-            if mask is not None:
-                return MaskedView(
-                    stamp=stamp_of(depth),
-                    depth=self._decode_depth(depth),
-                    mask=self._decode_mask(mask),
-                    camera=self._known_camera(),
-                )
-        have = f"{len(self._depths)} depth images and {len(self._masks)} masks"
-        raise ImageError(f"no depth image with its mask: {have} are here, expected a pair of equal stamps")
+        pair = self._images.newest_pair(DEPTH, MASK)
+        if pair is None:
+            have = " and ".join(f"{len(self._images.entries(name))} {name}" for name in (DEPTH, MASK))
+            raise ImageError(f"no depth image with its mask: {have} are here, expected a pair of equal stamps")
+        depth, mask = pair
+        return MaskedView(
+            stamp=depth.stamp,
+            depth=self._decode_depth(depth.value),
+            mask=self._decode_mask(mask.value),
+            camera=self._known_camera(),
+        )
 
     def _locate(self, depth: Any, mask: Any) -> StampedPose:
         tracker = self._tracker = self._tracker or PoseTracker(self._mesh, self._known_camera(), self._settings)
@@ -159,8 +159,3 @@ class CameraFeed:
         if self._camera is None:
             raise ImageError("a depth image came, but no camera_info yet")
         return self._camera
-
-    def _find(self, images: deque[Any], stamp: int) -> Any | None:
-        """Return the kept image that lies nearest to a stamp [ns], None if none belongs to it."""
-        nearest = min(images, key=lambda image: abs(stamp_of(image) - stamp), default=None)
-        return nearest if nearest is not None and abs(stamp_of(nearest) - stamp) <= self._tolerance else None

@@ -9,10 +9,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.gripper_frames import SIDES, jaw_in_gripper
+from finforce.stamps import Synchronizer
+
 Side = Literal["left", "right"]
 
-# right_jaw is gripper_base turned by 180 degrees about z; left_jaw has its orientation
-R_GRIPPER_JAW = {"left": np.diag([1.0, 1.0, 1.0]), "right": np.diag([-1.0, -1.0, 1.0])}
+R_GRIPPER_JAW = {side: jaw_in_gripper(side, 0.0)[:3, :3] for side in SIDES}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +60,8 @@ class ForcePairing:
     """
 
     def __init__(self, side: Side, depth: int = 16) -> None:
-        self._own_is_left = side == "left"
-        self._depth = depth
-        self._waiting: dict[bool, dict[int, NDArray[np.float64]]] = {True: {}, False: {}}
+        self._own, self._other = side, "right" if side == "left" else "left"
+        self._forces = Synchronizer({self._own: depth, self._other: depth})
         self._heard = -float("inf")
 
     @property
@@ -72,12 +73,10 @@ class ForcePairing:
         """Take a force (3,) [N] in its jaw's frame; return the grasp once the stamp has both forces."""
         if not own:
             self._heard = monotonic()
-        other = self._waiting[not own].pop(stamp, None)
-        if other is None:
-            waiting = self._waiting[own]
-            waiting[stamp] = force
-            if len(waiting) > self._depth:
-                waiting.pop(next(iter(waiting)))
+        mine, peer = (self._own, self._other) if own else (self._other, self._own)
+        found = self._forces.take(peer, stamp)
+        if found is None:
+            self._forces.add(mine, stamp, force)
             return None
-        mine_is_left = self._own_is_left == own
-        return combine_forces(force, other) if mine_is_left else combine_forces(other, force)
+        forces = {mine: force, peer: found.value}
+        return combine_forces(forces["left"], forces["right"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from time import monotonic
 from typing import Any
@@ -12,12 +11,13 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, ImageError
 from finforce.messages import camera_from_info, check_frame, color_from_image, depth_from_image, same_camera, stamp_of
-from finforce.stamps import SECOND
+from finforce.stamps import SECOND, Synchronizer
 from finforce_keypoints.errors import SyncError
 from finforce_keypoints.images import ImagePair, ImageWatch, RgbdImage, check_image
 from finforce_keypoints.parameters import DetectorParameters
 
 SILENCE = 1.0  # s without an image, after which another colour topic may be the camera's
+COLOR, DEPTH = "color", "depth"
 WAITING = 3  # colour images that may wait for their depth: a tenth of a second at 30 Hz
 
 
@@ -53,11 +53,11 @@ class CameraFeed:
 
     def reset(self) -> None:
         """Forget all images; intrinsics and topic stay."""
+        self._images = Synchronizer({COLOR: None, DEPTH: WAITING + 1}, self._tolerance)
         self._forget_colors()
-        self._depths: deque[Any] = deque(maxlen=WAITING + 1)
 
     def _forget_colors(self) -> None:
-        self._colors: deque[Any] = deque()
+        self._images.reset(COLOR)
         self._watch = ImageWatch(self._parameters.frozen_after)
 
     def take_info(self, info: Any) -> None:
@@ -89,33 +89,32 @@ class CameraFeed:
         """
         if not self.listens(topic):
             return None
-        self._colors.append(message)
-        found = self._match()
-        if found is None and len(self._colors) > WAITING:
-            raise self._missing_depth(stamp_of(self._colors.popleft()))
+        self._images.add(COLOR, stamp_of(message), message)
+        found, waiting = self._match(), self._images.entries(COLOR)
+        if found is None and len(waiting) > WAITING:
+            raise self._missing_depth(waiting.popleft().stamp)
         return found
 
     def take_depth(self, message: Any) -> ImagePair | None:
         """Take a depth image and return it with its colour; None while that has not come."""
-        self._depths.append(message)
+        self._images.add(DEPTH, stamp_of(message), message)
         return self._match()
 
     def _match(self) -> ImagePair | None:
         """Return the newest colour image that has its depth, and pass the older ones over."""
-        for place in reversed(range(len(self._colors))):
-            color = self._colors[place]
-            depth = min(self._depths, key=lambda image: _distance(image, stamp_of(color)), default=None)
-            if depth is not None and _distance(depth, stamp_of(color)) <= self._tolerance:
-                self.passed += place
-                for _ in range(place + 1):
-                    self._colors.popleft()
-                return ImagePair(stamp_of(color), color, depth)
-        return None
+        pair = self._images.newest_pair(COLOR, DEPTH)
+        if pair is None:
+            return None
+        color, depth = pair
+        waiting = self._images.entries(COLOR)
+        while waiting.popleft() is not color:
+            self.passed += 1
+        return ImagePair(color.stamp, color.value, depth.value)
 
     def pass_over(self) -> None:
         """Forget the colour images that wait: one after them has been answered."""
-        self.passed += len(self._colors)
-        self._colors.clear()
+        self.passed += len(self._images.entries(COLOR))
+        self._images.reset(COLOR)
 
     def read_color(self, message: Any) -> NDArray[np.uint8]:
         """Return the colours (h, w, 3) of a colour image.
@@ -148,7 +147,7 @@ class CameraFeed:
 
     def _missing_depth(self, stamp: int) -> SyncError:
         """Return the error of a colour image [ns] that has waited long enough."""
-        nearest = min((_distance(image, stamp) for image in self._depths), default=None)
+        nearest = self._images.nearest(DEPTH, stamp)
         limit = f"{1e3 * self._parameters.sync_tolerance:g} ms"
         if nearest is None:
             return SyncError(
@@ -157,10 +156,6 @@ class CameraFeed:
             )
         return SyncError(
             f"no depth image within {limit} of the colour image at {SECOND * stamp:.3f} s, the nearest lies "
-            f"{1e3 * SECOND * nearest:.1f} ms away; start the camera with enable_sync:=true or raise sync_tolerance"
+            f"{1e3 * SECOND * abs(nearest.stamp - stamp):.1f} ms away; start the camera with enable_sync:=true or "
+            "raise sync_tolerance"
         )
-
-
-def _distance(message: Any, stamp: int) -> int:
-    """Return how far a message's stamp is from another [ns]."""
-    return abs(stamp_of(message) - stamp)

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
+from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.settings import TimeParameters, check_bounds, setting
 from finforce.transforms import pose_from_quaternion, pose_numbers
 from finforce_keypoints.errors import DetectorSettingsError
-from finforce_keypoints.geometry.gripper import ROBOT_CAMERA
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw

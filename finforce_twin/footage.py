@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics
+from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA
 from finforce.stamps import NANOSECONDS
 from finforce.transforms import invert_pose
-from finforce_keypoints.geometry.gripper import BENCH_CAMERA, ROBOT_CAMERA
 from finforce_twin.errors import ScenarioError
 from finforce_twin.gripper.gripper import TwinGripper, TwinState
 from finforce_twin.mechanics.assembly import Assembly

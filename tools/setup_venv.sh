@@ -83,7 +83,7 @@ ros=wheels
 if has_sourced_ros; then ros=sourced; fi
 if ! fits "$venv/bin/python" || [ "$(cat "$venv/.ros" 2>/dev/null)" != "$ros" ]; then make_venv; fi
 case $purpose in
-  lint) install ruff ;;
+  lint) install ruff import-linter ;;
   run) check_system_libraries; install_product "" ;;
   test) check_system_libraries; install_product test ;;
   build) install_product ""; install colcon-common-extensions ;;

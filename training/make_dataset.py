@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from finforce.camera import CameraIntrinsics
+from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
-from finforce_keypoints.geometry.gripper import BENCH_CAMERA, ROBOT_CAMERA
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, intersect_plane, map_picture, take_picture
 from finforce_twin.gripper.gripper import JawState, TwinState
 from finforce_twin.rendering.bodies import DrawnJaw, draw_jaws

@@ -12,9 +12,9 @@ import yaml
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
+from finforce.gripper_frames import jaw_in_camera, jaw_in_gripper
 from finforce.transforms import pose_from_quaternion
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.geometry.gripper import jaw_in_camera, jaw_in_gripper
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, intersect_plane, map_picture, take_picture
 from training.dataset import MARGIN, LabelledPictures
 from training.errors import LabelFileError

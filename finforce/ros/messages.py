@@ -21,10 +21,9 @@ from visualization_msgs.msg import Marker
 
 from finforce.errors import ObservationError
 from finforce.health import Report
-from finforce.messages import check_frame
-from finforce.pointcloud import encode_cloud
+from finforce.messages import check_cloud, check_frame
+from finforce.pointcloud import decode_columns, encode_cloud
 from finforce.stamps import NANOSECONDS
-from finforce_ifea.messages import contact_from_cloud
 
 MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
 
@@ -122,9 +121,9 @@ def is_touching(cloud: PointCloud2, frame: str) -> bool:
 
     Raises:
         ObservationError: the frame, the height, the fields or the buffer are wrong.
-        ContactError: a coordinate or a weight is not finite.
     """
-    return bool(contact_from_cloud(cloud, frame, free=False).touching)
+    check_cloud(cloud, frame, "the contact")
+    return bool((decode_columns(cloud, ("touching",))["touching"] == 1).any())
 
 
 def joint_state_message(

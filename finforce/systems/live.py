@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import yaml
 
+from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.systems.options import BenchOptions, GripperOptions, RobotOptions, SolverOptions
 from finforce.systems.processes import (
     Include,
@@ -22,7 +23,7 @@ from finforce.systems.processes import (
     solver_process,
     viewer,
 )
-from finforce_keypoints.parameters import DetectorParameters
+from finforce.transforms import pose_numbers
 
 # Fast DDS loses most images without it; as finforce.ros.node gives it to our own nodes
 TRANSPORT = Path(__file__).parents[1] / "ros" / "fastdds.xml"
@@ -247,7 +248,7 @@ def camera_pose(options: SolverOptions) -> Sequence[float]:
     """
     asked = read_numbers("T_gripper_camera", options.T_gripper_camera, 7)
     told = _parameters_of(options.parameter_file, "keypoint_detector").get("T_gripper_camera")
-    return asked or told or DetectorParameters().T_gripper_camera
+    return asked or told or pose_numbers(ROBOT_CAMERA)
 
 
 def _parameters_of(file: str, node: str) -> Mapping[str, Any]:

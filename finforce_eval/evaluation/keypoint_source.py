@@ -209,8 +209,8 @@ def _parse_parameters(texts: Sequence[str]) -> dict[str, Any]:
 
 def _parse_extrinsics(text: str) -> list[float]:
     """Return x, y, z [m], qx, qy, qz, qw of a camera by its name or its numbers."""
+    from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA
     from finforce.transforms import pose_numbers
-    from finforce_keypoints.geometry.gripper import BENCH_CAMERA, ROBOT_CAMERA
 
     known = {"bench": BENCH_CAMERA, "robot": ROBOT_CAMERA}
     if text in known:

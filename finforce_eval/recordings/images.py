@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, IntrinsicsError
 from finforce.errors import ObservationError
 from finforce.messages import camera_from_info, read_stamp, same_camera
+from finforce.stamps import find_nearest
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagReader, check_types, open_bag
 from finforce_eval.recordings.image_messages import (
@@ -138,7 +139,7 @@ def find_images(bag: BagReader, source: Path, pairing: int = PAIRED) -> ImageTra
     for raw in bag.raw((color, depth)):
         found[raw.topic].append(read_stamp(raw.data))
     stamps = {topic: _rising(times, topic, bag.name) for topic, times in found.items()}
-    nearest = _nearest(stamps[depth], stamps[color])
+    nearest = find_nearest(stamps[depth], stamps[color])
     paired = np.abs(stamps[depth][nearest] - stamps[color]) <= pairing
     if not paired.any():
         raise RecordingError(f"{bag.name}: no depth image on {depth} within {pairing / 10**6:g} ms of one on {color}")
@@ -190,10 +191,3 @@ def _rising(stamps: Sequence[int], topic: str, name: str) -> NDArray[np.int64]:
     if wrong.size:
         raise RecordingError(f"{name}: the stamps of {topic} do not rise at message {wrong[0] + 1}")
     return times
-
-
-def _nearest(times: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for each stamp the index of the nearest of rising times."""
-    after = np.clip(np.searchsorted(times, stamps), 0, len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(stamps - times[before] <= times[after] - stamps, before, after)

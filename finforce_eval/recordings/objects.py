@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.errors import PoseError
+from finforce.stamps import find_nearest
 from finforce.transforms import invert_pose, pose_from_quaternion
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.tracks import PoseTrack, Recording
@@ -97,7 +98,7 @@ def track_object(recording: Recording, side: str) -> ObjectTrack:
         return ObjectTrack(stamps=stamps, poses=T_parent_object)
     jaw = _require_jaw_poses(recording, side, objects.frame_id)
     T_camera_jaw = _matrices(jaw, f"/{side}/jaw_pose", recording.name)
-    nearest = _nearest(jaw.stamps, stamps)
+    nearest = find_nearest(jaw.stamps, stamps)
     paired = np.abs(jaw.stamps[nearest] - stamps) <= PAIRED
     if not paired.any():
         raise RecordingError(f"{recording.name}: no /{side}/jaw_pose within {PAIRED // 10**6} ms of any /object_pose")
@@ -147,13 +148,3 @@ def _matrices(track: PoseTrack, topic: str, name: str) -> NDArray[np.float64]:
         except PoseError as error:
             raise RecordingError(f"{name}: {topic} message {index}: {error}") from error
     return np.stack(poses)
-
-
-def _nearest(times: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for each stamp the index of the nearest time; the times may be in any order."""
-    order = np.argsort(times, kind="stable")
-    rising = times[order]
-    after = np.clip(np.searchsorted(rising, stamps), 0, len(rising) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.where(stamps - rising[before] <= rising[after] - stamps, before, after)
-    return order[closer]

@@ -70,8 +70,8 @@ def build_finder(
     jaws: Mapping[str, Jaw], parameters: DetectorParameters, settings: DetectorSettings, dots: DotSettings | None = None
 ) -> BuiltFinder:
     """Return what finds the pixels of key points; see `build_detector`."""
+    from finforce.gripper_frames import OpeningRange
     from finforce_keypoints.detectors.side_plane import PlaneFinder
-    from finforce_keypoints.geometry.gripper import OpeningRange
 
     opening = OpeningRange(nearest=settings.opening_min, farthest=settings.opening_max)
     if parameters.finder == "dots":

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
+from finforce.gripper_frames import OpeningRange
 from finforce_keypoints.detectors.pixel_finder import REFERENCE, PixelFinding
 from finforce_keypoints.errors import ModelError
-from finforce_keypoints.geometry.gripper import OpeningRange
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from finforce.camera import CameraIntrinsics, project
+from finforce.gripper_frames import SIDES, jaw_in_camera
 from finforce.transforms import check_pose, move_pose
 from finforce_keypoints.errors import GeometryError
-from finforce_keypoints.geometry.gripper import SIDES, jaw_in_camera
 
 LEAST_POINTS = 8
 _OUTLIER = 2.0  # [px] beyond which a point loses its weight

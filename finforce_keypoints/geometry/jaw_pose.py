@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.gripper_frames import jaw_in_camera
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.geometry.gripper import jaw_in_camera
 from finforce_keypoints.settings import DetectorSettings
 
 _BENT_AT = 0.010  # height for which the bending is given [m]

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.gripper_frames import BENCH_ORIGIN_X
 from finforce_contact.localization.section import cut_outline
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.jaw.meshing import MeshDensity
-from finforce_keypoints.geometry.gripper import BENCH_ORIGIN_X
 from finforce_twin.errors import ScenarioError
 from finforce_twin.mechanics.balance import HeldObject, Setting
 from finforce_twin.mechanics.material import PrintedMaterial, draw_material

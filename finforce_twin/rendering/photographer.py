@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project
+from finforce.gripper_frames import jaw_in_camera
 from finforce.transforms import invert_pose
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_keypoints.geometry.gripper import jaw_in_camera
 from finforce_twin.rendering.bodies import DrawnJaw, Wardrobe, draw_occluders, dress_jaw, dress_object, dress_palm
 from finforce_twin.rendering.lighting import Look, draw_look
 from finforce_twin.rendering.render import Picture, Stage, Window

@@ -88,7 +88,7 @@ class TrackingBench(ContactBench):
         self.info.publish(camera_info(stamp, self.camera))
         self.probe.wait_for(lambda: feed._camera is not None)
         self.depth.publish(depth_image(stamp, depth))
-        self.probe.wait_for(lambda: any(stamp_of(kept) == stamp for kept in feed._depths))
+        self.probe.wait_for(lambda: any(kept.stamp == stamp for kept in feed._images.entries("depth images")))
         if masked:
             self.mask.publish(mask_image(stamp, mask))
         return stamp

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from finforce.gripper_frames import BENCH_CAMERA
 from finforce.settings import TimeParameters
 from finforce.systems.launch import options_from_texts
 from finforce.systems.live import bench_processes
@@ -25,7 +26,6 @@ from finforce_eval.replay.parameters import PlayerParameters
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.detectors.dots import DotSettings
-from finforce_keypoints.geometry.gripper import BENCH_CAMERA
 from finforce_keypoints.parameters import DetectorParameters
 from finforce_keypoints.settings import DetectorSettings
 from finforce_twin.parameters import TwinParameters

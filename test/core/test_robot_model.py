@@ -8,10 +8,10 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from finforce.gripper_frames import SIDES, jaw_in_gripper
 from finforce_driver.parameters import DriverParameters
 from finforce_driver.settings import GripperSettings
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.geometry.gripper import SIDES, jaw_in_gripper
 
 URDF = Path(__file__).resolve().parents[2] / "urdf"
 GRIPPER, ARM = URDF / "finray_gripper.urdf", URDF / "gen3_finray.urdf.xacro"

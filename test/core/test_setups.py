@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
+from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.systems.live import (
     SIM_OBJECT,
     TRANSPORT,
@@ -20,7 +21,6 @@ from finforce.systems.processes import Include
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.parameters import ContactParameters
 from finforce_driver.parameters import DriverParameters
-from finforce_keypoints.geometry.gripper import ROBOT_CAMERA
 from finforce_keypoints.parameters import DetectorParameters
 from finforce_twin.parameters import TwinParameters
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from rgbd_fakes import CAMERA, MESH, FakeGripper, FakePhotographer
 
+from finforce.gripper_frames import BENCH_CAMERA
 from finforce.messages import read_stamp
 from finforce_eval.bench.film import MASK_TOPIC, OBJECT_TOPIC, film_images, film_keypoints, film_mask, thin_messages
 from finforce_eval.bench.scenes import EVERY_RATE, FINE_RATE, START, SmoothGripper, slot_of
@@ -13,7 +14,6 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.image_messages import IMAGE
 from finforce_eval.recordings.twin_writer import write_footage
 from finforce_eval.replay.playback import RawMessage
-from finforce_keypoints.geometry.gripper import BENCH_CAMERA
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_twin.footage import Footage
 from finforce_twin.rendering.photographer import Setting

@@ -20,7 +20,7 @@ def test_a_signal_ends_the_node_cleanly(number):
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        ("jaw_name:=middle", "jaw_name is 'middle'"),
+        ("jaw_name:=middle", "jaw_name: got 'middle'"),
         ("jaw_file:=no_such_jaw", "no_such_jaw"),
         ("max_age:=-1.0", "max_age"),
         ("max_age:=soon", "max_age"),

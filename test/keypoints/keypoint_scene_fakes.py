@@ -6,12 +6,12 @@ from functools import lru_cache
 import numpy as np
 
 from finforce.camera import CameraIntrinsics, project
+from finforce.gripper_frames import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, jaw_in_camera
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.detectors.pixel_finder import PixelFinding
-from finforce_keypoints.geometry.gripper import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, jaw_in_camera
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.settings import DetectorSettings
 from finforce_twin.rendering.depth_camera import D405_DISTORTION, DepthNoise, disturb_depth

@@ -8,10 +8,10 @@ from keypoint_fakes import bend, draw_dots
 
 from finforce.camera import CameraIntrinsics
 from finforce.errors import MissingDependencyError
+from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detectors.dots import DotFinder, DotSettings, find_dots
 from finforce_keypoints.errors import DetectorSettingsError
-from finforce_keypoints.geometry.gripper import ROBOT_CAMERA, jaw_in_camera
 from finforce_keypoints.images import RgbdImage
 
 CAMERA = CameraIntrinsics(

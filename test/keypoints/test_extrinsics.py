@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from finforce.camera import project
+from finforce.gripper_frames import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import move_pose, pose_from_quaternion, pose_numbers, rotation_between
 from finforce_eval.cli.main import main
 from finforce_eval.recordings.twin_writer import write_footage
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.geometry.extrinsics import SeenJaw, find_extrinsics
-from finforce_keypoints.geometry.gripper import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, jaw_in_camera
 from finforce_twin.footage import Footage, build_footage
 from finforce_twin.rendering.depth_camera import build_d405_vga
 from finforce_twin.scenes.scenarios import build_scenario

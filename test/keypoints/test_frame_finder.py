@@ -5,9 +5,9 @@ import pytest
 from keypoint_fakes import COLOURS, Fake, paint, small_jaws, write_model
 
 from finforce.camera import CameraIntrinsics
+from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_keypoints.detectors.whole_image import FrameFinder, check_offsets
 from finforce_keypoints.errors import DetectionError
-from finforce_keypoints.geometry.gripper import ROBOT_CAMERA, jaw_in_camera
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.networks.decoding import Peaks
 from finforce_keypoints.networks.model import KeypointModel

@@ -3,9 +3,8 @@ import pytest
 from keypoint_scene_fakes import CAMERA, VIEWS, FakeScene
 
 from finforce.camera import project
-from finforce.transforms import check_pose
-from finforce_keypoints.errors import GeometryError
-from finforce_keypoints.geometry.gripper import (
+from finforce.errors import PoseError
+from finforce.gripper_frames import (
     BENCH_CAMERA,
     BENCH_ORIGIN_X,
     ROBOT_CAMERA,
@@ -13,6 +12,7 @@ from finforce_keypoints.geometry.gripper import (
     jaw_in_gripper,
     look_at,
 )
+from finforce.transforms import check_pose
 
 
 def test_the_jaws_close_towards_each_other():
@@ -51,5 +51,5 @@ def test_a_camera_looks_at_its_target_with_its_rows_along_the_closing_axis():
 
 
 def test_an_unknown_side_is_refused():
-    with pytest.raises(GeometryError, match="'middle'.*left.*right"):
+    with pytest.raises(PoseError, match="'middle'.*left.*right"):
         jaw_in_gripper("middle", 0.0)

@@ -3,7 +3,7 @@ import pytest
 from keypoint_scene_fakes import CAMERA, FakeScene
 
 from finforce.camera import project
-from finforce_keypoints.geometry.gripper import jaw_in_camera
+from finforce.gripper_frames import jaw_in_camera
 from finforce_keypoints.geometry.jaw_pose import Origin, OriginFinder, OriginTrack
 from finforce_keypoints.geometry.side_fit import rays_through
 from finforce_keypoints.settings import DetectorSettings

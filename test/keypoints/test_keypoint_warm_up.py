@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from keypoint_scene_fakes import bare_image, build
 
+from finforce.gripper_frames import jaw_in_camera
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.geometry import jaw_localizer as jaw_localizer
-from finforce_keypoints.geometry.gripper import jaw_in_camera
 from finforce_keypoints.geometry.reference_patch import ReferencePatch
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from finforce.camera import project
+from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detectors.side_plane import PlaneFinder, grid_from_metadata
 from finforce_keypoints.errors import ModelError
-from finforce_keypoints.geometry.gripper import ROBOT_CAMERA, jaw_in_camera
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.networks.decoding import Peaks

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from finforce.camera import project
+from finforce.gripper_frames import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.geometry.gripper import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, jaw_in_camera
 from finforce_keypoints.geometry.side_picture import (
     PlaneGrid,
     intersect_plane,

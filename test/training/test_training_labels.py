@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 import training
+from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.errors import NamingError
-from finforce_keypoints.geometry.gripper import ROBOT_CAMERA, jaw_in_camera
 from finforce_keypoints.geometry.side_picture import PlaneGrid, project_plane
 from training.dataset import MARGIN
 from training.errors import LabelFileError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finforce.camera import project
-from finforce_keypoints.geometry.gripper import ROBOT_CAMERA
+from finforce.gripper_frames import ROBOT_CAMERA
 from finforce_twin.gripper.gripper import TwinGripper
 from finforce_twin.rendering.bodies import DrawnJaw
 from finforce_twin.rendering.depth_camera import build_d405_vga

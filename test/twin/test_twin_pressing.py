@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from finforce.gripper_frames import BENCH_ORIGIN_X
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_ifea.grasp_force import R_GRIPPER_JAW, combine_forces
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.relaxation import apply_relaxation
-from finforce_keypoints.geometry.gripper import BENCH_ORIGIN_X
 from finforce_twin.errors import GraspError
 from finforce_twin.gripper.gripper import TwinGripper
 from finforce_twin.gripper.pressing import JAMMED, PressedGrasp, RelaxedGrasp

@@ -6,7 +6,7 @@ import numpy as np
 from rgbd_fakes import CAMERA
 
 from finforce.camera import project
-from finforce_keypoints.geometry.gripper import ROBOT_CAMERA, jaw_in_camera
+from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_twin.rendering.photographer import Setting, Shot, TrueKeypoints, View
 
 CAMERA_POSE = ROBOT_CAMERA

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from finforce.errors import PoseError
 from finforce.transforms import invert_pose, pose_from_quaternion
-from finforce_keypoints.errors import GeometryError
 
 SIDES = ("left", "right")
 
@@ -20,10 +20,10 @@ def jaw_in_gripper(side: str, origin_x: float) -> NDArray:
     The left jaw has the orientation of the gripper base, the right jaw is that turned by 180 degrees about z.
 
     Raises:
-        GeometryError: the side is neither "left" nor "right".
+        PoseError: the side is neither "left" nor "right".
     """
     if side not in SIDES:
-        raise GeometryError(f"side: got {side!r}, expected 'left' or 'right'")
+        raise PoseError(f"side: got {side!r}, expected 'left' or 'right'")
     T = np.eye(4) if side == "left" else np.diag([-1.0, -1.0, 1.0, 1.0])
     T[0, 3] = origin_x
     return T
