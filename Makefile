@@ -14,7 +14,7 @@ demo: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main demo --report report
 
 test: .venv/.$(ROS)-test
-	$(PYTHON) -m pytest
+	$(PYTHON) -m pytest -n auto
 
 lint: .venv/.$(ROS)-lint
 	$(PYTHON) -m ruff check .

@@ -60,8 +60,8 @@ setup(
         "can": ["python-can>=4.3,!=4.6.0"],
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
-        "test": ["pytest", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0"],
-        "lint": ["ruff"],
+        "test": ["pytest", "pytest-xdist", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0"],
+        "lint": ["ruff", "import-linter"],
     },
     entry_points={
         "console_scripts": [

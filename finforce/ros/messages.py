@@ -123,7 +123,7 @@ def is_touching(cloud: PointCloud2, frame: str) -> bool:
         ObservationError: the frame, the height, the fields or the buffer are wrong.
     """
     check_cloud(cloud, frame, "the contact")
-    return bool((decode_columns(cloud, ("touching",))["touching"] == 1).any())
+    return bool(np.any(decode_columns(cloud, (), ("touching",)).get("touching", 0) == 1))
 
 
 def joint_state_message(

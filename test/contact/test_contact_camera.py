@@ -191,7 +191,7 @@ def test_reconstruct_finds_the_object_in_the_image(probe, camera, scene):
     answer = call(probe, "contact_estimator/reconstruct")
     assert not answer.success and "no depth image" in answer.message
     bench.see(scene, masked=True)
-    probe.wait_for(lambda: bench.node.session._camera._masks)
+    probe.wait_for(lambda: bench.node.session._camera._images.entries("masks"))
     answer = call(probe, "contact_estimator/reconstruct")
     assert answer.success and "primitive" in answer.message, answer.message
     size = np.sort(np.ptp(bench.node.session.mesh.vertices, axis=0))
