@@ -56,8 +56,7 @@ setup(
             "ros-jazzy-common-interfaces",
             "ros-jazzy-ament-index-python",
         ],
-        # other CAN adapters than SLCAN ones: SocketCAN and more; 4.6.0 cannot open SLCAN
-        "can": ["python-can>=4.3,!=4.6.0"],
+        "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
         "test": ["pytest", "pytest-xdist", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0"],

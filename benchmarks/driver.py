@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import Command, decode_move, split_identifier
 from finforce_driver.can.serial_bus import SerialBus
 from finforce_driver.errors import DriverError
@@ -65,12 +65,12 @@ class WatchedBus(SerialBus):
         super().__init__(port)
         self.orders: list[tuple[Any, float]] = []
 
-    def send(self, frame: Frame) -> None:
+    def send(self, message: CanMessage) -> None:
         """Send, and keep orders."""
         began = time.monotonic()
-        super().send(frame)
-        if split_identifier(frame.id).command == Command.MOVE and frame.data:
-            self.orders.append((decode_move(frame), began))
+        super().send(message)
+        if split_identifier(message.id).command == Command.MOVE and message.data:
+            self.orders.append((decode_move(message), began))
 
 
 @contextmanager

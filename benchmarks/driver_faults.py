@@ -22,7 +22,7 @@ from driver_oracle import Guard, Oracle, Tape
 from driver_tally import Tally, print_tally, tally_json
 from tqdm import tqdm
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import Command, decode_move, split_identifier
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, draw_plan
@@ -32,7 +32,7 @@ from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
 from finforce_driver.errors import DriverError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
-from finforce_driver.state import GripperState, Outcome, Phase
+from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_eval.bench.bench import describe_machine, write_figures
 
 PER_RUN = 100
@@ -78,7 +78,7 @@ class FaultRun:
         plan = [replace(fault, time=fault.time + START) for fault in draw_plan(seed, count, PERIOD, kinds)]
         self.adapter = FaultyAdapter(sound, plan, seed)
         self.bus = VirtualBus(self.adapter, self.clock)
-        self._send, self.bus.send = self.bus.send, self._watch_frame
+        self._send, self.bus.send = self.bus.send, self._watch_message
         self.tape = Tape(self.emulated)
         self.clock.attach(self.tape)
         settings = GripperSettings(poll_rate=self._random.choice((50.0, 100.0, 200.0)), telemetry_period=0.3)
@@ -192,16 +192,16 @@ class FaultRun:
                 f"{self.clock.now():.3f} {complaints} {state}\n   {self.tape.truths[-1]} {self.adapter.injected[-3:]}"
             )
 
-    def _watch_frame(self, frame: Frame) -> None:
-        """Check a frame that leaves."""
-        if split_identifier(frame.id).command == Command.MOVE and frame.data:
+    def _watch_message(self, message: CanMessage) -> None:
+        """Check a message that leaves."""
+        if split_identifier(message.id).command == Command.MOVE and message.data:
             self.tally.orders += 1
             goal = self.gripper.scale.counts_of(self._goal) if self._allowed else None
-            complaints = self.guard.check(decode_move(frame), goal, self._stopped, self._allowed)
+            complaints = self.guard.check(decode_move(message), goal, self._stopped, self._allowed)
             self.tally.motion.update(complaints)
             if self._tracing and complaints:
-                print(f"{self.clock.now():.3f} {complaints} {decode_move(frame)} {self.gripper.state}")
-        self._send(frame)
+                print(f"{self.clock.now():.3f} {complaints} {decode_move(message)} {self.gripper.state}")
+        self._send(message)
 
     def _recover(self) -> None:
         """Bring the gripper back to work, as a user would."""
@@ -233,7 +233,7 @@ class FaultRun:
         self.gripper.move(self._goal, 0.1)
         state = self.gripper.wait(lambda state: state.phase is not Phase.MOVING, 5.0)
         way = self.tape.truths[-1].place - self.gripper.scale.counts_of(self._goal)
-        return state.outcome is Outcome.REACHED and abs(way) < 3.0
+        return state.outcome is MoveOutcome.REACHED and abs(way) < 3.0
 
 
 def choose_kinds(seed: int) -> tuple[FaultKind, ...]:

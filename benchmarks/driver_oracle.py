@@ -11,7 +11,7 @@ from finforce_driver.emulator.control import Mode
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.mechanism import Jaws
 from finforce_driver.emulator.protection import Fault
-from finforce_driver.state import GripperState, Outcome, Phase
+from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_driver.units import GripperScale
 
 WINDOW = 0.06  # [s] a reply may be as old as its time-out, and is stamped when it comes
@@ -106,7 +106,7 @@ class Oracle:
         self.tape = tape
         self.worst: Counter[str] = Counter()
         self._scale = scale
-        self.outcome = Outcome.NONE
+        self.outcome = MoveOutcome.NONE
         self._telemetry: dict[str, float] = {}
         self._cut = False
 
@@ -188,12 +188,12 @@ class Oracle:
     def _check_outcome(self, state: GripperState, goal: float) -> list[str]:
         recent = self.tape.last(state.stamp, LONG_WINDOW)
         right = True
-        if state.outcome is Outcome.REACHED:
+        if state.outcome is MoveOutcome.REACHED:
             place = self._scale.counts_of(goal)
             right = any(abs(truth.place - place) <= GOAL_TOLERANCE for truth in recent)
-        elif state.outcome in (Outcome.GRASPED, Outcome.CLOSED_EMPTY):
+        elif state.outcome in (MoveOutcome.GRASPED, MoveOutcome.CLOSED_EMPTY):
             right = any(truth.blocked in (1, 2) for truth in recent)
-        elif state.outcome is Outcome.BLOCKED:
+        elif state.outcome is MoveOutcome.BLOCKED:
             right = any(truth.blocked in (-1, 2) for truth in recent)
         return [] if right else [f"outcome {state.outcome.value}"]
 

@@ -1,9 +1,9 @@
-"""A million lines of rubbish and damaged frames through the reader of SLCAN lines; table and JSON.
+"""A million lines of rubbish and damaged messages through the reader of SLCAN lines; table and JSON.
 
     python benchmarks/slcan_fuzz.py [--json report/slcan_fuzz.json] [--lines 1000000] [--seed 1]
 
-What is a frame is decided a second time here, letter by letter and without the reader's patterns. A false frame is one
-that the reader finds and this does not. `hypothesis` adds streams of its own where it is installed.
+What is a message is decided a second time here, letter by letter and without the reader's patterns. A false message is
+one that the reader finds and this does not. `hypothesis` adds streams of its own where it is installed.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from finforce_driver.can.bus import Frame
-from finforce_driver.can.slcan import LONGEST_LINE, SlcanParser, encode_frame
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.slcan import LONGEST_LINE, SlcanParser, encode_message
 from finforce_eval.bench.bench import describe_machine, write_figures
 
 BATCH = 500  # lines that are fed as one stream, in pieces
@@ -36,15 +36,15 @@ class Tally:
     """What one kind of stream gave."""
 
     lines: int = 0
-    frames: int = 0
-    false_frames: int = 0
-    missed_frames: int = 0
+    messages: int = 0
+    false_messages: int = 0
+    missed_messages: int = 0
     exceptions: int = 0
     errors: list[str] = field(default_factory=list)
 
 
-def frame_of(line: bytes) -> Frame | None:
-    """Return the frame that a line is by the letter of the protocol, None when it is none."""
+def message_of(line: bytes) -> CanMessage | None:
+    """Return the message that a line is by the letter of the protocol, None when it is none."""
     if not 5 <= len(line) <= LONGEST_LINE or line[0] not in b"tr" or line[1] not in b"01234567":
         return None
     if any(letter not in HEX for letter in line[2:4]) or line[4] not in b"012345678":
@@ -54,14 +54,14 @@ def frame_of(line: bytes) -> Frame | None:
     rest = line[5:]
     if len(rest) not in (size, size + 4) or any(letter not in HEX for letter in rest):
         return None
-    return Frame(id=int(line[1:4], 16), data=bytes.fromhex(rest[:size].decode()), remote=remote)
+    return CanMessage(id=int(line[1:4], 16), data=bytes.fromhex(rest[:size].decode()), remote=remote)
 
 
-def random_frame(chance: random.Random) -> Frame:
-    """Return any frame."""
+def random_message(chance: random.Random) -> CanMessage:
+    """Return any message."""
     if chance.random() < 0.1:
-        return Frame(id=chance.randrange(0x800), remote=True)
-    return Frame(id=chance.randrange(0x800), data=chance.randbytes(chance.randrange(9)))
+        return CanMessage(id=chance.randrange(0x800), remote=True)
+    return CanMessage(id=chance.randrange(0x800), data=chance.randbytes(chance.randrange(9)))
 
 
 def random_line(chance: random.Random) -> bytes:
@@ -75,8 +75,8 @@ def lettered_line(chance: random.Random) -> bytes:
 
 
 def damaged_line(chance: random.Random) -> bytes:
-    """Return a frame's line with none to three damages."""
-    line = encode_frame(random_frame(chance))
+    """Return a message's line with none to three damages."""
+    line = encode_message(random_message(chance))
     for _ in range(chance.randrange(4)):
         line = chance.choice(DAMAGES)(line, chance)
     return line
@@ -123,7 +123,7 @@ DAMAGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (_flip, _replace,
 KINDS: dict[str, Callable[[random.Random], bytes]] = {
     "any bytes": random_line,
     "letters of the protocol": lettered_line,
-    "damaged frames": damaged_line,
+    "damaged messages": damaged_line,
 }
 
 
@@ -137,9 +137,9 @@ def cut_stream(stream: bytes, chance: random.Random) -> Iterator[bytes]:
 
 
 def check_stream(stream: bytes, chance: random.Random, tally: Tally) -> None:
-    """Feed one stream and compare the frames with those that are in it."""
+    """Feed one stream and compare the messages with those that are in it."""
     lines = (stream + b"\r").replace(b"\a", b"\r").split(b"\r")[:-1]
-    expected = [frame for frame in map(frame_of, lines) if frame is not None]
+    expected = [message for message in map(message_of, lines) if message is not None]
     parser, found = SlcanParser(), []
     try:
         for piece in cut_stream(stream + b"\r", chance):
@@ -148,10 +148,10 @@ def check_stream(stream: bytes, chance: random.Random, tally: Tally) -> None:
         tally.exceptions += 1
         tally.errors.append(repr(error))
     tally.lines += len(lines)
-    tally.frames += len(expected)
+    tally.messages += len(expected)
     if found != expected:
-        tally.false_frames += sum(frame not in expected for frame in found) or max(0, len(found) - len(expected))
-        tally.missed_frames += sum(frame not in found for frame in expected)
+        tally.false_messages += sum(message not in expected for message in found) or max(0, len(found) - len(expected))
+        tally.missed_messages += sum(message not in found for message in expected)
 
 
 def fuzz(kind: str, count: int, seed: int, bar: tqdm) -> Tally:
@@ -171,7 +171,7 @@ def fuzz_by_hypothesis(seed: int) -> Tally | None:
     except ImportError:
         return None
     tally, chance = Tally(), random.Random(seed)
-    valid = strategies.randoms(use_true_random=False).map(lambda source: encode_frame(random_frame(source)))
+    valid = strategies.randoms(use_true_random=False).map(lambda source: encode_message(random_message(source)))
     letters = strategies.lists(strategies.sampled_from(list(LETTERS)), max_size=80).map(bytes)
     pieces = strategies.one_of(strategies.binary(max_size=80), letters, valid)
 
@@ -185,9 +185,9 @@ def fuzz_by_hypothesis(seed: int) -> Tally | None:
 
 
 def time_replies(seed: int) -> dict[str, float]:
-    """Return the time that one reply takes from bytes to a frame [us]."""
+    """Return the time that one reply takes from bytes to a message [us]."""
     chance, parser = random.Random(seed), SlcanParser()
-    lines = [encode_frame(Frame(id=0x78, data=chance.randbytes(4))) for _ in range(TIMED)]
+    lines = [encode_message(CanMessage(id=0x78, data=chance.randbytes(4))) for _ in range(TIMED)]
     times = []
     for line in lines:
         begin = time.perf_counter()
@@ -199,10 +199,10 @@ def time_replies(seed: int) -> dict[str, float]:
 
 def print_table(tallies: dict[str, Tally], reply_us: dict[str, float]) -> None:
     """Print a line per kind of stream, and the time of a reply."""
-    print(f"{'':<26}{'lines':>10}{'frames':>10}{'exceptions':>12}{'false':>8}{'missed':>8}")
+    print(f"{'':<26}{'lines':>10}{'messages':>10}{'exceptions':>12}{'false':>8}{'missed':>8}")
     for name, tally in tallies.items():
-        counts = f"{tally.exceptions:>12}{tally.false_frames:>8}{tally.missed_frames:>8}"
-        print(f"{name:<26}{tally.lines:>10}{tally.frames:>10}{counts}")
+        counts = f"{tally.exceptions:>12}{tally.false_messages:>8}{tally.missed_messages:>8}"
+        print(f"{name:<26}{tally.lines:>10}{tally.messages:>10}{counts}")
     times = ", ".join(f"{name} {value:.1f}" for name, value in reply_us.items() if name != "n")
     machine = describe_machine()
     print(f"one reply read, us: {times} ({reply_us['n']} replies)")

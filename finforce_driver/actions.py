@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 from finforce_driver.errors import DriverError
 from finforce_driver.messages import move_from_gripper_command
 from finforce_driver.services import GripperTasks
-from finforce_driver.state import GripperState, Outcome, Phase
+from finforce_driver.state import GripperState, MoveOutcome, Phase
 
 if TYPE_CHECKING:
     from finforce_driver.gripper import Gripper
 
-SUCCESSES = (Outcome.REACHED, Outcome.GRASPED)
+SUCCESSES = (MoveOutcome.REACHED, MoveOutcome.GRASPED)
 
 
 class GripperCommandAction:
@@ -46,7 +46,7 @@ class GripperCommandAction:
             if state.phase is Phase.MOVING:
                 self._tasks.stop()
         except DriverError:
-            state = replace(self._gripper.state, outcome=Outcome.ABORTED)
+            state = replace(self._gripper.state, outcome=MoveOutcome.ABORTED)
         if state.phase is Phase.MOVING:
             handle.canceled()
         elif state.outcome in SUCCESSES:
@@ -69,5 +69,8 @@ class GripperCommandAction:
         message.position, message.effort = (
             value if math.isfinite(value) else 0.0 for value in (state.opening, state.force)
         )
-        message.stalled, message.reached_goal = state.outcome is Outcome.GRASPED, state.outcome is Outcome.REACHED
+        message.stalled, message.reached_goal = (
+            state.outcome is MoveOutcome.GRASPED,
+            state.outcome is MoveOutcome.REACHED,
+        )
         return message

@@ -8,8 +8,7 @@ from typing import Any
 
 from finforce.health import Health, Level, Outcome, Report
 from finforce_driver.grasp.status import GraspPhase, GraspStatus
-from finforce_driver.state import GripperState, Phase, describe
-from finforce_driver.state import Outcome as MoveOutcome
+from finforce_driver.state import GripperState, MoveOutcome, Phase, describe
 
 LEVELS = {Phase.READY: Level.OK, Phase.MOVING: Level.OK, Phase.FAULT: Level.ERROR, Phase.DISCONNECTED: Level.ERROR}
 FAILURES = (MoveOutcome.BLOCKED, MoveOutcome.TIMED_OUT, MoveOutcome.ABORTED)

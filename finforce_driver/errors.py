@@ -7,8 +7,8 @@ class DriverError(FinforceError):
     """The base of the errors of this package."""
 
 
-class FrameError(DriverError, ValueError):
-    """A CAN frame cannot be: its identifier or data are out of range."""
+class CanMessageError(DriverError, ValueError):
+    """A CAN message cannot be: its identifier or data are out of range."""
 
 
 class LinkError(DriverError, OSError):

@@ -22,7 +22,7 @@ from finforce_driver.errors import GraspError, GripperStateError, GripperTimeout
 from finforce_driver.machine.loop import GripperLoop
 from finforce_driver.machine.machine import GripperMachine
 from finforce_driver.settings import GripperSettings
-from finforce_driver.state import GripperState, Outcome, Phase
+from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_driver.units import GripperScale
 
 Listener = Callable[[GripperState], None]
@@ -35,7 +35,7 @@ class Gripper:
     """An SSG-48 behind a bus.
 
     Args:
-        bus: what carries the frames; the gripper opens and closes it.
+        bus: what carries the messages; the gripper opens and closes it.
         settings: of the gripper.
         clock: what it lives by; the machine's own where none is given.
     """
@@ -149,7 +149,7 @@ class Gripper:
         self._loop.command(lambda machine, now: machine.clear_errors())
 
     def estop(self) -> None:
-        """Stop at once: the frames leave from the calling thread, and the jaws go limp.
+        """Stop at once: the messages leave from the calling thread, and the jaws go limp.
 
         Repeated until the gripper says that it is stopped, also after a lost link; only `clear_errors` ends it.
         """
@@ -222,7 +222,7 @@ class Gripper:
             raise
         if state.phase in LOST:
             raise GripperStateError(f"the grasp was lost: {state.message}")
-        if state.outcome is not Outcome.GRASPED:
+        if state.outcome is not MoveOutcome.GRASPED:
             self.hold()
             raise GraspError(f"nothing was grasped ({state.outcome.value}) down to {1e3 * state.opening:.1f} mm")
         return state

@@ -11,7 +11,7 @@ from finforce_driver.errors import GripperStateError, GripperTimeoutError
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.messages import MoveRequest
 from finforce_driver.parameters import DriverParameters
-from finforce_driver.state import GripperState, Outcome, Phase
+from finforce_driver.state import GripperState, MoveOutcome, Phase
 
 if TYPE_CHECKING:
     from finforce_driver.gripper import Gripper
@@ -93,7 +93,7 @@ class GripperTasks:
         given = self._parameters
         least, force = self._gripper.settings.closed_opening, given.motor_force
         state = self.go(MoveRequest(opening=least, speed=given.grasp_speed, force=force), "a grasp without vision")
-        if state.outcome is not Outcome.GRASPED:
+        if state.outcome is not MoveOutcome.GRASPED:
             self._gripper.hold()
             raise GripperStateError(f"nothing was grasped: {state.outcome.value} at {1e3 * state.opening:.1f} mm")
         return f"holds with {force:.0f} N by the motor's current, without vision, at {1e3 * state.opening:.1f} mm"
@@ -103,7 +103,7 @@ class GripperTasks:
         given, widest = self._parameters, self._gripper.settings.closed_opening + self._gripper.settings.stroke
         opening = widest if math.isnan(given.release_opening) else given.release_opening
         state = self.go(MoveRequest(opening=opening, speed=given.release_speed), "release was commanded")
-        if state.outcome is not Outcome.REACHED:
+        if state.outcome is not MoveOutcome.REACHED:
             raise GripperStateError(f"the gripper did not open: {state.outcome.value} at {1e3 * state.opening:.1f} mm")
         return f"open: {1e3 * state.opening:.1f} mm"
 

@@ -23,7 +23,7 @@ class Phase(Enum):
     FAULT = "fault"  # the gripper's power stage is asleep until its errors are cleared
 
 
-class Outcome(Enum):
+class MoveOutcome(Enum):
     """What became of the last move."""
 
     NONE = "none"  # none yet, or still under way
@@ -75,7 +75,7 @@ class GripperState:
     activated: bool = False
     faults: tuple[str, ...] = ()
     estopped: bool = False
-    outcome: Outcome = Outcome.NONE
+    outcome: MoveOutcome = MoveOutcome.NONE
     message: str = ""
     temperature: float = math.nan
     voltage: float = math.nan
@@ -106,13 +106,13 @@ FAULTS = {
 }
 UNKNOWN_FAULT = "the gripper reports a fault: clear the errors"
 OUTCOMES = {
-    Outcome.REACHED: "the opening is reached",
-    Outcome.GRASPED: "something is grasped",
-    Outcome.CLOSED_EMPTY: "closed on nothing",
-    Outcome.BLOCKED: "something blocks the opening jaws",
-    Outcome.TIMED_OUT: "the opening was not reached in time, nothing resists: is the gripper configured as a gripper?",
-    Outcome.REPLACED: "the move was replaced",
-    Outcome.ABORTED: "the move was aborted",
+    MoveOutcome.REACHED: "the opening is reached",
+    MoveOutcome.GRASPED: "something is grasped",
+    MoveOutcome.CLOSED_EMPTY: "closed on nothing",
+    MoveOutcome.BLOCKED: "something blocks the opening jaws",
+    MoveOutcome.TIMED_OUT: "the opening was not reached in time, nothing resists: is it configured as a gripper?",
+    MoveOutcome.REPLACED: "the move was replaced",
+    MoveOutcome.ABORTED: "the move was aborted",
 }
 
 
@@ -121,7 +121,7 @@ def describe_faults(faults: Sequence[str]) -> str:
     return "; ".join(FAULTS.get(name, UNKNOWN_FAULT) for name in faults) or UNKNOWN_FAULT
 
 
-def describe(phase: Phase, outcome: Outcome, faults: Sequence[str]) -> str:
+def describe(phase: Phase, outcome: MoveOutcome, faults: Sequence[str]) -> str:
     """Return the sentence for a phase in which nothing more special is to be said."""
     if phase is Phase.FAULT:
         return describe_faults(faults)

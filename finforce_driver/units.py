@@ -23,7 +23,7 @@ class Pace:
     """How a speed is carried out.
 
     Attributes:
-        byte: speed byte of the frames.
+        byte: speed byte of the messages.
         speed: of the opening that results [m/s].
         stepped: the speed is below what the byte can do, the target has to be moved on in steps.
         note: what was changed in what was asked for; empty when nothing was.

@@ -1,4 +1,4 @@
-"""Classic CAN frames and what carries them."""
+"""Classic CAN messages and what carries them."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from finforce_driver.errors import FrameError
+from finforce_driver.errors import CanMessageError
 
 LARGEST_ID = 0x7FF  # 11 bits; the gripper misreads longer ones
 LARGEST_DATA = 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class Frame:
-    """One CAN 2.0A frame.
+class CanMessage:
+    """One CAN 2.0A message.
 
     Attributes:
         id: identifier of 11 bits.
-        data: 0 to 8 bytes; none in a remote frame.
-        remote: whether it asks for a frame instead of being one.
+        data: 0 to 8 bytes; none in a remote message.
+        remote: whether it asks for a message instead of being one.
     """
 
     id: int
@@ -30,18 +30,18 @@ class Frame:
         """Refuses what no bus carries.
 
         Raises:
-            FrameError: identifier or length is out of range, or a remote frame has data.
+            CanMessageError: identifier or length is out of range, or a remote message has data.
         """
         if not 0 <= self.id <= LARGEST_ID:
-            raise FrameError(f"CAN identifier {self.id:#x}: expected 0 to {LARGEST_ID:#x}, 11 bits")
+            raise CanMessageError(f"CAN identifier {self.id:#x}: expected 0 to {LARGEST_ID:#x}, 11 bits")
         if len(self.data) > LARGEST_DATA:
-            raise FrameError(f"CAN frame with {len(self.data)} bytes: expected at most {LARGEST_DATA}")
+            raise CanMessageError(f"CAN message with {len(self.data)} bytes: expected at most {LARGEST_DATA}")
         if self.remote and self.data:
-            raise FrameError(f"remote CAN frame with {len(self.data)} bytes: expected none")
+            raise CanMessageError(f"remote CAN message with {len(self.data)} bytes: expected none")
 
 
 class Bus(Protocol):
-    """What carries frames; opened and closed again and again."""
+    """What carries messages; opened and closed again and again."""
 
     def open(self) -> None:
         """Open the port and join the bus.
@@ -53,15 +53,15 @@ class Bus(Protocol):
     def close(self) -> None:
         """Leave the bus and close the port, also one that is gone; never raises."""
 
-    def send(self, frame: Frame) -> None:
-        """Put a frame on the way; may be called from any thread.
+    def send(self, message: CanMessage) -> None:
+        """Put a message on the way; may be called from any thread.
 
         Raises:
             LinkError: the port is closed or gone.
         """
 
-    def receive(self, timeout: float) -> Frame | None:
-        """Return the next frame, None when none came within `timeout` [s].
+    def receive(self, timeout: float) -> CanMessage | None:
+        """Return the next message, None when none came within `timeout` [s].
 
         Raises:
             LinkError: the port is closed or gone.
@@ -69,7 +69,7 @@ class Bus(Protocol):
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What happened since the bus was made, by name: frames, lines that were no frames, refusals (BELL)."""
+        """What happened since the bus was made, by name: messages, lines that were no messages, refusals (BELL)."""
 
     @property
     def suspicion(self) -> str:

@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
-from finforce_driver.can.bus import Frame
-from finforce_driver.errors import FrameError
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.errors import CanMessageError
 
 LARGEST_NODE = 15
 LARGEST_BYTE = 255
@@ -19,7 +19,7 @@ CONTACT = (1, 2)  # which of them means closing depends on the firmware: the cur
 
 
 class Command(IntEnum):
-    """What a frame is about."""
+    """What a message is about."""
 
     ESTOP = 0
     CLEAR = 1
@@ -51,7 +51,7 @@ class Flag(IntFlag):
     OFF = 0x00
 
 
-FREE_FLAGS = 0x0F  # without meaning, but a frame that differs in them is a new command
+FREE_FLAGS = 0x0F  # without meaning, but a message that differs in them is a new command
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +83,7 @@ class Move:
         """Refuses what the gripper would misread: it checks nothing itself.
 
         Raises:
-            FrameError: a value is out of range.
+            CanMessageError: a value is out of range.
         """
         for name, low, high in (
             ("position", 0, LARGEST_BYTE),
@@ -92,7 +92,7 @@ class Move:
             ("flags", 0, LARGEST_BYTE),
         ):
             if not low <= getattr(self, name) <= high:
-                raise FrameError(f"{name} of a move is {getattr(self, name)}; expected {low} to {high}")
+                raise CanMessageError(f"{name} of a move is {getattr(self, name)}; expected {low} to {high}")
 
     @property
     def drives(self) -> bool:
@@ -127,6 +127,11 @@ class Reply:
     estopped: bool
     calibrated: bool
     error: bool
+
+    @property
+    def faults(self) -> tuple[bool, ...]:
+        """What the reply says of faults."""
+        return self.error, self.overheated, self.watchdog, self.estopped
 
     @property
     def contact(self) -> bool:
@@ -164,12 +169,12 @@ def identifier(node: int, command: int, error: bool = False) -> int:
     """Return the identifier (node << 7) | (command << 1) | error.
 
     Raises:
-        FrameError: the node is not 0 to 15 or the command not 0 to 63.
+        CanMessageError: the node is not 0 to 15 or the command not 0 to 63.
     """
     if not 0 <= node <= LARGEST_NODE:
-        raise FrameError(f"CAN node {node}: expected 0 to {LARGEST_NODE}")
+        raise CanMessageError(f"CAN node {node}: expected 0 to {LARGEST_NODE}")
     if not 0 <= command <= 63:
-        raise FrameError(f"command {command}: expected 0 to 63")
+        raise CanMessageError(f"command {command}: expected 0 to 63")
     return node << 7 | int(command) << 1 | int(error)
 
 
@@ -178,44 +183,44 @@ def split_identifier(id: int) -> Address:
     return Address(node=id >> 7 & 0xF, command=id >> 1 & 0x3F, error=bool(id & 1))
 
 
-def encode_poll(node: int) -> Frame:
+def encode_poll(node: int) -> CanMessage:
     """Return the empty command 61, which changes nothing and is always answered."""
-    return Frame(id=identifier(node, Command.MOVE))
+    return CanMessage(id=identifier(node, Command.MOVE))
 
 
-def encode_move(node: int, move: Move) -> Frame:
+def encode_move(node: int, move: Move) -> CanMessage:
     """Return a 5-byte command 61."""
     current = move.current_mA.to_bytes(2, "big")
-    return Frame(id=identifier(node, Command.MOVE), data=bytes((move.position, move.speed, *current, move.flags)))
+    return CanMessage(id=identifier(node, Command.MOVE), data=bytes((move.position, move.speed, *current, move.flags)))
 
 
-def encode_command(node: int, command: Command) -> Frame:
+def encode_command(node: int, command: Command) -> CanMessage:
     """Return a command without content; none of them is answered."""
-    return Frame(id=identifier(node, command))
+    return CanMessage(id=identifier(node, command))
 
 
-def encode_request(node: int, command: Command) -> Frame:
-    """Return the remote frame that asks for a value; the answer has the same command."""
-    return Frame(id=identifier(node, command), remote=True)
+def encode_request(node: int, command: Command) -> CanMessage:
+    """Return the remote message that asks for a value; the answer has the same command."""
+    return CanMessage(id=identifier(node, command), remote=True)
 
 
-def decode_move(frame: Frame) -> Move:
+def decode_move(message: CanMessage) -> Move:
     """Return the content of a 5-byte command 61, of whichever master.
 
     Raises:
-        FrameError: it is no such frame, or a value is out of range.
+        CanMessageError: it is no such message, or a value is out of range.
     """
-    data = _content(frame, Command.MOVE, 5)
+    data = _content(message, Command.MOVE, 5)
     return Move(position=data[0], speed=data[1], current_mA=_signed(data[2:4]), flags=data[4])
 
 
-def decode_reply(frame: Frame) -> Reply:
+def decode_reply(message: CanMessage) -> Reply:
     """Return the content of a reply 60.
 
     Raises:
-        FrameError: it is none.
+        CanMessageError: it is none.
     """
-    data = _content(frame, Command.REPLY, 4)
+    data = _content(message, Command.REPLY, 4)
     status = data[3]
     return Reply(
         position=data[0],
@@ -227,35 +232,35 @@ def decode_reply(frame: Frame) -> Reply:
         watchdog=bool(status & 0x04),
         estopped=bool(status & 0x02),
         calibrated=bool(status & 0x01),
-        error=split_identifier(frame.id).error,
+        error=split_identifier(message.id).error,
     )
 
 
-def decode_temperature(frame: Frame) -> float:
+def decode_temperature(message: CanMessage) -> float:
     """Return the temperature of the motor [deg C].
 
     Raises:
-        FrameError: it is no answer to command 23.
+        CanMessageError: it is no answer to command 23.
     """
-    return float(_signed(_content(frame, Command.TEMPERATURE, 2)))
+    return float(_signed(_content(message, Command.TEMPERATURE, 2)))
 
 
-def decode_supply(frame: Frame) -> float:
+def decode_supply(message: CanMessage) -> float:
     """Return the voltage of the supply [V].
 
     Raises:
-        FrameError: it is no answer to command 24.
+        CanMessageError: it is no answer to command 24.
     """
-    return 1e-3 * int.from_bytes(_content(frame, Command.SUPPLY, 2), "big")
+    return 1e-3 * int.from_bytes(_content(message, Command.SUPPLY, 2), "big")
 
 
-def decode_errors(frame: Frame) -> ErrorReport:
+def decode_errors(message: CanMessage) -> ErrorReport:
     """Return what is latched; no name beside a fault means the E-stop of a command 61.
 
     Raises:
-        FrameError: it is no answer to command 26.
+        CanMessageError: it is no answer to command 26.
     """
-    first, second = _content(frame, Command.ERRORS, 2)
+    first, second = _content(message, Command.ERRORS, 2)
     names = [name for bit, name in FAULT_BITS if first & bit]
     if second & WATCHDOG:
         names.append("watchdog")
@@ -264,13 +269,13 @@ def decode_errors(frame: Frame) -> ErrorReport:
     return ErrorReport(faults=tuple(names), motor_calibrated=bool(second & MOTOR_CALIBRATED))
 
 
-def _content(frame: Frame, command: Command, length: int) -> bytes:
-    """Return the data of a frame that has to be of a command and of a length."""
-    got = split_identifier(frame.id).command
-    if got != command or frame.remote or len(frame.data) != length:
-        kind = "remote frame" if frame.remote else f"frame of {len(frame.data)} bytes"
-        raise FrameError(f"{kind} of command {got}: expected {length} bytes of command {command:d}")
-    return frame.data
+def _content(message: CanMessage, command: Command, length: int) -> bytes:
+    """Return the data of a message that has to be of a command and of a length."""
+    got = split_identifier(message.id).command
+    if got != command or message.remote or len(message.data) != length:
+        kind = "remote message" if message.remote else f"message of {len(message.data)} bytes"
+        raise CanMessageError(f"{kind} of command {got}: expected {length} bytes of command {command:d}")
+    return message.data
 
 
 def _signed(data: bytes) -> int:

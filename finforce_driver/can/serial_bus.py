@@ -15,8 +15,8 @@ from types import ModuleType
 from typing import Any
 
 from finforce.optional import import_library
-from finforce_driver.can.bus import Bus, Frame
-from finforce_driver.can.slcan import END, SlcanParser, encode_frame
+from finforce_driver.can.bus import Bus, CanMessage
+from finforce_driver.can.slcan import END, SlcanParser, encode_message
 from finforce_driver.errors import LinkError, TargetError
 
 BIT_RATES = {10_000: 0, 20_000: 1, 50_000: 2, 100_000: 3, 125_000: 4, 250_000: 5, 500_000: 6, 800_000: 7, 1_000_000: 8}
@@ -25,12 +25,12 @@ _PORT_ERRORS = (OSError, termios.error)  # pyserial passes the second one throug
 _SETTLE = 0.02  # [s] in which an adapter that was left open stops sending after "C"
 _WRITE_TIMEOUT = 0.1  # [s] a line takes 1.4 ms on a real 115200 baud port
 _CHUNK = 4096  # [bytes]
-_SUSPICIOUS_BYTES = 32  # two replies' worth; an adapter's greeting is forgotten with the first frame
+_SUSPICIOUS_BYTES = 32  # two replies' worth; an adapter's greeting is forgotten with the first message
 _SUSPICIOUS_REFUSALS = 5  # one is normal: "C" on a channel that is closed
 
 
 class SerialBus(Bus):
-    """CAN frames through a USB-CAN adapter that speaks SLCAN, acknowledging or silent.
+    """CAN messages through a USB-CAN adapter that speaks SLCAN, acknowledging or silent.
 
     `send` may be called from any thread while another one waits in `receive`.
     """
@@ -56,7 +56,7 @@ class SerialBus(Bus):
         self._poll = select.poll()
         self._torn = b""  # what ends a line that went out only in part
         self._parser = SlcanParser()
-        self._frames: deque[Frame] = deque()
+        self._messages: deque[CanMessage] = deque()
         self._reading, self._writing = Lock(), Lock()
         self._counts = {"opened": 0, "sent": 0}
 
@@ -89,7 +89,7 @@ class SerialBus(Bus):
         sleep(_SETTLE)
         self._serial.reset_input_buffer()
         self._parser.discard()
-        self._frames.clear()
+        self._messages.clear()
         write_all(self._serial, b"S%d\rO\r" % BIT_RATES[self._bit_rate])
 
     def close(self) -> None:
@@ -109,15 +109,15 @@ class SerialBus(Bus):
         with suppress(*_PORT_ERRORS):
             self._serial.close()
         self._serial = None
-        self._frames.clear()
+        self._messages.clear()
 
-    def send(self, frame: Frame) -> None:
-        """Write a frame's line, whole, at once.
+    def send(self, message: CanMessage) -> None:
+        """Write a message's line, whole, at once.
 
         Raises:
             LinkError: the port is closed or gone, or the adapter takes nothing.
         """
-        line = encode_frame(frame)
+        line = encode_message(message)
         with self._writing:
             port = self._opened()
             try:
@@ -128,23 +128,23 @@ class SerialBus(Bus):
             self._torn = b""
             self._counts["sent"] += 1
 
-    def receive(self, timeout: float) -> Frame | None:
-        """Return the next frame as soon as its last byte is there, None when none came within `timeout` [s].
+    def receive(self, timeout: float) -> CanMessage | None:
+        """Return the next message as soon as its last byte is there, None when none came within `timeout` [s].
 
         Raises:
             LinkError: the port is closed or gone.
         """
         end = monotonic() + timeout
         with self._reading:
-            while not self._frames:
+            while not self._messages:
                 port = self._opened()
                 left = max(0.0, end - monotonic())
                 if not self._poll.poll(ceil(1e3 * left)):
                     return None
-                self._frames.extend(self._parser.feed(self._read(port)))
-                if not self._frames and left == 0.0:
+                self._messages.extend(self._parser.feed(self._read(port)))
+                if not self._messages and left == 0.0:
                     return None
-            return self._frames.popleft()
+            return self._messages.popleft()
 
     def _read(self, port: Any) -> bytes:
         """Return what has come; the port is known to have something, or to be gone."""

@@ -1,10 +1,10 @@
-"""CAN frames as lines of the SLCAN (Lawicel) protocol, and the strict reading of them."""
+"""CAN messages as lines of the SLCAN (Lawicel) protocol, and the strict reading of them."""
 
 from __future__ import annotations
 
 import re
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 
 END = b"\r"
 BELL = b"\a"  # an adapter's refusal; it stands alone, no END follows
@@ -12,37 +12,37 @@ LONGEST_LINE = 64  # [bytes] more than twice the longest valid line
 
 _LINE_ENDS = re.compile(rb"[\r\a]")
 _DATA = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
-_REMOTE = re.compile(rb"r([0-7][0-9A-Fa-f]{2})[0-8](?:[0-9A-Fa-f]{4})?")
-_EXTENDED = re.compile(rb"[TR][01][0-9A-Fa-f]{7}[0-8](?:[0-9A-Fa-f]{2})*")
+_REMOTE = re.compile(rb"r([0-7][0-9A-Fa-f]{2})[0-8]([0-9A-Fa-f]{4})?")
+EXTENDED = re.compile(rb"[TR][01][0-9A-Fa-f]{7}[0-8](?:[0-9A-Fa-f]{2})*")
 _ACKNOWLEDGEMENTS = (b"", b"z", b"Z")
 _STAMP = 2  # [bytes] after the data, where an adapter was told to stamp what it receives
 
 
-def encode_frame(frame: Frame) -> bytes:
-    """Return the line that makes an adapter send a frame, with its end."""
-    kind = "r" if frame.remote else "t"
-    return f"{kind}{frame.id:03X}{len(frame.data)}{frame.data.hex().upper()}\r".encode("ascii")
+def encode_message(message: CanMessage) -> bytes:
+    """Return the line that makes an adapter send a message, with its end."""
+    kind = "r" if message.remote else "t"
+    return f"{kind}{message.id:03X}{len(message.data)}{message.data.hex().upper()}\r".encode("ascii")
 
 
-def decode_line(line: bytes) -> Frame | None:
-    """Return the frame of 11-bit identifier that a line (without its end) is, None when it is not exactly one.
+def decode_line(line: bytes, *, stamped: bool = True) -> CanMessage | None:
+    """Return the message of 11-bit identifier that a line (without its end) is, None when it is not exactly one.
 
-    A time stamp of four hex digits after the data is read over.
+    Where lines may be `stamped`, a time stamp of four hex digits after the data is read over.
     """
     match = _DATA.fullmatch(line)
     if match:
         data, size = bytes.fromhex(match[3].decode("ascii")), int(match[2])
-        return Frame(id=int(match[1], 16), data=data[:size]) if len(data) in (size, size + _STAMP) else None
+        return CanMessage(id=int(match[1], 16), data=data[:size]) if len(data) - size in (0, _STAMP * stamped) else None
     match = _REMOTE.fullmatch(line)
-    return Frame(id=int(match[1], 16), remote=True) if match else None
+    return CanMessage(id=int(match[1], 16), remote=True) if match and (stamped or not match[2]) else None
 
 
 class SlcanParser:
-    """Finds frames in what an adapter sends, however it is cut into pieces; what is not exactly a frame is counted.
+    """Finds messages in what an adapter sends, however it is cut into pieces; what is not exactly a message is counted.
 
     Attributes:
-        unexplained: bytes since the last frame that belong to no frame, acknowledgement or refusal.
-        refused: refusals since the last frame.
+        unexplained: bytes since the last message that belong to no message, acknowledgement or refusal.
+        refused: refusals since the last message.
     """
 
     def __init__(self) -> None:
@@ -50,33 +50,33 @@ class SlcanParser:
         self.unexplained = 0
         self.refused = 0
         self._line = bytearray()
-        names = ("frames", "acknowledgements", "bells", "garbage", "overlong", "extended")
+        names = ("messages", "acknowledgements", "bells", "garbage", "overlong", "extended")
         self._counts = dict.fromkeys(names, 0)
 
     @property
     def counts(self) -> dict[str, int]:
         """How many lines came, by what they were.
 
-        `frames`; `acknowledgements`; `bells` (refusals); `garbage` (no frame, to the letter); `overlong` (no end within
-        64 bytes); `extended` (29-bit identifiers, which this bus has no use for).
+        `messages`; `acknowledgements`; `bells` (refusals); `garbage` (no message, to the letter); `overlong` (no end
+        within 64 bytes); `extended` (29-bit identifiers, which this bus has no use for).
         """
         return dict(self._counts)
 
-    def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that `data` completes; takes any bytes."""
-        frames = []
+    def feed(self, data: bytes) -> list[CanMessage]:
+        """Return the messages that `data` completes; takes any bytes."""
+        messages = []
         begin = 0
         for end in _LINE_ENDS.finditer(data):
             self._extend(data[begin : end.start()])
-            frame = self._finish(refused=end[0] == BELL)
-            if frame is not None:
-                frames.append(frame)
+            message = self._finish(refused=end[0] == BELL)
+            if message is not None:
+                messages.append(message)
             begin = end.end()
         self._extend(data[begin:])
-        return frames
+        return messages
 
     def discard(self) -> None:
-        """Forget an unfinished line and what came since the last frame, for a port opened anew; the counts stay."""
+        """Forget an unfinished line and what came since the last message, for a port opened anew; the counts stay."""
         self._line.clear()
         self.unexplained = self.refused = 0
 
@@ -85,8 +85,8 @@ class SlcanParser:
         self.unexplained += len(piece)
         self._line += piece[: LONGEST_LINE + 1 - len(self._line)]
 
-    def _finish(self, refused: bool) -> Frame | None:
-        """Return the frame of the line that ends here, if it is one, and start the next."""
+    def _finish(self, refused: bool) -> CanMessage | None:
+        """Return the message of the line that ends here, if it is one, and start the next."""
         line = bytes(self._line)
         self._line.clear()
         if refused:
@@ -94,22 +94,22 @@ class SlcanParser:
             self.refused += 1
             if not line:
                 return None
-        frame = decode_line(line)
-        if frame is not None:
-            self._counts["frames"] += 1
+        message = decode_line(line)
+        if message is not None:
+            self._counts["messages"] += 1
             self.unexplained = self.refused = 0
         else:
             self._count_other(line)
-        return frame
+        return message
 
     def _count_other(self, line: bytes) -> None:
-        """Count a line that is no frame."""
+        """Count a line that is no message."""
         if len(line) > LONGEST_LINE:
             self._counts["overlong"] += 1
         elif line in _ACKNOWLEDGEMENTS:
             self._counts["acknowledgements"] += 1
             self.unexplained -= len(line)
-        elif _EXTENDED.fullmatch(line):
+        elif EXTENDED.fullmatch(line):
             self._counts["extended"] += 1
             self.unexplained -= len(line)
         else:

@@ -6,34 +6,15 @@ import re
 from collections import Counter, deque
 from collections.abc import Iterable
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.slcan import BELL, END, EXTENDED, decode_line, encode_message
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.errors import TargetError
 
 ACK_MODES = ("none", "lawicel")
-_BELL = b"\x07"
 _LONGEST_LINE = 64
 _CLOCK_PERIOD = 60_000  # [ms] after which time stamps begin again
-_DATA = re.compile(r"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
-_REMOTE = re.compile(r"r([0-7][0-9A-Fa-f]{2})[0-8]")
-_LONG = re.compile(r"T[01][0-9A-Fa-f]{7}[0-8](?:[0-9A-Fa-f]{2})*|R[01][0-9A-Fa-f]{7}[0-8]")
 _SETTER = re.compile(r"Z[01]|X[01]|M.*|m.*|W.*")
-
-
-def frame_from_line(line: str) -> Frame | None:
-    """Return the frame of 11 bits in a host's line, None where it is not exactly one."""
-    if match := _DATA.fullmatch(line):
-        data = bytes.fromhex(match[3])
-        return Frame(id=int(match[1], 16), data=data) if len(data) == int(match[2]) else None
-    if match := _REMOTE.fullmatch(line):
-        return Frame(id=int(match[1], 16), remote=True)
-    return None
-
-
-def line_from_frame(frame: Frame) -> bytes:
-    """Return an adapter's line for a frame, without its end."""
-    kind = "r" if frame.remote else "t"
-    return f"{kind}{frame.id:03X}{len(frame.data)}{frame.data.hex().upper()}".encode()
 
 
 class EmulatedAdapter:
@@ -41,10 +22,10 @@ class EmulatedAdapter:
 
     Attributes:
         grippers: on the bus.
-        latency: from a frame on the bus to its line at the host [s].
+        latency: from a message on the bus to its line at the host [s].
         plugged: whether the host sees the adapter; `unplug` and `replug` change it.
-        counts: lines that were no command, frames sent, frames refused, frames lost to a wrong bit rate.
-        traffic: the last frames of the host that reached the bus, with their times [s].
+        counts: lines that were no command, messages sent, messages refused, messages lost to a wrong bit rate.
+        traffic: the last messages of the host that reached the bus, with their times [s].
     """
 
     def __init__(
@@ -55,7 +36,7 @@ class EmulatedAdapter:
         Args:
             grippers: on the bus.
             ack_mode: "none" stays silent as CANable does, "lawicel" answers every line.
-            latency: from a frame on the bus to its line at the host [s].
+            latency: from a message on the bus to its line at the host [s].
 
         Raises:
             TargetError: there is no such mode.
@@ -66,7 +47,7 @@ class EmulatedAdapter:
         self.latency = latency
         self.plugged = True
         self.counts: Counter[str] = Counter()
-        self.traffic: deque[tuple[float, Frame]] = deque(maxlen=1000)
+        self.traffic: deque[tuple[float, CanMessage]] = deque(maxlen=1000)
         self.now = 0.0
         self._acknowledges = ack_mode == "lawicel"
         self._lose_power()
@@ -108,20 +89,20 @@ class EmulatedAdapter:
         """Let `dt` [s] pass for the adapter and the grippers."""
         self.now += dt
         for gripper in self.grippers:
-            for frame in gripper.step(dt):
-                self.deliver(frame)
+            for message in gripper.step(dt):
+                self.deliver(message)
 
-    def put_on_bus(self, frame: Frame) -> None:
-        """Let another participant of the bus send a frame: grippers answer it, the host sees it and the answers."""
-        self.deliver(frame)
-        self._broadcast(frame)
+    def put_on_bus(self, message: CanMessage) -> None:
+        """Let another participant of the bus send a message: grippers answer it, the host sees it and the answers."""
+        self.deliver(message)
+        self._broadcast(message)
 
-    def deliver(self, frame: Frame) -> None:
-        """Send a frame from the bus to the host, if the channel is open."""
+    def deliver(self, message: CanMessage) -> None:
+        """Send a message from the bus to the host, if the channel is open."""
         if not (self.plugged and self.joined):
             return
         stamp = f"{round(self.now * 1000.0) % _CLOCK_PERIOD:04X}".encode() if self._stamps else b""
-        self._output.append((self.now + self.latency, line_from_frame(frame) + stamp + b"\r"))
+        self._output.append((self.now + self.latency, encode_message(message)[:-1] + stamp + END))
 
     def unplug(self) -> None:
         """Take the adapter off the host; the grippers keep their own supply."""
@@ -152,25 +133,26 @@ class EmulatedAdapter:
             self._answer(line)
 
     def _transmit(self, line: str) -> None:
-        frame = frame_from_line(line)
-        if frame is None and not _LONG.fullmatch(line):
+        raw = line.encode("latin-1")
+        message = decode_line(raw, stamped=False)
+        if message is None and not EXTENDED.fullmatch(raw):
             self._refuse("garbage")
         elif not self._opened or self._listens:
             self._refuse("refused")
         else:
             self._say((b"z" if line[0] in "tr" else b"Z") if self._polled else b"")
-            if frame is None:  # the firmware would misread a long identifier; what it reads is not known
+            if message is None:  # the firmware would misread a long identifier; what it reads is not known
                 self.gripper.violations["long identifier"] += 1
             elif not self.joined:
                 self.counts["wrong bit rate"] += 1
             else:
-                self.counts["frames"] += 1
-                self.traffic.append((self.now, frame))
-                self._broadcast(frame)
+                self.counts["messages"] += 1
+                self.traffic.append((self.now, message))
+                self._broadcast(message)
 
-    def _broadcast(self, frame: Frame) -> None:
+    def _broadcast(self, message: CanMessage) -> None:
         for gripper in self.grippers:
-            for answer in gripper.handle(frame):
+            for answer in gripper.handle(message):
                 self.deliver(answer)
 
     def _set_rate(self, line: str) -> None:
@@ -212,7 +194,7 @@ class EmulatedAdapter:
     def _refuse(self, name: str) -> None:
         self.counts[name] += 1
         if self._acknowledges:
-            self._put(_BELL)
+            self._put(BELL)
 
     def _put(self, data: bytes) -> None:
         self._output.append((self.now, data))

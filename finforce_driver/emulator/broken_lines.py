@@ -1,4 +1,4 @@
-"""Ways in which an adapter's line for a frame can go wrong."""
+"""Ways in which an adapter's line for a message can go wrong."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 from random import Random
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.emulator import broken_lines
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.protection import Fault
@@ -18,7 +18,7 @@ from finforce_driver.errors import TargetError
 
 _LINE = re.compile(rb"[^\r\a]*[\r\a]")  # of the adapter
 _COMMAND = re.compile(rb"[^\r]*\r|[^\r]+")  # of the host
-_FRAME_LINES = (b"t", b"r")
+_MESSAGE_LINES = (b"t", b"r")
 
 
 class FaultKind(Enum):
@@ -193,7 +193,7 @@ class FaultyAdapter:
             self.adapter.write(data)
             return
         for line in _COMMAND.findall(data):
-            if self._requests_to_lose and line[:1] in _FRAME_LINES:
+            if self._requests_to_lose and line[:1] in _MESSAGE_LINES:
                 self._requests_to_lose -= 1
             else:
                 self.adapter.write(line)
@@ -220,9 +220,9 @@ class FaultyAdapter:
             self._end_lasting(now)
 
     def _spoil(self, line: bytes) -> None:
-        """Queue a line, spoiled if a fault is armed and the line is a frame; later ones wait for it."""
+        """Queue a line, spoiled if a fault is armed and the line is a message; later ones wait for it."""
         pieces: broken_lines.Pieces = [(0.0, line)]
-        if self._armed and line[:1] in _FRAME_LINES:
+        if self._armed and line[:1] in _MESSAGE_LINES:
             pieces = LINE_FAULTS[self._armed.popleft()](line, self._random)
         time = self.adapter.now
         for delay, data in pieces:
@@ -260,10 +260,10 @@ class FaultyAdapter:
         node = self.adapter.gripper.node_id << 7
         position = self._random.randrange(256)
         commands = [
-            Frame(id=node | 0x7A, data=bytes([position, 50, 0x01, 0xF4, 0xC0])),
-            Frame(id=node | 0x7A, data=bytes([position, 50, 0x01, 0xF4, 0x00])),
-            Frame(id=node | 0x00),
-            Frame(id=node | 0x02),
-            Frame(id=node | 0x18),
+            CanMessage(id=node | 0x7A, data=bytes([position, 50, 0x01, 0xF4, 0xC0])),
+            CanMessage(id=node | 0x7A, data=bytes([position, 50, 0x01, 0xF4, 0x00])),
+            CanMessage(id=node | 0x00),
+            CanMessage(id=node | 0x02),
+            CanMessage(id=node | 0x18),
         ]
         self.adapter.put_on_bus(self._random.choice(commands))

@@ -1,4 +1,4 @@
-"""The gripper's controller: CAN frames in, frames out, in steps of a millisecond."""
+"""The gripper's controller: CAN messages in, messages out, in steps of a millisecond."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.emulator.conduct import list_violations
 from finforce_driver.emulator.control import Calibration, Endpoints, Mode, MoveControl, Order
 from finforce_driver.emulator.mechanism import STEP, Jaws
@@ -15,7 +15,7 @@ from finforce_driver.emulator.settings import VARIANTS, EmulatorSettings, Stored
 from finforce_driver.errors import TargetError
 
 _REPLY, _ORDER = 60, 61
-_FIFO = 3  # frames that the CAN controller keeps while the firmware is busy
+_FIFO = 3  # messages that the CAN controller keeps while the firmware is busy
 _ADVISED_BURST = 2
 
 
@@ -117,7 +117,7 @@ class EmulatedGripper:
         current = self._blip_current if self._steps < self._blip_until else self.jaws.current
         return max(min(int(current), 0x7FFF), -0x8000)
 
-    def step(self, dt: float = STEP) -> list[Frame]:
+    def step(self, dt: float = STEP) -> list[CanMessage]:
         """Go on for `dt` [s] in whole milliseconds, keeping the rest; return the heartbeats sent meanwhile."""
         self._rest += dt
         self._received = 0
@@ -130,25 +130,25 @@ class EmulatedGripper:
                 heartbeats.append(self._send(9, b""))
         return heartbeats
 
-    def handle(self, frame: Frame) -> list[Frame]:
-        """Take a frame from the bus and return the answers."""
-        if self.booting or (frame.id >> 7) & 0xF != self.node_id:
+    def handle(self, message: CanMessage) -> list[CanMessage]:
+        """Take a message from the bus and return the answers."""
+        if self.booting or (message.id >> 7) & 0xF != self.node_id:
             return []
         self._received += 1
         if self._received > _ADVISED_BURST:
             self.violations["burst"] += 1
         if self._received > _FIFO:
             return []
-        command = (frame.id >> 1) & 0x3F
-        if frame.remote:
+        command = (message.id >> 1) & 0x3F
+        if message.remote:
             if command not in self._questions:
                 return []
             self.protection.feed()
             return [self._send(command, self._questions[command]())]
         if command == _ORDER:
-            return [self._take_order(frame.data)]
+            return [self._take_order(message.data)]
         if command in self._orders:
-            self._orders[command](frame.data)
+            self._orders[command](message.data)
         return []
 
     def reboot(self) -> None:
@@ -180,7 +180,7 @@ class EmulatedGripper:
         }
 
     def _list_questions(self) -> dict[int, Callable[[], bytes]]:
-        """Return what answers the remote frames."""
+        """Return what answers the remote messages."""
         answers: dict[int, Callable[[], bytes]] = {
             10: lambda: b"",
             23: lambda: struct.pack(">h", self.protection.reported_temperature),
@@ -229,11 +229,11 @@ class EmulatedGripper:
             self.calibrated = self._calibration.finished
             self.mode = Mode.IDLE
 
-    def _send(self, command: int, data: bytes) -> Frame:
+    def _send(self, command: int, data: bytes) -> CanMessage:
         self._last_sent = self._steps
-        return Frame(id=(self.node_id & 0xF) << 7 | command << 1 | bool(self.faults), data=data)
+        return CanMessage(id=(self.node_id & 0xF) << 7 | command << 1 | bool(self.faults), data=data)
 
-    def _take_order(self, data: bytes) -> Frame:
+    def _take_order(self, data: bytes) -> CanMessage:
         if len(data) in (0, 5):
             self.protection.feed()
         if len(data) == 5:

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from threading import Event
 from typing import Protocol
 
-from finforce_driver.can.bus import Frame
-from finforce_driver.can.slcan import SlcanParser, encode_frame
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.slcan import SlcanParser, encode_message
 from finforce_driver.errors import LinkError
 
 _STEP = 0.001  # [s]
@@ -86,16 +86,16 @@ class VirtualBus:
     """A bus through the bytes of an emulated adapter, in stepped time; receiving lets time pass.
 
     Attributes:
-        sent: the last frames with their times [s].
+        sent: the last messages with their times [s].
     """
 
     def __init__(self, adapter: SteppedAdapter, clock: VirtualClock) -> None:
         """Connect an adapter, which the clock steps from now on."""
-        self.sent: deque[tuple[float, Frame]] = deque(maxlen=1000)
+        self.sent: deque[tuple[float, CanMessage]] = deque(maxlen=1000)
         self._adapter = adapter
         self._clock = clock
         self._parser = SlcanParser()
-        self._waiting: deque[Frame] = deque()
+        self._waiting: deque[CanMessage] = deque()
         self._opened = False
         clock.attach(adapter)
 
@@ -129,18 +129,18 @@ class VirtualBus:
             self._adapter.write(b"C\r")
         self._opened = False
 
-    def send(self, frame: Frame) -> None:
-        """Hand a frame to the adapter at once.
+    def send(self, message: CanMessage) -> None:
+        """Hand a message to the adapter at once.
 
         Raises:
             LinkError: the bus is closed, or the adapter unplugged.
         """
         self._check()
-        self.sent.append((self._clock.now(), frame))
-        self._adapter.write(encode_frame(frame))
+        self.sent.append((self._clock.now(), message))
+        self._adapter.write(encode_message(message))
 
-    def receive(self, timeout: float) -> Frame | None:
-        """Return the next frame; time passes until it comes or `timeout` [s] is over.
+    def receive(self, timeout: float) -> CanMessage | None:
+        """Return the next message; time passes until it comes or `timeout` [s] is over.
 
         Raises:
             LinkError: the bus is closed, or the adapter unplugged.

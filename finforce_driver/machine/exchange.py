@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import Command, Move, encode_request, split_identifier
 
 LENGTHS = {
@@ -19,23 +19,23 @@ LENGTHS = {
 }
 # asked in turn, so that the late answer to one is not taken for the answer to the next
 MARKERS = (Command.PING, Command.CURRENT, Command.ENCODER, Command.ERRORS)
-UNANSWERED_PAUSE = 0.001  # [s] for the gripper to take a frame that it does not answer: it keeps three at most
-TRIES = 2  # with markers before the first answer to one: an adapter may know no remote frames
+UNANSWERED_PAUSE = 0.001  # [s] for the gripper to take a message that it does not answer: it keeps three at most
+TRIES = 2  # with markers before the first answer to one: an adapter may know no remote messages
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """A frame to be sent.
+    """A message to be sent.
 
     Attributes:
-        frame: it.
-        answer: command of the frame that answers it; None when none does.
+        message: it.
+        answer: command of the message that answers it; None when none does.
         node: that answers.
         move: the order in it, where there is one.
         counted: whether silence says that the gripper does not answer.
     """
 
-    frame: Frame
+    message: CanMessage
     answer: Command | None = None
     node: int = 0
     move: Move | None = None
@@ -78,14 +78,14 @@ class Exchange:
         self.sent = now
         self.free = now if request.answer is not None else now + UNANSWERED_PAUSE
 
-    def answers(self, frame: Frame) -> bool:
-        """Return whether a frame is the reply that is waited for."""
-        request, address = self.pending, split_identifier(frame.id)
+    def answers(self, message: CanMessage) -> bool:
+        """Return whether a message is the reply that is waited for."""
+        request, address = self.pending, split_identifier(message.id)
         return (
             request is not None
-            and not frame.remote
+            and not message.remote
             and (address.node, address.command) == (request.node, request.answer)
-            and len(frame.data) == LENGTHS[request.answer]
+            and len(message.data) == LENGTHS[request.answer]
         )
 
     def end(self, now: float) -> Request:
@@ -94,7 +94,7 @@ class Exchange:
         self.latency = now - self.sent
         if request.counted and request.node == self._node:
             self.misses = 0
-        self._marks |= request.frame.remote and request.node == self._node
+        self._marks |= request.message.remote and request.node == self._node
         if request.node == self._node and (request.answer is MARKERS[self._marker] or self._rested):
             self._tries, self._rested = 0, False
         return request
@@ -114,7 +114,7 @@ class Exchange:
         if self.in_step or not (self._marks or self._tries <= TRIES):
             return None
         command = MARKERS[self._marker]
-        return Request(frame=encode_request(self._node, command), answer=command, node=self._node)
+        return Request(message=encode_request(self._node, command), answer=command, node=self._node)
 
     def rest(self) -> None:
         """Note that so long a pause was made that nothing older can be on the way: the next reply puts us in step."""

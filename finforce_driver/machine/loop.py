@@ -1,4 +1,4 @@
-"""Carries a machine's frames over a bus, one request at a time, and opens the bus again and again."""
+"""Carries a machine's messages over a bus, one request at a time, and opens the bus again and again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from finforce_driver.state import GripperState
 LOG = logging.getLogger(__name__)
 FIRST_PAUSE, LONGEST_PAUSE = 0.5, 5.0  # [s] between two tries to open the bus
 SHORTEST_WAIT = 1e-4  # [s], so that a rounding error of the clock makes no endless loop
-LATE_FRAMES = 64  # that are taken at most between two requests, however many come
+LATE_MESSAGES = 64  # that are taken at most between two requests, however many come
 LEAVING_TURNS = 20  # that the last order may take
 
 Listener = Callable[[GripperState], None]
@@ -26,7 +26,7 @@ Listener = Callable[[GripperState], None]
 class GripperLoop:
     """Runs a machine on a bus.
 
-    Whatever is sent is chosen and sent under one lock, so that after an emergency stop, which takes it too, no frame
+    Whatever is sent is chosen and sent under one lock, so that after an emergency stop, which takes it too, no message
     that was chosen before can leave.
 
     Args:
@@ -68,11 +68,11 @@ class GripperLoop:
     def estop(self) -> None:
         """Stop the gripper from the calling thread; what cannot be sent now is sent as soon as the bus is open."""
         with self._lock:
-            frames = self._machine.estop(self._clock.now())
+            messages = self._machine.estop(self._clock.now())
             if self._opened:
                 try:
-                    for frame in frames:
-                        self._bus.send(frame)
+                    for message in messages:
+                        self._bus.send(message)
                 except FinforceError as error:
                     LOG.warning("the emergency stop waits for the link: %s", error)
         self._wake.set()
@@ -126,12 +126,12 @@ class GripperLoop:
 
     def _exchange(self, longest: float) -> None:
         """Send what is due and receive its reply, or wait."""
-        self._take_late_frames()
+        self._take_late_messages()
         with self._lock:
             now = self._clock.now()
             request = self._machine.next_request(now)
             if request is not None:
-                self._bus.send(request.frame)
+                self._bus.send(request.message)
             left = self._machine.next_time(now) - now
         if request is None:
             self._clock.wait(max(min(left, longest), SHORTEST_WAIT), self._wake)
@@ -140,25 +140,24 @@ class GripperLoop:
         if self._machine.must_reopen:
             raise LinkError(self._machine.state.message)
 
-    def _take_late_frames(self) -> None:
+    def _take_late_messages(self) -> None:
         """Take what has come without being asked for: it must not pass for the next reply."""
-        for _ in range(LATE_FRAMES):
-            frame = self._bus.receive(0.0)
-            if frame is None:
+        for _ in range(LATE_MESSAGES):
+            message = self._bus.receive(0.0)
+            if message is None:
                 return
             with self._lock:
-                self._machine.on_frame(frame, self._clock.now())
+                self._machine.on_message(message, self._clock.now())
 
     def _receive(self, request: Request, sent: float) -> None:
         """Wait for the reply to a request that was sent at a time [s]."""
         deadline = sent + self._machine.settings.reply_timeout
         while (left := deadline - self._clock.now()) > 0.0:
-            frame = self._bus.receive(left)
-            if frame is None:
+            message = self._bus.receive(left)
+            if message is None:
                 break
             with self._lock:
-                self._machine.link_counts = self._bus.counts
-                if self._machine.on_frame(frame, self._clock.now()):
+                if self._machine.on_message(message, self._clock.now(), self._bus.counts):
                     self._pause = FIRST_PAUSE
                     return
         with self._lock:

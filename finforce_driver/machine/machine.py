@@ -1,126 +1,283 @@
-"""The gripper as a state machine: commands and frames in, requests and a state out.
+"""The gripper as a state machine: commands and CAN messages in, requests and a state out.
 
-The one who carries its frames asks `next_request`, sends it, and gives what comes to `on_frame`, or tells `on_silence`.
+Whoever carries its messages asks `next_request`, sends it, and gives what comes to `on_message`, or tells `on_silence`.
 Times are those of the carrier's clock [s].
 """
 
 from __future__ import annotations
 
-from collections import deque
+import math
+from collections import Counter, deque
 from collections.abc import Mapping
 
-from finforce_driver.can.bus import Frame
-from finforce_driver.can.protocol import Command, decode_reply, split_identifier
-from finforce_driver.machine import commands
-from finforce_driver.machine.core import Core
-from finforce_driver.machine.exchange import Request
-from finforce_driver.machine.judge import judge_reply, lose_link, overrule
-from finforce_driver.machine.portrait import build_state
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import Command, Flag, Move, Reply, decode_reply, split_identifier
+from finforce_driver.errors import GripperStateError, TargetError
+from finforce_driver.machine.calibration import CalibrationRun, CalibrationStep
+from finforce_driver.machine.exchange import Exchange, Request
+from finforce_driver.machine.knowledge import Knowledge
+from finforce_driver.machine.move import GRACE, Goal, MoveJob
+from finforce_driver.machine.orders import Echo, EchoWatch, Orders
 from finforce_driver.machine.requests import RequestSource
+from finforce_driver.machine.state_report import build_state
+from finforce_driver.machine.stop import EmergencyStop, Recovery, RecoveryStep, StopStage
 from finforce_driver.settings import GripperSettings
-from finforce_driver.state import SILENT, GripperState, Phase
+from finforce_driver.state import (
+    HALF_CALIBRATED,
+    OTHER_MASTER,
+    OTHER_NODE,
+    REBOOTED,
+    SILENT,
+    MoveOutcome,
+    Phase,
+)
+from finforce_driver.units import SLOWEST_BYTE, GripperScale, is_number
 
 SHORT_SILENCE = 5  # requests in a row without a reply after which the gripper is taken to be absent
 PROBES = 20  # the same before the first reply: a second
-ECHOES = 8  # last frames, in which a frame of ours is recognised that an adapter gives back
-COMMANDS = frozenset({Command.ESTOP, Command.CLEAR, Command.IDLE, Command.RESET, Command.CALIBRATE})
+ECHOES = 8  # last messages, in which one of ours is recognised that an adapter gives back
+OLD = 0.1  # [s] after which a reply does not tell where moving jaws are
+STANDING = 2.0  # [counts/s], below which an unknown order is taken to hold
+GO = Flag.ACTIVATE | Flag.GO
+FOREIGN = frozenset({Command.ESTOP, Command.CLEAR, Command.IDLE, Command.RESET, Command.CALIBRATE})
 LOST_ORDER = "the gripper fell silent before the order could be sent: command again"
+NO_FAULTS = (False, False, False, False)
+CONNECTED = (Phase.UNCALIBRATED, Phase.READY, Phase.MOVING)
+USABLE = (Phase.READY, Phase.MOVING)
+REFUSALS = {
+    Phase.DISCONNECTED: "no gripper answers",
+    Phase.PROBING: "the gripper has not answered yet: wait for its first reply",
+    Phase.UNCALIBRATED: "the gripper is not calibrated: calibrate it first",
+    Phase.CALIBRATING: "the gripper calibrates, which another command would cut short: wait",
+    Phase.FAULT: "a fault or an emergency stop is latched: clear the errors first",
+}
 
 
 class GripperMachine:
     """Drives one gripper, without input or output of its own.
 
+    Its parts are read by what chooses the next request and by what shows the state; they change here alone.
+
     Attributes:
         state: what is known.
         settings: of the gripper.
-        link_counts: what the link counts, to be shown in the state.
+        scale: its units.
+        known: what the replies say.
+        exchange: requests and replies.
+        orders: what the gripper shall do.
+        stop: the emergency stop.
+        recovery: errors being cleared; None: none are.
+        calibration: under way; None: none is.
+        job: the last move; None: none, or it was replaced by something else.
+        outcome: of the last move.
+        hold_wanted: the jaws are to be held where the next reply says that they are.
+        note: sentence that stays until the next command.
+        counts: of events by name.
 
     Args:
-        settings: the same.
+        settings: of the gripper.
         salt: any number, other than that of the program that drove the gripper before.
     """
 
     def __init__(self, settings: GripperSettings | None = None, salt: int = 0) -> None:
         self.settings = settings or GripperSettings()
-        self.link_counts: Mapping[str, int] = {}
-        self._core = Core(self.settings, salt)
-        self._requests = RequestSource(self._core)
-        self._sent: deque[Frame] = deque(maxlen=ECHOES)
-        self.state = GripperState()
+        self.scale = GripperScale(self.settings)
+        self.known = Knowledge(self.settings)
+        self.exchange = Exchange(self.settings.node_id)
+        self.orders = Orders(salt)
+        self.stop = EmergencyStop()
+        self.recovery: Recovery | None = None
+        self.calibration: CalibrationRun | None = None
+        self.job: MoveJob | None = None
+        self.hold_wanted = False
+        self.note = ""
+        self.counts: Counter[str] = Counter()
+        self._echo = EchoWatch()
+        self._ended = MoveOutcome.NONE  # of the last move that is no job any more
+        self._enabled = True  # not switched off
+        self._joined = self._silent = False
+        self._order_sent = -math.inf
+        self._link_counts: Mapping[str, int] = {}
+        self._requests = RequestSource(self)
+        self._sent: deque[CanMessage] = deque(maxlen=ECHOES)
         self._refresh()
 
-    def move(self, opening: float, speed: float | None, force: float | None, now: float) -> None:
-        """Go to an opening [m] at a speed [m/s], stalling with a force [N]; see `Gripper.move`."""
-        commands.move(self._core, commands.make_goal(self._core, opening, speed, force), now)
-        self._refresh()
+    # What is known
 
-    def hold(self, now: float) -> None:
-        """Stop in place; see `Gripper.hold`."""
-        commands.hold(self._core, now)
-        self._refresh()
+    @property
+    def phase(self) -> Phase:
+        """Where the driver is with the gripper."""
+        if not self._joined or self._silent:
+            return Phase.DISCONNECTED
+        if self.known.reply is None:
+            return Phase.PROBING
+        if self.stop.active or self.recovery is not None or self.known.error:
+            return Phase.FAULT
+        if self.calibration is not None:
+            return Phase.CALIBRATING
+        if not self.known.calibrated:
+            return Phase.UNCALIBRATED
+        return Phase.MOVING if self.moving else Phase.READY
 
-    def calibrate(self) -> None:
-        """Find the end stops; see `Gripper.calibrate`."""
-        commands.calibrate(self._core)
-        self._refresh()
+    @property
+    def moving(self) -> bool:
+        """Whether a move is under way."""
+        return self.job is not None and self.job.outcome is MoveOutcome.NONE
 
-    def clear_errors(self) -> None:
-        """Clear what is latched; see `Gripper.clear_errors`."""
-        commands.clear_errors(self._core)
-        self._refresh()
+    @property
+    def outcome(self) -> MoveOutcome:
+        """What became of the last move."""
+        return self._ended if self.job is None else self.job.outcome
 
-    def activate(self, on: bool, now: float) -> None:
-        """Switch the power stage on or off; see `Gripper.activate`."""
-        commands.activate(self._core, on, now)
-        self._refresh()
+    @property
+    def silent(self) -> bool:
+        """Whether nothing has answered for long."""
+        return self._silent
 
-    def release_power(self, now: float) -> None:
-        """Let the jaws go limp; see `Gripper.release_power`."""
-        commands.release_power(self._core, now)
-        self._refresh()
+    @property
+    def may_drive(self) -> bool:
+        """Whether an order that moves the jaws may leave: everything that speaks against it is known and does not."""
+        return self.phase in USABLE and self.exchange.in_step and not self.known.filter.alarming
 
-    def estop(self, now: float) -> list[Frame]:
-        """Stop at once: return the frames that are to be sent before anything else; no motion comes after them."""
-        core = self._core
-        commands.demand_stop(core)
-        first = self._requests.begin_stop(now)
-        # the gripper keeps three frames at most, and one is on the way already: the second follows its reply
-        second = self._requests.end_stop() if core.exchange.pending is None else None
-        frames = [request.frame for request in (first, second) if request is not None]
-        self._sent.extend(frames)
-        self._refresh()
-        return frames
-
-    def leave(self, now: float) -> None:
-        """Prepare to be ended: hold in place, or let go where the settings say so."""
-        core = self._core
-        if core.phase in commands.CONNECTED and self.settings.release_on_stop:
-            commands.activate(core, False, now)
-        elif core.phase in (*commands.USABLE, Phase.CALIBRATING):
-            commands.hold(core, now)
+    @property
+    def settled(self) -> bool:
+        """Whether the last believed reply speaks of the last order, not of the one before."""
+        return self.known.stamp - self._order_sent >= GRACE
 
     @property
     def has_orders(self) -> bool:
         """Whether an order or an emergency stop has still to be sent."""
-        return self._core.orders.pending or (self._core.stop.active and not self._core.known.error)
+        return self.orders.pending or (self.stop.active and not self.known.error)
 
     @property
     def must_reopen(self) -> bool:
         """Whether nothing has answered for so long that the link is to be opened anew."""
-        return self._core.exchange.misses >= self.settings.missed_replies
+        return self.exchange.misses >= self.settings.missed_replies
 
     def opening_at(self, time: float) -> float:
         """Return the opening [m] at a past time; NaN unknown."""
-        core = self._core
         reach = 2.0 / self.settings.poll_rate + self.settings.reply_timeout
-        return core.scale.opening_of(core.known.history.place_at(time, reach))
+        return self.scale.opening_of(self.known.history.place_at(time, reach))
+
+    # Commands; each is refused by name where it cannot be done
+
+    def move(self, opening: float, speed: float | None, force: float | None, now: float) -> None:
+        """Go to an opening [m] at a speed [m/s], stalling with a force [N]; the same goal again changes nothing.
+
+        Raises:
+            TargetError: a value is no number or out of bounds.
+            GripperStateError: the gripper could not move.
+        """
+        goal = self._make_goal(opening, speed, force)
+        self._require("move", USABLE)
+        if not self._enabled:
+            raise GripperStateError("move: the gripper was switched off: activate it first")
+        job = self.job
+        if job is not None and job.goal == goal and job.outcome in (MoveOutcome.NONE, MoveOutcome.REACHED):
+            return
+        start = self._setpoint(now)
+        self.hold_wanted = False
+        self._end_job(MoveOutcome.REPLACED)
+        self.note, self._ended = goal.pace.note, MoveOutcome.NONE
+        self.job = MoveJob(goal, start=start, rate=goal.pace.speed / self.scale.resolution, now=now)
+        self._want_position()
+        self._refresh()
+
+    def hold(self, now: float) -> None:
+        """Stop in place and hold, or end a calibration, limp; a gripper that stands or was let go stays as it is.
+
+        Raises:
+            GripperStateError: the jaws are limp, or unknown.
+        """
+        self._require("hold", (*USABLE, Phase.CALIBRATING))
+        self._hold(now)
+        self._refresh()
+
+    def calibrate(self) -> None:
+        """Find the end stops.
+
+        Raises:
+            GripperStateError: the gripper is absent or faulty, or calibrates already.
+        """
+        self._require("calibrate", CONNECTED)
+        self._end_job(MoveOutcome.REPLACED)
+        self.orders.drop()
+        self._echo.forget()
+        self.note, self._enabled = "", True
+        self.calibration = CalibrationRun(calibrated=self.known.calibrated, reset=self.known.half_calibrated)
+        self._refresh()
+
+    def clear_errors(self) -> None:
+        """Clear what is latched; without a fault nothing is sent, since clearing lets go.
+
+        Raises:
+            GripperStateError: the gripper is absent, or calibrates.
+        """
+        self._require("clear_errors", (*CONNECTED, Phase.FAULT))
+        self.note = ""
+        if self.phase is Phase.FAULT and self.recovery is None:
+            self._abort()
+            self.recovery = Recovery(unflag=self.stop.active or bool(self.known.reply and self.known.reply.estopped))
+            self.stop.begin_clearing()
+        self._refresh()
+
+    def activate(self, on: bool, now: float) -> None:
+        """Switch the power stage on, holding in place, or off, limp.
+
+        Raises:
+            GripperStateError: the gripper is absent, faulty or calibrates.
+        """
+        self._require("activate", CONNECTED)
+        self.note, self._enabled = "", on
+        if not on:
+            self._let_go(Flag.OFF, now)
+        elif not self.known.calibrated:
+            self.orders.want(self.order(position=0, flags=Flag.ACTIVATE))
+        elif not self.known.driving:
+            self._end_job(MoveOutcome.REPLACED)
+            self.orders.want(self.order(position=self.place_for_order(now), flags=GO))
+        self._refresh()
+
+    def release_power(self, now: float) -> None:
+        """Let the jaws go limp, ready for the next move.
+
+        Raises:
+            GripperStateError: the gripper is absent, faulty or calibrates.
+        """
+        self._require("release_power", CONNECTED)
+        self.note = ""
+        self._let_go(Flag.ACTIVATE, now)
+        self._refresh()
+
+    def estop(self, now: float) -> list[CanMessage]:
+        """Stop at once, in whichever state: return the messages to be sent before anything else; no motion follows."""
+        self._break_calibration()
+        self.recovery = None
+        self._abort()
+        self.stop.demand()
+        first = self._requests.begin_stop(now)
+        # the gripper keeps three messages at most, and one is on the way already: the second follows its reply
+        second = self._requests.end_stop() if self.exchange.pending is None else None
+        messages = [request.message for request in (first, second) if request is not None]
+        self._sent.extend(messages)
+        self._refresh()
+        return messages
+
+    def leave(self, now: float) -> None:
+        """Prepare to be ended: hold in place, or let go where the settings say so."""
+        if self.phase in CONNECTED and self.settings.release_on_stop:
+            self.activate(False, now)
+        elif self.phase in (*USABLE, Phase.CALIBRATING):
+            self.hold(now)
+
+    # What the carrier asks and tells
 
     def next_request(self, now: float) -> Request | None:
         """Return what to send now, None when nothing is due; it counts as sent."""
         request = self._requests.next_request(now)
         if request is not None:
-            self._core.exchange.begin(request, now)
-            self._sent.append(request.frame)
+            self.exchange.begin(request, now)
+            self._sent.append(request.message)
         return request
 
     def next_time(self, now: float) -> float:
@@ -129,95 +286,296 @@ class GripperMachine:
 
     def on_link_open(self) -> None:
         """Begin on a link that was opened."""
-        self._core.exchange.reset()
-        self._core.joined = True
+        self.exchange.reset()
+        self._joined = True
         self._refresh()
 
     def on_link_lost(self, reason: str) -> None:
         """Forget what can have changed by the time the link is back, and want nothing."""
-        lose_link(self._core, reason)
+        if self.calibration is not None:
+            # without an earlier calibration the gripper's flag will say whether it was completed
+            self.known.half_calibrated |= self.known.calibrated
+            self.calibration = None
+        self.recovery = None
+        self.stop.end_clearing(False)
+        self._abort(reason)
+        self.known.forget()
+        self.exchange.reset()
+        self._joined = self._silent = False
         self._refresh()
 
-    def on_frame(self, frame: Frame, now: float) -> bool:
-        """Take a frame; return whether it was the reply that was waited for."""
-        if not self._core.exchange.answers(frame):
-            if frame not in self._sent:
-                self._take_unasked(frame)
+    def on_message(self, message: CanMessage, now: float, link_counts: Mapping[str, int] | None = None) -> bool:
+        """Take a message; return whether it was the reply that was waited for.
+
+        Args:
+            message: as it came.
+            now: when [s].
+            link_counts: what the link counts, to be shown in the state.
+        """
+        self._link_counts = link_counts or self._link_counts
+        if not self.exchange.answers(message):
+            if message not in self._sent:
+                self._take_unasked(message)
             return False
-        core, request = self._core, self._core.exchange.end(now)
-        core.counts["replies"] += 1
+        request = self.exchange.end(now)
+        self.counts["replies"] += 1
         if request.answer is Command.REPLY:
-            self._take_reply(request, frame, now)
+            self._take_reply(request, message, now)
         elif request.node != self.settings.node_id:
-            commands.explain_other_node(core, request.node)
+            self.note = OTHER_NODE.format(node=self.settings.node_id, other=request.node)
             self._refresh()
         elif not request.counted:
-            core.known.telemetry.take(request.answer, frame, now)
+            self.known.telemetry.take(request.answer, message, now)
         return True
 
     def on_silence(self, now: float, suspicion: str = "") -> None:
         """Note that the reply did not come in time; `suspicion` is what the link has to say to that."""
-        core, request = self._core, self._core.exchange.miss()
+        request = self.exchange.miss()
         if request is None:
             return
-        core.counts["lost replies"] += 1
-        if request.move is not None and core.orders.urgent and core.orders.wanted.drives:
-            core.postpone_hold()
+        self.counts["lost replies"] += 1
+        if request.move is not None and self.orders.urgent and self.orders.wanted.drives:
+            self._postpone_hold()
         if not request.counted:
-            core.known.telemetry.miss(now)
+            self.known.telemetry.miss(now)
             return
-        if core.exchange.misses >= (PROBES if core.known.reply is None else SHORT_SILENCE) and not core.silent:
-            core.silent = True
-            if core.orders.pending:
-                core.abort(LOST_ORDER)
-            core.note = core.note or suspicion or SILENT.format(node=self.settings.node_id)
+        if self.exchange.misses >= (PROBES if self.known.reply is None else SHORT_SILENCE) and not self._silent:
+            self._silent = True
+            if self.orders.pending:
+                self._abort(LOST_ORDER)
+            self.note = self.note or suspicion or SILENT.format(node=self.settings.node_id)
             self._refresh()
 
-    def _take_reply(self, request: Request, frame: Frame, now: float) -> None:
-        """Take the reply to a poll or an order."""
-        core, reply = self._core, decode_reply(frame)
+    # For the choice of requests
+
+    def order(self, *, position: int, flags: int, speed: int | None = None, current_mA: int | None = None) -> Move:
+        """Return an order; what is not given stays as it was last."""
+        last = self.orders.wanted or self.orders.taken
+        if last is None:
+            default = round(1e3 * self.settings.default_current)
+            last = Move(position=0, speed=SLOWEST_BYTE, current_mA=default, flags=Flag.OFF)
+        return Move(
+            position=position,
+            speed=last.speed if speed is None else speed,
+            current_mA=last.current_mA if current_mA is None else current_mA,
+            flags=flags,
+        )
+
+    def place_for_order(self, now: float) -> int:
+        """Return the position that holds the jaws where they are [counts].
+
+        The reply truncates: jaws that rest between two counts report the one on the open side.
+        """
+        place = self._place_now(now)
+        if math.isnan(place):
+            return 0
+        return math.ceil(place) if self.known.history.speed() >= 0.0 else math.floor(place)
+
+    def advance_move(self, now: float) -> None:
+        """Let the target of a slow move go on when it is due."""
+        if self.job is not None and self.orders.wanted is not None and not (self.job.sent and self.orders.pending):
+            self.job.advance(now, self.known.place, self.known.stamp)
+            self._want_position()
+
+    # Within
+
+    def _require(self, what: str, phases: tuple[Phase, ...]) -> None:
+        """Refuse what cannot be done in the present phase, by raising GripperStateError."""
+        if self.phase not in phases:
+            raise GripperStateError(f"{what}: {REFUSALS[self.phase]}" + (f" ({self.note})" if self.note else ""))
+
+    def _make_goal(self, opening: float, speed: float | None, force: float | None) -> Goal:
+        """Return a move in the gripper's units; raises TargetError."""
+        for name, value in {"opening": opening, "speed": speed, "force": force}.items():
+            if value is not None and not is_number(value):
+                raise TargetError(f"{name}: got {value!r}, expected a number; the gripper stays as it was")
+        default = round(1e3 * self.settings.default_current)
+        return Goal(
+            opening=float(opening),
+            position=self.scale.position_of(opening),
+            pace=self.scale.pace_of(self.settings.default_speed if speed is None else speed),
+            current_mA=default if force is None else self.scale.current_of(force),
+        )
+
+    def _want_position(self) -> None:
+        """Have the gripper get the order that the present move wants."""
+        goal = self.job.goal
+        order = self.order(position=self.job.position, flags=GO, speed=goal.pace.byte, current_mA=goal.current_mA)
+        self.orders.want(order)
+
+    def _hold(self, now: float) -> None:
+        """Stop in place; see `hold`."""
+        if self.calibration is not None:
+            self._break_calibration()
+            self.note = HALF_CALIBRATED
+            self.orders.want(self.order(position=0, flags=Flag.ACTIVATE), urgent=True)
+            return
+        stepping = self.job is not None and self.job.steps is not None and self.job.stepping
+        # a hold that had to wait comes with the first reply after a gap, which tells no speed
+        still = abs(self.known.history.speed()) <= STANDING and not self.hold_wanted
+        standing = still and not self.moving and not stepping
+        self._end_job(MoveOutcome.REPLACED)
+        self.note, self.hold_wanted = "", False
+        drives = self.known.driving or self.orders.pending
+        if now - self.known.stamp > OLD and drives:
+            self._postpone_hold()
+            return
+        kept, place = self.orders.wanted, self._place_now(now)
+        if standing or not drives or (kept is not None and (not kept.drives or abs(kept.position - place) <= 1.0)):
+            return
+        self.orders.want(self.order(position=self.place_for_order(now), flags=GO), urgent=True)
+
+    def _let_go(self, flags: Flag, now: float) -> None:
+        """Want an order that moves nothing and holds nothing."""
+        self._end_job(MoveOutcome.REPLACED)
+        self.hold_wanted = False
+        self.orders.want(self.order(position=self.place_for_order(now), flags=flags), urgent=True)
+
+    def _end_job(self, outcome: MoveOutcome) -> None:
+        """End a move that is under way; one that has ended keeps its outcome."""
+        if self.job is not None:
+            self._ended = outcome if self.moving else self.job.outcome
+            self.job = None
+
+    def _abort(self, note: str = "") -> None:
+        """Want nothing any more, after what the gripper may have been interrupted by."""
+        self._end_job(MoveOutcome.ABORTED)
+        self.hold_wanted = False
+        self.orders.drop()
+        self._echo.forget()
+        self.note = note
+
+    def _break_calibration(self) -> None:
+        """Note that a calibration under way is cut short."""
+        if self.calibration is not None:
+            self.calibration, self.known.half_calibrated = None, True
+
+    def _postpone_hold(self) -> None:
+        """Hold as soon as it is known where: at an old place, to hold would be to go back."""
+        self.orders.forget()
+        self._echo.forget()
+        self.hold_wanted = True
+
+    def _place_now(self, now: float) -> float:
+        """Return where the jaws are by now [counts]; NaN unknown."""
+        order = self.orders.taken
+        return self.known.place_now(now, float(order.position) if order is not None and order.drives else None)
+
+    def _setpoint(self, now: float) -> float:
+        """Return where the target or the jaws are now [counts], for a move that goes on from there."""
+        place, wanted = self._place_now(now), self.orders.wanted
+        if wanted is None or not wanted.flags & Flag.GO:
+            return place
+        ramp = self.job.steps.ramp(now) if self.job and self.job.steps else float(wanted.position)
+        return ramp if abs(ramp - place) <= 2.0 else place
+
+    def _take_reply(self, request: Request, message: CanMessage, now: float) -> None:
+        """Take the reply to a poll or an order, and draw the conclusions if it is believed."""
         if request.move is not None:
             self._take_echo(request, now)
-        order = core.orders.taken
-        speed = 0.0 if order is None else core.scale.speed_of(order.speed) / core.scale.resolution
-        before = core.known.reply
-        believed = core.known.take(reply, now, order, speed)
-        core.counts["doubted replies"] = core.known.filter.doubted
+        order, before = self.orders.taken, self.known.reply
+        speed = 0.0 if order is None else self.scale.speed_of(order.speed) / self.scale.resolution
+        believed = self.known.take(decode_reply(message), now, order, speed)
+        self.counts["doubted replies"] = self.known.filter.doubted
         if believed is not None:
-            judge_reply(core, before, believed, now)
+            self._conclude(before, believed, now)
             self._refresh()
 
     def _take_echo(self, request: Request, now: float) -> None:
         """Note that an order was answered."""
-        core = self._core
-        if core.recovery is not None:
-            core.recovery.unflagged()
-        elif request.move == core.orders.wanted:
-            core.orders.take(request.move)
-            core.echo.send(request.move, now)
-            core.order_sent = now
-            core.known.restart_contact()
-            if core.job is not None:
-                core.job.send(now)
+        if self.recovery is not None:
+            self.recovery.unflagged()
+        elif request.move == self.orders.wanted:
+            self.orders.take(request.move)
+            self._echo.send(request.move, now)
+            self._order_sent = now
+            self.known.restart_contact()
+            if self.job is not None:
+                self.job.send(now)
 
-    def _take_unasked(self, frame: Frame) -> None:
-        """Count a frame that nobody waits for, and look for other programs' orders."""
-        address, core = split_identifier(frame.id), self._core
+    def _conclude(self, before: Reply | None, reply: Reply, now: float) -> None:
+        """Draw the conclusions from a reply that is believed; `before` is the one before it."""
+        if self._silent or before is None:
+            self._silent, self.note = False, ""
+        self.stop.take(reply)
+        self._follow_recovery(reply, now)
+        self._follow_fault(before, reply, now)
+        if self.calibration is not None:
+            self._follow_calibration(reply, now)
+        elif before is not None and before.calibrated and not reply.calibrated:
+            self._abort(REBOOTED)
+            self.known.half_calibrated = False
+        elif not reply.error:
+            self._follow_orders(reply, now)
+        if self.hold_wanted and self.phase in USABLE:
+            self._hold(now)
+
+    def _follow_recovery(self, reply: Reply, now: float) -> None:
+        """Let the clearing of errors go on."""
+        recovery = self.recovery
+        if recovery is None:
+            return
+        recovery.take(reply, now)
+        if recovery.over:
+            cleared = recovery.step is RecoveryStep.DONE
+            self.recovery = None
+            self.stop.end_clearing(cleared)
+            self._abort()
+            if not cleared:
+                self.known.telemetry.ask_errors(now)
+
+    def _follow_fault(self, before: Reply | None, reply: Reply, now: float) -> None:
+        """End what a fault ends, and have its name asked for."""
+        if reply.faults == (before.faults if before is not None else NO_FAULTS):
+            return
+        self.known.telemetry.ask_errors(now)
+        if reply.error and self.recovery is None and self.stop.stage is not StopStage.CLEARING:
+            self._abort()
+
+    def _follow_calibration(self, reply: Reply, now: float) -> None:
+        """Let the calibration go on, and end it."""
+        run = self.calibration
+        run.take(reply, now)
+        if run.over:
+            self.calibration = None
+            self.known.half_calibrated = run.step is CalibrationStep.FAILED
+            self.known.restart_places()
+            self._abort(run.reason)
+            self._ended = MoveOutcome.NONE
+
+    def _follow_orders(self, reply: Reply, now: float) -> None:
+        """Judge the move, and whether the gripper has our order."""
+        echo = self._echo.take(reply, now)
+        if echo is Echo.OVERRULED:
+            self._yield_to_other("it does not do what it was told last")
+        elif echo is Echo.UNHEARD and not (self.moving and self.orders.repeat()):
+            self._echo.forget()
+        if self.job is not None:
+            self.job.take(reply, now)
+            if self.job.outcome is MoveOutcome.TIMED_OUT and self.orders.pending:
+                self.orders.drop()
+
+    def _take_unasked(self, message: CanMessage) -> None:
+        """Count a message that nobody waits for, and look for other programs' orders."""
+        address = split_identifier(message.id)
         if address.node != self.settings.node_id:
-            core.counts["frames of other nodes"] += 1
+            self.counts["messages of other nodes"] += 1
         elif address.command == Command.HEARTBEAT:
-            core.counts["heartbeats"] += 1
-        elif address.command == Command.MOVE and len(frame.data) == 5 and not frame.remote:
-            core.counts["foreign commands"] += 1
-            overrule(core, "a move was seen on the bus")
-            self._refresh()
-        elif address.command in COMMANDS and not frame.remote:
-            core.counts["foreign commands"] += 1
-            overrule(core, f"command {address.command} was seen on the bus")
-            self._refresh()
+            self.counts["heartbeats"] += 1
+        elif address.command == Command.MOVE and len(message.data) == 5 and not message.remote:
+            self._yield_to_other("a move was seen on the bus")
+        elif address.command in FOREIGN and not message.remote:
+            self._yield_to_other(f"command {address.command} was seen on the bus")
         else:
-            core.counts["unexpected frames"] += 1
+            self.counts["unexpected messages"] += 1
+
+    def _yield_to_other(self, what: str) -> None:
+        """Yield to another program: the gripper has its order, and gets none of ours until one is asked for."""
+        self.counts["foreign commands"] += 1
+        self._break_calibration()
+        self._abort(OTHER_MASTER.format(what=what))
+        self._refresh()
 
     def _refresh(self) -> None:
         """Make the state anew."""
-        self.state = build_state(self._core, self.link_counts)
+        self.state = build_state(self, self._link_counts)

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 from finforce_driver.can.protocol import Reply
-from finforce_driver.state import Outcome
+from finforce_driver.state import MoveOutcome
 from finforce_driver.units import Pace
 
 GRACE = 0.05  # [s] after a move in which its replies may still speak of the one before
@@ -64,7 +64,7 @@ class MoveWatch:
         self._arrivals = 0
 
     def send(self, now: float) -> None:
-        """Note that a frame of the move was sent: what comes soon after is of the one before."""
+        """Note that a message of the move was sent: what comes soon after is of the one before."""
         self._sent = now
         self._contact, self._arrivals = None, 0
 
@@ -72,7 +72,7 @@ class MoveWatch:
         """Note that the move got on: its time begins anew."""
         self._deadline = now + self._allowed
 
-    def take(self, reply: Reply, now: float, final: bool) -> Outcome:
+    def take(self, reply: Reply, now: float, final: bool) -> MoveOutcome:
         """Return what became of the move; NONE while it is under way.
 
         Args:
@@ -81,7 +81,7 @@ class MoveWatch:
             final: whether the gripper was sent to the end of the move, not to a step on the way.
         """
         if now - self._sent < GRACE:
-            return Outcome.NONE
+            return MoveOutcome.NONE
         self._follow_contact(reply, now)
         contact = self._contact
         if contact and now - contact.since >= CONTACT_TIME and contact.replies >= CONTACT_REPLIES:
@@ -89,8 +89,8 @@ class MoveWatch:
         there = reply.at_target and abs(reply.position - self._position) <= TOLERANCE
         self._arrivals = self._arrivals + 1 if there and final else 0
         if self._arrivals >= REACHED_REPLIES:
-            return Outcome.REACHED
-        return Outcome.TIMED_OUT if now > self._deadline else Outcome.NONE
+            return MoveOutcome.REACHED
+        return MoveOutcome.TIMED_OUT if now > self._deadline else MoveOutcome.NONE
 
     def _follow_contact(self, reply: Reply, now: float) -> None:
         """Keep how long a contact lasts at one place."""
@@ -102,11 +102,11 @@ class MoveWatch:
             kept = _Contact(since=now, position=reply.position, replies=0)
         self._contact = _Contact(since=kept.since, position=kept.position, replies=kept.replies + 1)
 
-    def _judge_contact(self, reply: Reply) -> Outcome:
+    def _judge_contact(self, reply: Reply) -> MoveOutcome:
         """Return what a lasting contact means."""
         if push_direction(reply, self.closing) > 0:
-            return Outcome.CLOSED_EMPTY if reply.position >= CLOSED else Outcome.GRASPED
-        return Outcome.REACHED if max(reply.position, self._position) <= OPENED else Outcome.BLOCKED
+            return MoveOutcome.CLOSED_EMPTY if reply.position >= CLOSED else MoveOutcome.GRASPED
+        return MoveOutcome.REACHED if max(reply.position, self._position) <= OPENED else MoveOutcome.BLOCKED
 
 
 LARGEST_LAG = 3.5  # [counts] that the jaws may stay behind the target: more means that something is in the way
@@ -177,7 +177,7 @@ class Steps:
 
 
 LOOSE_TIME = 0.1  # [s] without contact after which what was grasped is taken to be gone
-PRESSING = (Outcome.GRASPED, Outcome.BLOCKED)
+PRESSING = (MoveOutcome.GRASPED, MoveOutcome.BLOCKED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,7 +214,7 @@ class MoveJob:
 
     def __init__(self, goal: Goal, *, start: float, rate: float, now: float) -> None:
         self.goal = goal
-        self.outcome = Outcome.NONE
+        self.outcome = MoveOutcome.NONE
         self._rate = rate
         self.steps = Steps(start=start, goal=goal.position, rate=rate, now=now) if goal.pace.stepped else None
         allowed = 2.0 / rate if self.steps else abs(goal.position - start) / rate
@@ -236,7 +236,7 @@ class MoveJob:
     @property
     def stepping(self) -> bool:
         """Whether the target may go on: under way, or pressing on something that may give way."""
-        return self.outcome is Outcome.NONE or self.outcome in PRESSING
+        return self.outcome is MoveOutcome.NONE or self.outcome in PRESSING
 
     def advance(self, now: float, place: float, stamp: float) -> None:
         """Let the target go on when it is due.
@@ -263,12 +263,12 @@ class MoveJob:
 
     def take(self, reply: Reply, now: float) -> None:
         """Judge by a believed reply."""
-        if self.outcome is Outcome.NONE:
+        if self.outcome is MoveOutcome.NONE:
             final = self.steps is None or self.steps.done
             self.outcome = self.watch.take(reply, now, final)
             self._pressed = now
         elif self.outcome in PRESSING:
             self._pressed = now if reply.contact else self._pressed
             if now - self._pressed > LOOSE_TIME:
-                self.outcome = Outcome.NONE
+                self.outcome = MoveOutcome.NONE
                 self.watch.delay(now)

@@ -13,7 +13,7 @@ REPEAT = 0.02  # [s] between two tries
 TRIES = 3  # after which the error bit alone is believed: another fault may hide the stop's own bit
 
 
-class Stage(Enum):
+class StopStage(Enum):
     """How far an emergency stop has come."""
 
     NONE = 0
@@ -30,23 +30,23 @@ class EmergencyStop:
     """
 
     def __init__(self) -> None:
-        self.stage = Stage.NONE
+        self.stage = StopStage.NONE
         self._next_time = 0.0
         self._tries = 0
 
     @property
     def active(self) -> bool:
         """Whether anything but standing still is forbidden."""
-        return self.stage is not Stage.NONE
+        return self.stage is not StopStage.NONE
 
     def demand(self) -> None:
         """Stop, whatever happened before; what is on its way already is not sent anew."""
-        if self.stage is not Stage.WANTED:
-            self.stage, self._next_time, self._tries = Stage.WANTED, 0.0, 0
+        if self.stage is not StopStage.WANTED:
+            self.stage, self._next_time, self._tries = StopStage.WANTED, 0.0, 0
 
     def due(self, now: float) -> bool:
-        """Return whether its frames are to be sent now, and count that as done."""
-        if self.stage is not Stage.WANTED or now < self._next_time:
+        """Return whether its messages are to be sent now, and count that as done."""
+        if self.stage is not StopStage.WANTED or now < self._next_time:
             return False
         self._next_time = now + REPEAT
         self._tries += 1
@@ -55,18 +55,18 @@ class EmergencyStop:
     def begin_clearing(self) -> None:
         """Note that it is being cleared."""
         if self.active:
-            self.stage = Stage.CLEARING
+            self.stage = StopStage.CLEARING
 
     def end_clearing(self, cleared: bool) -> None:
         """Note how the clearing ended, unless a new stop came between."""
-        if self.stage is Stage.CLEARING:
-            self.stage = Stage.NONE if cleared else Stage.LATCHED
+        if self.stage is StopStage.CLEARING:
+            self.stage = StopStage.NONE if cleared else StopStage.LATCHED
 
     def take(self, reply: Reply) -> None:
         """Compare with what the gripper says."""
-        if self.stage is Stage.WANTED and (reply.estopped or (reply.error and self._tries >= TRIES)):
-            self.stage = Stage.LATCHED
-        elif self.stage is Stage.LATCHED and not reply.error:
+        if self.stage is StopStage.WANTED and (reply.estopped or (reply.error and self._tries >= TRIES)):
+            self.stage = StopStage.LATCHED
+        elif self.stage is StopStage.LATCHED and not reply.error:
             self.demand()
 
 
@@ -85,7 +85,7 @@ class RecoveryStep(Enum):
 
 
 class Recovery:
-    """One attempt to clear the errors, with repetitions for frames that are lost.
+    """One attempt to clear the errors, with repetitions for messages that are lost.
 
     Attributes:
         step: what is to be done next.

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import Command, ErrorReport, decode_errors, decode_supply, decode_temperature
 
 LARGEST_STEP = {Command.TEMPERATURE: 3.0, Command.SUPPLY: 0.5}  # [deg C], [V] between two answers, without repetition
-VALUES: dict[Command, tuple[str, Callable[[Frame], float | ErrorReport]]] = {
+VALUES: dict[Command, tuple[str, Callable[[CanMessage], float | ErrorReport]]] = {
     Command.TEMPERATURE: ("temperature", decode_temperature),
     Command.SUPPLY: ("voltage", decode_supply),
     Command.ERRORS: ("errors", decode_errors),
@@ -67,17 +67,17 @@ class Telemetry:
         unknown = self._silences >= SILENCES and not self._answered
         self._next_time = now + (PATIENCE if unknown else self._period)
 
-    def take(self, command: Command, frame: Frame, now: float) -> None:
+    def take(self, command: Command, message: CanMessage, now: float) -> None:
         """Take an answer; one that is doubted is asked for again at once."""
         self._silences, self._answered = 0, True
-        if self._believe(command, frame):
+        if self._believe(command, message):
             self._turn = (ORDER.index(command) + 1) % len(ORDER)
             self._next_time = now + self._period
 
-    def _believe(self, command: Command, frame: Frame) -> bool:
+    def _believe(self, command: Command, message: CanMessage) -> bool:
         """Keep a value that goes on from the last one or repeats itself; return whether it was kept."""
         name, decode = VALUES[command]
-        value = decode(frame)
+        value = decode(message)
         known = any(_goes_on(command, value, other) for other in (getattr(self, name), self._doubt.get(command)))
         self._doubt[command] = value
         if known:

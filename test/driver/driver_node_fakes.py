@@ -18,7 +18,7 @@ from finforce_driver.clock import MonotonicClock
 from finforce_driver.errors import GripperStateError, GripperTimeoutError, TargetError
 from finforce_driver.node import GripperDriverNode
 from finforce_driver.settings import GripperSettings
-from finforce_driver.state import GripperState, Outcome, Phase
+from finforce_driver.state import GripperState, MoveOutcome, Phase
 
 COMMAND, GOAL = "/gripper_driver/command", "/gripper_driver/grasp_goal"
 READY = GripperState(
@@ -84,7 +84,7 @@ class FakeGripper:
             if value is not None and not (math.isfinite(value) and value >= 0.0):
                 raise TargetError(f"{name}: got {value}, expected a number that is not negative")
         self._do("move", opening, speed, force)
-        self.state = replace(self.state, phase=Phase.MOVING, outcome=Outcome.NONE, target=opening)
+        self.state = replace(self.state, phase=Phase.MOVING, outcome=MoveOutcome.NONE, target=opening)
 
     def grasp_without_vision(self, current_force, speed=None, least_opening=None, time_limit=None):
         self._do("grasp_without_vision", current_force)
@@ -221,6 +221,6 @@ def ask(probe, kind, name, request=None):
     return client.call_async(request or kind.Request())
 
 
-def wrench(force, *, stamp=None, frame="gripper_base"):
-    header = Header(stamp=ros.stamp_message(time_ns() if stamp is None else stamp), frame_id=frame)
+def wrench(force, *, stamp=None, message="gripper_base"):
+    header = Header(stamp=ros.stamp_message(time_ns() if stamp is None else stamp), frame_id=message)
     return WrenchStamped(header=header, wrench=Wrench(force=Vector3(x=force)))

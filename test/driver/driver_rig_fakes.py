@@ -3,13 +3,13 @@
 import sys
 from pathlib import Path
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import Reply, decode_move
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.faults import FaultyAdapter
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
-from finforce_driver.errors import FrameError
+from finforce_driver.errors import CanMessageError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import Phase
@@ -69,7 +69,7 @@ class Rig:
         return self.wait_for(Phase.READY, Phase.FAULT, Phase.UNCALIBRATED, Phase.DISCONNECTED)
 
     def sent(self, since=0.0):
-        return [frame for time, frame in self.bus.sent if time >= since]
+        return [message for time, message in self.bus.sent if time >= since]
 
     def orders(self, since=0.0):
         """The 5-byte orders that were sent."""
@@ -77,15 +77,15 @@ class Rig:
 
     def timed_orders(self, since=0.0):
         found = []
-        for time, frame in self.bus.sent:
+        for time, message in self.bus.sent:
             try:
-                found += [(time, decode_move(frame))] if time >= since else []
-            except FrameError:
+                found += [(time, decode_move(message))] if time >= since else []
+            except CanMessageError:
                 continue
         return found
 
-    def frames(self, command, since=0.0):
-        return [frame for frame in self.sent(since) if frame.id >> 1 & 0x3F == command]
+    def messages(self, command, since=0.0):
+        return [message for message in self.sent(since) if message.id >> 1 & 0x3F == command]
 
 
 def reply(**changes) -> Reply:
@@ -95,7 +95,7 @@ def reply(**changes) -> Reply:
     return Reply(**{**parts, **flags, "calibrated": True, **changes})
 
 
-def frame_of(line: str) -> Frame:
-    """The frame of an SLCAN line."""
+def message_of(line: str) -> CanMessage:
+    """The message of an SLCAN line."""
     remote = line[0] == "r"
-    return Frame(id=int(line[1:4], 16), data=b"" if remote else bytes.fromhex(line[5:]), remote=remote)
+    return CanMessage(id=int(line[1:4], 16), data=b"" if remote else bytes.fromhex(line[5:]), remote=remote)

@@ -1,7 +1,8 @@
-"""A host that talks to an emulated gripper frame by frame, without any driver."""
+"""A host that talks to an emulated gripper message by message, without any driver."""
 
-from finforce_driver.can.bus import Frame
-from finforce_driver.emulator.adapter import EmulatedAdapter, frame_from_line, line_from_frame
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.slcan import decode_line, encode_message
+from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.firmware import EmulatedGripper
 
 VARIANTS = ("new", "old")
@@ -9,14 +10,14 @@ CLEAR, ESTOP, IDLE, RESET, CALIBRATE = "t0020", "t0000", "t0180", "t01C0", "t07C
 
 
 class Host:
-    """Frames in, frames out, in the gripper's own time."""
+    """CanMessages in, messages out, in the gripper's own time."""
 
     def __init__(self, *arguments, **named):
         self.gripper = EmulatedGripper(*arguments, **named)
 
     def ask(self, line: str) -> list[str]:
-        """Return the answers to a line of SLCAN, as such lines, a frame's way of 0.2 ms later or not at all."""
-        return [line_from_frame(answer).decode() for answer in self.gripper.handle(frame_from_line(line))]
+        """Return the answers to a line of SLCAN, as such lines, a message's way of 0.2 ms later or not at all."""
+        return [encode_message(answer)[:-1].decode() for answer in self.gripper.handle(decode_line(line.encode()))]
 
     def tell(self, *lines: str) -> None:
         """Send lines that nothing answers, a step apart."""
@@ -27,13 +28,13 @@ class Host:
     def poll(self) -> bytes:
         """Return the data of a reply to an empty request."""
         self.gripper.step()
-        return self.gripper.handle(Frame(id=self.gripper.node_id << 7 | 0x7A))[0].data
+        return self.gripper.handle(CanMessage(id=self.gripper.node_id << 7 | 0x7A))[0].data
 
     def order(self, position=0, speed=50, current=500, flags=0xC0) -> bytes:
         """Send five bytes and return the data of the reply."""
         data = bytes([position, speed]) + current.to_bytes(2, "big", signed=True) + bytes([flags])
         self.gripper.step()
-        return self.gripper.handle(Frame(id=self.gripper.node_id << 7 | 0x7A, data=data))[0].data
+        return self.gripper.handle(CanMessage(id=self.gripper.node_id << 7 | 0x7A, data=data))[0].data
 
     def wait(self, seconds: float) -> None:
         self.gripper.step(seconds)

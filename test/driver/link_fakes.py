@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from time import monotonic
 
-from finforce_driver.can.bus import Bus, Frame
+from finforce_driver.can.bus import Bus, CanMessage
 
-POLL = Frame(id=0x07A)
-REPLY = Frame(id=0x078, data=bytes.fromhex("800000C1"))
+POLL = CanMessage(id=0x07A)
+REPLY = CanMessage(id=0x078, data=bytes.fromhex("800000C1"))
 REPLY_LINE = b"t0784800000C1\r"
 LONG = 5.0  # [s] far beyond what anything here takes; nothing is measured with it
 ENOUGH = 5.0  # [s] what was written on one side is there on the other at once; a machine under load may take its time
@@ -66,11 +66,11 @@ class FakeAdapter:
         return bool(select.select([self._ends[0]], [], [], timeout)[0])
 
 
-def receive_until(bus: Bus, condition: Callable[[], bool]) -> list[Frame]:
-    """Return the frames that come until a condition holds; what is written here may take its time to be there."""
-    end, frames = monotonic() + ENOUGH, []
+def receive_until(bus: Bus, condition: Callable[[], bool]) -> list[CanMessage]:
+    """Return the messages that come until a condition holds; what is written here may take its time to be there."""
+    end, messages = monotonic() + ENOUGH, []
     while not condition() and monotonic() < end:
-        frame = bus.receive(0.01)
-        frames += [] if frame is None else [frame]
+        message = bus.receive(0.01)
+        messages += [] if message is None else [message]
     assert condition()
-    return frames
+    return messages

@@ -8,7 +8,7 @@ from driver_rig_fakes import VARIANTS, Rig
 from finforce_driver.can.protocol import Command
 from finforce_driver.emulator.faults import FaultKind
 from finforce_driver.errors import GripperStateError
-from finforce_driver.state import Outcome, Phase
+from finforce_driver.state import MoveOutcome, Phase
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
 LIMP = (Phase.UNCALIBRATED, Phase.FAULT)
@@ -28,8 +28,8 @@ def test_an_uncalibrated_gripper_says_so_and_knows_no_opening(rig):
 @both_variants
 def test_nothing_is_sent_but_questions_before_anything_is_asked_for(rig):
     rig.live(5.0)
-    assert all(frame.remote or frame.data == b"" for frame in rig.sent())
-    assert {frame.id for frame in rig.sent()} == {0x07A, 0x02E, 0x030, 0x034}
+    assert all(message.remote or message.data == b"" for message in rig.sent())
+    assert {message.id for message in rig.sent()} == {0x07A, 0x02E, 0x030, 0x034}
 
 
 @both_variants
@@ -40,7 +40,7 @@ def test_a_calibration_finds_the_stops_and_ends_closed(rig):
     assert state.calibrated
     assert state.opening == pytest.approx(0.0, abs=1e-4)
     assert rig.emulated.true_opening == pytest.approx(0.0, abs=1e-4)
-    assert rig.arrive(0.02).outcome is Outcome.REACHED
+    assert rig.arrive(0.02).outcome is MoveOutcome.REACHED
 
 
 @both_variants
@@ -52,7 +52,7 @@ def test_during_a_calibration_only_empty_polls_are_sent(rig):
     while rig.state.phase is Phase.CALIBRATING:
         assert math.isnan(rig.state.opening)
         rig.gripper.turn()
-    assert {(frame.id, frame.data, frame.remote) for frame in rig.sent(begin)} == {(0x07A, b"", False)}
+    assert {(message.id, message.data, message.remote) for message in rig.sent(begin)} == {(0x07A, b"", False)}
 
 
 @both_variants
@@ -71,14 +71,14 @@ def test_a_calibration_that_got_lost_is_sent_again(rig):
     rig.adapter.inject(FaultKind.REQUEST_LOST)
     rig.gripper.calibrate()
     rig.wait_for(Phase.READY)
-    assert len(rig.frames(Command.CALIBRATE)) == 2
+    assert len(rig.messages(Command.CALIBRATE)) == 2
 
 
 @both_variants
 def test_a_motor_that_never_starts_ends_the_calibration_with_advice(rig):
     rig.adapter.inject(FaultKind.REQUEST_LOST)
     lost = rig.bus.send
-    rig.bus.send = lambda frame: None if frame.id == 0x07C else lost(frame)
+    rig.bus.send = lambda message: None if message.id == 0x07C else lost(message)
     rig.gripper.calibrate()
     assert "draws no current" in rig.wait_for(Phase.UNCALIBRATED).message
 
@@ -115,9 +115,9 @@ def test_hold_ends_a_calibration_limp_and_the_next_one_restarts_the_gripper(rig)
     begin = rig.clock.now()
     rig.gripper.calibrate()
     rig.wait_for(Phase.READY)
-    assert len(rig.frames(Command.RESET, begin)) == 1
+    assert len(rig.messages(Command.RESET, begin)) == 1
     assert rig.clock.now() - begin > 3.0
-    assert rig.arrive(0.02).outcome is Outcome.REACHED
+    assert rig.arrive(0.02).outcome is MoveOutcome.REACHED
 
 
 @both_variants

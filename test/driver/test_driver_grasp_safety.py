@@ -62,7 +62,7 @@ def test_short_silence_does_not_end_a_grasp():
     assert course.overshoot(2.0) < 0.25
 
 
-def test_frames_refused_while_the_force_rises_fast_cost_time_and_no_force():
+def test_messages_refused_while_the_force_rises_fast_cost_time_and_no_force():
     last = [0.0, 0.0]
 
     def refuse(sample):

@@ -16,7 +16,7 @@ from finforce_driver.emulator.pty_port import PtyPort
 from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, TargetError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
-from finforce_driver.state import Outcome, Phase
+from finforce_driver.state import MoveOutcome, Phase
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
 
@@ -84,7 +84,7 @@ def test_a_grasp_without_vision_holds_with_its_current(variant):
     rig = Rig(variant)
     rig.emulated.jaws.object_opening = 0.03
     state = rig.gripper.grasp_without_vision(10.0, 0.05)
-    assert state.outcome is Outcome.GRASPED
+    assert state.outcome is MoveOutcome.GRASPED
     assert state.force == pytest.approx(10.0, rel=0.03)
     assert rig.emulated.order.current == 210
 
@@ -138,7 +138,7 @@ def test_a_gripper_that_is_commanded_by_threads_in_real_time():
         gripper.wait(lambda state: state.phase is Phase.READY, 10.0)
         gripper.move(0.03, 0.1)
         state = gripper.wait(lambda state: state.phase is Phase.READY, 10.0)
-        assert state.outcome is Outcome.REACHED
+        assert state.outcome is MoveOutcome.REACHED
         assert emulated.true_opening == pytest.approx(0.03, abs=COUNT)
         gripper.estop()
         gripper.wait(lambda _: len(emulated.faults) == 2, 10.0)
@@ -151,12 +151,12 @@ class SlowBus:
         self._rig, self._send = rig, rig.bus.send
         self.written, self.begun, self.go_on = [], threading.Event(), threading.Event()
 
-    def send(self, frame):
-        if len(frame.data) == 5 and frame.data[4] & 0xE0 == 0xC0:
+    def send(self, message):
+        if len(message.data) == 5 and message.data[4] & 0xE0 == 0xC0:
             self.begun.set()
             self.go_on.wait(10.0)
-        self.written.append(frame)
-        self._send(frame)
+        self.written.append(message)
+        self._send(message)
 
 
 def test_no_order_leaves_after_a_stop_that_another_thread_demands_meanwhile(rig):
@@ -172,7 +172,11 @@ def test_no_order_leaves_after_a_stop_that_another_thread_demands_meanwhile(rig)
     slow.go_on.set()
     loop.join()
     stop.join()
-    driving = [index for index, frame in enumerate(slow.written) if len(frame.data) == 5 and frame.data[4] & 0x20 == 0]
-    stopping = [index for index, frame in enumerate(slow.written) if len(frame.data) == 5 and frame.data[4] & 0x20]
+    driving = [
+        index for index, message in enumerate(slow.written) if len(message.data) == 5 and message.data[4] & 0x20 == 0
+    ]
+    stopping = [
+        index for index, message in enumerate(slow.written) if len(message.data) == 5 and message.data[4] & 0x20
+    ]
     assert len(driving) == 1
     assert driving[0] < min(stopping)

@@ -9,7 +9,7 @@ from test_driver_tasks import Grasping, build
 from finforce.health import Level
 from finforce_driver.diagnostics import news_of_state, outcome_of_state
 from finforce_driver.errors import GraspError, GripperStateError
-from finforce_driver.state import Outcome, Phase
+from finforce_driver.state import MoveOutcome, Phase
 
 
 @pytest.mark.parametrize("name", ["grasp", "stop"])
@@ -60,7 +60,7 @@ def test_the_end_of_a_grasp_is_told_at_once():
     assert told == ["stopped"]
 
 
-@pytest.mark.parametrize("outcome", [Outcome.REACHED, Outcome.REPLACED, Outcome.NONE])
+@pytest.mark.parametrize("outcome", [MoveOutcome.REACHED, MoveOutcome.REPLACED, MoveOutcome.NONE])
 def test_what_another_program_does_to_a_gripper_that_works_is_a_warning(outcome):
     state = replace(READY, outcome=outcome, message="another program commands this gripper: stop it")
     assert outcome_of_state(state).level == Level.WARN
@@ -68,5 +68,8 @@ def test_what_another_program_does_to_a_gripper_that_works_is_a_warning(outcome)
 
 
 def test_an_ordinary_sentence_is_no_warning():
-    assert outcome_of_state(replace(READY, outcome=Outcome.REACHED, message="the opening is reached")).level == Level.OK
+    assert (
+        outcome_of_state(replace(READY, outcome=MoveOutcome.REACHED, message="the opening is reached")).level
+        == Level.OK
+    )
     assert outcome_of_state(replace(READY, phase=Phase.MOVING, message="moving")).level == Level.OK

@@ -1,4 +1,4 @@
-"""Claims about the serial port: frames pass at once, and every way to fail says what would help."""
+"""Claims about the serial port: messages pass at once, and every way to fail says what would help."""
 
 import os
 import threading
@@ -39,10 +39,10 @@ def test_a_request_goes_out_and_its_reply_comes_in(adapter, bus):
     adapter.write(REPLY_LINE)
     assert bus.receive(LONG) == REPLY
     assert bus.receive(0.0) is None
-    assert (bus.counts["sent"], bus.counts["frames"], bus.counts["opened"]) == (1, 1, 1)
+    assert (bus.counts["sent"], bus.counts["messages"], bus.counts["opened"]) == (1, 1, 1)
 
 
-def test_frames_that_come_together_are_returned_one_by_one(adapter, bus):
+def test_messages_that_come_together_are_returned_one_by_one(adapter, bus):
     adapter.write(3 * REPLY_LINE)
     assert [bus.receive(LONG) for _ in range(3)] == [REPLY] * 3
     assert bus.receive(0.0) is None
@@ -80,7 +80,7 @@ def test_what_an_open_channel_still_sends_while_it_is_closed_is_forgotten(adapte
     link.open()
     adapter.write(b"z\r")
     assert receive_until(link, lambda: link.counts["acknowledgements"] == 1) == []
-    assert link.counts["frames"] == 0
+    assert link.counts["messages"] == 0
     link.close()
 
 
@@ -159,7 +159,7 @@ def test_a_closed_bus_refuses(adapter, bus, act):
         act(bus)
 
 
-def test_frames_that_nobody_took_are_gone_with_the_port(adapter, bus):
+def test_messages_that_nobody_took_are_gone_with_the_port(adapter, bus):
     adapter.write(2 * REPLY_LINE)
     assert bus.receive(LONG) == REPLY
     bus.close()
@@ -201,7 +201,9 @@ def test_lines_of_two_threads_stay_whole(monkeypatch, bus):
         halves.append(data[3:])
 
     monkeypatch.setattr(serial_bus, "write_all", write_slowly)
-    threads = [threading.Thread(target=lambda one=frame: [bus.send(one) for _ in range(10)]) for frame in (POLL, REPLY)]
+    threads = [
+        threading.Thread(target=lambda one=message: [bus.send(one) for _ in range(10)]) for message in (POLL, REPLY)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -265,7 +267,7 @@ def test_a_line_that_went_out_in_part_spoils_no_other(monkeypatch, bus):
     monkeypatch.undo()
 
 
-def test_garbage_alone_makes_the_adapter_suspect_until_a_frame_comes(adapter, bus):
+def test_garbage_alone_makes_the_adapter_suspect_until_a_message_comes(adapter, bus):
     adapter.write(b"\xf0\x00\x87" * 20)
     assert receive_until(bus, lambda: bus.suspicion != "") == []
     assert "wrong adapter speed?" in bus.suspicion
@@ -285,7 +287,7 @@ def test_an_adapter_that_refuses_everything_is_suspect(adapter, bus):
     assert "24 V" in bus.suspicion
 
 
-def test_an_adapter_that_greets_before_its_frames_is_not_suspect(adapter, bus):
+def test_an_adapter_that_greets_before_its_messages_is_not_suspect(adapter, bus):
     adapter.write(b"CAN adapter 1.0, at your service, built for tests\r" + REPLY_LINE)
     assert bus.receive(LONG) == REPLY
     assert bus.suspicion == ""

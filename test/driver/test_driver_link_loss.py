@@ -8,7 +8,7 @@ from driver_rig_fakes import VARIANTS, Rig
 from finforce_driver.can.protocol import Command
 from finforce_driver.emulator.faults import FaultKind
 from finforce_driver.errors import GripperStateError, LinkError
-from finforce_driver.state import Outcome, Phase
+from finforce_driver.state import MoveOutcome, Phase
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
 
@@ -25,7 +25,7 @@ def test_an_unplugged_adapter_is_told_at_once_and_found_again(rig):
     rig.adapter.inject(FaultKind.UNPLUGGED, duration=3.0)
     rig.live(0.05)
     state = rig.state
-    assert (state.phase, state.outcome) == (Phase.DISCONNECTED, Outcome.ABORTED)
+    assert (state.phase, state.outcome) == (Phase.DISCONNECTED, MoveOutcome.ABORTED)
     assert "unplugged" in state.message
     assert math.isnan(state.opening) and math.isnan(state.stamp)
     begin = rig.clock.now()
@@ -101,14 +101,14 @@ def test_a_wrong_node_id_is_named():
     rig.live(6.0)
     assert "does at node 3: set node_id to 3" in rig.state.message
     assert rig.orders() == []
-    assert all(frame.remote or frame.id == 0x07A for frame in rig.sent())
+    assert all(message.remote or message.id == 0x07A for message in rig.sent())
 
 
 @both_variants
 def test_a_gripper_at_another_node_is_driven_there(variant):
     rig = Rig(variant, node_id=7, calibrated=False, found=False)
     rig = Rig(variant, node_id=0)
-    assert rig.arrive(0.02).outcome is Outcome.REACHED
+    assert rig.arrive(0.02).outcome is MoveOutcome.REACHED
 
 
 @both_variants
@@ -118,11 +118,11 @@ def test_a_restart_of_the_gripper_ends_the_move_and_nothing_is_sent_after_it(rig
     begin = rig.clock.now()
     rig.adapter.inject(FaultKind.REBOOT)
     state = rig.wait_for(Phase.UNCALIBRATED)
-    assert state.outcome is Outcome.ABORTED
+    assert state.outcome is MoveOutcome.ABORTED
     assert "restarted: calibrate it" in state.message
     rig.live(2.0)
     assert math.isnan(rig.state.opening)
-    assert rig.orders(begin) == [] and rig.frames(Command.CALIBRATE) == []
+    assert rig.orders(begin) == [] and rig.messages(Command.CALIBRATE) == []
 
 
 @both_variants
@@ -133,18 +133,18 @@ def test_an_order_that_could_not_leave_before_the_silence_never_leaves(rig):
     rig.live(3.0)
     place = rig.emulated.true_opening
     assert rig.state.phase is Phase.READY
-    assert place == pytest.approx(0.048) or rig.state.outcome is not Outcome.ABORTED
+    assert place == pytest.approx(0.048) or rig.state.outcome is not MoveOutcome.ABORTED
 
 
 @both_variants
-def test_an_adapter_without_remote_frames_does(rig):
+def test_an_adapter_without_remote_messages_does(rig):
     send = rig.bus.send
-    rig.bus.send = lambda frame: None if frame.remote else send(frame)
+    rig.bus.send = lambda message: None if message.remote else send(message)
     for _ in range(5):
         rig.adapter.inject(FaultKind.LOST)
         rig.live(0.5)
         assert rig.state.phase is Phase.READY
-    assert rig.arrive(0.01).outcome is Outcome.REACHED
+    assert rig.arrive(0.01).outcome is MoveOutcome.REACHED
     assert math.isnan(rig.state.temperature) or rig.state.temperature == 26.0
 
 

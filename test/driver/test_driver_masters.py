@@ -3,12 +3,12 @@
 import pytest
 from driver_rig_fakes import VARIANTS, Rig
 
-from finforce_driver.can.bus import Frame
-from finforce_driver.state import Outcome, Phase
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.state import MoveOutcome, Phase
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
-ELSEWHERE = Frame(id=0x07A, data=bytes([60, 50, 0x01, 0xF4, 0xC0]))
-OFF = Frame(id=0x07A, data=bytes([60, 50, 0x01, 0xF4, 0x00]))
+ELSEWHERE = CanMessage(id=0x07A, data=bytes([60, 50, 0x01, 0xF4, 0xC0]))
+OFF = CanMessage(id=0x07A, data=bytes([60, 50, 0x01, 0xF4, 0x00]))
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def test_an_order_of_another_program_that_is_seen_ends_our_move(rig):
     begin = rig.clock.now()
     rig.adapter.adapter.put_on_bus(ELSEWHERE)
     rig.live(2.0)
-    assert rig.state.outcome is Outcome.ABORTED
+    assert rig.state.outcome is MoveOutcome.ABORTED
     assert "another program commands this gripper" in rig.state.message
     assert rig.state.counts["foreign commands"] == 1
     assert rig.orders(begin) == []
@@ -46,7 +46,7 @@ def test_an_order_of_another_program_that_is_not_seen_is_found_by_its_effect(rig
 def test_a_new_move_takes_the_gripper_back(rig):
     rig.adapter.adapter.put_on_bus(ELSEWHERE)
     rig.live(0.5)
-    assert rig.arrive(0.01).outcome is Outcome.REACHED
+    assert rig.arrive(0.01).outcome is MoveOutcome.REACHED
     assert "another program" not in rig.state.message
 
 
@@ -62,32 +62,32 @@ def test_a_calibration_that_another_program_cuts_short_is_not_trusted(rig):
 @both_variants
 @pytest.mark.parametrize("id", [0x000, 0x002, 0x018, 0x07C])
 def test_other_commands_of_another_program_are_told(rig, id):
-    rig.adapter.adapter.put_on_bus(Frame(id=id))
+    rig.adapter.adapter.put_on_bus(CanMessage(id=id))
     rig.live(0.05)
     assert rig.state.counts["foreign commands"] == 1
     assert "another program" in rig.state.message or rig.state.estopped
 
 
 @both_variants
-def test_frames_of_other_nodes_change_nothing(rig):
+def test_messages_of_other_nodes_change_nothing(rig):
     before = rig.state
     for id in (0x0F8, 0x0FA, 0x7F9):
-        rig.adapter.adapter.put_on_bus(Frame(id=id, data=b"\x10\x00\x00\xd1"))
+        rig.adapter.adapter.put_on_bus(CanMessage(id=id, data=b"\x10\x00\x00\xd1"))
     rig.live(0.5)
-    assert rig.state.counts["frames of other nodes"] == 3
+    assert rig.state.counts["messages of other nodes"] == 3
     assert (rig.state.opening, rig.state.phase, rig.state.message) == (before.opening, before.phase, before.message)
 
 
 @both_variants
-def test_an_adapter_that_gives_our_frames_back_is_no_other_program(rig):
+def test_an_adapter_that_gives_our_messages_back_is_no_other_program(rig):
     send = rig.bus.send
 
-    def echo(frame):
-        rig.adapter.adapter.deliver(frame)
-        send(frame)
+    def echo(message):
+        rig.adapter.adapter.deliver(message)
+        send(message)
 
     rig.bus.send = echo
-    assert rig.arrive(0.01).outcome is Outcome.REACHED
+    assert rig.arrive(0.01).outcome is MoveOutcome.REACHED
     assert "foreign commands" not in rig.state.counts
 
 
@@ -98,5 +98,5 @@ def test_jaws_that_are_pulled_away_from_their_target_are_no_sign_of_another_prog
     assert rig.emulated.true_opening > 0.021
     rig.live(1.0)
     assert "foreign commands" not in rig.state.counts
-    assert rig.state.outcome is Outcome.REACHED
+    assert rig.state.outcome is MoveOutcome.REACHED
     assert rig.state.opening == pytest.approx(rig.emulated.true_opening, abs=2e-4)

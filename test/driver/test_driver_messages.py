@@ -18,7 +18,7 @@ from finforce_driver.grasp.settings import GraspGoal, GraspSettings
 from finforce_driver.messages import goal_from_joint_state, move_from_gripper_command, move_from_joint_state
 from finforce_driver.parameters import DriverParameters, build_gripper
 from finforce_driver.settings import GripperSettings
-from finforce_driver.state import Outcome, Phase
+from finforce_driver.state import MoveOutcome, Phase
 
 
 def joints(position=(), velocity=(), effort=()):
@@ -129,9 +129,9 @@ def test_joints_that_are_not_two_are_refused(names):
     [
         ({}, Level.OK),
         ({"phase": Phase.MOVING}, Level.OK),
-        ({"outcome": Outcome.GRASPED}, Level.OK),
-        ({"outcome": Outcome.ABORTED}, Level.WARN),
-        ({"outcome": Outcome.BLOCKED}, Level.WARN),
+        ({"outcome": MoveOutcome.GRASPED}, Level.OK),
+        ({"outcome": MoveOutcome.ABORTED}, Level.WARN),
+        ({"outcome": MoveOutcome.BLOCKED}, Level.WARN),
         ({"phase": Phase.UNCALIBRATED}, Level.WARN),
         ({"phase": Phase.DISCONNECTED}, Level.ERROR),
         ({"estopped": True}, Level.ERROR),

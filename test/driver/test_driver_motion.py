@@ -7,7 +7,7 @@ from driver_rig_fakes import COUNT, VARIANTS, Rig
 
 from finforce_driver.can.protocol import Flag
 from finforce_driver.errors import GripperStateError, TargetError
-from finforce_driver.state import Outcome, Phase
+from finforce_driver.state import MoveOutcome, Phase
 
 GO = Flag.ACTIVATE | Flag.GO
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
@@ -24,7 +24,7 @@ def test_a_move_reaches_its_opening(rig, opening):
     rig.arrive(0.02)
     state = rig.arrive(opening)
     # closing to the end the stop comes first: "closed on nothing" says more than "reached"
-    assert state.outcome in (Outcome.REACHED, Outcome.CLOSED_EMPTY)
+    assert state.outcome in (MoveOutcome.REACHED, MoveOutcome.CLOSED_EMPTY)
     assert state.opening == pytest.approx(opening, abs=0.6 * COUNT)
     assert rig.emulated.true_opening == pytest.approx(opening, abs=COUNT)
 
@@ -51,7 +51,7 @@ def test_one_order_is_sent_for_one_move(rig):
 def test_closing_on_an_object_grasps_it(rig):
     rig.emulated.jaws.object_opening = 0.025
     state = rig.arrive(0.0, 0.05, 20.0)
-    assert (state.outcome, state.contact) == (Outcome.GRASPED, "closing")
+    assert (state.outcome, state.contact) == (MoveOutcome.GRASPED, "closing")
     assert state.opening == pytest.approx(0.025, abs=0.6 * COUNT)
     assert state.force == pytest.approx(20.0, rel=0.02)
     assert state.current < 0.0
@@ -62,14 +62,14 @@ def test_opening_against_a_wall_is_blocked(rig):
     rig.arrive(0.01)
     rig.emulated.jaws.wall_opening = 0.02
     state = rig.arrive(0.04)
-    assert (state.outcome, state.contact) == (Outcome.BLOCKED, "opening")
+    assert (state.outcome, state.contact) == (MoveOutcome.BLOCKED, "opening")
     assert state.current > 0.0
 
 
 @both_variants
 def test_closing_with_less_force_than_the_stop_needs_is_closed_on_nothing(rig):
     rig.emulated.jaws.object_opening = 0.0005
-    assert rig.arrive(0.0).outcome is Outcome.CLOSED_EMPTY
+    assert rig.arrive(0.0).outcome is MoveOutcome.CLOSED_EMPTY
 
 
 @both_variants
@@ -77,9 +77,9 @@ def test_an_object_that_vanishes_is_not_grasped_any_more(rig):
     rig.emulated.jaws.object_opening = 0.025
     rig.arrive(0.01, 0.05)
     rig.emulated.jaws.object_opening = None
-    state = rig.gripper.wait(lambda state: state.outcome is not Outcome.GRASPED, 1.0)
+    state = rig.gripper.wait(lambda state: state.outcome is not MoveOutcome.GRASPED, 1.0)
     assert state.contact == ""
-    assert rig.wait_for(Phase.READY).outcome is Outcome.REACHED
+    assert rig.wait_for(Phase.READY).outcome is MoveOutcome.REACHED
 
 
 @both_variants
@@ -92,7 +92,7 @@ def test_a_slow_move_is_smooth_within_a_fifth_of_a_millimetre(rig):
         ideal = max(0.02 - 0.001 * (rig.clock.now() - begin), 0.012)
         # the jaws follow a step within 40 ms
         assert abs(rig.emulated.true_opening - ideal) < 0.0002
-    assert rig.state.outcome is Outcome.REACHED
+    assert rig.state.outcome is MoveOutcome.REACHED
     orders = rig.orders(begin)
     assert all(abs(after.position - before.position) == 1 for before, after in zip(orders, orders[1:], strict=False))
     assert {order.speed for order in orders} == {3}
@@ -118,7 +118,7 @@ def test_a_slow_move_grasps_and_follows_what_gives_way(rig):
     rig.emulated.jaws.object_opening = 0.025
     rig.arrive(0.027)
     state = rig.arrive(0.01, 0.002)
-    assert state.outcome is Outcome.GRASPED
+    assert state.outcome is MoveOutcome.GRASPED
     assert min(order.position for order in rig.orders()[-1:]) - rig.gripper.scale.counts_of(0.025) < 5.0
     rig.emulated.jaws.object_opening = 0.020
     begin = rig.clock.now()
@@ -141,7 +141,7 @@ def test_a_gripper_that_does_not_move_times_out(rig):
     rig.emulated.configured = False
     begin = rig.clock.now()
     state = rig.arrive(0.02)
-    assert state.outcome is Outcome.TIMED_OUT
+    assert state.outcome is MoveOutcome.TIMED_OUT
     assert "configured as a gripper" in state.message
     assert 1.2 < rig.clock.now() - begin < 2.0
 
@@ -158,7 +158,7 @@ def test_switching_off_lets_go_and_refuses_moves(rig):
     rig.live(0.3)
     assert rig.state.activated
     assert rig.emulated.true_opening == pytest.approx(0.02, abs=1.1 * COUNT)
-    assert rig.arrive(0.01).outcome is Outcome.REACHED
+    assert rig.arrive(0.01).outcome is MoveOutcome.REACHED
 
 
 BAD = [

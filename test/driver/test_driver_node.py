@@ -23,7 +23,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from finforce.health import Level
 from finforce.messages import stamp_of
-from finforce_driver.state import GripperState, Outcome, Phase
+from finforce_driver.state import GripperState, MoveOutcome, Phase
 
 SECOND = 1_000_000_000
 
@@ -211,7 +211,7 @@ def test_the_standard_action_is_offered_where_its_type_is_installed(probe, monke
     goal = FakeGoal(0.02)
     result = probe.spinner.create_task(node.action.execute, goal)
     probe.wait_for(lambda: gripper.calls)
-    gripper.reply(phase=Phase.READY, outcome=Outcome.REACHED)
+    gripper.reply(phase=Phase.READY, outcome=MoveOutcome.REACHED)
     probe.wait_for(result.done)
     assert result.result().reached_goal and goal.ends == ["succeed"]
     node.destroy_node()

@@ -14,7 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 from finforce.health import Level
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 
 VARIANTS = ("new", "old")
 STEP = 0.048 / 255  # m, of the position byte
@@ -148,7 +148,7 @@ def test_another_program_that_commands_the_gripper_is_named(bench):
     bench.move(0.03, velocity=[0.1])
     bench.probe.wait_for(lambda: abs(bench.gripper.true_opening - 0.03) < 2 * STEP)
     with bench.port.lock:
-        bench.port.adapter.put_on_bus(Frame(id=0x07A, data=bytes([0x40, 0x80, 0x01, 0xF4, 0xC0])))
+        bench.port.adapter.put_on_bus(CanMessage(id=0x07A, data=bytes([0x40, 0x80, 0x01, 0xF4, 0xC0])))
     bench.diagnosis(Level.WARN, "another program")
 
 

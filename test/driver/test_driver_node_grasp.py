@@ -37,7 +37,7 @@ def probe():
 BAD_FORCES = {
     "old": (lambda: wrench(1.0, stamp=time_ns() - SECOND), Level.STALE, "old"),
     "ahead": (lambda: wrench(1.0, stamp=time_ns() + 5 * SECOND), Level.ERROR, "ahead of the node's clock"),
-    "frame": (lambda: wrench(1.0, frame="left_jaw"), Level.ERROR, "expected 'gripper_base'"),
+    "message": (lambda: wrench(1.0, message="left_jaw"), Level.ERROR, "expected 'gripper_base'"),
 }
 
 
@@ -126,8 +126,8 @@ def test_the_goal_changes_while_a_grasp_runs(probe):
     assert node.session.runs
 
 
-def contact(side, touching, *, frame=None):
-    header = Header(stamp=ros.stamp_message(time_ns()), frame_id=frame or f"{side}_jaw")
+def contact(side, touching, *, message=None):
+    header = Header(stamp=ros.stamp_message(time_ns()), frame_id=message or f"{side}_jaw")
     columns = {**ros.xyz_columns(np.zeros((1, 3))), "touching": np.array([touching], dtype=np.uint8)}
     return ros.cloud_message(header, columns)
 
@@ -135,7 +135,7 @@ def contact(side, touching, *, frame=None):
 def test_a_contact_in_another_frame_is_named(probe):
     gripper, _ = driver(probe)
     gripper.reply()
-    send(probe, "left/contact", contact("left", 1, frame="camera"))
+    send(probe, "left/contact", contact("left", 1, message="camera"))
     gripper_state(probe, Level.ERROR, "expected 'left_jaw'")
 
 

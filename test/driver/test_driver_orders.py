@@ -8,7 +8,7 @@ from driver_rig_fakes import COUNT, VARIANTS, Rig
 from finforce_driver.can.protocol import Command, Flag
 from finforce_driver.emulator.faults import FaultKind
 from finforce_driver.errors import TargetError
-from finforce_driver.state import Outcome, Phase
+from finforce_driver.state import MoveOutcome, Phase
 
 GO = Flag.ACTIVATE | Flag.GO
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
@@ -26,7 +26,7 @@ def test_hold_stops_the_jaws_where_they_are(rig):
     place = rig.emulated.true_opening
     rig.gripper.hold()
     rig.live(0.3)
-    assert (rig.state.phase, rig.state.outcome) == (Phase.READY, Outcome.REPLACED)
+    assert (rig.state.phase, rig.state.outcome) == (Phase.READY, MoveOutcome.REPLACED)
     assert rig.emulated.true_opening == pytest.approx(place, abs=0.02 * 0.03 + COUNT)
     assert rig.emulated.order.current == 500
 
@@ -72,7 +72,7 @@ def test_an_order_whose_reply_is_lost_is_sent_again(rig, kind):
     rig.live(0.005)
     rig.adapter.inject(kind)
     state = rig.arrive(0.02)
-    assert state.outcome is Outcome.REACHED
+    assert state.outcome is MoveOutcome.REACHED
     assert [order.position for order in rig.orders()] == [149, 149]
 
 
@@ -127,8 +127,8 @@ def test_an_order_waits_until_requests_and_replies_are_in_step(rig):
     begin = rig.clock.now()
     rig.gripper.move(0.02, 0.1)
     rig.live(0.1)
-    frames = rig.sent(begin)
-    assert frames[0].remote
+    messages = rig.sent(begin)
+    assert messages[0].remote
     assert len(rig.orders(begin)) == 1
 
 
@@ -136,7 +136,7 @@ def test_an_order_waits_until_requests_and_replies_are_in_step(rig):
 def test_an_order_waits_for_a_link_that_gets_into_step_by_a_pause(variant):
     rig = Rig(variant, reply_timeout=0.005)
     send = rig.bus.send
-    rig.bus.send = lambda frame: None if frame.remote else send(frame)
+    rig.bus.send = lambda message: None if message.remote else send(message)
     rig.adapter.inject(FaultKind.LOST)
     begin = rig.clock.now() + 0.02  # a reply and two markers were waited for, the last reply is still new
     rig.at(begin, lambda: rig.gripper.move(0.02, 0.1))
@@ -149,8 +149,8 @@ def test_an_order_waits_for_a_link_that_gets_into_step_by_a_pause(variant):
 def test_an_order_waits_while_a_reply_is_in_doubt(variant):
     rig = Rig(variant, latency=0.0)
     rig.emulated.calibrated = False
-    count = len(rig.frames(Command.MOVE))
-    while len(rig.frames(Command.MOVE)) == count:
+    count = len(rig.messages(Command.MOVE))
+    while len(rig.messages(Command.MOVE)) == count:
         rig.gripper.turn()
     assert rig.state.phase is Phase.READY  # not believed yet
     rig.gripper.move(0.02, 0.1)
@@ -165,8 +165,8 @@ def test_an_order_does_not_leave_on_the_word_of_an_old_reply(rig):
     begin = rig.clock.now()
     rig.gripper.move(0.02, 0.1)
     rig.live(0.1)
-    frames = rig.sent(begin)
-    assert frames[0].data == b""
+    messages = rig.sent(begin)
+    assert messages[0].data == b""
     assert len(rig.orders(begin)) == 1
 
 

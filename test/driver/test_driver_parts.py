@@ -5,7 +5,7 @@ import math
 import pytest
 from driver_rig_fakes import reply
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import Command, Flag, Move, encode_poll
 from finforce_driver.machine.calibration import CalibrationRun, CalibrationStep
 from finforce_driver.machine.exchange import MARKERS, Exchange, Request
@@ -13,16 +13,16 @@ from finforce_driver.machine.knowledge import History
 from finforce_driver.machine.move import GRACE, Goal, MoveJob, MoveWatch
 from finforce_driver.machine.orders import Orders
 from finforce_driver.machine.telemetry import Telemetry
-from finforce_driver.state import Outcome
+from finforce_driver.state import MoveOutcome
 from finforce_driver.units import Pace
 
-POLL = Request(frame=encode_poll(0), answer=Command.REPLY)
-REPLY = Frame(id=0x078, data=b"\x00\x00\x00\xf1")
+POLL = Request(message=encode_poll(0), answer=Command.REPLY)
+REPLY = CanMessage(id=0x078, data=b"\x00\x00\x00\xf1")
 GO = Flag.ACTIVATE | Flag.GO
 
 
 def temperature(value):
-    return Frame(id=0x02E, data=value.to_bytes(2, "big"))
+    return CanMessage(id=0x02E, data=value.to_bytes(2, "big"))
 
 
 def test_after_a_lost_reply_a_late_one_is_not_taken_for_the_next():
@@ -32,14 +32,14 @@ def test_after_a_lost_reply_a_late_one_is_not_taken_for_the_next():
     assert not exchange.in_step
     exchange.begin(exchange.marker(), 0.05)
     assert not exchange.answers(REPLY)
-    assert exchange.answers(Frame(id=MARKERS[1] << 1, data=b"\x00\x00"))
+    assert exchange.answers(CanMessage(id=MARKERS[1] << 1, data=b"\x00\x00"))
     exchange.end(0.06)
     assert exchange.in_step and exchange.marker() is None
 
 
 def test_every_lost_marker_is_followed_by_another_one():
     exchange = Exchange(0)
-    exchange.begin(Request(frame=Frame(id=0x14, remote=True), answer=Command.PING), 0.0)
+    exchange.begin(Request(message=CanMessage(id=0x14, remote=True), answer=Command.PING), 0.0)
     exchange.end(0.0)
     asked = []
     for _ in range(6):
@@ -50,12 +50,14 @@ def test_every_lost_marker_is_followed_by_another_one():
     assert all(before is not after for before, after in zip(asked, asked[1:], strict=False))
 
 
-@pytest.mark.parametrize("frame", [Frame(id=0x0F8, data=bytes(4)), Frame(id=0x078, data=bytes(3)), Frame(id=0x034)])
-def test_frames_of_other_nodes_lengths_and_commands_answer_nothing(frame):
+@pytest.mark.parametrize(
+    "message", [CanMessage(id=0x0F8, data=bytes(4)), CanMessage(id=0x078, data=bytes(3)), CanMessage(id=0x034)]
+)
+def test_messages_of_other_nodes_lengths_and_commands_answer_nothing(message):
     exchange = Exchange(0)
     exchange.begin(POLL, 0.0)
     assert exchange.answers(REPLY)
-    assert not exchange.answers(frame)
+    assert not exchange.answers(message)
 
 
 def test_a_single_odd_temperature_is_not_believed_and_a_repeated_one_is():
@@ -81,12 +83,12 @@ def test_what_comes_soon_after_an_order_speaks_of_the_one_before():
     watch = MoveWatch(position=100, closing=True, allowed=1.0, now=0.0)
     early = [watch.take(reply(), GRACE * part, True) for part in (0.1, 0.5, 0.9)]
     late = [watch.take(reply(), GRACE + time, True) for time in (0.01, 0.03)]
-    assert (early, late) == ([Outcome.NONE] * 3, [Outcome.NONE, Outcome.REACHED])
+    assert (early, late) == ([MoveOutcome.NONE] * 3, [MoveOutcome.NONE, MoveOutcome.REACHED])
 
 
 def test_a_step_on_the_way_is_not_the_end():
     watch = MoveWatch(position=100, closing=True, allowed=1.0, now=0.0)
-    assert {watch.take(reply(), 0.1 + 0.02 * index, False) for index in range(10)} == {Outcome.NONE}
+    assert {watch.take(reply(), 0.1 + 0.02 * index, False) for index in range(10)} == {MoveOutcome.NONE}
 
 
 def test_a_slow_move_begins_where_the_jaws_are_not_where_they_were_thought_to_be():

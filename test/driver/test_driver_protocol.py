@@ -1,11 +1,11 @@
-"""Claims about the frames, to the byte."""
+"""Claims about the messages, to the byte."""
 
 import pytest
-from driver_rig_fakes import frame_of
+from driver_rig_fakes import message_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import (
     Command,
     Flag,
@@ -22,10 +22,10 @@ from finforce_driver.can.protocol import (
     identifier,
     split_identifier,
 )
-from finforce_driver.errors import FrameError
+from finforce_driver.errors import CanMessageError
 
 GO = Flag.ACTIVATE | Flag.GO
-# the worked frames of the maker's library
+# the worked messages of the maker's library
 MOVES = {
     "t07A5001E012CC0": (0, 30, 300, GO),
     "t07A5FF1E012CC0": (255, 30, 300, GO),
@@ -84,44 +84,44 @@ REPLY_FIELDS = ("position", "current_mA", "activated", "action", "code", *FLAG_F
 def test_moves_are_coded_as_the_maker_does(line):
     position, speed, current, flags = MOVES[line]
     move = Move(position=position, speed=speed, current_mA=current, flags=flags)
-    assert encode_move(0, move) == frame_of(line)
-    assert decode_move(frame_of(line)) == move
+    assert encode_move(0, move) == message_of(line)
+    assert decode_move(message_of(line)) == move
 
 
 @pytest.mark.parametrize("line", COMMANDS)
 def test_commands_are_coded_as_the_maker_does(line):
-    assert encode_command(0, COMMANDS[line]) == frame_of(line)
+    assert encode_command(0, COMMANDS[line]) == message_of(line)
 
 
 @pytest.mark.parametrize("line", REQUESTS)
-def test_requests_are_remote_frames(line):
-    assert encode_request(0, REQUESTS[line]) == frame_of(line)
+def test_requests_are_remote_messages(line):
+    assert encode_request(0, REQUESTS[line]) == message_of(line)
 
 
 def test_a_poll_is_empty():
-    assert encode_poll(0) == frame_of("t07A0")
+    assert encode_poll(0) == message_of("t07A0")
 
 
 @pytest.mark.parametrize("line", REPLIES)
 def test_replies_are_read_as_the_gripper_means_them(line):
-    got = decode_reply(frame_of(line))
+    got = decode_reply(message_of(line))
     assert tuple(int(getattr(got, name)) for name in REPLY_FIELDS) == REPLIES[line]
 
 
 def test_both_codes_of_contact_are_contact_and_no_other_is():
-    contacts = [decode_reply(frame_of(f"t0784000000{bits:X}1")).contact for bits in (0xC, 0xD, 0xE, 0xF)]
+    contacts = [decode_reply(message_of(f"t0784000000{bits:X}1")).contact for bits in (0xC, 0xD, 0xE, 0xF)]
     assert contacts == [False, True, True, False]
 
 
 def test_telemetry_is_read():
-    assert decode_temperature(frame_of("t02E2001A")) == 26.0
-    assert decode_temperature(frame_of("t02E2FFF6")) == -10.0
-    assert decode_supply(frame_of("t03025DC0")) == pytest.approx(24.0)
+    assert decode_temperature(message_of("t02E2001A")) == 26.0
+    assert decode_temperature(message_of("t02E2FFF6")) == -10.0
+    assert decode_supply(message_of("t03025DC0")) == pytest.approx(24.0)
 
 
 @pytest.mark.parametrize("line", ERRORS)
 def test_errors_are_named(line):
-    report = decode_errors(frame_of(line))
+    report = decode_errors(message_of(line))
     assert (report.faults, report.motor_calibrated) == ERRORS[line]
 
 
@@ -147,20 +147,22 @@ def test_decoding_inverts_encoding(position, speed, current, flags):
     "change", [{"position": 256}, {"position": -1}, {"speed": 256}, {"current_mA": 0}, {"current_mA": -500}]
 )
 def test_what_the_gripper_would_misread_is_refused(change):
-    with pytest.raises(FrameError, match=next(iter(change))):
+    with pytest.raises(CanMessageError, match=next(iter(change))):
         Move(**{"position": 0, "speed": 3, "current_mA": 500, "flags": 0, **change})
 
 
 @pytest.mark.parametrize("node, command", [(16, 61), (-1, 61), (0, 64)])
 def test_addresses_out_of_range_are_refused(node, command):
-    with pytest.raises(FrameError, match="expected 0 to"):
+    with pytest.raises(CanMessageError, match="expected 0 to"):
         identifier(node, command)
 
 
-@pytest.mark.parametrize("frame", [Frame(id=0x078, data=b"123"), Frame(id=0x078, remote=True), Frame(id=0x07A)])
-def test_what_is_no_reply_is_refused(frame):
-    with pytest.raises(FrameError, match="expected 4 bytes of command 60"):
-        decode_reply(frame)
+@pytest.mark.parametrize(
+    "message", [CanMessage(id=0x078, data=b"123"), CanMessage(id=0x078, remote=True), CanMessage(id=0x07A)]
+)
+def test_what_is_no_reply_is_refused(message):
+    with pytest.raises(CanMessageError, match="expected 4 bytes of command 60"):
+        decode_reply(message)
 
 
 def test_only_an_order_with_both_flags_and_no_stop_drives():

@@ -7,9 +7,9 @@ from driver_rig_fakes import reply
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import decode_reply
-from finforce_driver.errors import FrameError
+from finforce_driver.errors import CanMessageError
 from finforce_driver.machine.reply_filter import MOST_DOUBTS, Expectation, ReplyFilter, Sample
 
 REST = Expectation(drift=0.0, reach=100.0)
@@ -64,12 +64,12 @@ def test_a_flipped_digit_never_becomes_a_state(position, current, status, error,
     data = bytes([position, *current.to_bytes(2, "big", signed=True), status])
     line = f"{0x079 if error else 0x078:03X}{data.hex()}"
     flipped = line[:place] + f"{digit:X}" + line[place + 1 :]
-    true = decode_reply(Frame(id=int(line[:3], 16), data=data))
+    true = decode_reply(CanMessage(id=int(line[:3], 16), data=data))
     if int(flipped[:3], 16) & 0x7FE != 0x078:
-        return  # another node's or command's frame, which no filter sees
+        return  # another node's or command's message, which no filter sees
     try:
-        wrong = decode_reply(Frame(id=int(flipped[:3], 16), data=bytes.fromhex(flipped[3:])))
-    except FrameError:
+        wrong = decode_reply(CanMessage(id=int(flipped[:3], 16), data=bytes.fromhex(flipped[3:])))
+    except CanMessageError:
         return
     for believed in feed(settled(true), [wrong, true]):
         if believed is not None:

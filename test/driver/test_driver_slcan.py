@@ -1,83 +1,83 @@
-"""Claims about the lines of SLCAN: what is written, what is read, and what is not taken for a frame."""
+"""Claims about the lines of SLCAN: what is written, what is read, and what is not taken for a message."""
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finforce_driver.can.bus import Frame
-from finforce_driver.can.slcan import LONGEST_LINE, SlcanParser, decode_line, encode_frame
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.slcan import LONGEST_LINE, SlcanParser, decode_line, encode_message
 
-# Frames that a gripper's maker's own library writes, and replies that it reads.
+# CanMessages that a gripper's maker's own library writes, and replies that it reads.
 VECTORS = {
-    b"t07A0": Frame(id=0x07A),
-    b"t07A5001E012CC0": Frame(id=0x07A, data=bytes.fromhex("001E012CC0")),
-    b"t07A5801E01F4E0": Frame(id=0x07A, data=bytes.fromhex("801E01F4E0")),
-    b"t07C0": Frame(id=0x07C),
-    b"t0000": Frame(id=0),
-    b"t016103": Frame(id=0x016, data=b"\x03"),
-    b"r0340": Frame(id=0x034, remote=True),
-    b"t0784800000C1": Frame(id=0x078, data=bytes.fromhex("800000C1")),
-    b"t0794800003C9": Frame(id=0x079, data=bytes.fromhex("800003C9")),
-    b"t7FF8FFFFFFFFFFFFFFFF": Frame(id=0x7FF, data=b"\xff" * 8),
+    b"t07A0": CanMessage(id=0x07A),
+    b"t07A5001E012CC0": CanMessage(id=0x07A, data=bytes.fromhex("001E012CC0")),
+    b"t07A5801E01F4E0": CanMessage(id=0x07A, data=bytes.fromhex("801E01F4E0")),
+    b"t07C0": CanMessage(id=0x07C),
+    b"t0000": CanMessage(id=0),
+    b"t016103": CanMessage(id=0x016, data=b"\x03"),
+    b"r0340": CanMessage(id=0x034, remote=True),
+    b"t0784800000C1": CanMessage(id=0x078, data=bytes.fromhex("800000C1")),
+    b"t0794800003C9": CanMessage(id=0x079, data=bytes.fromhex("800003C9")),
+    b"t7FF8FFFFFFFFFFFFFFFF": CanMessage(id=0x7FF, data=b"\xff" * 8),
 }
 REPLY = b"t078478FE64E1"
 HEX = b"0123456789ABCDEFabcdef"
 
-frames = st.one_of(
-    st.builds(Frame, id=st.integers(0, 0x7FF), data=st.binary(max_size=8)),
-    st.builds(Frame, id=st.integers(0, 0x7FF), remote=st.just(True)),
+messages = st.one_of(
+    st.builds(CanMessage, id=st.integers(0, 0x7FF), data=st.binary(max_size=8)),
+    st.builds(CanMessage, id=st.integers(0, 0x7FF), remote=st.just(True)),
 )
 pieces = st.one_of(
     st.binary(max_size=80),
     st.lists(st.sampled_from(list(b"trTRz\r\a" + HEX)), max_size=80).map(bytes),
-    frames.map(encode_frame),
+    messages.map(encode_message),
 )
 
 
-def could_say(line: bytes, frame: Frame) -> bool:
-    """Whether a line is a frame's own, in any case of the letters, with or without a time stamp."""
-    own = encode_frame(frame)[:-1]
+def could_say(line: bytes, message: CanMessage) -> bool:
+    """Whether a line is a message's own, in any case of the letters, with or without a time stamp."""
+    own = encode_message(message)[:-1]
     line = line.upper()
-    if frame.remote:
+    if message.remote:
         return line[:1] == b"R" and line[1:4] == own[1:4] and len(line) in (5, 9)
     return line[:1] == b"T" and line[1:].startswith(own[1:]) and len(line) - len(own) in (0, 4)
 
 
 @pytest.mark.parametrize("line", VECTORS, ids=bytes.decode)
 def test_known_lines_are_written_and_read(line):
-    assert encode_frame(VECTORS[line]) == line + b"\r"
+    assert encode_message(VECTORS[line]) == line + b"\r"
     assert decode_line(line) == VECTORS[line]
 
 
 @settings(deadline=None)
-@given(frames)
-def test_decode_inverts_encode(frame):
-    assert SlcanParser().feed(encode_frame(frame)) == [frame]
+@given(messages)
+def test_decode_inverts_encode(message):
+    assert SlcanParser().feed(encode_message(message)) == [message]
 
 
 @settings(deadline=None)
-@given(st.lists(frames, max_size=6), st.data())
-def test_frames_arrive_however_the_bytes_are_cut(sent, data):
-    stream = b"".join(map(encode_frame, sent))
+@given(st.lists(messages, max_size=6), st.data())
+def test_messages_arrive_however_the_bytes_are_cut(sent, data):
+    stream = b"".join(map(encode_message, sent))
     parser, found = SlcanParser(), []
     while stream:
         size = data.draw(st.integers(1, len(stream)))
         found += parser.feed(stream[:size])
         stream = stream[size:]
     assert found == sent
-    assert parser.counts["frames"] == len(sent)
+    assert parser.counts["messages"] == len(sent)
 
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(pieces, max_size=12).map(b"".join))
-def test_no_bytes_raise_and_every_frame_is_a_line_of_its_own(stream):
+def test_no_bytes_raise_and_every_message_is_a_line_of_its_own(stream):
     found = SlcanParser().feed(stream)
     lines = iter(stream.replace(b"\a", b"\r").split(b"\r")[:-1])
-    # each frame has its line, in order; `any` uses the lines up as it goes
-    assert all(any(could_say(line, frame) for line in lines) for frame in found)
+    # each message has its line, in order; `any` uses the lines up as it goes
+    assert all(any(could_say(line, message) for line in lines) for message in found)
 
 
-def test_a_changed_letter_makes_another_frame_or_none():
+def test_a_changed_letter_makes_another_message_or_none():
     for place in range(len(REPLY)):
         for byte in set(range(256)) - {13, 7}:
             line = REPLY[:place] + bytes([byte]) + REPLY[place + 1 :]
@@ -96,7 +96,7 @@ def test_a_changed_letter_makes_another_frame_or_none():
 
 
 @pytest.mark.parametrize("place", range(len(REPLY)))
-def test_a_lost_or_doubled_letter_makes_no_frame(place):
+def test_a_lost_or_doubled_letter_makes_no_message(place):
     assert SlcanParser().feed(REPLY[:place] + REPLY[place + 1 :] + b"\r") == []
     assert SlcanParser().feed(REPLY[:place] + REPLY[place : place + 1] + REPLY[place:] + b"\r") == []
 
@@ -114,7 +114,7 @@ def test_a_lost_or_doubled_letter_makes_no_frame(place):
     ]
     + [b"\xfft0780", b"t07\xb20", b"t0784800000C1 ", b"r0340001", b"x0784800000C1", b"T078480"],
 )
-def test_lines_that_are_nearly_frames_are_garbage(line):
+def test_lines_that_are_nearly_messages_are_garbage(line):
     parser = SlcanParser()
     assert parser.feed(line + b"\r") == []
     assert parser.counts["garbage"] == 1
@@ -122,14 +122,14 @@ def test_lines_that_are_nearly_frames_are_garbage(line):
 
 def test_time_stamps_are_read_over():
     parser = SlcanParser()
-    assert parser.feed(REPLY + b"EA5F\rr0340EA5F\r") == [decode_line(REPLY), Frame(id=0x034, remote=True)]
+    assert parser.feed(REPLY + b"EA5F\rr0340EA5F\r") == [decode_line(REPLY), CanMessage(id=0x034, remote=True)]
 
 
-def test_a_refusal_stands_between_frames_without_an_end():
+def test_a_refusal_stands_between_messages_without_an_end():
     parser = SlcanParser()
     assert parser.feed(b"\a" + REPLY + b"\r\a\a" + REPLY + b"\r") == [decode_line(REPLY)] * 2
     assert parser.counts == {
-        "frames": 2,
+        "messages": 2,
         "acknowledgements": 0,
         "bells": 3,
         "garbage": 0,
@@ -165,11 +165,11 @@ def test_a_line_without_an_end_takes_no_memory_and_spoils_no_other():
     assert parser.counts["overlong"] == 1
 
 
-def test_the_end_of_an_overlong_line_is_no_frame():
+def test_the_end_of_an_overlong_line_is_no_message():
     assert SlcanParser().feed(b"0" * 100 + REPLY + b"\r") == []
 
 
-def test_garbage_stays_unexplained_until_a_frame_comes():
+def test_garbage_stays_unexplained_until_a_message_comes():
     parser = SlcanParser()
     parser.feed(b"\xff\x00" * 10 + b"\r\a")
     assert (parser.unexplained, parser.refused) == (20, 1)

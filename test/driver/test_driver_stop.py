@@ -7,7 +7,7 @@ from finforce_driver.can.protocol import Command, Flag
 from finforce_driver.emulator.faults import FaultKind
 from finforce_driver.emulator.protection import Fault
 from finforce_driver.errors import GripperStateError
-from finforce_driver.state import Outcome, Phase
+from finforce_driver.state import MoveOutcome, Phase
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
 LATCHED = {Fault.ESTOP_COMMAND, Fault.ESTOP_FLAG}
@@ -54,7 +54,7 @@ def test_a_stop_latches_at_once_and_no_motion_follows(rig, what):
 
 
 @both_variants
-def test_the_stops_frames_leave_before_estop_returns(rig):
+def test_the_stops_messages_leave_before_estop_returns(rig):
     rig.gripper.estop()
     order, command = list(rig.bus.sent)[-2:]
     assert order[1].id == 0x07A and order[1].data[4] & Flag.ESTOP
@@ -67,7 +67,7 @@ def test_a_stop_aborts_the_move(rig):
     rig.gripper.move(0.0, 0.02)
     rig.live(0.2)
     rig.gripper.estop()
-    assert rig.state.outcome is Outcome.ABORTED
+    assert rig.state.outcome is MoveOutcome.ABORTED
 
 
 @both_variants
@@ -77,8 +77,8 @@ def test_the_stop_is_cleared_in_the_grippers_order(rig):
     begin = rig.clock.now()
     rig.gripper.clear_errors()
     state = rig.wait_for(Phase.READY)
-    commands = [frame for frame in rig.sent(begin) if not frame.remote and (frame.data or frame.id != 0x07A)]
-    assert [frame.id for frame in commands] == [0x07A, 0x002]
+    commands = [message for message in rig.sent(begin) if not message.remote and (message.data or message.id != 0x07A)]
+    assert [message.id for message in commands] == [0x07A, 0x002]
     assert commands[0].data[4] & 0xF0 == Flag.ACTIVATE
     assert (rig.emulated.faults, state.estopped) == (set(), False)
 
@@ -155,7 +155,7 @@ def test_faults_are_named_and_cleared(rig, name, fault):
     rig.adapter.inject(fault, duration=0.2)
     rig.live(0.5)
     state = rig.state
-    assert (state.phase, state.faults, state.outcome) == (Phase.FAULT, (name,), Outcome.ABORTED)
+    assert (state.phase, state.faults, state.outcome) == (Phase.FAULT, (name,), MoveOutcome.ABORTED)
     assert "clear the errors" in state.message
     assert not state.estopped
     rig.gripper.clear_errors()
@@ -189,13 +189,13 @@ def test_clearing_without_a_fault_sends_nothing_since_it_would_let_go(rig):
     begin = rig.clock.now()
     rig.gripper.clear_errors()
     rig.live(0.5)
-    assert rig.frames(Command.CLEAR, begin) == [] and rig.orders(begin) == []
-    assert rig.state.outcome is Outcome.GRASPED
+    assert rig.messages(Command.CLEAR, begin) == [] and rig.orders(begin) == []
+    assert rig.state.outcome is MoveOutcome.GRASPED
 
 
 @both_variants
 @pytest.mark.parametrize("kind", [FaultKind.LOST, FaultKind.REQUEST_LOST])
-def test_clearing_survives_lost_frames(rig, kind):
+def test_clearing_survives_lost_messages(rig, kind):
     rig.gripper.estop()
     rig.live(0.3)
     rig.gripper.clear_errors()

@@ -15,7 +15,7 @@ from finforce_driver.grasp.status import GraspPhase
 from finforce_driver.messages import move_from_joint_state
 from finforce_driver.parameters import DriverParameters
 from finforce_driver.services import GripperTasks
-from finforce_driver.state import Outcome, Phase
+from finforce_driver.state import MoveOutcome, Phase
 
 
 def build(gripper=None, **parameters):
@@ -67,7 +67,7 @@ def test_release_opens_as_far_as_the_gripper_goes():
     gripper, _, tasks = build(FakeGripper(closed_opening=0.01), release_speed=0.03)
     with Caller(tasks.release) as caller:
         caller.wait_for(lambda: gripper.calls)
-        gripper.reply(phase=Phase.READY, outcome=Outcome.REACHED, opening=0.058)
+        gripper.reply(phase=Phase.READY, outcome=MoveOutcome.REACHED, opening=0.058)
         assert "58.0 mm" in caller.result()
     assert gripper.calls == [("move", pytest.approx(0.058), 0.03, None)]
 
@@ -76,7 +76,7 @@ def test_release_opens_as_far_as_it_is_told():
     gripper, _, tasks = build(release_opening=0.03)
     with Caller(tasks.release) as caller:
         caller.wait_for(lambda: gripper.calls)
-        gripper.reply(phase=Phase.READY, outcome=Outcome.BLOCKED)
+        gripper.reply(phase=Phase.READY, outcome=MoveOutcome.BLOCKED)
         with pytest.raises(GripperStateError, match="blocked while opening"):
             caller.result()
     assert gripper.calls[0][1] == 0.03
@@ -86,7 +86,7 @@ def test_a_grasp_without_vision_uses_the_motors_force_and_is_named_so():
     gripper, _, tasks = build(motor_force=12.0, grasp_speed=0.006)
     with Caller(tasks.grasp_without_vision) as caller:
         caller.wait_for(lambda: gripper.calls)
-        gripper.reply(phase=Phase.READY, outcome=Outcome.GRASPED)
+        gripper.reply(phase=Phase.READY, outcome=MoveOutcome.GRASPED)
         assert "without vision" in caller.result()
     assert gripper.calls == [("move", 0.0, 0.006, 12.0)]
 
@@ -95,7 +95,7 @@ def test_a_grasp_without_vision_on_nothing_holds_in_place():
     gripper, _, tasks = build()
     with Caller(tasks.grasp_without_vision) as caller:
         caller.wait_for(lambda: gripper.calls)
-        gripper.reply(phase=Phase.READY, outcome=Outcome.CLOSED_EMPTY, opening=0.0)
+        gripper.reply(phase=Phase.READY, outcome=MoveOutcome.CLOSED_EMPTY, opening=0.0)
         with pytest.raises(GripperStateError, match="closed on nothing"):
             caller.result()
     assert gripper.calls[-1] == ("hold",)
@@ -147,7 +147,7 @@ def test_another_command_ends_a_grasp(name, words, last):
     with Grasping() as grasp:
         with Caller(getattr(grasp.tasks, name)) as other:
             assert words in grasp.refusal()
-            grasp.gripper.reply(phase=Phase.READY, outcome=Outcome.REACHED)
+            grasp.gripper.reply(phase=Phase.READY, outcome=MoveOutcome.REACHED)
             other.result()
         assert not grasp.session.runs
         assert grasp.gripper.calls[-1][0] == last
@@ -253,10 +253,10 @@ KIND = SimpleNamespace(Result=SimpleNamespace, Feedback=SimpleNamespace)
 @pytest.mark.parametrize(
     ("outcome", "end", "reached", "stalled"),
     [
-        (Outcome.REACHED, "succeed", True, False),
-        (Outcome.GRASPED, "succeed", False, True),
-        (Outcome.BLOCKED, "abort", False, False),
-        (Outcome.TIMED_OUT, "abort", False, False),
+        (MoveOutcome.REACHED, "succeed", True, False),
+        (MoveOutcome.GRASPED, "succeed", False, True),
+        (MoveOutcome.BLOCKED, "abort", False, False),
+        (MoveOutcome.TIMED_OUT, "abort", False, False),
     ],
 )
 def test_the_standard_action_ends_with_the_outcome_of_the_move(outcome, end, reached, stalled):

@@ -3,8 +3,9 @@ from emulator_fakes import LineHost
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finforce_driver.can.bus import Frame
-from finforce_driver.emulator.adapter import EmulatedAdapter, frame_from_line, line_from_frame
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.slcan import decode_line, encode_message
+from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.errors import TargetError
 
@@ -12,7 +13,7 @@ REPLY = b"t078400000030\r"
 POLL = b"t07A0\r"
 
 
-def test_silent_adapter_says_nothing_but_frames():
+def test_silent_adapter_says_nothing_but_messages():
     host = LineHost(opened=False)
     assert host.say(b"C\rS8\rO\r") == b""
     assert host.say(POLL) == REPLY
@@ -52,7 +53,7 @@ def test_listening_adapter_sends_nothing():
     host = LineHost(opened=False)
     host.say(b"S8\rL\r")
     assert host.say(POLL) == b""
-    host.adapter.deliver(Frame(id=0x123))
+    host.adapter.deliver(CanMessage(id=0x123))
     assert host.say(b"") == b"t1230\r"
 
 
@@ -86,7 +87,7 @@ def test_two_grippers_share_the_bus():
 
 def test_traffic_of_another_master_is_seen_and_obeyed():
     host = LineHost()
-    host.adapter.put_on_bus(Frame(id=0x07A, data=bytes.fromhex("80 1E 01 F4 80")))
+    host.adapter.put_on_bus(CanMessage(id=0x07A, data=bytes.fromhex("80 1E 01 F4 80")))
     assert host.say(b"") == b"t07A5801E01F480\rt0784000000B0\r"
     assert host.say(POLL) == b"t078400000080\r"
 
@@ -117,8 +118,8 @@ def test_unknown_acknowledgement_is_refused():
 
 @given(st.integers(0, 0x7FF), st.binary(max_size=8))
 def test_reading_inverts_writing_of_lines(identifier, data):
-    for frame in (Frame(id=identifier, data=data), Frame(id=identifier, remote=True)):
-        assert frame_from_line(line_from_frame(frame).decode()) == frame
+    for message in (CanMessage(id=identifier, data=data), CanMessage(id=identifier, remote=True)):
+        assert decode_line(encode_message(message)[:-1], stamped=False) == message
 
 
 @given(st.binary(max_size=300))

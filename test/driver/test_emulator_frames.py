@@ -3,7 +3,7 @@ import struct
 import pytest
 from emulator_fakes import CALIBRATE, CLEAR, ESTOP, IDLE, VARIANTS, Host, calibrated_host, code_of, current_of
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.emulator.control import Endpoints, Mode, Order
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.protection import Fault
@@ -56,7 +56,7 @@ def test_faults_show_in_the_reply(host, fault, status):
     assert host.ask("t07A0") == [f"t0794480000{status}"]
 
 
-def test_telemetry_is_answered_to_remote_frames(host):
+def test_telemetry_is_answered_to_remote_messages(host):
     gripper = host.gripper
     gripper.jaws.current = -35.9
     assert host.ask("r0140") == ["t0140"]
@@ -105,7 +105,7 @@ def test_motor_without_calibration_can_never_be_cleared(host):
     assert host.ask("r0340") == ["t03528000"]
 
 
-def test_commands_are_silent_and_data_frames_are_no_requests(host):
+def test_commands_are_silent_and_data_messages_are_no_requests(host):
     for line in (ESTOP, CLEAR, IDLE, CALIBRATE, "t01E5000001F400", "t03C4000003E8", "t016103"):
         host.wait(0.001)
         assert host.ask(line) == []
@@ -120,14 +120,14 @@ def test_only_the_own_node_is_answered(node):
     gripper = EmulatedGripper(node_id=node)
     for other in range(16):
         gripper.step()
-        answers = gripper.handle(Frame(id=other << 7 | 0x7A))
+        answers = gripper.handle(CanMessage(id=other << 7 | 0x7A))
         assert [answer.id for answer in answers] == ([node << 7 | 0x78] if other == node else [])
 
 
 def test_any_length_is_answered_but_only_five_bytes_are_an_order(host):
     for length in range(9):
         host.wait(0.001)
-        answers = host.gripper.handle(Frame(id=0x7A, data=b"\xc8" * length))
+        answers = host.gripper.handle(CanMessage(id=0x7A, data=b"\xc8" * length))
         assert len(answers) == 1
         assert (host.gripper.order != Order()) == (length >= 5)
     assert host.gripper.order.position == 0xC8
@@ -159,7 +159,7 @@ def test_speeds_are_those_of_the_maker():
     assert {byte: Order(speed=byte).ticks_per_second for byte in speeds} == speeds
 
 
-def test_frames_beyond_the_controllers_memory_are_lost(host):
+def test_messages_beyond_the_controllers_memory_are_lost(host):
     assert [len(host.ask("t07A0")) for _ in range(5)] == [1, 1, 1, 0, 0]
     assert host.gripper.violations["burst"] == 3
 

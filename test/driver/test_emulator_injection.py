@@ -1,7 +1,7 @@
 import pytest
 from emulator_fakes import VARIANTS
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, PlannedFault, draw_plan
 from finforce_driver.emulator.firmware import EmulatedGripper
@@ -207,12 +207,12 @@ def test_faults_without_number_or_time_are_refused(host):
     assert len(LINE_FAULTS) == 12
 
 
-def test_foreign_frames_of_the_bus_pass_without_spoiling_acknowledgements():
+def test_foreign_messages_of_the_bus_pass_without_spoiling_acknowledgements():
     faulty = FaultyAdapter(EmulatedAdapter(EmulatedGripper(), "lawicel", latency=0.0))
     faulty.write(b"S8\rO\r")
     faulty.inject(FaultKind.LOST)
     faulty.write(POLL)
     faulty.step(0.001)
     assert faulty.read() == b"\r\rz\r"
-    faulty.adapter.deliver(Frame(id=0x155))
+    faulty.adapter.deliver(CanMessage(id=0x155))
     assert faulty.read() == b"t1550\r"

@@ -102,7 +102,7 @@ def set_watchdog(host, milliseconds):
 
 
 @pytest.mark.parametrize("line", ["t07A0", "t07A50000012C80", "r0140", "r02E0", "r0340"])
-def test_some_frames_feed_the_watchdog(moving, line):
+def test_some_messages_feed_the_watchdog(moving, line):
     set_watchdog(moving, 100)
     for _ in range(5):
         moving.wait(0.09)
@@ -134,7 +134,7 @@ def test_heartbeats_come_only_in_silence():
     assert host.gripper.step(10.0) == []
     assert len(host.ask("t1FA0")) == 1
     host.ask("t1BC4000003E8")
-    assert [frame.id for frame in host.gripper.step(3.5)] == [0x192] * 3
+    assert [message.id for message in host.gripper.step(3.5)] == [0x192] * 3
     for _ in range(10):
         host.ask("t1FA0")
         assert host.gripper.step(0.9) == []

@@ -3,15 +3,15 @@ from threading import Event
 import pytest
 from emulator_fakes import VARIANTS
 
-from finforce_driver.can.bus import Frame
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.faults import FaultKind, FaultyAdapter
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
 from finforce_driver.errors import LinkError
 
-POLL = Frame(id=0x07A)
-REPLY = Frame(id=0x078, data=bytes.fromhex("00000030"))
+POLL = CanMessage(id=0x07A)
+REPLY = CanMessage(id=0x078, data=bytes.fromhex("00000030"))
 
 
 class Setup:
@@ -45,7 +45,7 @@ def test_without_a_reply_the_whole_timeout_passes(setup):
     assert setup.gripper.now == pytest.approx(0.05, abs=1e-9)
 
 
-def test_frames_that_came_together_are_returned_one_by_one(setup):
+def test_messages_that_came_together_are_returned_one_by_one(setup):
     setup.adapter.inject(FaultKind.DOUBLED)
     setup.bus.send(POLL)
     assert setup.bus.receive(0.05) == REPLY
@@ -113,7 +113,7 @@ def test_half_a_line_from_before_does_not_spoil_the_first_reply(setup):
     assert setup.bus.receive(0.05) == REPLY
 
 
-def test_frames_from_before_are_forgotten_when_the_bus_is_opened_again(setup):
+def test_messages_from_before_are_forgotten_when_the_bus_is_opened_again(setup):
     setup.adapter.inject(FaultKind.DOUBLED)
     setup.bus.send(POLL)
     assert setup.bus.receive(0.05) == REPLY
@@ -125,11 +125,11 @@ def test_frames_from_before_are_forgotten_when_the_bus_is_opened_again(setup):
 def test_what_was_sent_is_kept_with_its_time(setup):
     setup.clock.wait(0.25)
     setup.bus.send(POLL)
-    ((time, frame),) = setup.bus.sent
-    assert frame == POLL and time == pytest.approx(0.25, abs=1e-9)
-    assert setup.bus.counts["frames"] == 0
+    ((time, message),) = setup.bus.sent
+    assert message == POLL and time == pytest.approx(0.25, abs=1e-9)
+    assert setup.bus.counts["messages"] == 0
     setup.bus.receive(0.05)
-    assert setup.bus.counts["frames"] == 1
+    assert setup.bus.counts["messages"] == 1
 
 
 def test_a_wait_for_a_rest_of_rounding_ends():
