@@ -15,7 +15,7 @@ from typing import Any
 from tqdm import tqdm
 
 from finforce_eval.bench.bench import write_figures
-from finforce_eval.cli.evaluate import Setup, make_setup
+from finforce_eval.cli.evaluate import EvaluationSetup, make_setup
 from finforce_eval.cli.main import add_jaw_options
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_choice import parse_contacts
@@ -58,7 +58,7 @@ class Cell:
         return 100.0 * (1.0 - self.score.record_skipped / max(self.score.record_frames, 1))
 
 
-def measure(recording: Recording, contact: str, setup: Setup, progress: Callable[[int], Any]) -> Cell:
+def measure(recording: Recording, contact: str, setup: EvaluationSetup, progress: Callable[[int], Any]) -> Cell:
     """Return the score of one recording under one contact."""
     setup = replace(setup, contacts=parse_contacts([contact]))
     try:
@@ -72,7 +72,7 @@ def measure(recording: Recording, contact: str, setup: Setup, progress: Callable
     return Cell(case=recording.name, contact=contact, score=score)
 
 
-def measure_all(recordings: Sequence[Recording], setup: Setup) -> dict[tuple[str, str], Cell]:
+def measure_all(recordings: Sequence[Recording], setup: EvaluationSetup) -> dict[tuple[str, str], Cell]:
     """Return every cell of both tables by recording and contact, under one progress bar."""
     pairs = [(recording, contact) for recording in recordings for contact in ("estimate", FIXED)]
     for recording in recordings:

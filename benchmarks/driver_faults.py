@@ -19,7 +19,7 @@ from dataclasses import replace
 from random import Random
 
 from driver_oracle import Guard, Oracle, Tape
-from driver_tally import Tally, print_tally, tally_json
+from driver_tally import FaultTally, print_tally, tally_json
 from tqdm import tqdm
 
 from finforce_driver.can.bus import CanMessage
@@ -47,7 +47,7 @@ LATENCIES = (0.0003, 0.001, 0.003, 0.012)  # [s]
 class _Complaints(logging.Handler):
     """Counts the errors that the loop survived."""
 
-    def __init__(self, tally: Tally) -> None:
+    def __init__(self, tally: FaultTally) -> None:
         super().__init__(logging.ERROR)
         self._tally = tally
 
@@ -67,7 +67,7 @@ class FaultRun:
     """
 
     def __init__(self, seed: int, count: int, kinds: Sequence[FaultKind], tracing: bool = False) -> None:
-        self.tally = Tally()
+        self.tally = FaultTally()
         self._random = Random(seed)
         self._tracing = tracing
         self._until = START + count * PERIOD
@@ -88,7 +88,7 @@ class FaultRun:
         self._next_act = 0.0
         self.gripper.listen(self._take)
 
-    def run(self) -> Tally:
+    def run(self) -> FaultTally:
         """Live until the plan is over and the gripper works again."""
         complaints = _Complaints(self.tally)
         logging.getLogger("finforce_driver").addHandler(complaints)
@@ -241,9 +241,9 @@ def choose_kinds(seed: int) -> tuple[FaultKind, ...]:
     return tuple(LINE_FAULTS) if seed % 3 == 0 else tuple(FaultKind)
 
 
-def run_all(faults: int, seed: int) -> Tally:
+def run_all(faults: int, seed: int) -> FaultTally:
     """Return the tally of enough runs for a number of faults."""
-    tally = Tally()
+    tally = FaultTally()
     with tqdm(total=faults, disable=None, leave=False) as bar:
         for index in range(-(-faults // PER_RUN)):
             run = FaultRun(seed + index, min(PER_RUN, faults - index * PER_RUN), choose_kinds(seed + index))

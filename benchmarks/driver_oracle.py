@@ -30,7 +30,7 @@ FAULT_NAMES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Truth:
+class TrueGripper:
     """One millisecond of a gripper: place [counts] between its own end stops, what it latched and does."""
 
     time: float
@@ -51,7 +51,7 @@ class Tape:
 
     def __init__(self, gripper: EmulatedGripper, length: int = 6000) -> None:
         self.gripper = gripper
-        self.truths: deque[Truth] = deque(maxlen=length)
+        self.truths: deque[TrueGripper] = deque(maxlen=length)
         self.now = 0.0
 
     def step(self, dt: float) -> None:
@@ -61,7 +61,7 @@ class Tape:
         ends, jaws = gripper.endpoints, gripper.jaws
         span = ends.closed - ends.open
         self.truths.append(
-            Truth(
+            TrueGripper(
                 time=self.now,
                 place=(jaws.encoder - ends.open) * 255.0 / span if span else math.nan,
                 current=1e-3 * gripper.reported_current,
@@ -76,7 +76,7 @@ class Tape:
             )
         )
 
-    def last(self, stamp: float, window: float) -> list[Truth]:
+    def last(self, stamp: float, window: float) -> list[TrueGripper]:
         """Return the truths of a window [s] that ends at a stamp."""
         found = []
         for truth in reversed(self.truths):
@@ -137,7 +137,7 @@ class Oracle:
         known += ["calibrated"] * state.calibrated + ["phase"] * (state.phase in (Phase.READY, Phase.MOVING))
         return [f"{name} without a reply" for name in known]
 
-    def _check_flags(self, state: GripperState, near: list[Truth], stopped: bool, clearing: bool) -> list[str]:
+    def _check_flags(self, state: GripperState, near: list[TrueGripper], stopped: bool, clearing: bool) -> list[str]:
         wrong = []
         if state.calibrated and not any(truth.calibrated for truth in near):
             wrong.append("calibrated")
@@ -157,7 +157,7 @@ class Oracle:
             wrong.append("usable")
         return wrong
 
-    def _check_values(self, state: GripperState, near: list[Truth]) -> list[str]:
+    def _check_values(self, state: GripperState, near: list[TrueGripper]) -> list[str]:
         wrong = []
         # a controller that ceases to be a gripper freezes its position byte, which only a calibration finds out
         if not math.isnan(state.opening) and all(truth.configured for truth in near):

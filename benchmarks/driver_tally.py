@@ -8,7 +8,7 @@ from typing import Any
 
 
 @dataclass(kw_only=True)
-class Tally:
+class FaultTally:
     """What came out of some runs."""
 
     faults: Counter[str] = field(default_factory=Counter)
@@ -24,7 +24,7 @@ class Tally:
     worst: dict[str, float] = field(default_factory=dict)
     violations: Counter[str] = field(default_factory=Counter)
 
-    def add(self, other: Tally) -> None:
+    def add(self, other: FaultTally) -> None:
         """Add another tally."""
         for name in ("faults", "wrong", "motion", "crashes", "phases", "outcomes", "violations"):
             getattr(self, name).update(getattr(other, name))
@@ -39,7 +39,7 @@ def tally_json(value: Any) -> Any:
     return {str(key): number for key, number in value.items()} if isinstance(value, dict) else value
 
 
-def print_tally(tally: Tally) -> None:
+def print_tally(tally: FaultTally) -> None:
     """Print what came out."""
     print(f"faults injected          {sum(tally.faults.values()):>8}  {dict(tally.faults.most_common())}")
     print(f"states compared          {tally.states:>8}  {dict(tally.phases)}")

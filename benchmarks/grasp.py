@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from grasp_twin import TWINS, EstimatorSensor, build_plant, build_pressed
-from grasp_world import Case, Course, NoisySensor, Plant, World, build_spring
+from grasp_world import GraspCase, GraspTrace, NoisySensor, Plant, World, build_spring
 from tqdm import tqdm
 
 from finforce_driver.grasp.status import GraspPhase
@@ -44,9 +44,9 @@ STEADY = 5.0  # [s]
 class Grasped:
     """A case with its course."""
 
-    case: Case
+    case: GraspCase
     sensor: str
-    course: Course
+    course: GraspTrace
 
     @property
     def overshoot(self) -> float:
@@ -78,7 +78,7 @@ class Grasped:
         return not self.course.error
 
 
-def list_cases(plants: Sequence[Plant], seeds: int) -> list[Case]:
+def list_cases(plants: Sequence[Plant], seeds: int) -> list[GraspCase]:
     """Return every combination that the fingers can reach; seeds and firmware variants alternate."""
     cases = []
     for plant, speed, latency, force, seed in product(plants, SPEEDS, LATENCIES, FORCES, range(seeds)):
@@ -86,7 +86,7 @@ def list_cases(plants: Sequence[Plant], seeds: int) -> list[Case]:
             continue
         number = len(cases)
         cases.append(
-            Case(
+            GraspCase(
                 plant=plant,
                 force=force,
                 speed=speed,
@@ -111,7 +111,7 @@ def run_estimated(name: str) -> Iterator[Grasped]:
     plant = build_plant(name, pressed)
     forces = [force for force in FORCES if force <= plant.force_at(0.0)]
     for number, force in enumerate(tqdm(forces, desc="with the estimator", disable=None, leave=False)):
-        case = Case(plant=plant, force=force, speed=SPEEDS[0], latency=LATENCIES[1], seed=number)
+        case = GraspCase(plant=plant, force=force, speed=SPEEDS[0], latency=LATENCIES[1], seed=number)
         course = World(case, EstimatorSensor(pressed, number)).run()
         yield Grasped(case=case, sensor="estimator", course=course)
 

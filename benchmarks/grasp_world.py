@@ -83,7 +83,7 @@ def build_spring(stiffness: float, rise: float = 1.0, over: float = 0.004) -> Ca
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
+class GraspCase:
     """One grasp: what is held, how hard and how fast, and how late the camera is."""
 
     plant: Plant
@@ -95,7 +95,7 @@ class Case:
 
 
 @dataclass(kw_only=True)
-class Course:
+class GraspTrace:
     """What happened: true force and opening over time, and the controller's words."""
 
     times: list[float] = field(default_factory=list)
@@ -110,7 +110,7 @@ class Course:
 class World:
     """One emulated gripper with fingers and camera; it is the force source of `hold_force`, too."""
 
-    def __init__(self, case: Case, sensor: Sensor) -> None:
+    def __init__(self, case: GraspCase, sensor: Sensor) -> None:
         self._case, self._sensor = case, sensor
         self.emulated = EmulatedGripper(case.variant, load=case.plant.force_at)
         self.clock = VirtualClock()
@@ -122,7 +122,7 @@ class World:
         self._order = count()
         self._next_image = 0.0
         self.force = 0.0
-        self.course = Course()
+        self.course = GraspTrace()
 
     def step(self, dt: float) -> None:
         """Bend and relax the fingers, and take an image where one is due."""
@@ -144,7 +144,7 @@ class World:
             ready.append(heapq.heappop(self._arrivals)[2])
         return ready
 
-    def run(self) -> Course:
+    def run(self) -> GraspTrace:
         """Calibrate, open, grasp, hold, and return what happened."""
         self._prepare()
         goal = GraspGoal(force=self._case.force, speed=self._case.speed)

@@ -16,7 +16,7 @@ from peer_install import measure_installation, read_project
 from tqdm import tqdm
 
 from finforce_eval.bench.bench import row_from_times, time_calls
-from finforce_eval.bench.cases import LEVELS, Press, bench_finger, load_cases, record_press
+from finforce_eval.bench.cases import LEVELS, ReplayedPress, bench_finger, load_cases, record_press
 from finforce_eval.bench.growth_solver import factorise_sparse
 from finforce_eval.bench.scores import score_shapes
 from finforce_eval.bench.tiers import TIERS, Run, Tier, run_tier
@@ -61,7 +61,7 @@ def measure_all() -> dict[str, Any]:
     }
 
 
-def add_noise(press: Press, seed: int) -> Press:
+def add_noise(press: ReplayedPress, seed: int) -> ReplayedPress:
     """Returns a press with white noise on every key point, all of them seen."""
     random = np.random.default_rng(seed)
     seen = [
@@ -79,7 +79,7 @@ def build_yardstick() -> Callable[[], object]:
 
 
 def measure_tier(
-    tier: Tier, exact: Sequence[Press], noisy: Sequence[Press], progress: Callable[[], object]
+    tier: Tier, exact: Sequence[ReplayedPress], noisy: Sequence[ReplayedPress], progress: Callable[[], object]
 ) -> dict[str, Any]:
     """Returns steps beside the yardstick, and errors without and with noise.
 
@@ -137,7 +137,7 @@ def score_noise(runs: Sequence[Run]) -> dict[str, float]:
     }
 
 
-def scatter_targets(press: Press, scatter: float, seed: int) -> Press:
+def scatter_targets(press: ReplayedPress, scatter: float, seed: int) -> ReplayedPress:
     """Returns a press whose key points stay, from the 4 mm level on, at places that no force can bring them to.
 
     Args:
@@ -154,7 +154,7 @@ def scatter_targets(press: Press, scatter: float, seed: int) -> Press:
 
 
 def measure_unreachable(
-    tier: Tier, noisy: Sequence[Press], scatter: float, progress: Callable[[], object]
+    tier: Tier, noisy: Sequence[ReplayedPress], scatter: float, progress: Callable[[], object]
 ) -> dict[str, float]:
     """Returns the share of images of unreachable targets with a trusted force, and by how much that jumps [N]."""
     presses = [scatter_targets(press, scatter, SEED + number) for number, press in enumerate(noisy)]

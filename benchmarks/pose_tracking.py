@@ -29,7 +29,7 @@ from finforce_contact.pose.tracker import PoseTracker
 from finforce_eval.bench.bench import write_figures
 from finforce_twin.rendering.depth_camera import build_d405
 from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
-from finforce_twin.scenes.pose_sequences import Frame, Motion, render_sequence
+from finforce_twin.scenes.pose_sequences import Motion, SequenceImage, render_sequence
 
 STEPS = {"848x480": 1, "424x240": 2}
 HIDDEN = (0.0, 0.3, 0.5)
@@ -40,7 +40,7 @@ IN, LENGTH = 35, 60  # the image in which the plates of a sequence of so many im
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
+class TrackingCase:
     """Which sequence, followed how."""
 
     name: str
@@ -52,7 +52,7 @@ class Case:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sample:
+class TrackedPose:
     """One image: errors [mm, deg], turn about the axis since the first image [deg], sure or not, time [ms]."""
 
     translation: float
@@ -69,16 +69,16 @@ class MaskFree:
         """Prepares the mesh."""
         self.tracker = PoseTracker(mesh, camera)
 
-    def locate(self, frame: Frame, guess: NDArray) -> ObjectPose:
+    def locate(self, frame: SequenceImage, guess: NDArray) -> ObjectPose:
         """Starts with a mask and a guess (4, 4)."""
         return self.tracker.locate(frame.stamp, frame.depth, frame.mask, [guess])
 
-    def track(self, frame: Frame) -> ObjectPose:
+    def track(self, frame: SequenceImage) -> ObjectPose:
         """Follows without a mask."""
         return self.tracker.track(frame.stamp, frame.depth)
 
 
-def follow(case: Case, frames: int) -> dict:
+def follow(case: TrackingCase, frames: int) -> dict:
     """Returns the figures of one sequence: its samples, and how often the object was lost and found again."""
     mesh, camera = build_object(case.name), build_d405(step=STEPS[case.resolution])
     motion = Motion(
@@ -102,7 +102,7 @@ def follow(case: Case, frames: int) -> dict:
         sure = _is_sure(case.name, pose)
         if before is not None:
             samples.append(
-                Sample(
+                TrackedPose(
                     translation=1e3 * off.translation,
                     rotation=float(np.rad2deg(off.rotation)),
                     spin=float(np.rad2deg(turn)),
@@ -160,27 +160,28 @@ def locate_all(count: int) -> dict:
 
 def run(frames: int, seeds: int) -> dict:
     """Returns the figures of every case."""
-    plan: dict[str, list[Case]] = {}
+    plan: dict[str, list[TrackingCase]] = {}
     for resolution in STEPS:
         for hidden in HIDDEN:
             for name in OBJECT_NAMES:
                 plan[f"{name} {resolution} hidden {hidden:.0%}"] = [
-                    Case(name=name, resolution=resolution, hidden=hidden, seed=seed) for seed in range(seeds)
+                    TrackingCase(name=name, resolution=resolution, hidden=hidden, seed=seed) for seed in range(seeds)
                 ]
     for name in OBJECT_NAMES:
         plan[f"{name} 424x240 0.3 m/s 90 deg/s"] = [
-            Case(name=name, resolution="424x240", hidden=0.0, seed=seed, speed=0.3) for seed in range(seeds)
+            TrackingCase(name=name, resolution="424x240", hidden=0.0, seed=seed, speed=0.3) for seed in range(seeds)
         ]
     for library in find_libraries():
         for hidden in (0.0, 0.5):
             plan[f"{library}, true mask, 424x240 hidden {hidden:.0%}"] = [
-                Case(name=name, resolution="424x240", hidden=hidden, seed=0, method=library) for name in OBJECT_NAMES
+                TrackingCase(name=name, resolution="424x240", hidden=hidden, seed=0, method=library)
+                for name in OBJECT_NAMES
             ]
     figures, every = {}, {resolution: [] for resolution in STEPS}
     for title, cases in tqdm(plan.items(), desc="sequences", leave=False):
         followed = [follow(case, frames) for case in cases]
         figures[title] = summarize(followed) | {"cases": [asdict(case) for case in cases]}
-        if cases[0].method == "tracker" and cases[0].speed == Case.speed:
+        if cases[0].method == "tracker" and cases[0].speed == TrackingCase.speed:
             every[cases[0].resolution] += followed
     return figures | {f"all {resolution}": summarize(followed) for resolution, followed in every.items()}
 
@@ -207,7 +208,7 @@ def _is_sure(name: str, pose: ObjectPose) -> bool:
     return bool((np.sqrt(np.diag(covariance)) < SURE).all())
 
 
-def _disturb(frame: Frame, seed: int) -> NDArray:
+def _disturb(frame: SequenceImage, seed: int) -> NDArray:
     rng = np.random.default_rng(seed)
     return move_pose(frame.T_camera_object, np.concatenate([rng.normal(0.0, 2e-3, 3), rng.normal(0.0, 0.03, 3)]))
 

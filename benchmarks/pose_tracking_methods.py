@@ -13,7 +13,7 @@ from finforce_contact.errors import PoseLostError
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.pose.source import ObjectPose
-from finforce_twin.scenes.pose_sequences import Frame
+from finforce_twin.scenes.pose_sequences import SequenceImage
 
 ROUND = ("cylinder", "bottle")
 HANDLE_RADIUS, HANDLE_SHARE = 0.042, 0.015  # the mug's body ends within; fewer of its pixels say nothing of its turn
@@ -37,12 +37,12 @@ class IcpTracker:
         self._view, self._camera, self._library = MeshView(mesh), camera, library
         self._T: NDArray | None = None
 
-    def locate(self, frame: Frame, guess: NDArray) -> ObjectPose:
+    def locate(self, frame: SequenceImage, guess: NDArray) -> ObjectPose:
         """Starts from a guess (4, 4)."""
         self._T = guess
         return self.track(frame)
 
-    def track(self, frame: Frame) -> ObjectPose:
+    def track(self, frame: SequenceImage) -> ObjectPose:
         """Follows the object by the points within the frame's mask, which is the true one."""
         step = max(1, int(np.sqrt(frame.mask.sum() / POINTS)))
         chosen = np.zeros_like(frame.mask)
@@ -58,7 +58,7 @@ class IcpTracker:
         )
 
 
-def compute_deviation(name: str, frame: Frame, T: NDArray, camera: CameraIntrinsics) -> PoseDeviation:
+def compute_deviation(name: str, frame: SequenceImage, T: NDArray, camera: CameraIntrinsics) -> PoseDeviation:
     """Returns what a pose (4, 4) of an object is off.
 
     Of round objects, and of the mug while less than 1.5 % of its seen pixels are handle, the tilt of the axis counts;
@@ -78,7 +78,7 @@ def compute_deviation(name: str, frame: Frame, T: NDArray, camera: CameraIntrins
     return PoseDeviation(translation=float(np.linalg.norm(T[:3, 3] - true[:3, 3])), rotation=rotation)
 
 
-def _shows_handle(frame: Frame, camera: CameraIntrinsics) -> bool:
+def _shows_handle(frame: SequenceImage, camera: CameraIntrinsics) -> bool:
     back = invert_pose(frame.T_camera_object)
     points = deproject(frame.depth, camera, frame.mask) @ back[:3, :3].T + back[:3, 3]
     outside = np.hypot(points[:, 0], points[:, 1]) > HANDLE_RADIUS

@@ -31,7 +31,7 @@ from finforce_eval.bench.bench import write_figures
 from finforce_twin.rendering.depth_camera import build_d405
 from finforce_twin.scenes.guesses import GuessError, draw_guess, place_mesh
 from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
-from finforce_twin.scenes.table import Scene, draw_scene, roughen_mask
+from finforce_twin.scenes.table import TableScene, draw_scene, roughen_mask
 
 DISTANCES = (13e-3, 16e-3)  # [m] of the guess from the truth
 ALONE = "alone"  # the choice between primitive and completion
@@ -61,7 +61,7 @@ CONDITIONS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class ReconstructionTrial:
     """One result: distances [mm], infinite where the method gave up, and the time it took [s]."""
 
     condition: str
@@ -73,7 +73,7 @@ class Trial:
     seconds: float
 
 
-def run_trials(condition: Condition, name: str, seed: int) -> list[Trial]:
+def run_trials(condition: Condition, name: str, seed: int) -> list[ReconstructionTrial]:
     """Return the results of all methods on one image."""
     rng = np.random.default_rng([seed, OBJECT_NAMES.index(name)])
     scene = draw_scene(build_object(name), build_d405(), rng, hidden=condition.hidden)
@@ -96,12 +96,12 @@ def run_trials(condition: Condition, name: str, seed: int) -> list[Trial]:
     return trials
 
 
-def compare(scene: Scene, placed: ObjectMesh) -> Chamfer:
+def compare(scene: TableScene, placed: ObjectMesh) -> Chamfer:
     """Return the distance of a mesh in the camera frame from the true one."""
     return compute_chamfer(placed, place_mesh(scene.mesh, scene.T_camera_object))
 
 
-def scale_guess(scene: Scene, mask: NDArray, guess: GeneratedMesh) -> NDArray:
+def scale_guess(scene: TableScene, mask: NDArray, guess: GeneratedMesh) -> NDArray:
     """Return the guess's map (4, 4) after the paper's coarse scale."""
     cloud = deproject(scene.depth, scene.camera, mask)
     mesh = ObjectMesh(vertices=guess.vertices, triangles=guess.triangles, watertight=False, name="guess")
@@ -113,8 +113,10 @@ def _place(guess: GeneratedMesh, affine: NDArray) -> ObjectMesh:
     return place_mesh(mesh, affine)
 
 
-def _make_trial(condition: Condition, scene: Scene, seed: int, method: str, chamfer: Chamfer, seconds: float) -> Trial:
-    return Trial(
+def _make_trial(
+    condition: Condition, scene: TableScene, seed: int, method: str, chamfer: Chamfer, seconds: float
+) -> ReconstructionTrial:
+    return ReconstructionTrial(
         condition=condition.title,
         target=scene.mesh.name,
         seed=seed,
@@ -125,7 +127,7 @@ def _make_trial(condition: Condition, scene: Scene, seed: int, method: str, cham
     )
 
 
-def summarise(trials: Sequence[Trial]) -> dict[str, float | int | None]:
+def summarise(trials: Sequence[ReconstructionTrial]) -> dict[str, float | int | None]:
     """Return median, 95th percentile and largest distance, and how many gave up."""
     mean = np.array([trial.mean_mm for trial in trials])
     known = [trial for trial in trials if np.isfinite(trial.mean_mm)]
@@ -143,7 +145,7 @@ def summarise(trials: Sequence[Trial]) -> dict[str, float | int | None]:
     }
 
 
-def tabulate(trials: Sequence[Trial]) -> list[dict]:
+def tabulate(trials: Sequence[ReconstructionTrial]) -> list[dict]:
     """Return one row per condition, method and object, and one for all objects together."""
     keys = dict.fromkeys((trial.condition, trial.method) for trial in trials)
     rows = []

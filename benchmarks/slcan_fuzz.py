@@ -32,7 +32,7 @@ WORTHWHILE = bytes(range(256)) + 8 * LETTERS  # half of what is inserted could b
 
 
 @dataclass(kw_only=True)
-class Tally:
+class FuzzTally:
     """What one kind of stream gave."""
 
     lines: int = 0
@@ -136,7 +136,7 @@ def cut_stream(stream: bytes, chance: random.Random) -> Iterator[bytes]:
         begin = end
 
 
-def check_stream(stream: bytes, chance: random.Random, tally: Tally) -> None:
+def check_stream(stream: bytes, chance: random.Random, tally: FuzzTally) -> None:
     """Feed one stream and compare the messages with those that are in it."""
     lines = (stream + b"\r").replace(b"\a", b"\r").split(b"\r")[:-1]
     expected = [message for message in map(message_of, lines) if message is not None]
@@ -154,9 +154,9 @@ def check_stream(stream: bytes, chance: random.Random, tally: Tally) -> None:
         tally.missed_messages += sum(message not in found for message in expected)
 
 
-def fuzz(kind: str, count: int, seed: int, bar: tqdm) -> Tally:
+def fuzz(kind: str, count: int, seed: int, bar: tqdm) -> FuzzTally:
     """Return what `count` lines of a kind gave."""
-    chance, tally = random.Random(seed), Tally()
+    chance, tally = random.Random(seed), FuzzTally()
     while tally.lines < count:
         before = tally.lines
         check_stream(b"".join(KINDS[kind](chance) for _ in range(BATCH)), chance, tally)
@@ -164,13 +164,13 @@ def fuzz(kind: str, count: int, seed: int, bar: tqdm) -> Tally:
     return tally
 
 
-def fuzz_by_hypothesis(seed: int) -> Tally | None:
+def fuzz_by_hypothesis(seed: int) -> FuzzTally | None:
     """Return what the streams of hypothesis gave; None where it is not installed."""
     try:
         from hypothesis import given, settings, strategies
     except ImportError:
         return None
-    tally, chance = Tally(), random.Random(seed)
+    tally, chance = FuzzTally(), random.Random(seed)
     valid = strategies.randoms(use_true_random=False).map(lambda source: encode_message(random_message(source)))
     letters = strategies.lists(strategies.sampled_from(list(LETTERS)), max_size=80).map(bytes)
     pieces = strategies.one_of(strategies.binary(max_size=80), letters, valid)
@@ -197,7 +197,7 @@ def time_replies(seed: int) -> dict[str, float]:
     return {"median": p50, "p95": p95, "p99": p99, "max": max(times), "n": TIMED}
 
 
-def print_table(tallies: dict[str, Tally], reply_us: dict[str, float]) -> None:
+def print_table(tallies: dict[str, FuzzTally], reply_us: dict[str, float]) -> None:
     """Print a line per kind of stream, and the time of a reply."""
     print(f"{'':<26}{'lines':>10}{'messages':>10}{'exceptions':>12}{'false':>8}{'missed':>8}")
     for name, tally in tallies.items():

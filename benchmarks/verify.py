@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 from verification_page import ForwardCase, InverseCase, format_page
 
-from finforce_ifea.contact_mechanics.forward_press import Cylinder, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.fem.mechanics import build_mechanics
@@ -35,7 +35,7 @@ REST_FRAMES, RAMP_FRAMES, HOLD_FRAMES = 60, 15, 45
 
 
 @dataclass(frozen=True, kw_only=True)
-class Truth:
+class TruePress:
     """One pressed finger: depths (n,) [m], forces (n,) [N], key point displacements (n, K, 3) [m]."""
 
     name: str
@@ -74,7 +74,7 @@ INVERSE_MODELS = (
 )
 
 
-def load_truth(path: Path) -> list[Truth]:
+def load_truth(path: Path) -> list[TruePress]:
     """Returns the cases of an extract: lengths in it are in millimetres, forces in newtons."""
     data = np.load(path)
     cases = []
@@ -85,7 +85,7 @@ def load_truth(path: Path) -> list[Truth]:
         depth = 1e-3 * data[f"{key}_depth"].astype(float)
         name = f"Ø{diameter} {height}"
         cases.append(
-            Truth(name=name, height=height, radius=5e-4 * float(diameter), depth=depth, force=force, moved=moved)
+            TruePress(name=name, height=height, radius=5e-4 * float(diameter), depth=depth, force=force, moved=moved)
         )
     return cases
 
@@ -98,7 +98,7 @@ def finger(model: Model) -> Jaw:
     return replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
 
 
-def press_model(model: Model, cases: Sequence[Truth], progress: Callable[[], object]) -> list[ForwardCase]:
+def press_model(model: Model, cases: Sequence[TruePress], progress: Callable[[], object]) -> list[ForwardCase]:
     """Returns the errors of a model pressed as the truth was."""
     jaw = finger(model)
     mechanics = build_mechanics(jaw, EstimatorSettings(solver=model.solver, mesh=model.mesh))
@@ -131,12 +131,12 @@ def _turn(jaw: Jaw, height: str, moved: NDArray) -> float:
     return float(np.arctan2(now[0], now[2]) - np.arctan2(rest[0], rest[2]))
 
 
-def _press_as_deep_as_it_goes(mechanics, face_x: float, truth: Truth):
+def _press_as_deep_as_it_goes(mechanics, face_x: float, truth: TruePress):
     """Returns the equilibria up to the depth at which the model buckles."""
     for count in range(len(truth.depth), 0, -1):
         try:
             return press_jaw(
-                mechanics.model, mechanics.contact.surface, face_x, Cylinder(radius=truth.radius),
+                mechanics.model, mechanics.contact.surface, face_x, RigidCylinder(radius=truth.radius),
                 HEIGHTS[truth.height], truth.depth[:count],
             )  # fmt: skip
         except ContactError:
@@ -144,7 +144,7 @@ def _press_as_deep_as_it_goes(mechanics, face_x: float, truth: Truth):
     raise ContactError(f"{truth.name}: no equilibrium at any depth")
 
 
-def invert_model(model: Model, cases: Sequence[Truth], progress: Callable[[], object]) -> list[InverseCase]:
+def invert_model(model: Model, cases: Sequence[TruePress], progress: Callable[[], object]) -> list[InverseCase]:
     """Returns the forces that an estimator finds in noise-free shapes, its relaxation switched off."""
     calibration = replace(load_calibration("bench"), relaxation=(), solver="")
     settings = EstimatorSettings(solver=model.solver, mesh=model.mesh)
@@ -161,7 +161,9 @@ def invert_model(model: Model, cases: Sequence[Truth], progress: Callable[[], ob
     return results
 
 
-def _hold_levels(settings: EstimatorSettings, calibration: Calibration, truth: Truth, levels: NDArray) -> list[float]:
+def _hold_levels(
+    settings: EstimatorSettings, calibration: Calibration, truth: TruePress, levels: NDArray
+) -> list[float]:
     """Returns the forces [N] at the end of each held level; between levels the shapes are interpolated."""
     jaw = load_jaw("bench")
     estimator = JawEstimator(jaw, settings=settings, calibration=calibration)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from finforce_eval.bench.bench import write_figures
-from finforce_eval.cli.evaluate import Setup, make_setup
+from finforce_eval.cli.evaluate import EvaluationSetup, make_setup
 from finforce_eval.evaluation.evaluate import evaluate_recording
 from finforce_eval.evaluation.places import InnerSurface
 from finforce_eval.recordings.recording import read_recording
@@ -36,7 +36,7 @@ def true_places(path: Path, recording: Recording, face_x: float) -> dict[float, 
     return places
 
 
-def evaluated_places(recording: Recording, setup: Setup) -> dict[float, float]:
+def evaluated_places(recording: Recording, setup: EvaluationSetup) -> dict[float, float]:
     """Return by displacement [mm] the place that the evaluation takes for true, median of the first loading [mm]."""
     stop = int(recording.phases.stamps[np.argmax(recording.phases.cycle == 1)])
     first = recording.between(0, stop)

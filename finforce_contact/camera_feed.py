@@ -45,7 +45,7 @@ class MaskedView:
     camera: CameraIntrinsics
 
 
-class CameraFeed:
+class DepthFeed:
     """Brings depth images and masks together and hands them to a tracker, which is made for object and camera.
 
     A mask is needed to find the object first, or again when it was lost; between, depth images are enough.

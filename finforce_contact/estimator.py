@@ -17,7 +17,7 @@ from finforce_contact.checks import check_stamp, check_wrench
 from finforce_contact.localization.closest import ClosestLocalizer
 from finforce_contact.localization.gaps import count_inside
 from finforce_contact.localization.inner_face import build_inner_face
-from finforce_contact.localization.outline_localizer import Localizer, OutlineLocalizer, Place, Scene
+from finforce_contact.localization.outline_localizer import ContactScene, Localizer, OutlineLocalizer, Place
 from finforce_contact.localization.section import Section, SectionKeeper
 from finforce_contact.localization.stillness import RestWatch
 from finforce_contact.localization.touch import SURELY_BENT, TouchBelief, describe_conflict
@@ -174,7 +174,7 @@ class ContactEstimator:
         if self._localizer is not None:
             self._localizer.reset()
         self._counts.update({reason: -count for reason, count in self._counts.items()})
-        self._solved: Scene | None = None
+        self._solved: ContactScene | None = None
         self._place: Place | None = None
 
     def _build_localizer(self, mesh: ObjectMesh) -> Localizer:
@@ -242,10 +242,10 @@ class ContactEstimator:
             return self._give_up(stamp, "no_pose", message)
         pose = self._poses.at(self._poses.stamp if self._rest.resting else stamp)
         section = self._sections.at(pose.T)
-        scene = Scene(T=pose.T, section=section, surface=surface, line=self.face.deform(surface), wrench=wrench)
+        scene = ContactScene(T=pose.T, section=section, surface=surface, line=self.face.deform(surface), wrench=wrench)
         return self._follow(stamp, pose, scene)
 
-    def _follow(self, stamp: float, pose: FilteredPose, scene: Scene) -> ContactEstimate:
+    def _follow(self, stamp: float, pose: FilteredPose, scene: ContactScene) -> ContactEstimate:
         """Finds the place in a scene, or keeps the last one, and says whether the object touches."""
         skipped = self._find_reason_to_skip(scene)
         if not (skipped and self.skips.allows(_RULES[skipped])):
@@ -266,7 +266,7 @@ class ContactEstimator:
         self._rest.update(stamp, scene.line if self._belief.touching and self._is_live(scene) else None)
         return self._report(stamp, pose, scene, skipped, message)
 
-    def _find_reason_to_skip(self, scene: Scene) -> str:
+    def _find_reason_to_skip(self, scene: ContactScene) -> str:
         """Returns why the last place still holds, empty when it does not."""
         before = self._solved
         if before is None or self._place is None or not scene.section.polygons:
@@ -284,16 +284,16 @@ class ContactEstimator:
             same = np.abs(scene.wrench[0] - before.wrench[0]).max() < _STILL_FORCE
         return "still" if same else ""
 
-    def _is_far(self, scene: Scene) -> bool:
+    def _is_far(self, scene: ContactScene) -> bool:
         """Whether the boxes around object and jaw are apart along x by more than the margin."""
         front = scene.T[0, :3] @ self._centre + scene.T[0, 3] - np.abs(scene.T[0, :3]) @ self._half
         return front - self.settings.margin > max(scene.line[:, 0].max(), self.face.x)
 
-    def _is_live(self, scene: Scene) -> bool:
+    def _is_live(self, scene: ContactScene) -> bool:
         """Whether the surface is that of a solver at work."""
         return bool(np.abs(scene.line - self._rest_line).max() > _AT_REST)
 
-    def _surrounds_jaw(self, scene: Scene) -> bool:
+    def _surrounds_jaw(self, scene: ContactScene) -> bool:
         """Whether most of the jaw lies within the object."""
         jaw = scene.surface[self._samples]
         inside = np.abs((jaw - scene.T[:3, 3]) @ scene.T[:3, :3] - self._centre) < self._half
@@ -301,7 +301,7 @@ class ContactEstimator:
             return False
         return count_inside(np.ascontiguousarray(jaw[:, ::2]), scene.section.edges) > _SURROUNDED * len(jaw)
 
-    def _judge_touch(self, pose: FilteredPose, scene: Scene) -> str:
+    def _judge_touch(self, pose: FilteredPose, scene: ContactScene) -> str:
         """Decides whether the object touches, and returns what is odd about that."""
         place, settings = self._place, self.settings
         if place.touching is not None:
@@ -315,7 +315,9 @@ class ContactEstimator:
         self._belief.update(place.bend - place.gap, stddev, place.bend if live else None)
         return ""
 
-    def _report(self, stamp: float, pose: FilteredPose, scene: Scene, skipped: str, message: str) -> ContactEstimate:
+    def _report(
+        self, stamp: float, pose: FilteredPose, scene: ContactScene, skipped: str, message: str
+    ) -> ContactEstimate:
         """Returns the estimate of an image."""
         touching = self._belief.touching
         return ContactEstimate(

@@ -14,7 +14,7 @@ from finforce.errors import FinforceError
 from finforce.stamps import SECOND
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.pose.pairing import DEPTH, PosePairing, Step
+from finforce_contact.pose.pairing import DEPTH, PosePairing, PoseStep
 from finforce_ifea.tracking.clearance import is_away
 
 AWAY_FOR = 10  # images in a row, after which the object is taken to stay away: a second, of the ten that are looked at
@@ -151,7 +151,7 @@ class JawContact:
             self._passed.remove(image)
             self._follow(self._pairing.add_late(image.stamp, image.read()))
 
-    def _follow(self, steps: Iterable[Step]) -> list[TimedEstimate]:
+    def _follow(self, steps: Iterable[PoseStep]) -> list[TimedEstimate]:
         """Hand poses on and update for the images that are due."""
         estimates = []
         for step in steps:

@@ -11,7 +11,7 @@ from finforce.transforms import invert_pose
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.localization.contact_patch import Rows
 from finforce_contact.localization.inner_face import InnerFace
-from finforce_contact.localization.outline_localizer import Place, Scene
+from finforce_contact.localization.outline_localizer import ContactScene, Place
 from finforce_contact.mesh.solids import solid_from_triangles, to_manifold, triangles_of_solid
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.settings import ContactSettings
@@ -49,7 +49,7 @@ class IntersectionLocalizer:
         self._status = False
         self._last: Rows | None = None
 
-    def locate(self, scene: Scene) -> Place | None:
+    def locate(self, scene: ContactScene) -> Place | None:
         """Returns the place, None before any was found."""
         shift = self._slight_contact(scene.T) - scene.T[0, 3] if not self._status else 0.0
         T = scene.T.copy()

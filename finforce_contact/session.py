@@ -13,7 +13,7 @@ from finforce.errors import FinforceError
 from finforce.messages import pose_from_message, stamp_of, wrench_from_message
 from finforce.skipping import CONTACT, RESTING, Skips
 from finforce.stamps import SECOND
-from finforce_contact.camera_feed import CameraFeed, StampedPose
+from finforce_contact.camera_feed import DepthFeed, StampedPose
 from finforce_contact.diagnostics import describe_mesh
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.estimator import ContactEstimator
@@ -63,7 +63,7 @@ class ContactSession:
         self.trouble = ""
         self._frame = parameters.camera_frame
         self._source = ExternalPoseSource(self._frame)
-        self._camera = CameraFeed(parameters, tracker) if parameters.tracks else None
+        self._camera = DepthFeed(parameters, tracker) if parameters.tracks else None
         self._camera_lock, self._lock = RLock(), RLock()
 
     def load_mesh(self, parameters: ContactParameters) -> str:
@@ -196,12 +196,12 @@ class ContactSession:
         return pose and StampedPose(stamp_of(message), pose)
 
     def take_camera(self, info: Any) -> None:
-        """Take a camera's intrinsics; see `CameraFeed`."""
+        """Take a camera's intrinsics; see `DepthFeed`."""
         with self._camera_lock:
             self._camera.take_camera(info)
 
     def take_depth(self, image: Any) -> StampedPose | None:
-        """Return the object's pose in a depth image, None while every grasp rests; see `CameraFeed`."""
+        """Return the object's pose in a depth image, None while every grasp rests; see `DepthFeed`."""
         rests = self._skips.allows(RESTING) and all(jaw.estimator.resting for jaw in self.jaws.values())
         if rests:
             self._skips.count(RESTING)
@@ -209,6 +209,6 @@ class ContactSession:
             return self._camera.take_depth(image, rests=rests)
 
     def take_mask(self, image: Any) -> StampedPose | None:
-        """Return the object's pose in the image that a mask belongs to, if it is looked for; see `CameraFeed`."""
+        """Return the object's pose in the image that a mask belongs to, if it is looked for; see `DepthFeed`."""
         with self._camera_lock:
             return self._camera.take_mask(image)

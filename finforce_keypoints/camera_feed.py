@@ -21,7 +21,7 @@ COLOR, DEPTH = "color", "depth"
 WAITING = 3  # colour images that may wait for their depth: a tenth of a second at 30 Hz
 
 
-class CameraFeed:
+class RgbdFeed:
     """Brings the images of a camera together by their stamps, the newest first, and refuses what no camera sees.
 
     A colour image waits for its depth image; one that a newer whole image overtook is passed over. Of several colour

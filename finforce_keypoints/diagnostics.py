@@ -13,7 +13,7 @@ import numpy as np
 from finforce.health import Level, Outcome, Report
 
 if TYPE_CHECKING:
-    from finforce_keypoints.camera_feed import CameraFeed
+    from finforce_keypoints.camera_feed import RgbdFeed
     from finforce_keypoints.detectors.build import FinderCard
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
@@ -39,7 +39,7 @@ def report_of_rest(alarms: Sequence[Outcome], values: Mapping[str, str]) -> Repo
     return Report(level=level, message="; ".join([*said, "rests: nobody subscribes to the key points"]), values=values)
 
 
-def describe(feed: CameraFeed, card: FinderCard, found: JawKeypoints | None) -> dict[str, str]:
+def describe(feed: RgbdFeed, card: FinderCard, found: JawKeypoints | None) -> dict[str, str]:
     """Return what is known of the camera, the finder and a jaw's last key points, as text."""
     camera = feed.camera
     known = {

@@ -24,7 +24,7 @@ from finforce.ros.heap import keep_heap
 from finforce.ros.raw_image import read_image
 from finforce.skipping import IDLE, LATE, UNHEARD, Skips
 from finforce.stamps import Idling, StampGate
-from finforce_keypoints.camera_feed import SECOND, CameraFeed
+from finforce_keypoints.camera_feed import SECOND, RgbdFeed
 from finforce_keypoints.detectors.build import BuiltDetector, build_detector
 from finforce_keypoints.detectors.dots import DotSettings
 from finforce_keypoints.diagnostics import describe, outcome_of_keypoints, report_of_rest
@@ -72,7 +72,7 @@ class KeypointDetectorNode(Node):
         ros.name_unknown_parameters(self)
         self.skips = Skips(RULES, parameters.skip_off)
         self.detector, self.card = build(jaws, parameters, settings, dots, self.skips)
-        self.feed = CameraFeed(parameters)
+        self.feed = RgbdFeed(parameters)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
         source, age = self.feed.source, parameters.max_age
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}

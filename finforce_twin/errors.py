@@ -7,5 +7,5 @@ class ScenarioError(FinforceError, ValueError):
     """A scenario is not known, or its numbers fit no gripper."""
 
 
-class GraspError(FinforceError, RuntimeError):
+class BalanceError(FinforceError, RuntimeError):
     """Jaws and object find no equilibrium: a jaw buckles, or the object slips or falls."""

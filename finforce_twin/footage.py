@@ -20,7 +20,7 @@ from finforce_twin.gripper.gripper import TwinGripper, TwinState
 from finforce_twin.mechanics.assembly import Assembly
 from finforce_twin.rendering.bodies import DrawnJaw
 from finforce_twin.rendering.depth_camera import build_d405_vga
-from finforce_twin.rendering.photographer import Photographer, Setting, Shot
+from finforce_twin.rendering.photographer import Photographer, SceneSetting, Shot
 from finforce_twin.scenes.scenarios import Scenario
 
 FINGER = 0  # seed of the material for which the package has a calibration, `twin`
@@ -74,7 +74,7 @@ class TwinFrame:
     T_camera_object: NDArray | None
 
 
-class Gripper(Protocol):
+class FilmedGripper(Protocol):
     """What is filmed; `TwinGripper` is one."""
 
     def __len__(self) -> int:
@@ -84,7 +84,7 @@ class Gripper(Protocol):
         """Yield the states, always from the beginning."""
 
 
-class Camera(Protocol):
+class MountedCamera(Protocol):
     """What films; `Photographer` is one."""
 
     def shoot(self, state: TwinState) -> Shot:
@@ -107,7 +107,7 @@ class Footage:
         seed: of the object tracker's noise.
     """
 
-    def __init__(self, gripper: Gripper, photographer: Camera, setting: Setting, seed: int) -> None:
+    def __init__(self, gripper: FilmedGripper, photographer: MountedCamera, setting: SceneSetting, seed: int) -> None:
         self._gripper, self._photographer, self._seed = gripper, photographer, seed
         self.camera, self.T_gripper_camera, self.mesh = setting.camera, setting.T_gripper_camera, setting.mesh
         self.depth_step = setting.depth_step
@@ -156,9 +156,9 @@ def build_footage(
     return Footage(gripper, Photographer(setting, seed), setting, seed)
 
 
-def set_stage(assembly: Assembly, camera: CameraIntrinsics, depth_step: float) -> Setting:
+def set_stage(assembly: Assembly, camera: CameraIntrinsics, depth_step: float) -> SceneSetting:
     """Return jaws and object before the scenario's camera, with depth images in steps [m]."""
-    return Setting(
+    return SceneSetting(
         shapes={
             side: DrawnJaw(jaw=jaw, rest=assembly.rest_vertices(side), triangles=assembly.triangles(side))
             for side, jaw in assembly.jaws.items()

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from finforce_eval.recordings.steel import SHIPPED, points_from_picture
-from finforce_ifea.contact_mechanics.forward_press import Cylinder, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.jaw.drawing import Drawing
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
@@ -57,7 +57,7 @@ def press(
     mechanics = build_mechanics(finger, EstimatorSettings())
     probe = mechanics.model.attach(np.insert(drawn, 1, 0.0, axis=1), 1e-3)
     presses = press_jaw(
-        mechanics.model, mechanics.contact.surface, finger.inner_face_x, Cylinder(radius=radius), height, depths
+        mechanics.model, mechanics.contact.surface, finger.inner_face_x, RigidCylinder(radius=radius), height, depths
     )
     return np.stack([mechanics.model.positions(probe, state.q)[:, [0, 2]] for state in presses])
 

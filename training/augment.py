@@ -40,7 +40,7 @@ class AugmentSettings:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sample:
+class TrainingSample:
     """One picture as the network sees it.
 
     Attributes:
@@ -54,7 +54,7 @@ class Sample:
     visible: NDArray
 
 
-def crop_centre(picture: NDArray, points: NDArray, visible: NDArray) -> Sample:
+def crop_centre(picture: NDArray, points: NDArray, visible: NDArray) -> TrainingSample:
     """Return the picture (h, w, 3) without its padding, the points (K, 2) moved along."""
     cropped = picture[MARGIN:-MARGIN, MARGIN:-MARGIN]
     return _keep_inside(cropped, points - MARGIN, visible)
@@ -62,7 +62,7 @@ def crop_centre(picture: NDArray, points: NDArray, visible: NDArray) -> Sample:
 
 def augment(
     picture: NDArray, points: NDArray, visible: NDArray, settings: AugmentSettings, rng: np.random.Generator
-) -> Sample:
+) -> TrainingSample:
     """Return one picture seen from slightly elsewhere, in other light, partly covered.
 
     Args:
@@ -75,7 +75,9 @@ def augment(
     sample = _warp(picture, points, visible, settings, rng)
     if rng.random() < settings.occlusion:
         sample = _occlude(sample, rng)
-    return Sample(picture=change_light(sample.picture, settings, rng), points=sample.points, visible=sample.visible)
+    return TrainingSample(
+        picture=change_light(sample.picture, settings, rng), points=sample.points, visible=sample.visible
+    )
 
 
 def change_light(picture: NDArray, settings: AugmentSettings, rng: np.random.Generator) -> NDArray:
@@ -95,17 +97,17 @@ def change_light(picture: NDArray, settings: AugmentSettings, rng: np.random.Gen
     return _compress(image, rng) if rng.random() < settings.jpeg else image
 
 
-def _keep_inside(picture: NDArray, points: NDArray, visible: NDArray) -> Sample:
+def _keep_inside(picture: NDArray, points: NDArray, visible: NDArray) -> TrainingSample:
     """Return a sample whose points outside the picture are not visible."""
     height, width = picture.shape[:2]
     with np.errstate(invalid="ignore"):
         inside = ((points >= 0.0) & (points <= (width - 1, height - 1))).all(axis=1)
-    return Sample(picture=picture, points=points.astype(np.float32), visible=visible & inside)
+    return TrainingSample(picture=picture, points=points.astype(np.float32), visible=visible & inside)
 
 
 def _warp(
     picture: NDArray, points: NDArray, visible: NDArray, settings: AugmentSettings, rng: np.random.Generator
-) -> Sample:
+) -> TrainingSample:
     """Return the part of the picture that a slightly displaced camera sees."""
     cv2 = import_cv2()
     height, width = (size - 2 * MARGIN for size in picture.shape[:2])
@@ -124,7 +126,7 @@ def _warp(
     return _keep_inside(warped, moved, visible)
 
 
-def _occlude(sample: Sample, rng: np.random.Generator) -> Sample:
+def _occlude(sample: TrainingSample, rng: np.random.Generator) -> TrainingSample:
     """Return the sample with one to three things in front: random outlines, flat, graded or textured."""
     cv2 = import_cv2()
     picture, visible = sample.picture.copy(), sample.visible.copy()
@@ -141,7 +143,7 @@ def _occlude(sample: Sample, rng: np.random.Generator) -> Sample:
         picture[covered] = _draw_texture(picture, rng)[covered]
         at = np.round(np.where(visible[:, None], sample.points, 0.0)).astype(int)
         visible &= ~covered[at[:, 1], at[:, 0]]
-    return Sample(picture=picture, points=sample.points, visible=visible)
+    return TrainingSample(picture=picture, points=sample.points, visible=visible)
 
 
 def _draw_texture(picture: NDArray, rng: np.random.Generator) -> NDArray:

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.optional import import_cv2
-from training.augment import Sample
+from training.augment import TrainingSample
 from training.scoring import Detections
 
 ZOOM, COLUMNS = 2, 5
 TRUE, HIDDEN, FOUND, REFUSED = (0, 255, 0), (110, 110, 110), (255, 40, 40), (60, 120, 255)  # RGB
 
 
-def draw_sheet(path: str | Path, samples: Sequence[Sample], detections: Detections, threshold: float) -> None:
+def draw_sheet(path: str | Path, samples: Sequence[TrainingSample], detections: Detections, threshold: float) -> None:
     """Write pictures side by side: true points green, hidden ones grey, found ones red crosses, refused ones blue.
 
     Args:
@@ -35,7 +35,7 @@ def draw_sheet(path: str | Path, samples: Sequence[Sample], detections: Detectio
     cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
 
 
-def draw_points(sample: Sample, pixels: NDArray, accepted: NDArray) -> NDArray:
+def draw_points(sample: TrainingSample, pixels: NDArray, accepted: NDArray) -> NDArray:
     """Return a picture (2 h, 2 w, 3) uint8, brightened where it is dark, with its points and the found ones (K, 2)."""
     cv2 = import_cv2()
     gain = max(1.0, 90.0 / max(float(sample.picture.mean()), 1.0))

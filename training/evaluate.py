@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from finforce_keypoints.networks.model import KeypointModel, ModelOverrides
 from training.arguments import one_line_errors
-from training.augment import AugmentSettings, Sample, augment, crop_centre
+from training.augment import AugmentSettings, TrainingSample, augment, crop_centre
 from training.dataset import VALIDATION, LabelledPictures, load_pictures
 from training.drawing import draw_sheet
 from training.scoring import THRESHOLD, Detections, Score, find_worst, score_detections
@@ -63,20 +63,20 @@ def detect_with_model(folder: str | Path, pictures: LabelledPictures) -> Detecti
     return detect_samples(build_model(folder), crop_all(pictures))
 
 
-def crop_all(pictures: LabelledPictures) -> list[Sample]:
+def crop_all(pictures: LabelledPictures) -> list[TrainingSample]:
     """Return the pictures without their padding."""
     columns = zip(pictures.picture, pictures.xz, pictures.visible, strict=True)
     return [crop_centre(*column) for column in columns]
 
 
-def augment_all(pictures: LabelledPictures, seed: int = 0) -> list[Sample]:
+def augment_all(pictures: LabelledPictures, seed: int = 0) -> list[TrainingSample]:
     """Return the pictures changed as in training, the same ones for the same seed."""
     rng = np.random.default_rng(seed)
     columns = zip(pictures.picture, pictures.xz, pictures.visible, strict=True)
     return [augment(*column, AugmentSettings(), rng) for column in columns]
 
 
-def detect_samples(model: KeypointModel, samples: Sequence[Sample]) -> Detections:
+def detect_samples(model: KeypointModel, samples: Sequence[TrainingSample]) -> Detections:
     """Return what a network finds, decoded as in the product, with a progress bar."""
     found = []
     for start in tqdm(range(0, len(samples), BATCH), desc="detect", unit="batch", leave=False):
@@ -90,7 +90,7 @@ def detect_samples(model: KeypointModel, samples: Sequence[Sample]) -> Detection
 
 
 def score_groups(
-    detections: Detections, samples: Sequence[Sample], light: np.ndarray | None, threshold: float
+    detections: Detections, samples: Sequence[TrainingSample], light: np.ndarray | None, threshold: float
 ) -> dict[str, Score]:
     """Return the scores of all pictures, of each level of light and of each light's name."""
     level = np.array([sample.picture.mean() for sample in samples])

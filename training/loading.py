@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 
 from finforce.optional import import_cv2
-from training.augment import MEAN, STD, AugmentSettings, Sample, augment, crop_centre
+from training.augment import MEAN, STD, AugmentSettings, TrainingSample, augment, crop_centre
 from training.dataset import LabelledPictures, iterate_batches
 from training.optional import import_torch
 
@@ -106,7 +106,7 @@ class _BatchOrder(torch.utils.data.Sampler):
         return islice(enumerate(order), self.settings.first, None)
 
 
-def _stack(samples: Iterable[Sample]) -> list[torch.Tensor]:
+def _stack(samples: Iterable[TrainingSample]) -> list[torch.Tensor]:
     """Return pictures (B, h, w, 3) uint8, points (B, K, 2), visible (B, K) of samples."""
     samples = list(samples)
     return [

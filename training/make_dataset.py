@@ -24,7 +24,7 @@ from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, inter
 from finforce_twin.gripper.gripper import JawState, TwinState
 from finforce_twin.rendering.bodies import DrawnJaw, draw_jaws
 from finforce_twin.rendering.depth_camera import build_d405, build_d405_vga
-from finforce_twin.rendering.photographer import Photographer, Setting, Shot
+from finforce_twin.rendering.photographer import Photographer, SceneSetting, Shot
 from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
 from training.arguments import one_line_errors
 from training.dataset import MARGIN, TRAIN, VALIDATION, LabelledPictures, join_pictures, save_shard
@@ -63,7 +63,7 @@ class SceneMaker:
         camera = build_d405_vga() if rng.random() < 0.7 else build_d405(distorted=True)
         T = _disturb(BENCH_CAMERA if one_jaw else ROBOT_CAMERA, rng)
         mesh, state = self._draw_state(rng, ("left",) if one_jaw else ("left", "right"))
-        setting = Setting(
+        setting = SceneSetting(
             shapes=self._drawn,
             mesh=mesh,
             camera=camera,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from finforce.errors import FinforceError
-from finforce_ifea.contact_mechanics.forward_press import Box, Cylinder, Press, RigidObject, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import PressState, RigidBox, RigidCylinder, RigidObject, press_jaw
 from finforce_ifea.fem.mechanics import Mechanics, build_mechanics
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.settings import EstimatorSettings
@@ -51,9 +51,9 @@ def draw_pressed_shapes(jaw: Jaw, count: int, seed: int) -> list[PressedShape]:
         is_round = rng.random() < 0.7
         size = np.full(2, rng.uniform(8e-3, 55e-3)) if is_round else rng.uniform(8e-3, 50e-3, 2)
         rigid = (
-            Cylinder(radius=0.5 * size[0])
+            RigidCylinder(radius=0.5 * size[0])
             if is_round
-            else Box(size_x=size[0], size_z=size[1], edge_radius=min(2e-3, 0.2 * size.min()))
+            else RigidBox(size_x=size[0], size_z=size[1], edge_radius=min(2e-3, 0.2 * size.min()))
         )
         height = rng.uniform(low, high)
         for press in _press(mechanics, jaw, rigid, height, np.sort(DEPTHS * rng.uniform(0.85, 1.15))):
@@ -69,7 +69,7 @@ def draw_pressed_shapes(jaw: Jaw, count: int, seed: int) -> list[PressedShape]:
     return shapes
 
 
-def _press(mechanics: Mechanics, jaw: Jaw, rigid: RigidObject, height: float, depths: NDArray) -> list[Press]:
+def _press(mechanics: Mechanics, jaw: Jaw, rigid: RigidObject, height: float, depths: NDArray) -> list[PressState]:
     """Return the equilibria down to the deepest that there is."""
     contact = mechanics.contact
     for count in range(len(depths), 0, -1):

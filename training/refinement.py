@@ -14,7 +14,7 @@ from training.export import Sidecar, write_network, write_sidecar
 from training.losses import LossWeights
 from training.recipe import Recipe
 from training.scoring import FEWEST, Detections, fit_stddev
-from training.trainer import Pictures, Trainer, train
+from training.trainer import Trainer, TrainingImages, train
 from training.weights import read_network
 
 DIM = 0.15  # less than in the first training: the user's light is known
@@ -37,7 +37,7 @@ def refine(options: Namespace, teaching: LabelledPictures, judging: LabelledPict
     metadata = read_metadata(find_network(options.network).parent / METADATA_FILE)
     network = read_network(options.network)
     trainer = Trainer(metadata.bodyparts, recipe, LossWeights(), network)
-    train(trainer, Pictures(train=teaching, validation=judging), AugmentSettings(dim=DIM), options.output)
+    train(trainer, TrainingImages(train=teaching, validation=judging), AugmentSettings(dim=DIM), options.output)
     sidecar = Sidecar(
         names=metadata.bodyparts,
         shape=network.shape,

@@ -13,7 +13,7 @@ from training.checkpoint import load_checkpoint
 from training.dataset import TRAIN, VALIDATION, LabelledPictures, load_pictures
 from training.losses import LossWeights
 from training.recipe import Recipe
-from training.trainer import CHECKPOINT, Pictures, Trainer, train
+from training.trainer import CHECKPOINT, Trainer, TrainingImages, train
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -39,7 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
 def run(options: argparse.Namespace) -> None:
     """Train as the options say."""
     recipe = settings_from(options, Recipe)
-    pictures = Pictures(
+    pictures = TrainingImages(
         train=load_pictures(options.dataset, TRAIN, options.limit),
         validation=load_pictures(options.dataset, VALIDATION, recipe.validation),
     )

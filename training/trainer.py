@@ -31,7 +31,7 @@ SMOOTHING = 0.98  # part of the shown losses that stays in each step
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Pictures:
+class TrainingImages:
     """The pictures of one training, which share no shard: those learnt from and those that judge it."""
 
     train: LabelledPictures
@@ -137,7 +137,7 @@ def has_bfloat16(device: torch.device) -> bool:
     return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
 
 
-def train(trainer: Trainer, pictures: Pictures, augmentation: AugmentSettings, folder: Path) -> Score:
+def train(trainer: Trainer, pictures: TrainingImages, augmentation: AugmentSettings, folder: Path) -> Score:
     """Train until the recipe's end, with a log of losses and scores and a checkpoint beside it.
 
     Returns:

@@ -55,7 +55,7 @@ class KeepingExecutor(SingleThreadedExecutor):
     def __init__(self, *, context: Any = None) -> None:
         super().__init__(context=context)
         self._skips, self._spare_time = Skips(()), lambda: 0.0
-        self._kept: _Kept | None = None
+        self._kept: _KeptSet | None = None
         self._is_strange = False
 
     def obey(self, node: Any) -> None:
@@ -115,9 +115,9 @@ class KeepingExecutor(SingleThreadedExecutor):
         self._kept = None
         get_logger("finforce").warning(f"this rclpy is another one than expected, '{UNCHANGED}' is off: {error}")
 
-    def _keep(self) -> _Kept:
+    def _keep(self) -> _KeptSet:
         """Return the wait set, made now if there is none."""
-        self._kept = self._kept or _Kept(self.get_nodes(), self.context)
+        self._kept = self._kept or _KeptSet(self.get_nodes(), self.context)
         return self._kept
 
     def _is_busy(self) -> bool:
@@ -163,7 +163,7 @@ class _Ready(NamedTuple):
     has_more: bool
 
 
-class _Kept:
+class _KeptSet:
     """What nodes have, and a wait set large enough for it.
 
     Attributes:

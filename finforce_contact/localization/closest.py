@@ -5,7 +5,7 @@ import numpy as np
 from finforce_contact.localization.contact_patch import Rows
 from finforce_contact.localization.gaps import compute_gaps, distances_to
 from finforce_contact.localization.inner_face import InnerFace
-from finforce_contact.localization.outline_localizer import Place, Scene
+from finforce_contact.localization.outline_localizer import ContactScene, Place
 from finforce_ifea.jaw.jaw import Jaw
 
 
@@ -24,7 +24,7 @@ class ClosestLocalizer:
     def reset(self) -> None:
         """Starts anew; nothing is remembered."""
 
-    def locate(self, scene: Scene) -> Place | None:
+    def locate(self, scene: ContactScene) -> Place | None:
         """Returns the place, None when the object does not stand before the inner surface."""
         gaps = compute_gaps(self._line, scene.section.edges)
         if not np.isfinite(gaps).any():

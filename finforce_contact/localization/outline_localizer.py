@@ -20,7 +20,7 @@ from finforce_contact.settings import ContactSettings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class ContactScene:
     """What a localizer looks at.
 
     Attributes:
@@ -61,7 +61,7 @@ class Localizer(Protocol):
     def reset(self) -> None:
         """Starts anew, apart."""
 
-    def locate(self, scene: Scene) -> Place | None:
+    def locate(self, scene: ContactScene) -> Place | None:
         """Returns the place, None when the object does not stand before the inner surface."""
 
 
@@ -79,7 +79,7 @@ class OutlineLocalizer:
     def reset(self) -> None:
         """Starts anew; nothing is remembered."""
 
-    def locate(self, scene: Scene) -> Place | None:
+    def locate(self, scene: ContactScene) -> Place | None:
         """Returns the place, None when the object does not stand before the inner surface."""
         gaps = compute_gaps(scene.line, scene.section.edges)
         nearest = int(gaps.argmin())
@@ -93,7 +93,7 @@ class OutlineLocalizer:
         bend = float(np.interp(rows.mean, heights, self._face.x - scene.line[:, 0]))
         return Place(rows=rows, gap=float(gaps[nearest]), bend=bend)
 
-    def _follow_wrench(self, rows: Rows, gaps: NDArray, scene: Scene) -> Rows:
+    def _follow_wrench(self, rows: Rows, gaps: NDArray, scene: ContactScene) -> Rows:
         """Returns the rows with their mean moved towards the pressure centre, if that agrees with the gaps left (h,).
 
         A pose that is a little off along z closes the gap at one end of a wrapped surface and opens it at the other.

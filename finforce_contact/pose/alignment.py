@@ -11,7 +11,7 @@ from finforce.transforms import invert_pose
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.pose.contour import MeshOutline, Outline, compare_outline
-from finforce_contact.pose.depth_image import Comparison, DepthImage, Glance, Samples, Sight
+from finforce_contact.pose.depth_image import Comparison, DepthImage, Glance, Samples, Visibility
 from finforce_contact.settings import TrackerSettings
 
 # A surface seen at less than this cosine tells more about flying pixels than about itself.
@@ -93,7 +93,7 @@ class _Normal:
         """Returns both together, the other being that of the outline."""
         return replace(
             self,
-            outlined=float((other.sights == Sight.SEEN).mean()) if len(other.sights) else 0.0,
+            outlined=float((other.sights == Visibility.SEEN).mean()) if len(other.sights) else 0.0,
             information=self.information + other.information,
             gradient=self.gradient + other.gradient,
             told=self.told + other.told,
@@ -217,7 +217,7 @@ class MeshAligner:
     def _judge(self, T: NDArray, image: DepthImage, effort: Effort) -> Alignment:
         expected = self._expect(T, effort)
         normal = self._build(T, expected, image, effort.gates[-1])
-        counts = np.bincount(normal.sights, minlength=len(Sight))
+        counts = np.bincount(normal.sights, minlength=len(Visibility))
         basis = normal.sure_directions()
         # neighbouring depths err alike: so many pixels count as one
         alike = max(1.0, self.settings.noise_width / expected.step) ** 2
@@ -226,9 +226,9 @@ class MeshAligner:
             T_camera_object=T,
             information=known.T @ (basis.T @ normal.information @ basis) @ known / alike,
             determined=basis.shape[1],
-            fitness=float(counts[Sight.SEEN] / max(counts[Sight.SEEN] + counts[Sight.ABSENT], 1)),
-            visible=float(counts[Sight.SEEN] / max(counts.sum(), 1)),
-            seen=int(counts[Sight.SEEN]),
+            fitness=float(counts[Visibility.SEEN] / max(counts[Visibility.SEEN] + counts[Visibility.ABSENT], 1)),
+            visible=float(counts[Visibility.SEEN] / max(counts.sum(), 1)),
+            seen=int(counts[Visibility.SEEN]),
             outlined=normal.outlined,
             stddev=normal.stddev,
         )
@@ -243,7 +243,7 @@ class MeshAligner:
 
 
 def _spread(comparison: Comparison, least: float) -> float:
-    known = comparison.residuals[comparison.sights == Sight.SEEN]
+    known = comparison.residuals[comparison.sights == Visibility.SEEN]
     return max(_MAD * float(np.median(np.abs(known))), least) if len(known) else least
 
 
@@ -253,7 +253,7 @@ def _normal_equations(samples: Samples, seen: Comparison, about: _About, error: 
     Directions d that are off by an angle `error` make a motion along the surface look like one across it, this much
     smaller: what is told must be more than error^2 sum w.
     """
-    chosen = seen.sights == Sight.SEEN
+    chosen = seen.sights == Visibility.SEEN
     directions, residuals = samples.directions[chosen], seen.residuals[chosen]
     J = np.hstack([directions, np.cross(samples.points[chosen] - about.middle, directions) / about.radius])
     weights = 1.0 / (1.0 + (residuals / (_CAUCHY * about.stddev)) ** 2) / about.stddev**2

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics, project
 from finforce.transforms import invert_pose
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.pose.depth_image import Comparison, DepthImage, Glance, Samples, Sight
+from finforce_contact.pose.depth_image import Comparison, DepthImage, Glance, Samples, Visibility
 
 # Behind the outline the image must fall back by this [m] to be told from the object's own shape and from noise.
 _STEP_BACK = 0.006
@@ -106,7 +106,7 @@ def compare_outline(outline: Outline, image: DepthImage, reach: float) -> Compar
     clear = (agreement > 0.7 * votes.shape[1]) & (after - before < 3.1 * (along[:, -1] - along[:, 0]) / along.shape[1])
     clear &= (votes[rows, split - 1] == 1) & (votes[rows, split] == -1)
     residuals = np.where(clear, 0.5 * (before + after), np.nan)
-    return Comparison(residuals=residuals, sights=np.where(clear, Sight.SEEN, Sight.UNKNOWN))
+    return Comparison(residuals=residuals, sights=np.where(clear, Visibility.SEEN, Visibility.UNKNOWN))
 
 
 def _walk_across(outline: Samples, camera: CameraIntrinsics, reach: float) -> tuple[NDArray, NDArray]:

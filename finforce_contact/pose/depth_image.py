@@ -12,7 +12,7 @@ from finforce.camera import CameraIntrinsics, check_depth, check_mask, compute_r
 LEAST_PIXELS = 30
 
 
-class Sight(IntEnum):
+class Visibility(IntEnum):
     """What the image says about one point of the surface."""
 
     UNKNOWN = 0  # no depth there, or outside the image
@@ -59,13 +59,13 @@ class Comparison:
 
     Attributes:
         residuals: (n,) way along its direction from a sample to what was measured [m], NaN where nothing was.
-        sights: (n,) of type `Sight`.
+        sights: (n,) of type `Visibility`.
     """
 
     residuals: NDArray
     sights: NDArray
 
-    def count(self, sight: Sight) -> int:
+    def count(self, sight: Visibility) -> int:
         """Returns how many samples have this sight."""
         return int(np.count_nonzero(self.sights == sight))
 
@@ -127,11 +127,11 @@ class DepthImage:
         measured = self._rays[row, column] * depth[:, None]
         residuals = np.einsum("ij,ij->i", surface.directions, measured - surface.points)
         foreign = self.is_masked_out(pixels)
-        sights = np.where(depth < surface.points[:, 2], Sight.HIDDEN, Sight.ABSENT)
-        sights[np.isnan(depth) & ~foreign] = Sight.UNKNOWN
+        sights = np.where(depth < surface.points[:, 2], Visibility.HIDDEN, Visibility.ABSENT)
+        sights[np.isnan(depth) & ~foreign] = Visibility.UNKNOWN
         near = (np.abs(residuals) < gate) & (np.abs(depth - surface.points[:, 2]) < 2.0 * gate)
-        sights[near & ~foreign] = Sight.SEEN
-        return Comparison(residuals=np.where(sights == Sight.SEEN, residuals, np.nan), sights=sights)
+        sights[near & ~foreign] = Visibility.SEEN
+        return Comparison(residuals=np.where(sights == Visibility.SEEN, residuals, np.nan), sights=sights)
 
     def _nearest(self, pixels: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         known = np.isfinite(pixels).all(axis=-1)

@@ -17,7 +17,7 @@ BRIDGED = 250_000_000  # [ns] between two poses of a jaw that stand for the time
 UNMOVED = 0.2e-3  # [m] and, for its axes, [1]: a jaw that differs by less has not moved
 
 
-class Step(NamedTuple):
+class PoseStep(NamedTuple):
     """What is to be done next.
 
     Attributes:
@@ -56,7 +56,7 @@ class PosePairing:
         self._poses.reset()
         self._waiting = self._in_step = False
 
-    def add_jaw(self, stamp: int, T_camera_jaw: NDArray) -> list[Step]:
+    def add_jaw(self, stamp: int, T_camera_jaw: NDArray) -> list[PoseStep]:
         """Take the pose (4, 4) of the jaw in an image [ns]; return what is to be done now."""
         jaws = self._poses.entries(JAW)
         overdue = [self._step(jaws[-1], None)] if self._waiting else []
@@ -69,7 +69,7 @@ class PosePairing:
         steps = [*overdue, *between[-1:]]
         return steps if self._waiting else [*steps, self._step(jaws[-1], found)]
 
-    def add_object(self, stamp: int, T_camera_object: NDArray, covariance: NDArray | None = None) -> list[Step]:
+    def add_object(self, stamp: int, T_camera_object: NDArray, covariance: NDArray | None = None) -> list[PoseStep]:
         """Take the pose (4, 4) of the object in an image [ns]; return what is to be done now."""
         self._poses.add(OBJECT, stamp, (T_camera_object, covariance))
         jaws, pose = self._poses.entries(JAW), self._poses.entries(OBJECT)[-1]
@@ -82,7 +82,7 @@ class PosePairing:
         self._waiting &= not is_newest
         return [self._step(jaw, pose, is_due=is_due)]
 
-    def _bridge(self, pose: Stamped, before: Stamped, after: Stamped) -> list[Step]:
+    def _bridge(self, pose: Stamped, before: Stamped, after: Stamped) -> list[PoseStep]:
         """Return what is to be done with an object pose between two poses of a jaw, nothing if the jaw has moved."""
         is_between = before.stamp + self._tolerance < pose.stamp < after.stamp - self._tolerance
         is_near = after.stamp - before.stamp <= BRIDGED
@@ -94,7 +94,7 @@ class PosePairing:
         """Say whether the object's pose in an image [ns] is known."""
         return self._poses.find(OBJECT, stamp) is not None
 
-    def add_late(self, stamp: int, T_camera_jaw: NDArray) -> list[Step]:
+    def add_late(self, stamp: int, T_camera_jaw: NDArray) -> list[PoseStep]:
         """Take the pose (4, 4) of the jaw in an image [ns] that is not due any more; return what is to be done now."""
         found = self._poses.find(OBJECT, stamp)
         return [self._step(Stamped(stamp, invert_pose(T_camera_jaw)), found, is_due=False)] if found else []
@@ -107,8 +107,8 @@ class PosePairing:
         """Say whether two stamps [ns] are those of one image."""
         return self._poses.belong(one, other)
 
-    def _step(self, jaw: Stamped, pose: Stamped | None, *, is_due: bool = True) -> Step:
+    def _step(self, jaw: Stamped, pose: Stamped | None, *, is_due: bool = True) -> PoseStep:
         """Return the step of a jaw's inverted pose and the object's pose with its covariance."""
         T_camera_object, covariance = pose.value if pose else (None, None)
         T_jaw_object = jaw.value @ T_camera_object if pose else None
-        return Step(jaw.stamp, T_jaw_object, jaw.value, covariance, is_due)
+        return PoseStep(jaw.stamp, T_jaw_object, jaw.value, covariance, is_due)

@@ -16,7 +16,7 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.mesh.views import MeshView, View
+from finforce_contact.mesh.views import MeshSight, MeshView
 from finforce_contact.reconstruction.evidence import ImageEvidence
 
 
@@ -82,7 +82,7 @@ LARGEST_TURN, LARGEST_MOVE, LARGEST_STRETCH = 0.3, 0.03, 0.2  # of one step [rad
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
+class FitStage:
     """One pass of the fit: grid of the view [px], iterations, points used and the width of the loss [m]."""
 
     step: int
@@ -91,9 +91,15 @@ class Stage:
     width: float
 
 
-COARSE = (Stage(step=8, iterations=8, points=250, width=15e-3),)
-MIDDLE = (Stage(step=4, iterations=12, points=500, width=8e-3), Stage(step=2, iterations=8, points=1000, width=4e-3))
-FINE = (Stage(step=1, iterations=12, points=2000, width=2e-3), Stage(step=1, iterations=8, points=2000, width=1e-3))
+COARSE = (FitStage(step=8, iterations=8, points=250, width=15e-3),)
+MIDDLE = (
+    FitStage(step=4, iterations=12, points=500, width=8e-3),
+    FitStage(step=2, iterations=8, points=1000, width=4e-3),
+)
+FINE = (
+    FitStage(step=1, iterations=12, points=2000, width=2e-3),
+    FitStage(step=1, iterations=8, points=2000, width=1e-3),
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,7 +133,7 @@ def fit_shape(
     mesh: ObjectMesh,
     start: Placement,
     evidence: ImageEvidence,
-    stages: Iterable[Stage],
+    stages: Iterable[FitStage],
     freedom: ScaleFreedom = UNIFORM,
 ) -> Placement:
     """Return the placement of the mesh that explains the image best, near a start.
@@ -157,7 +163,7 @@ class _StageFit:
     """The equations of one stage, for a mesh into which the scale so far has gone."""
 
     def __init__(
-        self, mesh: ObjectMesh, placement: Placement, evidence: ImageEvidence, stage: Stage, freedom: ScaleFreedom
+        self, mesh: ObjectMesh, placement: Placement, evidence: ImageEvidence, stage: FitStage, freedom: ScaleFreedom
     ) -> None:
         # only then does "nearest on the mesh" mean nearest in metres
         self._baked = placement.log_scale
@@ -216,7 +222,7 @@ class _StageFit:
         return Pull(points=points, directions=directions, residuals=residuals, weights=weights)
 
 
-def _find_rim(view: View) -> NDArray:
+def _find_rim(view: MeshSight) -> NDArray:
     """Return which points of a view lie at its outline, holes included."""
     hit = np.isfinite(view.depth)
     rim = hit & ~binary_erosion(hit, border_value=0)

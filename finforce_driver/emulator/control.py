@@ -153,7 +153,7 @@ class MoveControl:
         return abs(current - self.order.current) <= self._firmware.contact_margin
 
 
-class Calibration:
+class FirmwareCalibration:
     """Looks for the open stop, then for the closed one; an abort leaves it where it was.
 
     Attributes:

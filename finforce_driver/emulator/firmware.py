@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.emulator.conduct import list_violations
-from finforce_driver.emulator.control import Calibration, Endpoints, Mode, MoveControl, Order
+from finforce_driver.emulator.control import Endpoints, FirmwareCalibration, Mode, MoveControl, Order
 from finforce_driver.emulator.mechanism import STEP, Jaws
 from finforce_driver.emulator.protection import Fault, Protection
 from finforce_driver.emulator.settings import VARIANTS, EmulatorSettings, StoredConfiguration
@@ -203,7 +203,7 @@ class EmulatedGripper:
         self.mode = Mode.IDLE
         self.endpoints = Endpoints()
         self._control = MoveControl(self._firmware)
-        self._calibration = Calibration(self._firmware)
+        self._calibration = FirmwareCalibration(self._firmware)
         self._position = self.endpoints.position(self.jaws.encoder) if self.configured else 0
         self._last_sent = self._steps
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from finforce_driver.errors import GraspError
 from finforce_driver.grasp.checks import check_force_value, check_gripper, check_silence, is_working
 from finforce_driver.grasp.force_feed import ForceFeed, ForceSample, TouchSample
-from finforce_driver.grasp.jaw_history import JawCourse, JawPlace
+from finforce_driver.grasp.jaw_history import JawHistory, JawPlace
 from finforce_driver.grasp.load_watch import LoadWatch, LocatedForce
 from finforce_driver.grasp.plan import GraspPlan
 from finforce_driver.grasp.settings import GraspGoal, GraspSettings
@@ -48,9 +48,9 @@ class ForceGrasp:
         self._set_force = self.settings.check_force(goal.force)
         self._feed = ForceFeed(self.settings.stale_after)
         self._load = LoadWatch(self.settings, min(self.settings.onset_force, 0.5 * goal.force))
-        self._course = JawCourse(resolution=resolution, closed_opening=closed_opening)
+        self._jaws = JawHistory(resolution=resolution, closed_opening=closed_opening)
         self._place = JawPlace(opening=math.nan, resting=False)
-        self._plan = GraspPlan(goal, self.settings, self._load, self._course, self._feed)
+        self._plan = GraspPlan(goal, self.settings, self._load, self._jaws, self._feed)
         self._pending: deque[ForceSample | TouchSample] = deque()
         self._phase, self._reason = GraspPhase.APPROACH, "waits for the first force"
         self._began = self._held_at = self._spare = self._saturated = math.nan
@@ -101,7 +101,7 @@ class ForceGrasp:
             if self._asked_to_stop:
                 raise GraspError(self._asked_to_stop)
             check_gripper(state, now)
-            self._course.check_power(state)
+            self._jaws.check_power(state)
             fresh = self._drain(state, now, opening_at)
             self._check_limits(state, now)
             move = self._choose_move(state, now) if fresh else None
@@ -132,11 +132,11 @@ class ForceGrasp:
 
     def _locate(self, force: float, stamp: float, state: GripperState, opening_at: OpeningAt) -> bool:
         """Take a force [N] with the opening at the time of its image; False where that is not known."""
-        place = self._course.locate(stamp, state, opening_at)
+        place = self._jaws.locate(stamp, state, opening_at)
         if math.isnan(place.opening):
             return False
-        way = self._course.way_stddev(self._place, place)
-        passing = self._course.stepping and not place.resting and self._load.loaded
+        way = self._jaws.way_stddev(self._place, place)
+        passing = self._jaws.stepping and not place.resting and self._load.loaded
         located = LocatedForce(
             force=force,
             stamp=stamp,
@@ -161,19 +161,19 @@ class ForceGrasp:
             GraspError: forces are late, time is up, or the jaws do not follow, slip, or may not close further.
         """
         check_silence(self._feed, now, self._began, self.settings)
-        course, pressing = self._course, 0.0 if math.isnan(self._load.force) else self._load.pressing
+        jaws, pressing = self._jaws, 0.0 if math.isnan(self._load.force) else self._load.pressing
         got = f"{pressing:.2f} N of {self._set_force:g} N"
         if self._phase is not GraspPhase.HOLDING and now - self._began > self.goal.time_limit:
             raise GraspError(f"{got} within the time limit of {self.goal.time_limit:g} s")
         if now - self._saturated > _SATURATED_AFTER:
-            raise GraspError(f"{got} with the jaws at their least opening, {1e3 * course.target:.1f} mm")
-        if course.is_late(now, state.opening):
+            raise GraspError(f"{got} with the jaws at their least opening, {1e3 * jaws.target:.1f} mm")
+        if jaws.is_late(now, state.opening):
             raise GraspError(
-                f"{got}: the jaws stay at {1e3 * state.opening:.1f} mm on their way to {1e3 * course.target:.1f} mm; "
+                f"{got}: the jaws stay at {1e3 * state.opening:.1f} mm on their way to {1e3 * jaws.target:.1f} mm; "
                 f"is something in the way, or the motor's limit of {self._motor_force:g} N too low?"
             )
-        if self._held_at - course.target > self._spare:
-            way = 1e3 * (self._held_at - course.target)
+        if self._held_at - jaws.target > self._spare:
+            way = 1e3 * (self._held_at - jaws.target)
             raise GraspError(
                 f"{got} although the jaws closed by {way:.1f} mm while holding: the object slips or yields"
             )
@@ -190,7 +190,7 @@ class ForceGrasp:
 
     def _watch(self, wish: float, target: float, now: float) -> None:
         """See whether the force is held, and whether the least opening keeps it from being reached."""
-        is_content = self._load.resting and target == self._course.target
+        is_content = self._load.resting and target == self._jaws.target
         if not (is_content and wish < target):
             self._saturated = math.nan
         elif math.isnan(self._saturated):
@@ -201,16 +201,16 @@ class ForceGrasp:
             self._phase, self._reason, self._held_at = GraspPhase.HOLDING, "holds the set force", target
             # as it is now: a force that drifts while the jaws close looks like something that gets softer
             yielded = self.settings.relaxation * self._set_force / self._load.model.stiffness
-            self._spare = yielded + _SPARE_STEPS * self._course.resolution
+            self._spare = yielded + _SPARE_STEPS * self._jaws.resolution
 
     def _pause(self, state: GripperState, now: float) -> GripperMove | None:
         """Return a move that keeps the jaws where they are until the next image says what to think of this one."""
-        here = self._course.nearest(state.opening)
-        is_closing = here - self._course.target > 0.5 * self._course.resolution
-        return self._move(here, self._course.speed, state, now) if is_closing else None
+        here = self._jaws.nearest(state.opening)
+        is_closing = here - self._jaws.target > 0.5 * self._jaws.resolution
+        return self._move(here, self._jaws.speed, state, now) if is_closing else None
 
     def _move(self, target: float, speed: float, state: GripperState, now: float) -> GripperMove:
-        self._course.command(target, speed, now, self._course.locate(now, state, lambda _: state.opening))
+        self._jaws.command(target, speed, now, self._jaws.locate(now, state, lambda _: state.opening))
         return GripperMove(opening=target, speed=speed, force=self._motor_force)
 
     @property
@@ -224,7 +224,7 @@ class ForceGrasp:
     def _status(self, state: GripperState, now: float) -> GraspStatus:
         """Return the grasp as it is."""
         load, model, feed = self._load, self._load.model, self._feed
-        here = self._course.locate(now, state, lambda _: state.opening).opening
+        here = self._jaws.locate(now, state, lambda _: state.opening).opening
         return GraspStatus(
             phase=self._phase,
             reason=self._reason,
@@ -238,6 +238,6 @@ class ForceGrasp:
             overshoot_bound=self._plan.overshoot_bound(self._set_force),
             peak=load.peak,
             resolution=self._plan.resolution,
-            target=self._course.target,
+            target=self._jaws.target,
             refused=dict(feed.refused),
         )

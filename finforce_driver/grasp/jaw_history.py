@@ -16,7 +16,7 @@ _NEAR = 2.0  # steps between target and reported opening at rest: the byte is tr
 _SMALL = 2.5  # steps: fewer are not planned anew on the way
 _POWERED_AFTER = 0.3  # [s] of the first command, which switches the power stage on
 _LATE = 1.0  # [s] after which jaws that have not come do not follow
-# A byte says the opening to a step; between two bytes the course is interpolated. At rest the jaws are within 4 ticks.
+# A byte says the opening to a step; between two bytes it is interpolated. At rest the jaws are within 4 ticks.
 _MOVING_STDDEV, _RESTING_STDDEV = 0.35, 0.1  # [steps]
 
 
@@ -28,7 +28,7 @@ class JawPlace:
     resting: bool
 
 
-class JawCourse:
+class JawHistory:
     """The gripper's steps, the last command, and the openings that follow from it.
 
     At rest the commanded opening says more than the reported byte, which is truncated and flickers.

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 
 from finforce_driver.grasp.force_feed import ForceFeed
-from finforce_driver.grasp.jaw_history import JawCourse
+from finforce_driver.grasp.jaw_history import JawHistory
 from finforce_driver.grasp.load_watch import LoadWatch
 from finforce_driver.grasp.settings import GraspGoal, GraspSettings
 
@@ -33,16 +33,16 @@ class GraspPlan:
         goal: speed and least opening.
         settings: limits and expectations.
         load: force, stiffness, contact.
-        course: steps and commands of the jaws.
+        jaws: steps and commands of the jaws.
         feed: latency and period.
     """
 
     def __init__(
-        self, goal: GraspGoal, settings: GraspSettings, load: LoadWatch, course: JawCourse, feed: ForceFeed
+        self, goal: GraspGoal, settings: GraspSettings, load: LoadWatch, jaws: JawHistory, feed: ForceFeed
     ) -> None:
         self._goal, self._settings = goal, settings
-        self._load, self._course, self._feed = load, course, feed
-        self._least = max(course.snap(goal.least_opening), course.closed)
+        self._load, self._jaws, self._feed = load, jaws, feed
+        self._least = max(jaws.snap(goal.least_opening), jaws.closed)
 
     @property
     def stiffness(self) -> float:
@@ -52,24 +52,24 @@ class GraspPlan:
     @property
     def resolution(self) -> float:
         """Change of the force with one step of the gripper [N]."""
-        return self._load.model.stiffness * self._course.resolution
+        return self._load.model.stiffness * self._jaws.resolution
 
     def wish(self, set_force: float) -> float:
         """Return the opening [m] to go to, on a step of the gripper; it may lie below the least opening."""
-        load, course = self._load, self._course
+        load, jaws = self._load, self._jaws
         if not self._load.resting:
-            return course.snap(load.opening - self._allowed(set_force) / self.stiffness)
+            return jaws.snap(load.opening - self._allowed(set_force) / self.stiffness)
         allowed = self._allowed(set_force, min(0.5 * self.resolution, self._settings.tolerance))
         if allowed < 0.0:
-            return course.target + self._steps_back(-allowed) * course.resolution
+            return jaws.target + self._steps_back(-allowed) * jaws.resolution
         reach = allowed / self.stiffness
         if self._may_step(allowed):
-            reach = max(reach, course.resolution)
-        return course.snap(course.target - reach)
+            reach = max(reach, jaws.resolution)
+        return jaws.snap(jaws.target - reach)
 
     def limit(self, wish: float) -> float:
         """Return a wish [m] within the least opening and what the gripper can open."""
-        return min(max(wish, self._least), self._course.widest)
+        return min(max(wish, self._least), self._jaws.widest)
 
     def choose_speed(self, target: float) -> float:
         """Return the speed [m/s] at which the next image comes before the jaws are at `target` [m]."""
@@ -79,19 +79,19 @@ class GraspPlan:
 
     def is_worth(self, target: float, speed: float, opening: float) -> bool:
         """Whether a target [m] with a speed [m/s] is worth a command to jaws that are at `opening` [m] now."""
-        course = self._course
-        if math.isnan(course.target):
+        jaws = self._jaws
+        if math.isnan(jaws.target):
             return True
-        steps = (course.target - target) / course.resolution
+        steps = (jaws.target - target) / jaws.resolution
         if self._load.resting:
             return abs(steps) > 0.5
-        if course.stepping and self._load.loaded:
+        if jaws.stepping and self._load.loaded:
             return False
         if steps < 0.5:
             return steps < -_BACK_STEPS
-        left = opening - course.target
-        slower, faster = course.speed / _SPEED_CHANGE, course.speed * _SPEED_CHANGE
-        is_due = left < 2.0 * course.speed * (self._feed.period + _REACTION)
+        left = opening - jaws.target
+        slower, faster = jaws.speed / _SPEED_CHANGE, jaws.speed * _SPEED_CHANGE
+        is_due = left < 2.0 * jaws.speed * (self._feed.period + _REACTION)
         return is_due or steps > _FEW_STEPS or not slower < speed < faster
 
     def overshoot_bound(self, set_force: float) -> float:
@@ -100,8 +100,8 @@ class GraspPlan:
         That way is speed x (latency + period), or what is left to the target. Before contact the greatest expected
         stiffness holds on it, later twice the learnt one, or the one that is reckoned with if that is more.
         """
-        load, course = self._load, self._course
-        unseen = min(load.opening - course.target, course.speed * (self._feed.latency + self._feed.period))
+        load, jaws = self._load, self._jaws
+        unseen = min(load.opening - jaws.target, jaws.speed * (self._feed.latency + self._feed.period))
         unseen = unseen if unseen > 0.0 else 0.0  # also where nothing is known yet
         if not load.loaded:
             return max(0.0, self.stiffness * unseen - set_force)
@@ -122,10 +122,10 @@ class GraspPlan:
         load = self._load
         if not load.loaded:
             return load.force < load.onset
-        return allowed > load.model.likely_stiffness * self._course.resolution
+        return allowed > load.model.likely_stiffness * self._jaws.resolution
 
     def _steps_back(self, excess: float) -> int:
         """Return by how many steps jaws at rest are to open for an excess of force [N]."""
         if excess < _HYSTERESIS * self.resolution + self._load.model.force_stddev:
             return 0
-        return max(1, round(excess / (self.stiffness * self._course.resolution)))
+        return max(1, round(excess / (self.stiffness * self._jaws.resolution)))

@@ -10,7 +10,7 @@ from bisect import bisect_left
 from collections import deque
 
 from finforce_driver.can.protocol import LARGEST_BYTE, Flag, Move, Reply
-from finforce_driver.machine.reply_filter import Expectation, ReplyFilter, Sample
+from finforce_driver.machine.reply_filter import Expectation, ReplyFilter, TimedReply
 from finforce_driver.machine.telemetry import Telemetry
 from finforce_driver.settings import GripperSettings
 
@@ -176,7 +176,7 @@ class Knowledge:
         """
         drift = self.history.speed()
         reach = FASTEST if order is None else max(REACH_MARGIN * speed, 2.0 * abs(drift))
-        believed = self.filter.take(Sample(reply=reply, time=now), Expectation(drift=drift, reach=reach))
+        believed = self.filter.take(TimedReply(reply=reply, time=now), Expectation(drift=drift, reach=reach))
         if believed is None:
             return None
         self.reply, self.stamp = believed, now

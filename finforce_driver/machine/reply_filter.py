@@ -35,7 +35,7 @@ class Expectation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sample:
+class TimedReply:
     """A reply and when it came [s]."""
 
     reply: Reply
@@ -55,8 +55,8 @@ class ReplyFilter:
     def __init__(self, longest_span: float) -> None:
         self._longest_span = longest_span
         self.doubted = 0
-        self._believed: Sample | None = None
-        self._doubts: deque[Sample] = deque(maxlen=CONFIRMATIONS)
+        self._believed: TimedReply | None = None
+        self._doubts: deque[TimedReply] = deque(maxlen=CONFIRMATIONS)
         self._unsettled = 0
 
     @property
@@ -78,7 +78,7 @@ class ReplyFilter:
         self._doubts.clear()
         self._unsettled = 0
 
-    def take(self, sample: Sample, expected: Expectation) -> Reply | None:
+    def take(self, sample: TimedReply, expected: Expectation) -> Reply | None:
         """Return what to believe after a reply: it, the middle of three where many disagree, or None for now."""
         if self._believed is not None and goes_on(self._believed, sample, expected):
             return self._believe(sample)
@@ -91,11 +91,11 @@ class ReplyFilter:
             if all(self._agree(*pair, expected) for pair in zip(run, run[1:], strict=False)):
                 return self._believe(sample)
             if self._unsettled > MOST_DOUBTS:
-                return self._believe(Sample(reply=_middle(run), time=sample.time))
+                return self._believe(TimedReply(reply=_middle(run), time=sample.time))
         self._doubts.append(sample)
         return None
 
-    def _agree(self, first: Sample, second: Sample, expected: Expectation) -> bool:
+    def _agree(self, first: TimedReply, second: TimedReply, expected: Expectation) -> bool:
         """Return whether the numbers of two replies can both be true."""
         span = second.time - first.time
         way = second.reply.position - first.reply.position
@@ -106,7 +106,7 @@ class ReplyFilter:
             and abs(rise) <= CONFIRMING_STEP + CONFIRMING_RATE * span
         )
 
-    def _believe(self, sample: Sample) -> Reply:
+    def _believe(self, sample: TimedReply) -> Reply:
         """Keep a sample and return its reply."""
         self._believed = sample
         self._doubts.clear()
@@ -114,7 +114,7 @@ class ReplyFilter:
         return sample.reply
 
 
-def goes_on(before: Sample, after: Sample, expected: Expectation) -> bool:
+def goes_on(before: TimedReply, after: TimedReply, expected: Expectation) -> bool:
     """Return whether a reply needs no repetition: same flags, position as expected, hardly another current."""
     span = after.time - before.time
     way = expected.drift * span
@@ -139,7 +139,7 @@ def _standing(reply: Reply) -> tuple[bool, ...]:
     return reply.activated, reply.action, reply.calibrated, reply.error
 
 
-def _middle(samples: list[Sample]) -> Reply:
+def _middle(samples: list[TimedReply]) -> Reply:
     """Return the last reply with the middle ones of their numbers."""
     replies = [sample.reply for sample in samples]
     names = ("position", "current_mA")

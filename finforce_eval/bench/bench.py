@@ -40,7 +40,7 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Part:
+class BenchPart:
     """One part of the benchmark.
 
     Attributes:
@@ -59,32 +59,34 @@ class Part:
 
 
 PARTS = (
-    Part(
+    BenchPart(
         name="solvers",
         module="finforce_eval.bench.solvers",
         title="Run time against force error of the solver tiers",
         takes_folder=True,
     ),
-    Part(name="growth", module="finforce_eval.bench.growth", title="How cost grows"),
-    Part(
+    BenchPart(name="growth", module="finforce_eval.bench.growth", title="How cost grows"),
+    BenchPart(
         name="localization",
         module="finforce_eval.bench.localization",
         title="Run time against place error of the contact",
     ),
-    Part(
+    BenchPart(
         name="detection",
         module="finforce_eval.bench.detection",
         title="Run time against pixel error of the key points",
     ),
-    Part(name="chain", module="finforce_eval.bench.chain", title="Latency against force error of the whole chain"),
-    Part(name="nodes", module="finforce_eval.bench.nodes", title="Share of a core that each node takes", usual=False),
-    Part(
+    BenchPart(name="chain", module="finforce_eval.bench.chain", title="Latency against force error of the whole chain"),
+    BenchPart(
+        name="nodes", module="finforce_eval.bench.nodes", title="Share of a core that each node takes", usual=False
+    ),
+    BenchPart(
         name="skipping",
         module="finforce_eval.bench.skipping",
         title="Share of a core that each node takes on three scenes, with what need not be done and without",
         usual=False,
     ),
-    Part(
+    BenchPart(
         name="live",
         module="finforce_eval.bench.live",
         title="Key points out to wrench in, one solver node per jaw",
@@ -173,7 +175,7 @@ def format_rows(rows: Sequence[Row]) -> str:
     return "\n".join([head, "-" * len(head), *lines])
 
 
-def select_parts(names: str | None) -> tuple[Part, ...]:
+def select_parts(names: str | None) -> tuple[BenchPart, ...]:
     """Return the parts of a comma-separated list; without one those that `make bench` measures.
 
     Raises:
@@ -210,7 +212,7 @@ def run_bench(options: argparse.Namespace) -> None:
     print(f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
 
 
-def _run_part(part: Part, options: argparse.Namespace, picture: Path | None) -> dict[str, Any]:
+def _run_part(part: BenchPart, options: argparse.Namespace, picture: Path | None) -> dict[str, Any]:
     """Measure one part, print and draw it, and return it as plain values."""
     module = import_module(part.module)
     print(f"\n{part.title}\n")
@@ -225,7 +227,7 @@ def _run_part(part: Part, options: argparse.Namespace, picture: Path | None) -> 
     return {**module.as_json(figures), "table": table}
 
 
-def _picture_name(path: str | None, part: Part, *, first: bool) -> Path | None:
+def _picture_name(path: str | None, part: BenchPart, *, first: bool) -> Path | None:
     """Return the picture's name as given for the first part, with the part's name added for the others."""
     if not path:
         return None

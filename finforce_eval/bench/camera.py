@@ -16,7 +16,7 @@ _SEEN_LIKELIHOOD, _HIDDEN_LIKELIHOOD = (0.6, 1.0), (0.02, 0.55)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sight:
+class MeasuredKeypoints:
     """Seen key points (n, K, 3) [m], jaw frame, NaN without depth, and their likelihoods (n, K)."""
 
     points: NDArray
@@ -24,7 +24,7 @@ class Sight:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Camera:
+class NoisyCamera:
     """A fixed RGB-D camera beside the finger.
 
     Attributes:
@@ -49,7 +49,7 @@ class Camera:
     holes: float = 0.01
     hidden_trusted: float = 0.05
 
-    def look(self, points: NDArray, axes: NDArray, radius: float, random: np.random.Generator) -> Sight:
+    def look(self, points: NDArray, axes: NDArray, radius: float, random: np.random.Generator) -> MeasuredKeypoints:
         """Returns what the camera sees of key points (n, K, 3) [m] beside a cylinder along y.
 
         Args:
@@ -76,7 +76,7 @@ class Camera:
         likelihood = np.where(
             doubted, random.uniform(*_HIDDEN_LIKELIHOOD, shape), random.uniform(*_SEEN_LIKELIHOOD, shape)
         )
-        return Sight(points=seen, likelihood=likelihood)
+        return MeasuredKeypoints(points=seen, likelihood=likelihood)
 
     def _find_cover(self, points: NDArray, axes: NDArray, radius: float) -> NDArray:
         """Returns which share of the way to each point (n, K) a cylinder lets the sight go; NaN when all of it."""

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.bench.camera import Camera, Sight
+from finforce_eval.bench.camera import MeasuredKeypoints, NoisyCamera
 from finforce_ifea.contact_mechanics.outline import ObjectOutline
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.observation import Contact, Observation
@@ -55,7 +55,7 @@ class BenchCase:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Press:
+class ReplayedPress:
     """One case as a sequence of images.
 
     Attributes:
@@ -107,7 +107,7 @@ def bench_finger() -> Jaw:
     return replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
 
 
-def record_press(case: BenchCase, jaw: Jaw, camera: Camera | None = None, seed: int = 0) -> Press:
+def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, seed: int = 0) -> ReplayedPress:
     """Returns a press to all levels at 2 mm/s, each held for 1.5 s, after two seconds at rest.
 
     Between the depths of the truth key points and forces are interpolated without overshoot.
@@ -128,11 +128,11 @@ def record_press(case: BenchCase, jaw: Jaw, camera: Camera | None = None, seed: 
     force = PchipInterpolator(grid, np.concatenate([np.zeros((1, 3)), case.force]))(depth)
     axes = np.stack([jaw.inner_face_x + case.radius - depth, np.full(len(depth), case.height)], axis=1)
     random = np.random.default_rng([seed, round(1e4 * case.radius), round(1e3 * case.height)])
-    sight = Sight(points=points, likelihood=np.ones(points.shape[:2]))
+    sight = MeasuredKeypoints(points=points, likelihood=np.ones(points.shape[:2]))
     if camera is not None:
         sight = camera.look(points, axes, case.radius, random)
     contact = Contact.fixed(jaw, case.height)
-    return Press(
+    return ReplayedPress(
         case=case,
         observations=_observe(sight),
         heights=[contact] * len(depth),
@@ -144,7 +144,7 @@ def record_press(case: BenchCase, jaw: Jaw, camera: Camera | None = None, seed: 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Course:
+class _PressMotion:
     """Depths (n,) [m] image by image, which of them are held (n,), and the last image of each level (levels,)."""
 
     depth: NDArray
@@ -152,7 +152,7 @@ class _Course:
     ends: NDArray
 
 
-def _build_course() -> _Course:
+def _build_course() -> _PressMotion:
     """Returns rest, then ramps and holds."""
     parts, ends = [np.zeros(REST_FRAMES)], []
     for level in LEVELS:
@@ -163,10 +163,10 @@ def _build_course() -> _Course:
     held = np.zeros(len(depth), bool)
     for end in ends:
         held[end - SCORED_FRAMES + 1 : end + 1] = True
-    return _Course(depth=depth, held=held, ends=np.array(ends))
+    return _PressMotion(depth=depth, held=held, ends=np.array(ends))
 
 
-def _observe(sight: Sight) -> list[Observation]:
+def _observe(sight: MeasuredKeypoints) -> list[Observation]:
     return [
         Observation(stamp=1.0 + PERIOD * index, points=points, likelihood=likelihood)
         for index, (points, likelihood) in enumerate(zip(sight.points, sight.likelihood, strict=True))

@@ -87,7 +87,7 @@ class DetectionFigures:
 
 
 @dataclass(kw_only=True)
-class _Run:
+class _DetectionRun:
     """A way at work on one recording: its detector, and what it said of each jaw."""
 
     way: Way
@@ -198,7 +198,7 @@ def measure_ways(
     return DetectionFigures(rows=rows, yardstick=time_stats(yardstick), notes=tuple(notes))
 
 
-def _look_at(recording: Recording, ways: Sequence[Way], yardstick: list[float]) -> list[_Run]:
+def _look_at(recording: Recording, ways: Sequence[Way], yardstick: list[float]) -> list[_DetectionRun]:
     """Return what each way said of the images of a recording; times of the yardstick [s] go to a list."""
     from tqdm import tqdm
 
@@ -214,13 +214,13 @@ def _look_at(recording: Recording, ways: Sequence[Way], yardstick: list[float]) 
     return runs
 
 
-def _begin(way: Way, recording: Recording) -> _Run:
+def _begin(way: Way, recording: Recording) -> _DetectionRun:
     """Return a way that is ready to look at a recording."""
     records = build_records(KeypointSource(parameters=way.parameters).node_parameters(recording))
     skips = Skips(RULES, () if way.rests else (ALL,))
     detector = build_detector(load_jaws(records.parameters), *records, skips).detector
     detector.warm_up()
-    return _Run(way=way, detector=detector, logs={side: SideLog() for side in recording.jaws})
+    return _DetectionRun(way=way, detector=detector, logs={side: SideLog() for side in recording.jaws})
 
 
 def time_product(size: int = 512) -> float:

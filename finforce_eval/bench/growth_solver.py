@@ -15,7 +15,7 @@ from finforce.errors import FinforceError
 from finforce_eval.bench.bench import time_calls
 from finforce_eval.bench.cases import PERIOD, bench_finger, load_cases, record_press
 from finforce_eval.bench.growth import Curve, Growth
-from finforce_ifea.contact_mechanics.forward_press import Cylinder, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.fem.model import JawModel
@@ -181,7 +181,7 @@ def _press_keypoints(jaw: Jaw) -> NDArray:
     probe = mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
     depths = np.linspace(0.0, 0.003, 41)[1:]
     presses = press_jaw(
-        mechanics.model, mechanics.contact.surface, jaw.inner_face_x, Cylinder(radius=_RADIUS), _HEIGHT, depths
+        mechanics.model, mechanics.contact.surface, jaw.inner_face_x, RigidCylinder(radius=_RADIUS), _HEIGHT, depths
     )
     pressed = [mechanics.model.positions(probe, press.q) for press in presses]
     rest = mechanics.model.positions(probe, np.zeros(mechanics.model.size))

@@ -19,7 +19,7 @@ from finforce.errors import MissingDependencyError
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_eval.bench.localization_methods import METHODS, Method, Setup
+from finforce_eval.bench.localization_methods import METHODS, Method, MethodSetup
 from finforce_eval.cli.demo import RECORDING
 from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import match_truth
@@ -42,7 +42,7 @@ JITTER, SEED = 0.05e-3, 1  # [m], so that no two calls are alike
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
+class LocatedImage:
     """One image in true contact.
 
     Attributes:
@@ -135,13 +135,13 @@ def build_methods(mesh: ObjectMesh, notes: list[str]) -> dict[str, Method]:
     methods: dict[str, Method] = {}
     for name, build in METHODS.items():
         try:
-            methods[name] = build(Setup(jaw=jaw, mesh=mesh))
+            methods[name] = build(MethodSetup(jaw=jaw, mesh=mesh))
         except MissingDependencyError as error:
             notes.append(f"{name}: not measured: {error}")
     return methods
 
 
-def follow(recording: Recording, mesh: ObjectMesh, every: int) -> Iterator[Frame]:
+def follow(recording: Recording, mesh: ObjectMesh, every: int) -> Iterator[LocatedImage]:
     """Yield every so-manieth image in true contact; surface and wrench are the solver's, with the estimated contact."""
     track = recording.jaw("left")
     solver = JawEstimator(load_jaw("bench"), calibration=load_calibration("bench"))
@@ -161,7 +161,7 @@ def follow(recording: Recording, mesh: ObjectMesh, every: int) -> Iterator[Frame
         if index % every == 0 and force[index] > LEAST_FORCE and estimate.T_jaw_object is not None:
             true = inner.cut(surface, lines.points[index], lines.directions[index])
             if np.isfinite(true):
-                yield Frame(T=estimate.T_jaw_object, surface=surface, wrench=wrench, true=true)
+                yield LocatedImage(T=estimate.T_jaw_object, surface=surface, wrench=wrench, true=true)
         points, likelihood = track.keypoints.points[index], track.keypoints.likelihood[index]
         solution = solver.update(
             Observation(stamp=1e-9 * stamp, points=points, likelihood=likelihood), estimate.contact
@@ -186,7 +186,9 @@ def _jittered_apart() -> Callable[[NDArray], NDArray]:
     return move
 
 
-def _run(method: Method, frames: Sequence[Frame], place: Callable[[NDArray], NDArray]) -> Iterator[tuple[float, float]]:
+def _run(
+    method: Method, frames: Sequence[LocatedImage], place: Callable[[NDArray], NDArray]
+) -> Iterator[tuple[float, float]]:
     """Yield the time [s] and the place error [m] of each image, NaN where no place was found; warm from the first."""
     for frame in frames[:WARM]:
         method(place(frame.T), frame.surface, frame.wrench)

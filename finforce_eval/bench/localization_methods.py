@@ -10,7 +10,7 @@ from finforce.optional import import_library
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.localization.closest import ClosestLocalizer
 from finforce_contact.localization.inner_face import build_inner_face
-from finforce_contact.localization.outline_localizer import Localizer, OutlineLocalizer, Scene
+from finforce_contact.localization.outline_localizer import ContactScene, Localizer, OutlineLocalizer
 from finforce_contact.localization.section import SectionKeeper
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.paper_contact import NearSolid, intersect
@@ -23,33 +23,33 @@ MOST_PAIRS = 2000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Setup:
+class MethodSetup:
     """A jaw and an object."""
 
     jaw: Jaw
     mesh: ObjectMesh
 
 
-def by_outline(setup: Setup, *, with_wrench: bool) -> Method:
+def by_outline(setup: MethodSetup, *, with_wrench: bool) -> Method:
     """Returns the way of mode "estimate"."""
     settings = ContactSettings()
     face = build_inner_face(setup.jaw, settings.mesh)
     return _by_localizer(setup, OutlineLocalizer(face, settings), with_wrench=with_wrench)
 
 
-def by_closest(setup: Setup) -> Method:
+def by_closest(setup: MethodSetup) -> Method:
     """Returns the way of mode "closest"."""
     face = build_inner_face(setup.jaw, ContactSettings().mesh)
     return _by_localizer(setup, ClosestLocalizer(setup.jaw, face), with_wrench=False)
 
 
-def _by_localizer(setup: Setup, localizer: Localizer, *, with_wrench: bool) -> Method:
+def _by_localizer(setup: MethodSetup, localizer: Localizer, *, with_wrench: bool) -> Method:
     settings = ContactSettings()
     face = build_inner_face(setup.jaw, settings.mesh)
     sections = SectionKeeper(setup.mesh, face.half_width, settings)
 
     def locate(T: NDArray, surface: NDArray, wrench: Wrench) -> float | None:
-        scene = Scene(
+        scene = ContactScene(
             T=T,
             section=sections.at(T),
             surface=surface,
@@ -62,7 +62,7 @@ def _by_localizer(setup: Setup, localizer: Localizer, *, with_wrench: bool) -> M
     return locate
 
 
-def by_intersection(setup: Setup, *, cut_down: bool) -> Method:
+def by_intersection(setup: MethodSetup, *, cut_down: bool) -> Method:
     """Returns the centre of the intersection with the whole object, or with what of it is near the jaw."""
     settings = ContactSettings()
     jaw = setup.jaw.build_mesh(settings.mesh)
@@ -76,7 +76,7 @@ def by_intersection(setup: Setup, *, cut_down: bool) -> Method:
     return locate
 
 
-def by_triangle_pairs(setup: Setup) -> Method:
+def by_triangle_pairs(setup: MethodSetup) -> Method:
     """Returns the mean of the points where triangles meet, found by coal.
 
     Raises:
@@ -116,7 +116,7 @@ def _height_of(centre: NDArray, surface: NDArray, nodes: NDArray) -> float:
     return float(nodes[((surface - centre) ** 2).sum(axis=1).argmin(), 2])
 
 
-def by_whole_estimator(setup: Setup) -> Method:
+def by_whole_estimator(setup: MethodSetup) -> Method:
     """Return the estimator with its pose filter and its outline as a way to find a place."""
     estimator, stamps = ContactEstimator(setup.jaw, mesh=setup.mesh, settings=ContactSettings()), iter(range(10**9))
 
@@ -129,7 +129,7 @@ def by_whole_estimator(setup: Setup) -> Method:
     return locate
 
 
-METHODS: dict[str, Callable[[Setup], Method]] = {
+METHODS: dict[str, Callable[[MethodSetup], Method]] = {
     "outline and line of action": lambda setup: by_outline(setup, with_wrench=True),
     "outline alone": lambda setup: by_outline(setup, with_wrench=False),
     "manifold3d, whole object": lambda setup: by_intersection(setup, cut_down=False),

@@ -10,7 +10,7 @@ import numpy as np
 
 from finforce.errors import FinforceError
 from finforce_eval.bench.tiers import Tier
-from finforce_eval.cli.evaluate import Setup
+from finforce_eval.cli.evaluate import EvaluationSetup
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.contact_choice import parse_contacts
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
@@ -93,8 +93,8 @@ def measure_recordings(
     return figures
 
 
-def _build_setup(tier: Tier) -> Setup:
-    return Setup(
+def _build_setup(tier: Tier) -> EvaluationSetup:
+    return EvaluationSetup(
         jaw=load_jaw("bench"),
         settings=tier.settings(),
         calibration=load_calibration(CALIBRATION),
@@ -103,7 +103,7 @@ def _build_setup(tier: Tier) -> Setup:
     )
 
 
-def _evaluate(recording: Recording, setup: Setup) -> CaseResult | None:
+def _evaluate(recording: Recording, setup: EvaluationSetup) -> CaseResult | None:
     """Returns what an estimator said of a recording; None when it solved nothing."""
     try:
         return evaluate_recording(recording, setup.jaw, setup.source(recording), factory=setup.estimator)

@@ -20,7 +20,7 @@ RATE = 30.0  # Hz
 
 
 @dataclass(frozen=True, kw_only=True)
-class Part:
+class StreamPart:
     """A stretch of time in which the images of one section are played, over and over where they do not suffice.
 
     Attributes:
@@ -38,7 +38,7 @@ class Part:
 class Span:
     """When a part is played, from the beginning of all [s]."""
 
-    part: Part
+    part: StreamPart
     begin: float
     end: float
 
@@ -63,7 +63,7 @@ class SceneReel:
     """
 
     def __init__(
-        self, sections: Mapping[str, Sequence[Sequence[RawMessage]]], parts: Sequence[Part], rate: float = RATE
+        self, sections: Mapping[str, Sequence[Sequence[RawMessage]]], parts: Sequence[StreamPart], rate: float = RATE
     ) -> None:
         for part in parts:
             if not sections.get(part.section):

@@ -19,7 +19,7 @@ from finforce.skipping import ALL, AWAY, CONTACT, EVERYWHERE, IDLE, SOLVER, STIL
 from finforce_eval.bench.chain import SIDES, awaited_topics, chain_processes
 from finforce_eval.bench.cpu_share import CpuMeter, busy_seconds
 from finforce_eval.bench.process import resident_bytes
-from finforce_eval.bench.scene_reel import OBJECT_TOPIC, Part, SceneReel, Span, cut_sections
+from finforce_eval.bench.scene_reel import OBJECT_TOPIC, SceneReel, Span, StreamPart, cut_sections
 from finforce_eval.bench.scenes import BenchScene, find_scene
 from finforce_eval.bench.skipping_figures import (  # noqa: F401 - for those who print and draw
     OFF,
@@ -96,16 +96,16 @@ def measure(
     )
 
 
-def _plan(sections: Mapping[str, Sequence[Any]], seconds: float) -> list[Part]:
+def _plan(sections: Mapping[str, Sequence[Any]], seconds: float) -> list[StreamPart]:
     """Return the course: idle, approach and grasp, each with what comes before it."""
     once = {name: len(images) / 30.0 for name, images in sections.items()}
     return [
-        Part(section="idle", seconds=WARM_UP),
-        Part(section="idle", seconds=seconds, name="idle"),
-        Part(section="approach", seconds=once["approach"], name="approach"),
-        Part(section="press", seconds=once["press"]),
-        Part(section="grasp", seconds=SETTLED),
-        Part(section="grasp", seconds=seconds, name="grasp"),
+        StreamPart(section="idle", seconds=WARM_UP),
+        StreamPart(section="idle", seconds=seconds, name="idle"),
+        StreamPart(section="approach", seconds=once["approach"], name="approach"),
+        StreamPart(section="press", seconds=once["press"]),
+        StreamPart(section="grasp", seconds=SETTLED),
+        StreamPart(section="grasp", seconds=seconds, name="grasp"),
     ]
 
 
@@ -129,7 +129,7 @@ class _Run:
     skipped: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
-class _Watch:
+class _SkipWatch:
     """Reads the CPU meter where a part begins or ends."""
 
     def __init__(self, meter: CpuMeter, reel: SceneReel, answers: Callable[[], int], setting: str) -> None:
@@ -186,7 +186,7 @@ def _run(nodes: Sequence[Process], reel: SceneReel, setting: str) -> _Run:
         await_listeners(player, group, awaited)
         player.spin_until(monotonic() + 0.5)
         pids = find_processes([node.name for node in nodes])
-        watch = _Watch(CpuMeter(pids), reel, lambda: len(log.grasp), setting)
+        watch = _SkipWatch(CpuMeter(pids), reel, lambda: len(log.grasp), setting)
         log.offset = time_ns() - reel.begin
         player.play(reel, offset=log.offset, sent=watch.look)
         watch.close()

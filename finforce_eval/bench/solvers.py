@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
 from finforce_eval.bench.bench import Row, row_from_times, time_calls
-from finforce_eval.bench.camera import Camera
-from finforce_eval.bench.cases import Press, bench_finger, load_cases, record_press
+from finforce_eval.bench.camera import NoisyCamera
+from finforce_eval.bench.cases import ReplayedPress, bench_finger, load_cases, record_press
 from finforce_eval.bench.process import Start, measure_start
 from finforce_eval.bench.recordings import RecordedFigures, find_recordings, measure_recordings
 from finforce_eval.bench.scores import Accuracy, ShapeErrors, score_runs, score_shapes
@@ -91,7 +91,7 @@ def measure(quick: bool, folder: Path | str | None = None) -> SolverFigures:
     cases = [case for case in cases if case.name.startswith("Ø25")] if quick else cases
     jaw = bench_finger()
     exact = [record_press(case, jaw) for case in cases]
-    noisy = [record_press(case, jaw, Camera(), SEED) for case in cases]
+    noisy = [record_press(case, jaw, NoisyCamera(), SEED) for case in cases]
     recordings = len(find_recordings(folder)) if folder else 0
     total, figures, notes = len(tiers) * (2 * len(cases) + recordings), [], []
     with tqdm(total=total, unit="press", disable=None, leave=False) as bar:
@@ -106,7 +106,7 @@ def measure(quick: bool, folder: Path | str | None = None) -> SolverFigures:
 
 
 def _measure_tier(
-    tier: Tier, exact: Sequence[Press], noisy: Sequence[Press], progress: Callable[[], object]
+    tier: Tier, exact: Sequence[ReplayedPress], noisy: Sequence[ReplayedPress], progress: Callable[[], object]
 ) -> TierFigures:
     jaw = bench_finger()
     yardstick = measure_factorisation()

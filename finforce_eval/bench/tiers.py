@@ -10,7 +10,7 @@ from time import perf_counter, thread_time
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.bench.cases import Press
+from finforce_eval.bench.cases import ReplayedPress
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.settings import SOLVERS, EstimatorSettings
@@ -77,7 +77,7 @@ class Run:
         cpu: the processor time of the same steps (m,) [s], from which other processes on the machine take nothing.
     """
 
-    press: Press
+    press: ReplayedPress
     force: NDArray
     seconds: NDArray
     cpu: NDArray
@@ -88,7 +88,7 @@ class Run:
         return np.linalg.norm(self.force, axis=1) - np.linalg.norm(self.press.force, axis=1)
 
 
-def run_tier(tier: Tier, jaw: Jaw, presses: Sequence[Press], progress=lambda: None) -> list[Run]:
+def run_tier(tier: Tier, jaw: Jaw, presses: Sequence[ReplayedPress], progress=lambda: None) -> list[Run]:
     """Runs one estimator over presses, each from the start; what compiles is compiled before.
 
     Args:
@@ -110,7 +110,7 @@ def run_tier(tier: Tier, jaw: Jaw, presses: Sequence[Press], progress=lambda: No
     return runs
 
 
-def _run_press(tier: Tier, estimator: JawEstimator, press: Press, frames: int | None = None) -> Run:
+def _run_press(tier: Tier, estimator: JawEstimator, press: ReplayedPress, frames: int | None = None) -> Run:
     """Returns what an estimator that starts anew makes of the first frames of a press."""
     estimator.reset()
     force = np.full(press.force.shape, np.nan)

@@ -29,7 +29,7 @@ from finforce_ifea.settings import EstimatorSettings
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setup:
+class EvaluationSetup:
     """What an offline run needs beside the recordings."""
 
     jaw: Jaw
@@ -38,7 +38,7 @@ class Setup:
     contacts: ContactChoice
     about: Mapping[str, str]
 
-    def side(self, side: str) -> Setup:
+    def side(self, side: str) -> EvaluationSetup:
         """Return the setup of the left or the right jaw; a jaw file describes the left one."""
         return self if side == self.jaw.side else replace(self, jaw=self.jaw.mirrored())
 
@@ -125,7 +125,7 @@ def _long_name(recording: Recording) -> str:
     return "/".join(recording.path.resolve().with_suffix("").parts[-3:])
 
 
-def make_setup(options: argparse.Namespace) -> Setup:
+def make_setup(options: argparse.Namespace) -> EvaluationSetup:
     """Load what the options name.
 
     Raises:
@@ -150,7 +150,7 @@ def make_setup(options: argparse.Namespace) -> Setup:
         "calibration": options.calibration or "none",
         "version": version(),
     }
-    return Setup(jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about)
+    return EvaluationSetup(jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about)
 
 
 def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorSettings:
@@ -193,7 +193,7 @@ def write_json(path: str, content: Mapping[str, Any]) -> None:
     Path(path).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def evaluate_all(recordings: Sequence[Recording], setup: Setup) -> Evaluation:
+def evaluate_all(recordings: Sequence[Recording], setup: EvaluationSetup) -> Evaluation:
     """Evaluate every jaw with ground truth of every recording, under one progress bar.
 
     Raises:
@@ -227,7 +227,7 @@ def truth_sides(recording: Recording) -> list[str]:
     return sides
 
 
-def _evaluate_case(recording: Recording, side: str, setup: Setup, progress: Any) -> CaseResult:
+def _evaluate_case(recording: Recording, side: str, setup: EvaluationSetup, progress: Any) -> CaseResult:
     """Evaluate one jaw of one recording."""
     result = evaluate_recording(
         recording,

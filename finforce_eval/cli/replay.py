@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
-from finforce_eval.cli.evaluate import Setup, make_setup, write_json
+from finforce_eval.cli.evaluate import EvaluationSetup, make_setup, write_json
 from finforce_eval.cli.main import Parser, add_jaw_options, add_source_options
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.tables import evaluation_json, format_table
@@ -84,7 +84,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _write(result: Replay, setup: Setup, options: argparse.Namespace) -> None:
+def _write(result: Replay, setup: EvaluationSetup, options: argparse.Namespace) -> None:
     """Write what was asked for."""
     if options.json:
         score = result.grasp_score

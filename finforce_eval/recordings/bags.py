@@ -13,7 +13,7 @@ from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
 
 
-class Sample(NamedTuple):
+class BagMessage(NamedTuple):
     """A message and the time [ns] at which the bag received it."""
 
     time: int

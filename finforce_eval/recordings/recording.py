@@ -13,7 +13,7 @@ from finforce.errors import ObservationError
 from finforce.pointcloud import Keypoints, decode_columns, decode_keypoints
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.bags import Sample, bag_source, check_types, open_bag
+from finforce_eval.recordings.bags import BagMessage, bag_source, check_types, open_bag
 from finforce_eval.recordings.images import PAIRED, ImageTrack, find_images
 from finforce_eval.recordings.tracks import (
     JAWS,
@@ -46,7 +46,7 @@ for _side in JAWS:
 class _Content(NamedTuple):
     """What lies in a bag: messages by topic, images, and notes on what was left aside."""
 
-    samples: Mapping[str, list[Sample]]
+    samples: Mapping[str, list[BagMessage]]
     images: ImageTrack | None
     notes: list[str]
 
@@ -99,7 +99,7 @@ def _no_jaw(*, has_images: bool) -> str:
     )
 
 
-def _has_jaw(samples: Mapping[str, list[Sample]], side: str, has_images: bool) -> bool:
+def _has_jaw(samples: Mapping[str, list[BagMessage]], side: str, has_images: bool) -> bool:
     """Say whether a recording tells of a jaw: by its key points, or with images by anything that is the jaw's own."""
     topics = [topic for topic in samples if topic.startswith(f"/{side}/")]
     return f"/{side}/keypoints" in topics or (has_images and bool(topics))
@@ -107,11 +107,11 @@ def _has_jaw(samples: Mapping[str, list[Sample]], side: str, has_images: bool) -
 
 def _read_samples(source: Path, name: str, pairing: int) -> _Content:
     """Decode the messages of our topics, by topic, and find the images."""
-    samples: dict[str, list[Sample]] = {}
+    samples: dict[str, list[BagMessage]] = {}
     with open_bag(source, name) as bag:
         check_types(bag.connections, {topic: (kind,) for topic, kind in TOPICS.items()}, name)
         for raw in bag.raw(TOPICS):
-            samples.setdefault(raw.topic, []).append(Sample(raw.time, bag.decode(raw)))
+            samples.setdefault(raw.topic, []).append(BagMessage(raw.time, bag.decode(raw)))
         notes = bag.foreign_notes()
         try:
             images = find_images(bag, source, pairing)
@@ -122,13 +122,13 @@ def _read_samples(source: Path, name: str, pairing: int) -> _Content:
         return _Content(samples, images, notes)
 
 
-def _stamp(sample: Sample) -> int:
+def _stamp(sample: BagMessage) -> int:
     """Return the header stamp [ns]."""
     stamp = sample.message.header.stamp
     return stamp.sec * NANOSECONDS + stamp.nanosec
 
 
-def _stamps(samples: Sequence[Sample], topic: str, name: str, *, strict: bool) -> np.ndarray:
+def _stamps(samples: Sequence[BagMessage], topic: str, name: str, *, strict: bool) -> np.ndarray:
     """Return the header stamps (n,) [ns] and check their order."""
     stamps = np.array([_stamp(sample) for sample in samples], dtype=np.int64)
     steps = np.diff(stamps)
@@ -141,7 +141,7 @@ def _stamps(samples: Sequence[Sample], topic: str, name: str, *, strict: bool) -
     return stamps
 
 
-def _jaw_track(samples: Mapping[str, list[Sample]], side: str, name: str) -> JawTrack:
+def _jaw_track(samples: Mapping[str, list[BagMessage]], side: str, name: str) -> JawTrack:
     """Gather what was recorded of one jaw."""
     truth = samples.get(f"/{side}/ground_truth_wrench")
     pose = samples.get(f"/{side}/jaw_pose")
@@ -156,7 +156,7 @@ def _jaw_track(samples: Mapping[str, list[Sample]], side: str, name: str) -> Jaw
     )
 
 
-def _check_frame(samples: Sequence[Sample], topic: str, side: str, name: str) -> None:
+def _check_frame(samples: Sequence[BagMessage], topic: str, side: str, name: str) -> None:
     """Refuse messages of a jaw that are not in its frame."""
     for sample in samples:
         frame = sample.message.header.frame_id
@@ -164,7 +164,7 @@ def _check_frame(samples: Sequence[Sample], topic: str, side: str, name: str) ->
             raise RecordingError(f"{name}: {topic} is in the frame '{frame}'; expected '{side}_jaw'")
 
 
-def _keypoint_track(samples: Sequence[Sample], side: str, name: str) -> KeypointTrack:
+def _keypoint_track(samples: Sequence[BagMessage], side: str, name: str) -> KeypointTrack:
     """Stack the key point clouds of one jaw."""
     topic = f"/{side}/keypoints"
     _check_frame(samples, topic, side, name)
@@ -188,7 +188,7 @@ def _keypoint_track(samples: Sequence[Sample], side: str, name: str) -> Keypoint
     return KeypointTrack(stamps=stamps, points=points, likelihood=likelihood, stddev=stddev)
 
 
-def _sight_track(samples: Sequence[Sample], side: str, name: str) -> SightTrack:
+def _sight_track(samples: Sequence[BagMessage], side: str, name: str) -> SightTrack:
     """Stack the true key points of one jaw."""
     topic = f"/{side}/{TRUE_KEYPOINTS}"
     _check_frame(samples, topic, side, name)
@@ -203,7 +203,7 @@ def _sight_track(samples: Sequence[Sample], side: str, name: str) -> SightTrack:
     return SightTrack(stamps=stamps, points=points, pixels=pixels, visible=visible > 0)
 
 
-def _cloud(sample: Sample, index: int, topic: str, name: str) -> Keypoints:
+def _cloud(sample: BagMessage, index: int, topic: str, name: str) -> Keypoints:
     """Decode one key point cloud."""
     try:
         return decode_keypoints(sample.message)
@@ -211,7 +211,7 @@ def _cloud(sample: Sample, index: int, topic: str, name: str) -> Keypoints:
         raise RecordingError(f"{name}: {topic} message {index}: {error}") from error
 
 
-def _wrench_track(samples: Sequence[Sample], side: str, name: str) -> WrenchTrack:
+def _wrench_track(samples: Sequence[BagMessage], side: str, name: str) -> WrenchTrack:
     """Stack the ground truth of one jaw."""
     topic = f"/{side}/ground_truth_wrench"
     _check_frame(samples, topic, side, name)
@@ -224,7 +224,7 @@ def _wrench_track(samples: Sequence[Sample], side: str, name: str) -> WrenchTrac
     return WrenchTrack(stamps=stamps, force=force, torque=torque)
 
 
-def _pose_track(samples: Sequence[Sample], topic: str, name: str) -> PoseTrack:
+def _pose_track(samples: Sequence[BagMessage], topic: str, name: str) -> PoseTrack:
     """Stack poses of one frame; the order of their stamps is not checked, trackers publish late results."""
     frames = [sample.message.header.frame_id for sample in samples]
     odd = next((index for index, frame in enumerate(frames) if frame != frames[0]), None)
@@ -240,7 +240,7 @@ def _pose_track(samples: Sequence[Sample], topic: str, name: str) -> PoseTrack:
     )
 
 
-def _phases(samples: Sequence[Sample], name: str) -> Any:
+def _phases(samples: Sequence[BagMessage], name: str) -> Any:
     """Read the phases; strings carry no stamp, the time of receipt stands for it."""
     return parse_phases([s.time for s in samples], [s.message.data for s in samples], name)
 

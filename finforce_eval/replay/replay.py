@@ -17,7 +17,7 @@ from finforce.errors import MissingDependencyError
 from finforce.skipping import IDLE
 from finforce.systems.options import ReplayOptions
 from finforce.systems.processes import Process, replay_processes
-from finforce_eval.cli.evaluate import Setup, truth_sides
+from finforce_eval.cli.evaluate import EvaluationSetup, truth_sides
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_choice import FIXED, ContactChoice
 from finforce_eval.evaluation.detection import awaiting_keypoints, with_detections
@@ -82,7 +82,7 @@ class Replay:
 
 def replay(
     recording: Recording,
-    setup: Setup,
+    setup: EvaluationSetup,
     *,
     calibration_file: str = "",
     playing: Playing | None = None,
@@ -173,7 +173,9 @@ def _results_of(sides: Sequence[str]) -> set[str]:
     return own | {"/grasp_wrench", "/manipulation_wrench", "/diagnostics", "/clock", "/rosout"}
 
 
-def _graph_options(recording: Recording, setup: Setup, calibration_file: str, playing: Playing) -> ReplayOptions:
+def _graph_options(
+    recording: Recording, setup: EvaluationSetup, calibration_file: str, playing: Playing
+) -> ReplayOptions:
     """Return what the graph of the solvers is asked for."""
     sides = list(recording.jaws)
     return ReplayOptions(
@@ -242,7 +244,7 @@ def _run(processes: Sequence[Process], messages: Playback, log: ReplayLog, playi
         nodes.check()
 
 
-def _score(recording: Recording, setup: Setup, log: ReplayLog) -> Evaluation:
+def _score(recording: Recording, setup: EvaluationSetup, log: ReplayLog) -> Evaluation:
     """Score the wrenches of every jaw with ground truth.
 
     Raises:

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.localization.section import cut_outline
 from finforce_contact.settings import ContactSettings
-from finforce_eval.stress.contact_objects import Scene, build_scenes
+from finforce_eval.stress.contact_objects import HardScene, build_scenes
 from finforce_eval.stress.press import Bench
-from finforce_eval.stress.session import LIKELIHOOD, OFFSET, PERIOD, Step, judge, noise_of, update
+from finforce_eval.stress.session import LIKELIHOOD, OFFSET, PERIOD, SessionStep, judge, noise_of, update
 from finforce_eval.stress.stress import Family, Plan, Trial, attempt
-from finforce_ifea.contact_mechanics.forward_press import Press, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import PressState, press_jaw
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.errors import ContactError
@@ -49,7 +49,7 @@ class PressedOutline:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
+class PressedImage:
     """What is true in one image: pose T_jaw_object (4, 4), key points (K, 3) [m], force [N] and torque [N m] (3,)."""
 
     T: NDArray
@@ -58,7 +58,7 @@ class Frame:
     torque: NDArray
 
 
-def plan_depths(scene: Scene) -> NDArray:
+def plan_depths(scene: HardScene) -> NDArray:
     """Returns the depth of the object in each image (n,) [m], from well clear of the jaw on."""
     last = min(scene.depth, 0.0)
     approach = np.linspace(-CLEAR + last, last, APPROACH)
@@ -66,7 +66,7 @@ def plan_depths(scene: Scene) -> NDArray:
     return np.concatenate([approach, rise, np.full(HOLD, scene.depth)])
 
 
-def press_scene(bench: Bench, scene: Scene) -> list[Frame]:
+def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
     """Returns what is true in each image; an object that no outline describes leaves the jaw as it is.
 
     Raises:
@@ -95,13 +95,13 @@ def press_scene(bench: Bench, scene: Scene) -> list[Frame]:
     return frames
 
 
-def _frame_of(bench: Bench, T: NDArray, press: Press | None) -> Frame:
+def _frame_of(bench: Bench, T: NDArray, press: PressState | None) -> PressedImage:
     """Returns the truth at a pose, with the jaw at rest without a press."""
     if press is None:
-        return Frame(T=T, points=bench.jaw.keypoints, force=np.zeros(3), torque=np.zeros(3))
+        return PressedImage(T=T, points=bench.jaw.keypoints, force=np.zeros(3), torque=np.zeros(3))
     model = bench.mechanics.model
     points = model.positions(model.attach(bench.jaw.keypoints, 1.0), press.q)
-    return Frame(T=T, points=points, force=press.force, torque=press.torque)
+    return PressedImage(T=T, points=points, force=press.force, torque=press.torque)
 
 
 def rotation_of(tilt: float) -> NDArray:
@@ -113,7 +113,7 @@ def rotation_of(tilt: float) -> NDArray:
 class Chain:
     """Contact estimator and solver of one jaw, fed as their nodes are."""
 
-    def __init__(self, bench: Bench, scene: Scene, random: np.random.Generator) -> None:
+    def __init__(self, bench: Bench, scene: HardScene, random: np.random.Generator) -> None:
         """Starts both anew and lets the solver tare while the object is clear."""
         self._bench, self._random = bench, random
         self._contact = ContactEstimator(bench.jaw, mesh=scene.mesh, settings=ContactSettings(mesh=bench.plan.mesh))
@@ -121,11 +121,11 @@ class Chain:
         self._stamp, self._last = 10.0, None
         bench.estimator.reset()
 
-    def see(self, frame: Frame) -> Step:
+    def see(self, frame: PressedImage) -> SessionStep:
         """Returns the next image of what is true, with noise; the contact is not known yet."""
         self._stamp += PERIOD
         noise = noise_of(self._random, (len(frame.points),))
-        return Step(
+        return SessionStep(
             stamp=self._stamp,
             points=frame.points + self._offsets + noise,
             likelihood=np.full(len(frame.points), LIKELIHOOD),
@@ -134,7 +134,7 @@ class Chain:
             torque=frame.torque,
         )
 
-    def solve(self, step: Step, T: NDArray) -> Solution:
+    def solve(self, step: SessionStep, T: NDArray) -> Solution:
         """Returns what both make of an image and a pose T_jaw_object (4, 4)."""
         T = T.copy()
         T[:3, 3] += POSE_NOISE * self._random.normal(size=3)
@@ -157,7 +157,7 @@ def run_objects(plan: Plan) -> Iterator[Trial]:
             yield from play_scene(bench, scene, frames, seed)
 
 
-def play_scene(bench: Bench, scene: Scene, frames: list[Frame], seed: int) -> Iterator[Trial]:
+def play_scene(bench: Bench, scene: HardScene, frames: list[PressedImage], seed: int) -> Iterator[Trial]:
     """Yields the images of a scene after the tare, each a step of contact estimator and solver."""
     chain = Chain(bench, scene, bench.plan.random("objects", scene.name, seed))
     tare = [frames[0]] * bench.estimator.settings.tare_frames

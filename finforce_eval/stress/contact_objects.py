@@ -14,7 +14,7 @@ LENGTH = 0.06
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class HardScene:
     """An object and where it presses.
 
     Attributes:
@@ -73,34 +73,38 @@ def in_single_precision(mesh: ObjectMesh) -> ObjectMesh:
     return replace(mesh, vertices=mesh.vertices.astype(np.float32))
 
 
-def build_scenes() -> tuple[Scene, ...]:
+def build_scenes() -> tuple[HardScene, ...]:
     """Returns the scenes."""
     rod, bar = build_prism(circle(0.0125)), build_prism(rectangle(0.03, 0.03))
     return (
-        Scene(name="rod", mesh=rod),
-        Scene(name="rod, single precision", mesh=in_single_precision(rod)),
-        Scene(name="rod near the base", mesh=rod, height=0.018),
-        Scene(name="rod near the tip", mesh=rod, height=0.066),
-        Scene(name="rod grazing by 0.05 mm", mesh=rod, depth=5e-5),
-        Scene(name="rod grazing by 0.2 mm", mesh=rod, depth=2e-4),
-        Scene(name="rod 0.3 mm away", mesh=rod, depth=-3e-4),
-        Scene(name="rod far away", mesh=rod, depth=-3e-2),
-        Scene(name="coplanar face", mesh=bar, depth=2e-4),
-        Scene(name="coplanar face, deeper", mesh=bar, depth=3e-3),
-        Scene(name="wall along the jaw", mesh=build_prism(rectangle(0.03, 0.2)), depth=1e-4),
-        Scene(name="edge", mesh=bar, tilt=np.pi / 4),
-        Scene(name="edge of a leaning bar", mesh=bar, tilt=0.12),
-        Scene(name="bar over the tip", mesh=bar, height=0.085, depth=1e-3),
-        Scene(name="wire of 0.5 mm", mesh=build_prism(circle(0.25e-3)), depth=1e-3, is_impossible=True),
-        Scene(name="wire of 2 mm", mesh=build_prism(circle(1e-3)), depth=2e-3),
-        Scene(name="drum of 1 m", mesh=build_prism(circle(0.5)), depth=5e-4),
-        Scene(name="block of 1 m", mesh=build_prism(rectangle(1.0, 1.0)), depth=5e-5),
-        Scene(name="plate of 1 mm, edge on", mesh=build_prism(rectangle(0.03, 1e-3)), depth=2e-3),
-        Scene(name="plate of 0.3 mm, edge on", mesh=build_prism(rectangle(0.03, 3e-4)), depth=2e-3, is_impossible=True),
-        Scene(name="plate of 1 mm, face on", mesh=build_prism(rectangle(1e-3, 0.03)), depth=2e-3),
-        Scene(name="plate of 0.3 mm, face on", mesh=build_prism(rectangle(3e-4, 0.03)), depth=2e-3, is_impossible=True),
-        Scene(name="open rod", mesh=leave_open(rod)),
-        Scene(name="open bar", mesh=leave_open(bar), depth=2e-4),
-        Scene(name="engulfing", mesh=build_prism(rectangle(0.2, 0.2), 0.2), depth=0.11, is_impossible=True),
-        Scene(name="beyond the tip", mesh=rod, height=0.2, is_impossible=True),
+        HardScene(name="rod", mesh=rod),
+        HardScene(name="rod, single precision", mesh=in_single_precision(rod)),
+        HardScene(name="rod near the base", mesh=rod, height=0.018),
+        HardScene(name="rod near the tip", mesh=rod, height=0.066),
+        HardScene(name="rod grazing by 0.05 mm", mesh=rod, depth=5e-5),
+        HardScene(name="rod grazing by 0.2 mm", mesh=rod, depth=2e-4),
+        HardScene(name="rod 0.3 mm away", mesh=rod, depth=-3e-4),
+        HardScene(name="rod far away", mesh=rod, depth=-3e-2),
+        HardScene(name="coplanar face", mesh=bar, depth=2e-4),
+        HardScene(name="coplanar face, deeper", mesh=bar, depth=3e-3),
+        HardScene(name="wall along the jaw", mesh=build_prism(rectangle(0.03, 0.2)), depth=1e-4),
+        HardScene(name="edge", mesh=bar, tilt=np.pi / 4),
+        HardScene(name="edge of a leaning bar", mesh=bar, tilt=0.12),
+        HardScene(name="bar over the tip", mesh=bar, height=0.085, depth=1e-3),
+        HardScene(name="wire of 0.5 mm", mesh=build_prism(circle(0.25e-3)), depth=1e-3, is_impossible=True),
+        HardScene(name="wire of 2 mm", mesh=build_prism(circle(1e-3)), depth=2e-3),
+        HardScene(name="drum of 1 m", mesh=build_prism(circle(0.5)), depth=5e-4),
+        HardScene(name="block of 1 m", mesh=build_prism(rectangle(1.0, 1.0)), depth=5e-5),
+        HardScene(name="plate of 1 mm, edge on", mesh=build_prism(rectangle(0.03, 1e-3)), depth=2e-3),
+        HardScene(
+            name="plate of 0.3 mm, edge on", mesh=build_prism(rectangle(0.03, 3e-4)), depth=2e-3, is_impossible=True
+        ),
+        HardScene(name="plate of 1 mm, face on", mesh=build_prism(rectangle(1e-3, 0.03)), depth=2e-3),
+        HardScene(
+            name="plate of 0.3 mm, face on", mesh=build_prism(rectangle(3e-4, 0.03)), depth=2e-3, is_impossible=True
+        ),
+        HardScene(name="open rod", mesh=leave_open(rod)),
+        HardScene(name="open bar", mesh=leave_open(bar), depth=2e-4),
+        HardScene(name="engulfing", mesh=build_prism(rectangle(0.2, 0.2), 0.2), depth=0.11, is_impossible=True),
+        HardScene(name="beyond the tip", mesh=rod, height=0.2, is_impossible=True),
     )

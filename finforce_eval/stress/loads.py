@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from finforce_eval.stress.press import Bench
-from finforce_eval.stress.session import Session, Step, open_session, take_another
+from finforce_eval.stress.session import Session, SessionStep, open_session, take_another
 from finforce_eval.stress.stress import Family, Plan, Trial
 
 FORCES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3)
@@ -64,7 +64,7 @@ def run_jumps(plan: Plan) -> Iterator[Trial]:
         yield from session.play(seed, _jump(session, kind, random))
 
 
-def _jump(session: Session, kind: str, random: np.random.Generator, count: int = 60) -> list[Step]:
+def _jump(session: Session, kind: str, random: np.random.Generator, count: int = 60) -> list[SessionStep]:
     """Returns `count` steps whose depth changes as `kind` says."""
     deepest = session.course.depth
     if kind == "teleport":

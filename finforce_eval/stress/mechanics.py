@@ -20,7 +20,7 @@ from finforce_eval.stress.mechanics_jaw import (
 from finforce_eval.stress.press import Bench
 from finforce_eval.stress.session import open_session, update
 from finforce_eval.stress.stress import Family, Plan, Trial, attempt
-from finforce_ifea.contact_mechanics.forward_press import Box, Cylinder
+from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder
 from finforce_ifea.errors import ContactError
 from finforce_ifea.fem.locking import warn_of_locking
 from finforce_ifea.fem.solid import SolidModel
@@ -40,11 +40,11 @@ ROUNDING, LOCKED = 1e-6, 0.2
 SIGHT = 5e-5
 DEPTHS = (1e-6, 1e-5, 1e-4, 1e-3, 5e-3, 1e-2, 1.5e-2, 2e-2, 3e-2)
 RIGID = (
-    Cylinder(radius=0.0125),
-    Cylinder(radius=0.002),
-    Cylinder(radius=0.5),
-    Box(size_x=0.03, size_z=0.01, edge_radius=1e-3),
-    Box(size_x=0.03, size_z=0.3, edge_radius=1e-3),
+    RigidCylinder(radius=0.0125),
+    RigidCylinder(radius=0.002),
+    RigidCylinder(radius=0.5),
+    RigidBox(size_x=0.03, size_z=0.01, edge_radius=1e-3),
+    RigidBox(size_x=0.03, size_z=0.3, edge_radius=1e-3),
 )
 DIRECTIONS = (np.array([-0.2, 0.0, -0.98]), np.array([-0.35, 0.0, -0.94]), np.array([-0.6, 0.0, -0.8]))
 WAYS = 1e-3 * np.array([0.1, 0.3, 0.6, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 15.0, 20.0])

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import LinearOperator, onenormest
 
 from finforce_eval.stress.press import OWN_MECHANICS
 from finforce_eval.stress.stress import Plan, Trial
-from finforce_ifea.contact_mechanics.forward_press import Cylinder, Press, RigidObject, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import PressState, RigidCylinder, RigidObject, press_jaw
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact, measure_penalty_energy
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.errors import ContactError
@@ -148,15 +148,15 @@ class Rig:
     mechanics: Mechanics
     jaw: Jaw
     height: float
-    rigid: RigidObject = Cylinder(radius=0.0125)
+    rigid: RigidObject = RigidCylinder(radius=0.0125)
 
-    def press(self, depth: float) -> list[Press]:
+    def press(self, depth: float) -> list[PressState]:
         """Returns the equilibria a little before a depth [m], at it and a little beyond."""
         surface, face = self.mechanics.contact.surface, self.jaw.inner_face_x
         depths = [share * depth for share in (1.0 - _LITTLE, 1.0, 1.0 + _LITTLE)]
         return press_jaw(self.mechanics.model, surface, face, self.rigid, self.height, depths)
 
-    def judge(self, presses: list[Press], expected: NDArray, tolerance: float) -> Trial:
+    def judge(self, presses: list[PressState], expected: NDArray, tolerance: float) -> Trial:
         """Returns how a press compares with an expected force (3,) [N], within three times a share of it.
 
         The residual is what is left of the equilibrium, over the force. The energy balance is that of the way from the
@@ -181,12 +181,12 @@ class Rig:
             note=f"{size:.4g} N",
         )
 
-    def _press(self, press: Press) -> PenaltyContact:
+    def _press(self, press: PressState) -> PenaltyContact:
         surface = self.mechanics.contact.surface
         points = self.mechanics.model.positions(surface.probe, press.q)
         return self.rigid.press(points, surface.stiffness, self.jaw.inner_face_x, press.depth, self.height)
 
-    def _measure_energy(self, press: Press) -> float:
+    def _measure_energy(self, press: PressState) -> float:
         return press.energy + measure_penalty_energy(
             self._press(press).forces, self.mechanics.contact.surface.stiffness
         )

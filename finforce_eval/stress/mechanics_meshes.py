@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from finforce_eval.stress.mechanics_jaw import Rig, build_jaw, measure_condition
 from finforce_eval.stress.stress import Family, Plan, Trial, attempt
-from finforce_ifea.contact_mechanics.forward_press import Press
+from finforce_ifea.contact_mechanics.forward_press import PressState
 from finforce_ifea.contact_mechanics.pressed_jaw import RollingContact
 from finforce_ifea.contact_mechanics.surface import build_contact_surface
 from finforce_ifea.fem.locking import warn_of_locking
@@ -202,7 +202,7 @@ class Tried:
     """A mesh that was accepted: its presses, and whether it is warned of."""
 
     rig: Rig
-    presses: list[Press]
+    presses: list[PressState]
     warned: bool
 
 

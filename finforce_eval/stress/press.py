@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from finforce_eval.stress.stress import Plan
-from finforce_ifea.contact_mechanics.forward_press import Cylinder, Press, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import PressState, RigidCylinder, press_jaw
 from finforce_ifea.contact_mechanics.penalty import measure_penalty_energy
 from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import JawEstimator
@@ -25,7 +25,7 @@ OWN_MECHANICS = ("solid", "frame")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Course:
+class PressHistory:
     """A jaw pressed ever deeper by a cylinder.
 
     Attributes:
@@ -64,7 +64,7 @@ class Bench:
         own, full = plan.solver in OWN_MECHANICS, replace(chosen, solver=self.jaw.model)
         self.mechanics = self.estimator.mechanics if own else build_mechanics(self.jaw, full)
 
-    def press(self, random: np.random.Generator, *, depth: float | None = None) -> Course:
+    def press(self, random: np.random.Generator, *, depth: float | None = None) -> PressHistory:
         """Returns a press by a drawn cylinder at a drawn height, `depth` [m] deep or drawn too.
 
         A press that slips off or buckles is drawn anew.
@@ -77,26 +77,26 @@ class Bench:
             except ContactError:
                 continue
 
-    def course(self, *, height: float, radius: float, depth: float) -> Course:
+    def course(self, *, height: float, radius: float, depth: float) -> PressHistory:
         """Returns the press of a cylinder; raises ContactError where there is no equilibrium."""
         model, surface = self.mechanics.model, self.mechanics.contact.surface
         depths = np.linspace(0.0, depth, COURSE_STEPS + 1)[1:]
-        presses = press_jaw(model, surface, self.jaw.inner_face_x, Cylinder(radius=radius), height, depths)
+        presses = press_jaw(model, surface, self.jaw.inner_face_x, RigidCylinder(radius=radius), height, depths)
         probe = model.attach(self.jaw.keypoints, 1.0)
         points = np.stack([model.positions(probe, press.q) for press in presses])
         grid, rest = np.r_[0.0, depths], model.positions(probe, np.zeros(model.size))
         zero = np.zeros((1, 3))
-        return Course(
+        return PressHistory(
             height=height,
             radius=radius,
             depth=depth,
             keypoints=PchipInterpolator(grid, np.concatenate([rest[None], points])),
             forces=PchipInterpolator(grid, np.concatenate([zero, [press.force for press in presses]])),
             torques=PchipInterpolator(grid, np.concatenate([zero, [press.torque for press in presses]])),
-            balance=self._balance(presses, Cylinder(radius=radius), height, grid),
+            balance=self._balance(presses, RigidCylinder(radius=radius), height, grid),
         )
 
-    def _balance(self, presses: list[Press], rigid: Cylinder, height: float, grid: NDArray) -> float:
+    def _balance(self, presses: list[PressState], rigid: RigidCylinder, height: float, grid: NDArray) -> float:
         """Returns work less energy of a press, over the energy; that of the springs of the surface counts."""
         model, surface = self.mechanics.model, self.mechanics.contact.surface
         pushes = np.array([0.0, *(-press.force[0] for press in presses)])

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.stress.press import Bench, Course
+from finforce_eval.stress.press import Bench, PressHistory
 from finforce_eval.stress.stress import Trial, attempt
 from finforce_ifea.observation import Contact, Observation, Solution
 
@@ -22,7 +22,7 @@ OFFSET = 0.2e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Step:
+class SessionStep:
     """What an estimator is given in one image, and the truth.
 
     Attributes:
@@ -68,19 +68,19 @@ class Session:
 
     bench: Bench
     random: np.random.Generator
-    course: Course
+    course: PressHistory
     contact: Contact
     offsets: NDArray
     start: float
     level: str = ""
 
-    def steps(self, depths: NDArray, *, scale: float = 1.0) -> list[Step]:
+    def steps(self, depths: NDArray, *, scale: float = 1.0) -> list[SessionStep]:
         """Returns one step for each depth (n,) [m], a period apart, with `scale` times a bench camera's noise."""
         clean = self.course.keypoints(depths) + self.offsets
         points = clean + noise_of(self.random, clean.shape[:2], scale)
         forces, torques = self.course.forces(depths), self.course.torques(depths)
         return [
-            Step(
+            SessionStep(
                 stamp=self.start + (i + 1) * PERIOD,
                 points=points[i],
                 likelihood=np.full(len(points[i]), LIKELIHOOD),
@@ -92,13 +92,13 @@ class Session:
             for i in range(len(depths))
         ]
 
-    def press(self, *, scale: float = 1.0) -> list[Step]:
+    def press(self, *, scale: float = 1.0) -> list[SessionStep]:
         """Returns the steps of a press: three images of rest, 0.4 s of ramp, 0.7 s of hold."""
         depth = self.course.depth
         rising = np.linspace(0.0, depth, 13)[1:]
         return self.steps(np.concatenate([np.zeros(3), rising, np.full(20, depth)]), scale=scale)
 
-    def play(self, seed: int, steps: Iterable[Step]) -> Iterator[Trial]:
+    def play(self, seed: int, steps: Iterable[SessionStep]) -> Iterator[Trial]:
         """Gives steps to the estimator and yields one trial each."""
         for step in steps:
             yield attempt(
@@ -110,7 +110,7 @@ class Session:
 
 
 def open_session(
-    bench: Bench, random: np.random.Generator, *, course: Course | None = None, tare: float = 1.0, level: str = ""
+    bench: Bench, random: np.random.Generator, *, course: PressHistory | None = None, tare: float = 1.0, level: str = ""
 ) -> Session:
     """Draws a press unless one is given, and lets the estimator tare on images with `tare` times the usual noise.
 
@@ -139,13 +139,13 @@ def take_another(session: Session, random: np.random.Generator) -> Session:
     return replace(session, course=course, contact=Contact.fixed(session.bench.jaw, course.height + error))
 
 
-def update(bench: Bench, step: Step) -> Solution:
+def update(bench: Bench, step: SessionStep) -> Solution:
     """Returns what the bench's estimator says of a step."""
     seen = Observation(stamp=step.stamp, points=step.points, likelihood=step.likelihood, stddev=step.stddev)
     return bench.estimator.update(seen, step.contact)
 
 
-def judge(solution: Solution, step: Step, balance: float = math.nan) -> Trial:
+def judge(solution: Solution, step: SessionStep, balance: float = math.nan) -> Trial:
     """Returns how a solution compares with the truth: along x, along z, in magnitude and in torque."""
     error = solution.force - step.force
     magnitude = np.linalg.norm(solution.force) - np.linalg.norm(step.force)

@@ -9,7 +9,7 @@ import numpy as np
 
 from finforce_eval.bench.process import resident_bytes
 from finforce_eval.stress.press import Bench
-from finforce_eval.stress.session import PERIOD, Session, Step, open_session, take_another
+from finforce_eval.stress.session import PERIOD, Session, SessionStep, open_session, take_another
 from finforce_eval.stress.stress import Family, Plan, Trial
 
 STAMPS = ("jitter", "gaps", "stall", "repeat", "backwards", "not finite")
@@ -70,7 +70,7 @@ def run_long(plan: Plan) -> Iterator[Trial]:
             worst, nan = 0.0, False
 
 
-def _press_on(presses: list[Session], random: np.random.Generator, count: int) -> Iterator[Step]:
+def _press_on(presses: list[Session], random: np.random.Generator, count: int) -> Iterator[SessionStep]:
     """Yields `count` steps: rest, a ramp, a hold, a ramp back, with one press after the other."""
     done = 0
     while done < count:

@@ -32,7 +32,7 @@ class RigidObject(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cylinder:
+class RigidCylinder:
     """A cylinder with its axis along y; radius [m]."""
 
     radius: float
@@ -43,7 +43,7 @@ class Cylinder:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Box:
+class RigidBox:
     """A box with rounded edges, its faces along the jaw's axes; sizes along x and z and edge radius [m]."""
 
     size_x: float
@@ -66,7 +66,7 @@ class Box:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Press:
+class PressState:
     """One equilibrium of the pressed jaw.
 
     Attributes:
@@ -97,7 +97,7 @@ def press_jaw(
     rigid: RigidObject,
     height: float,
     depths: Sequence[float],
-) -> list[Press]:
+) -> list[PressState]:
     """Presses a rigid object into the inner surface, displacement driven, frictionless.
 
     Args:
@@ -185,14 +185,14 @@ def _snaps(before: _State, after: _State, way: float) -> bool:
     return lost < -_SNAP * abs(work) or (after.push < before.push and lost > _SNAP * abs(work))
 
 
-def _describe(setting: _Setting, q: NDArray, depth: float, iterations: int) -> Press:
+def _describe(setting: _Setting, q: NDArray, depth: float, iterations: int) -> PressState:
     model, surface = setting.model, setting.surface
     points = model.positions(surface.probe, q)
     forces = setting.press(points, depth).forces
     size = np.linalg.norm(forces, axis=1)
     share = size / size.sum() if size.any() else np.full(len(size), np.nan)
     in_plane = np.array([1.0, 0.0, 1.0])
-    return Press(
+    return PressState(
         depth=depth,
         q=q,
         force=forces.sum(0),

@@ -47,7 +47,7 @@ class CourseFit:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Course:
+class _ForceHistory:
     """Stamps [s], elastic force estimates and true forces (n,) [N] of one recording."""
 
     stamps: NDArray
@@ -97,7 +97,9 @@ def fit_course(
     )
 
 
-def _track_course(jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration) -> _Course:
+def _track_course(
+    jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration
+) -> _ForceHistory:
     """Estimates the elastic force of every frame."""
     estimator = JawEstimator(jaw, settings=settings, calibration=replace(calibration, relaxation=()))
     solutions = [estimator.update(observation, case.contact) for observation in case.observations]
@@ -106,14 +108,14 @@ def _track_course(jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, 
         raise CalibrationError(f"{case.name}: hardly a loaded frame can be trusted; {solutions[-1].message}")
     stamps = np.array([solution.stamp for solution in trusted])
     true = np.interp(stamps, case.stamps_true, np.linalg.norm(case.forces_true, axis=1))
-    return _Course(stamps=stamps, elastic=np.array([np.linalg.norm(s.force) for s in trusted]), true=true)
+    return _ForceHistory(stamps=stamps, elastic=np.array([np.linalg.norm(s.force) for s in trusted]), true=true)
 
 
-def _model(x: NDArray, course: _Course) -> NDArray:
+def _model(x: NDArray, course: _ForceHistory) -> NDArray:
     return np.exp(x[0]) * apply_relaxation(course.elastic, course.stamps, branches_from_parameters(x[1:]))
 
 
-def _residuals(x: NDArray, courses: Sequence[_Course]) -> NDArray:
+def _residuals(x: NDArray, courses: Sequence[_ForceHistory]) -> NDArray:
     """Returns the force residuals of all frames over their standard deviations, and those of the prior."""
     rows = [(_model(x, c) - c.true) / (_RELATIVE_ERROR * c.true + _ABSOLUTE_ERROR) for c in courses]
     return np.concatenate([np.concatenate(rows) / np.sqrt(_CORRELATED_FRAMES), (x[1:] - BRANCH_PRIOR) / BRANCH_STDDEV])

@@ -64,20 +64,20 @@ class RestResponse:
         loads = fit.gains @ deviations[seen][:, ::2].ravel()
         return float(np.sqrt((np.maximum(loads, 0.0) ** 2 + fit.stddevs**2).mean()))
 
-    def _fit(self, seen: bytes, offset_stddev: float) -> "_Fit":
+    def _fit(self, seen: bytes, offset_stddev: float) -> "_PointFit":
         """Returns the fits for the key points that are seen, (K,) bool as bytes; kept, for they are mostly the same."""
         if (seen, offset_stddev) not in self.fits:
             rows = np.frombuffer(seen, bool)
             fits = [fit_load(motions[rows], np.full(int(rows.sum()), offset_stddev)) for motions in self.motions]
             self.fits.clear()
-            self.fits[seen, offset_stddev] = _Fit(
+            self.fits[seen, offset_stddev] = _PointFit(
                 gains=np.stack([fit.gain for fit in fits]), stddevs=np.array([fit.stddev for fit in fits])
             )
         return self.fits[seen, offset_stddev]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Fit:
+class _PointFit:
     """Gains (m, 2 n) [N/m] of the seen key points' deviations at each height, and standard deviations (m,) [N]."""
 
     gains: NDArray

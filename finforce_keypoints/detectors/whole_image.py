@@ -28,7 +28,7 @@ _CONFIDENT = 0.6  # DeepLabCut's cut-off
 
 
 @dataclass(frozen=True, kw_only=True)
-class Box:
+class Crop:
     """A part of an image: left column, upper row, width, height [px]."""
 
     x: int
@@ -43,12 +43,12 @@ class Box:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _View:
+class _CropView:
     """What the network is shown for some sides: a part of the image, blank but for a window, mirrored or not."""
 
     sides: tuple[str, ...]
-    canvas: Box
-    window: Box
+    canvas: Crop
+    window: Crop
     is_mirrored: bool = False
 
 
@@ -120,26 +120,26 @@ class FrameFinder:
             )
         return float(np.divide(trained, size).min())
 
-    def _plan(self, camera: CameraIntrinsics, expected: Mapping[str, NDArray | None]) -> list[_View]:
+    def _plan(self, camera: CameraIntrinsics, expected: Mapping[str, NDArray | None]) -> list[_CropView]:
         """Return what the network is shown."""
-        whole = Box(x=0, y=0, width=camera.width, height=camera.height)
+        whole = Crop(x=0, y=0, width=camera.width, height=camera.height)
         boxes = {side: self._expect(camera, side, pose) for side, pose in expected.items()}
         if not self._names.is_of_one_jaw:
             known = [box for box in boxes.values() if box is not None]
             is_whole = self._is_frozen or len(known) < len(boxes)
             canvas = whole if is_whole else _join(known, whole)
-            return [_View(sides=tuple(boxes), canvas=canvas, window=canvas)]
+            return [_CropView(sides=tuple(boxes), canvas=canvas, window=canvas)]
         rest = {side: whole if len(self._points) == 1 else _half(whole, side) for side in boxes}
         windows = [boxes[side] or rest[side] for side in boxes]
         canvases = [whole] * len(windows) if self._is_frozen else _equalize(windows, whole)
         return [
-            _View(
+            _CropView(
                 sides=(side,), canvas=canvas, window=window if self._is_frozen else canvas, is_mirrored=side == "right"
             )
             for side, canvas, window in zip(boxes, canvases, windows, strict=True)
         ]
 
-    def _expect(self, camera: CameraIntrinsics, side: str, T_camera_jaw: NDArray | None) -> Box | None:
+    def _expect(self, camera: CameraIntrinsics, side: str, T_camera_jaw: NDArray | None) -> Crop | None:
         """Return the part of the image where a jaw is expected, None where that is unknown or not wanted."""
         if T_camera_jaw is None or not self._crop:
             return None
@@ -148,9 +148,9 @@ class FrameFinder:
         low, high = pixels.min(axis=0) - CROP_MARGIN, pixels.max(axis=0) + CROP_MARGIN
         if not np.isfinite(pixels).all() or (high <= 0).any() or (low >= (camera.width, camera.height)).any():
             return None
-        return _fit_box(low, high, Box(x=0, y=0, width=camera.width, height=camera.height))
+        return _fit_box(low, high, Crop(x=0, y=0, width=camera.width, height=camera.height))
 
-    def _show(self, color: NDArray, view: _View, scale: float) -> NDArray:
+    def _show(self, color: NDArray, view: _CropView, scale: float) -> NDArray:
         """Return the picture (H, W, 3) uint8 of a view, in network pixels."""
         picture = color[view.canvas.slices]
         if view.window != view.canvas:
@@ -188,7 +188,7 @@ def check_offsets(peaks: Peaks) -> None:
         )
 
 
-def _map_back(pixels: NDArray, view: _View, scale: float) -> NDArray:
+def _map_back(pixels: NDArray, view: _CropView, scale: float) -> NDArray:
     """Return the pixels (n, 2) of the image for pixels (n, 2) of a view; the centre of the first one is (0, 0)."""
     pixels = (pixels + 0.5) / scale - 0.5
     if view.is_mirrored:
@@ -196,40 +196,40 @@ def _map_back(pixels: NDArray, view: _View, scale: float) -> NDArray:
     return pixels + (view.canvas.x, view.canvas.y)
 
 
-def _contains(box: Box, pixels: NDArray) -> NDArray:
+def _contains(box: Crop, pixels: NDArray) -> NDArray:
     """Tell (n,) which pixels (n, 2) lie in a box; NaN does not."""
     places = pixels - (box.x, box.y)
     return ((places >= -0.5) & (places <= (box.width - 0.5, box.height - 0.5))).all(axis=1)
 
 
-def _half(whole: Box, side: str) -> Box:
+def _half(whole: Crop, side: str) -> Crop:
     """Return the half of an image on the side of a jaw; the rows of the image run from the left to the right jaw."""
     width = whole.width // 2
     return replace(whole, width=width, x=0 if side == "left" else whole.width - width)
 
 
-def _join(boxes: Sequence[Box], whole: Box) -> Box:
+def _join(boxes: Sequence[Crop], whole: Crop) -> Crop:
     """Return the box around several ones."""
     low = np.min([(box.x, box.y) for box in boxes], axis=0)
     high = np.max([(box.x + box.width, box.y + box.height) for box in boxes], axis=0)
     return _fit_box(low, high, whole)
 
 
-def _equalize(boxes: Sequence[Box], whole: Box) -> list[Box]:
+def _equalize(boxes: Sequence[Crop], whole: Crop) -> list[Crop]:
     """Return boxes of the same size around the given ones."""
     size = np.max([(box.width, box.height) for box in boxes], axis=0)
     return [_place((box.x, box.y), size, whole) for box in boxes]
 
 
-def _fit_box(low: NDArray, high: NDArray, whole: Box) -> Box:
+def _fit_box(low: NDArray, high: NDArray, whole: Crop) -> Crop:
     """Return a box around two corners, of a size in steps and inside the image."""
     low = np.floor(np.clip(low, 0, (whole.width, whole.height)))
     high = np.ceil(np.clip(high, 0, (whole.width, whole.height)))
     return _place(low, np.ceil((high - low) / CROP_STEP) * CROP_STEP, whole)
 
 
-def _place(corner: Sequence[float], size: NDArray, whole: Box) -> Box:
+def _place(corner: Sequence[float], size: NDArray, whole: Crop) -> Crop:
     """Return a box of some size (width, height) at a corner, moved into the image."""
     width, height = (int(min(px, limit)) for px, limit in zip(size, (whole.width, whole.height), strict=True))
     x, y = int(min(corner[0], whole.width - width)), int(min(corner[1], whole.height - height))
-    return Box(x=x, y=y, width=width, height=height)
+    return Crop(x=x, y=y, width=width, height=height)

@@ -18,7 +18,7 @@ from finforce_keypoints.geometry.side_fit import (
     DepthScale,
     SideFit,
     SideModel,
-    Sight,
+    SideView,
     compute_stddev,
     fit_side,
     look_along,
@@ -222,7 +222,7 @@ class JawLocalizer:
         )
         return Located(keypoints=keypoints, scale=side.fit.scale)
 
-    def _check_rest(self, seen: _Seen, sight: Sight, side: SideEvidence) -> None:
+    def _check_rest(self, seen: _Seen, sight: SideView, side: SideEvidence) -> None:
         """Compare the likely points with the jaw file: along the side where their rays meet it, across it by depth."""
         points = sight.points_at(self._rest[:, 1])
         points[:, 1] += side.fit.y
@@ -239,7 +239,7 @@ class JawLocalizer:
         return likely & lie_inside(image, finding.pixels) & np.isfinite(finding.stddev)
 
     def _fit_side(
-        self, image: RgbdImage, sight: Sight, likely: NDArray, scale: DepthScale, T_camera_jaw: NDArray
+        self, image: RgbdImage, sight: SideView, likely: NDArray, scale: DepthScale, T_camera_jaw: NDArray
     ) -> SideEvidence:
         """Return where the points are across the jaw's side: first near the known plane, then near the one found."""
         expected = sight.depths_at(self._rest[:, 1])

@@ -19,7 +19,7 @@ _LEAST_STDDEV = 1e-7  # [m], or relative: keeps the fit regular where settings a
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sight:
+class SideView:
     """Rays through pixels, in the jaw frame.
 
     Attributes:
@@ -51,10 +51,10 @@ def rays_through(pixels: NDArray, camera: CameraIntrinsics) -> NDArray:
     return rays
 
 
-def look_along(rays: NDArray, T_camera_jaw: NDArray) -> Sight:
+def look_along(rays: NDArray, T_camera_jaw: NDArray) -> SideView:
     """Return rays (n, 3), camera frame, as seen from the jaw."""
     R = T_camera_jaw[:3, :3]
-    return Sight(camera=-T_camera_jaw[:3, 3] @ R, rays=rays @ R, axes=R)
+    return SideView(camera=-T_camera_jaw[:3, 3] @ R, rays=rays @ R, axes=R)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,7 +144,7 @@ def fit_side(model: SideModel, measured: NDArray, stddev: NDArray, lever: NDArra
     return SideFit(y=y, stddev=np.sqrt(variance), misfit=misfit, scale=found)
 
 
-def compute_stddev(sight: Sight, depths: NDArray, y_stddev: NDArray, ray_stddev: NDArray) -> NDArray:
+def compute_stddev(sight: SideView, depths: NDArray, y_stddev: NDArray, ray_stddev: NDArray) -> NDArray:
     """Return the standard deviations (n, 3) [m] of points along the jaw's axes.
 
     On the plane y = const, dp = d (dv - v dv_y / v_y) for a ray that errs by dv; across it, dp = v / v_y dy.

@@ -101,19 +101,19 @@ class SpotModel:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Look:
+class GreyLook:
     """How one jaw differs from its mean picture: shifts (4,) [m], what is left around each key point (n,)."""
 
     shifts: NDArray
     left: NDArray
 
 
-def look_at(values: NDArray, model: SpotModel) -> Look:
+def look_at(values: NDArray, model: SpotModel) -> GreyLook:
     """Return how the grey values (N,) of a jaw differ from those of a model."""
     away = values - model.mean
     answer = model.inverse @ away
     left = away - model.design @ answer
-    return Look(shifts=_LENGTH * answer[2:], left=np.square(left).reshape(len(model.square), -1).mean(axis=1))
+    return GreyLook(shifts=_LENGTH * answer[2:], left=np.square(left).reshape(len(model.square), -1).mean(axis=1))
 
 
 def place_spots(found: JawKeypoints, camera: CameraIntrinsics, half: int = HALVES[0]) -> JawSpots | None:
@@ -212,7 +212,7 @@ class JawWatch:
         if self._count & (self._count - 1) == 0 or self._count >= LEAST_IMAGES:
             self._model = self.spots.solve(self._mean, self._square)
 
-    def look(self, values: NDArray) -> Look:
+    def look(self, values: NDArray) -> GreyLook:
         """Return how the inner grey values (N,) of a picture differ from the mean."""
         return look_at(values, self._model)
 

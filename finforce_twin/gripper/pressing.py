@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.jaw.meshing import MeshDensity
-from finforce_twin.errors import GraspError
+from finforce_twin.errors import BalanceError
 from finforce_twin.footage import FINGER
 from finforce_twin.gripper.gripper import JawState, TwinState
 from finforce_twin.mechanics.assembly import Assembly
@@ -55,7 +55,7 @@ class PressedGrasp:
 
         Raises:
             FinforceError: The scenario's object or jaw cannot be used.
-            GraspError: The jaws cannot shut on the object at all.
+            BalanceError: The jaws cannot shut on the object at all.
         """
         self.assembly = assembly = Assembly(scenario, seed, density)
         self._reach = assembly.touch_origin - assembly.inner_face_x  # of each jaw, from touch to closed
@@ -180,7 +180,7 @@ def _solve_grasps(assembly: Assembly, step: float) -> list[_SolvedGrasp]:
         posture = Posture(closing=float(closing))
         try:
             shapes = held.follow(assembly.setting_of(posture))
-        except GraspError:
+        except BalanceError:
             if len(solved) < 2:
                 raise
             break

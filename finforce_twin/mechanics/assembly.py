@@ -11,7 +11,7 @@ from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.jaw.meshing import MeshDensity
 from finforce_twin.errors import ScenarioError
-from finforce_twin.mechanics.balance import HeldObject, Setting
+from finforce_twin.mechanics.balance import GraspSetting, HeldObject
 from finforce_twin.mechanics.material import PrintedMaterial, draw_material
 from finforce_twin.mechanics.pressed_jaw import TWIN_DENSITY, JawShape, PressedJaw
 from finforce_twin.scenes.objects import place_object
@@ -86,9 +86,9 @@ class Assembly:
             return None
         return HeldObject(self._jaws, self.scenario.offset, guided=self.scenario.is_guided)
 
-    def setting_of(self, posture: Posture, weight: NDArray | None = None) -> Setting:
+    def setting_of(self, posture: Posture, weight: NDArray | None = None) -> GraspSetting:
         """Returns what a posture, and a weight (3,) [N] in `gripper_base`, mean to the jaws."""
-        return Setting(
+        return GraspSetting(
             opening=self.touch_origin - posture.closing,
             height=self.scenario.height + posture.slide,
             tilt=posture.rock,

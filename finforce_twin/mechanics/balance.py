@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
-from finforce_twin.errors import GraspError
+from finforce_twin.errors import BalanceError
 from finforce_twin.mechanics.pressed_jaw import JawShape, JawStep, Load, PressedJaw
 
 _SETTLED = 1e-6  # [m] of the last Newton step, a hundredth of what a camera sees
@@ -22,7 +22,7 @@ FRICTION = 0.9  # of soft plastic on a dry object; more pull than this share of 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Setting:
+class GraspSetting:
     """What the jaws are told to do.
 
     Attributes:
@@ -37,10 +37,10 @@ class Setting:
     tilt: float
     weight: NDArray
 
-    def between(self, other: "Setting", share: float) -> "Setting":
+    def between(self, other: "GraspSetting", share: float) -> "GraspSetting":
         """Returns the setting that lies the share [-] of the way towards another."""
         mine, theirs = vars(self), vars(other)
-        return Setting(**{key: mine[key] + share * (theirs[key] - mine[key]) for key in mine})
+        return GraspSetting(**{key: mine[key] + share * (theirs[key] - mine[key]) for key in mine})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,7 +64,7 @@ class HeldObject:
         self._jaws, self._guided, self._is_free = jaws, guided, len(jaws) > 1
         rest = {side: np.zeros(jaw.model.size) for side, jaw in jaws.items()}
         self._balance = _Balance(q=rest, loads=dict.fromkeys(jaws), x=x if self._is_free else 0.0)
-        self._setting: Setting | None = None
+        self._setting: GraspSetting | None = None
         self._before: _Balance | None = None
 
     @property
@@ -72,11 +72,11 @@ class HeldObject:
         """Where the object is on the closing axis [m]."""
         return self._balance.x
 
-    def follow(self, setting: Setting) -> Mapping[str, JawShape]:
+    def follow(self, setting: GraspSetting) -> Mapping[str, JawShape]:
         """Moves to a setting and returns the jaws' shapes; the way is halved where Newton's method does not converge.
 
         Raises:
-            GraspError: There is no equilibrium, or the object would slip or fall.
+            BalanceError: There is no equilibrium, or the object would slip or fall.
         """
         start, reached, step = self._setting or setting, 0.0, 1.0
         while reached < 1.0:
@@ -88,7 +88,7 @@ class HeldObject:
                 continue
             self._before, step = None, 0.5 * step
             if step < _SHORTEST:
-                raise GraspError(
+                raise BalanceError(
                     f"no equilibrium at an opening of {1e3 * setting.opening:.2f} mm: a jaw buckles or slips off; "
                     "close less far or grasp at another height"
                 )
@@ -96,7 +96,7 @@ class HeldObject:
         q, loads = self._balance.q, self._balance.loads
         return {side: jaw.describe(q[side], loads[side]) for side, jaw in self._jaws.items()}
 
-    def _solve(self, setting: Setting) -> _Balance | None:
+    def _solve(self, setting: GraspSetting) -> _Balance | None:
         """Returns the balance at a setting, None when Newton's method does not find it."""
         gaps = {side: self._gap(side, setting) for side in self._jaws}
         if sum(gaps.values()) >= 0.0:
@@ -129,7 +129,7 @@ class HeldObject:
             return dict(last.q), last.x
         return {side: 2.0 * last.q[side] - self._before.q[side] for side in last.q}, 2.0 * last.x - self._before.x
 
-    def _find_loads(self, q: Mapping[str, NDArray], x: float, setting: Setting) -> dict[str, Load]:
+    def _find_loads(self, q: Mapping[str, NDArray], x: float, setting: GraspSetting) -> dict[str, Load]:
         """Returns each jaw's load: the object's place, and as pull what pressures leave of the weight in y and z."""
         loads = {
             side: Load(
@@ -148,19 +148,19 @@ class HeldObject:
         rest = rest * (0.0, 1.0, 1.0) / total if total > 0.0 else np.zeros(3)
         return {side: replace(load, pull=sizes[side] * R_GRIPPER_JAW[side].T @ rest) for side, load in loads.items()}
 
-    def _gap(self, side: str, setting: Setting) -> float:
+    def _gap(self, side: str, setting: GraspSetting) -> float:
         """Returns how far [m] the object at x = 0 is from first touch with a jaw at rest."""
         return setting.opening - self._jaws[side].find_touch(setting.height, _along(side) * setting.tilt)
 
-    def _release(self, setting: Setting, gaps: Mapping[str, float]) -> _Balance:
+    def _release(self, setting: GraspSetting, gaps: Mapping[str, float]) -> _Balance:
         """Returns jaws at rest, and the object where it was unless a jaw has pushed it."""
         if np.abs(setting.weight).max() > 0.0:
-            raise GraspError(f"the jaws let go of {np.linalg.norm(setting.weight):.2f} N; set the object down first")
+            raise BalanceError(f"the jaws let go of {np.linalg.norm(setting.weight):.2f} N; set the object down first")
         rest = {side: np.zeros(jaw.model.size) for side, jaw in self._jaws.items()}
         x = float(np.clip(self.x, -gaps["left"], gaps["right"])) if self._is_free else 0.0
         return _Balance(q=rest, loads=dict.fromkeys(self._jaws), x=x)
 
-    def _find_shift(self, steps: Mapping[str, JawStep], setting: Setting) -> float:
+    def _find_shift(self, steps: Mapping[str, JawStep], setting: GraspSetting) -> float:
         """Returns the object's way dx [m] that balances the pushes: sum of +-(push +- slope dx) = weight_x."""
         slope = sum(step.slope for step in steps.values())
         if not self._is_free or slope < _SOFTEST:
@@ -172,13 +172,13 @@ class HeldObject:
         for side, load in loads.items():
             pressure, needed = np.linalg.norm(steps[side].force), np.linalg.norm(load.pull)
             if pressure > _STRONGEST:
-                raise GraspError(
+                raise BalanceError(
                     f"the {side} jaw is pressed with {pressure:.0f} N, more than such a finger bears: the object meets "
                     "its clamped base; close less far or raise the object's height"
                 )
             held = FRICTION * pressure
             if needed > held + _LEAST_PULL:
-                raise GraspError(
+                raise BalanceError(
                     f"the object slips: the {side} jaw must pull with {needed:.2f} N and holds at most {held:.2f} N; "
                     "close further, or lift less"
                 )

@@ -54,7 +54,7 @@ class Exposure:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Look:
+class Lighting:
     """How a scene looks, beside its bodies' materials.
 
     Attributes:
@@ -72,7 +72,7 @@ class Look:
     exposure: Exposure
 
 
-def draw_look(rng: np.random.Generator, light: str = "any") -> Look:
+def draw_look(rng: np.random.Generator, light: str = "any") -> Lighting:
     """Return a look by chance.
 
     Args:
@@ -82,7 +82,7 @@ def draw_look(rng: np.random.Generator, light: str = "any") -> Look:
     tint = 1.0 + rng.normal(0.0, 0.06, 3)
     count = int(rng.integers(1, 4))
     lights = tuple(_draw_light(rng, tint, casts_shadow=number == 0) for number in range(count))
-    return Look(
+    return Lighting(
         ambient=tint * rng.uniform(0.15, 0.6),
         lights=lights,
         background=draw_background(rng),

@@ -14,8 +14,8 @@ from finforce.gripper_frames import jaw_in_camera
 from finforce.transforms import invert_pose
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_twin.rendering.bodies import DrawnJaw, Wardrobe, draw_occluders, dress_jaw, dress_object, dress_palm
-from finforce_twin.rendering.lighting import Look, draw_look
-from finforce_twin.rendering.render import Picture, Stage, Window
+from finforce_twin.rendering.lighting import Lighting, draw_look
+from finforce_twin.rendering.render import Picture, RenderedScene, Window
 from finforce_twin.rendering.sensor import D405_NOISE, expose, measure_depth
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class Shot:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class View:
+class WristView:
     """What comes through the lens: light and true depth, and the truth by side."""
 
     picture: Picture
@@ -66,7 +66,7 @@ class View:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Setting:
+class SceneSetting:
     """What stands before the camera, and how it is lit.
 
     Attributes:
@@ -97,11 +97,11 @@ class Photographer:
         window_only: render no more of an image than the jaws with a margin; the rest stays black.
     """
 
-    def __init__(self, setting: Setting, seed: int, *, window_only: bool = False) -> None:
+    def __init__(self, setting: SceneSetting, seed: int, *, window_only: bool = False) -> None:
         rng = np.random.default_rng((seed, 7))
         self.setting = setting
         self._wardrobe = Wardrobe.draw(rng)
-        self._look: Look = draw_look(rng, setting.light)
+        self._look: Lighting = draw_look(rng, setting.light)
         self._T_camera_gripper = invert_pose(setting.T_gripper_camera)
         self._clutter = draw_occluders(self._T_camera_gripper, self._wardrobe, rng) if setting.clutter else []
         self._seed, self._window_only = seed, window_only
@@ -112,14 +112,14 @@ class Photographer:
         view = self.look(state)
         return self.develop(view, state.stamp, self._smear(state.stamp, view.truth))
 
-    def look(self, state: TwinState) -> View:
+    def look(self, state: TwinState) -> WristView:
         """Return what a perfect sensor would see of a state."""
         stage = self._build_stage(state)
         truth = {side: self._look_for(side, state, stage) for side in state.jaws}
         window = self._window(truth) if self._window_only else None
-        return View(picture=stage.render(self.setting.camera, window), truth=truth)
+        return WristView(picture=stage.render(self.setting.camera, window), truth=truth)
 
-    def develop(self, view: View, stamp: float, smear: NDArray | None = None) -> Shot:
+    def develop(self, view: WristView, stamp: float, smear: NDArray | None = None) -> Shot:
         """Return a view as the sensor gives it.
 
         Args:
@@ -133,16 +133,16 @@ class Photographer:
         depth = measure_depth(view.picture.depth, color, self.setting.camera, rng, noise)
         return Shot(color=color, depth=depth, truth=view.truth)
 
-    def _build_stage(self, state: TwinState) -> Stage:
+    def _build_stage(self, state: TwinState) -> RenderedScene:
         T, bodies = self._T_camera_gripper, [dress_palm(self._T_camera_gripper, self._wardrobe), *self._clutter]
         for side, jaw in state.jaws.items():
             pose = jaw_in_camera(self.setting.T_gripper_camera, side, jaw.origin_x)
             bodies += dress_jaw(self.setting.shapes[side], jaw.vertices, pose, self._wardrobe)
         if self.setting.mesh is not None and state.T_gripper_object is not None:
             bodies.append(dress_object(self.setting.mesh, T @ state.T_gripper_object, self._wardrobe))
-        return Stage(bodies, self._look, T[:3, :3], T[:3, 3])
+        return RenderedScene(bodies, self._look, T[:3, :3], T[:3, 3])
 
-    def _look_for(self, side: str, state: TwinState, stage: Stage) -> TrueKeypoints:
+    def _look_for(self, side: str, state: TwinState, stage: RenderedScene) -> TrueKeypoints:
         """Return where the key points of a jaw are and which of them can be seen."""
         jaw, camera = state.jaws[side], self.setting.camera
         T = jaw_in_camera(self.setting.T_gripper_camera, side, jaw.origin_x)

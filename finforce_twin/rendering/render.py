@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, compute_rays, rays_from_pixels
 from finforce.optional import import_open3d
-from finforce_twin.rendering.lighting import TEXTURE_SIZE, TEXTURE_SPAN, Light, Look
+from finforce_twin.rendering.lighting import TEXTURE_SIZE, TEXTURE_SPAN, Light, Lighting
 from finforce_twin.rendering.paint import Paint
 
 SUBPIXELS = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])  # rotated grid
@@ -70,7 +70,7 @@ class Window:
     columns: slice
 
 
-class Stage:
+class RenderedScene:
     """Bodies ready to be looked at.
 
     Args:
@@ -83,7 +83,7 @@ class Stage:
         MissingDependencyError: Open3D is not installed.
     """
 
-    def __init__(self, bodies: list[Body], look: Look, R_camera_gripper: NDArray, base: NDArray) -> None:
+    def __init__(self, bodies: list[Body], look: Lighting, R_camera_gripper: NDArray, base: NDArray) -> None:
         open3d = import_open3d()
         self._tensor = open3d.core.Tensor
         self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)

@@ -13,7 +13,7 @@ from finforce.optional import import_trimesh
 from finforce_contact.mesh.chamfer import compute_chamfer
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.reconstruction.result import GeneratedMesh
-from finforce_twin.scenes.table import Scene
+from finforce_twin.scenes.table import TableScene
 
 EDGE_LENGTH = 4e-3  # [m] of the triangles before they are bent
 WAVES = 12
@@ -40,7 +40,7 @@ class GuessError:
 
 
 def draw_guess(
-    scene: Scene, rng: np.random.Generator, distance: float, error: GuessError | None = None
+    scene: TableScene, rng: np.random.Generator, distance: float, error: GuessError | None = None
 ) -> GeneratedMesh:
     """Return a generated mesh, in a unit cube as generators give it, whose place and size are wrong.
 

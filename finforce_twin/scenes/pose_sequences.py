@@ -20,7 +20,7 @@ PLATE_GAP = 0.012  # [m] from the plates to the object's nearest point
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
+class SequenceImage:
     """One image of a sequence, with the truth.
 
     Attributes:
@@ -59,7 +59,7 @@ class Motion:
 
 def render_sequence(
     mesh: ObjectMesh, camera: CameraIntrinsics, motion: Motion, seed: int, noise: DepthNoise | None = None
-) -> Iterator[Frame]:
+) -> Iterator[SequenceImage]:
     """Yields the images of a sequence, 30 a second.
 
     The object sways along one axis and about another. From a third of the sequence on, plates come in from both sides
@@ -81,7 +81,7 @@ def render_sequence(
         truth = np.where(covered, seen, _table_depth(T, lowest, camera))
         plates = _place_plates(covered, _hidden_share(index, motion))
         truth[plates] = np.nanmin(seen) - PLATE_GAP
-        yield Frame(
+        yield SequenceImage(
             stamp=1.0 + index * PERIOD,
             depth=disturb_depth(truth, camera, rng, noise),
             mask=covered & ~plates,

@@ -18,7 +18,7 @@ OCCLUDER_GAP = 0.02  # [m] from the object's nearest point to what hides it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class TableScene:
     """One image of an object, with the truth.
 
     Attributes:
@@ -42,7 +42,7 @@ def draw_scene(
     rng: np.random.Generator,
     noise: DepthNoise | None = None,
     hidden: float = 0.0,
-) -> Scene:
+) -> TableScene:
     """Return an image of an object that stands on a table, seen from 0.22 to 0.32 m away and from above.
 
     Args:
@@ -60,7 +60,7 @@ def draw_scene(
     bar = _draw_bar(covered, hidden, rng)
     truth[bar] = np.nanmin(seen.depth) - OCCLUDER_GAP
     depth = disturb_depth(truth, camera, rng, noise)
-    return Scene(camera=camera, depth=depth, mask=covered & ~bar, mesh=mesh, T_camera_object=T)
+    return TableScene(camera=camera, depth=depth, mask=covered & ~bar, mesh=mesh, T_camera_object=T)
 
 
 def draw_pose(rng: np.random.Generator) -> NDArray:

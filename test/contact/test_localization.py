@@ -16,7 +16,7 @@ from finforce_contact.localization.contact_patch import (
 )
 from finforce_contact.localization.gaps import compute_gaps, count_inside, distances_to, edges_of, place_edges
 from finforce_contact.localization.inner_face import build_inner_face
-from finforce_contact.localization.outline_localizer import OutlineLocalizer, Scene
+from finforce_contact.localization.outline_localizer import ContactScene, OutlineLocalizer
 from finforce_contact.localization.section import SectionKeeper, split_turn
 from finforce_contact.mesh.enclosure import surrounds
 from finforce_contact.paper_contact import IntersectionLocalizer, NearSolid, centre_of_volume, intersect
@@ -31,7 +31,7 @@ MM = 1e-3
 
 def scene_of(mesh, T, surface=NODES, wrench=None):
     section = SectionKeeper(mesh, INNER.half_width, SETTINGS).at(T)
-    return Scene(T=T, section=section, surface=surface, line=INNER.deform(surface), wrench=wrench)
+    return ContactScene(T=T, section=section, surface=surface, line=INNER.deform(surface), wrench=wrench)
 
 
 def locate(mesh, T, surface=NODES, wrench=None, settings=SETTINGS):
@@ -253,7 +253,7 @@ class TestOutline:
         face = build_inner_face(JAW.mirrored(), "default")
         T = pose(FACE + 0.0125, 0.0412)
         section = SectionKeeper(cylinder(), face.half_width, SETTINGS).at(T)
-        scene = Scene(T=T, section=section, surface=face.mesh.nodes, line=face.deform(face.mesh.nodes))
+        scene = ContactScene(T=T, section=section, surface=face.mesh.nodes, line=face.deform(face.mesh.nodes))
         assert OutlineLocalizer(face, SETTINGS).locate(scene).rows.mean == pytest.approx(0.0412, abs=0.1 * MM)
 
 

@@ -10,7 +10,7 @@ from finforce.camera import compute_rays
 from finforce.transforms import move_pose
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.pose.alignment import Effort, MeshAligner
-from finforce_contact.pose.depth_image import DepthImage, Samples, Sight
+from finforce_contact.pose.depth_image import DepthImage, Samples, Visibility
 from finforce_contact.pose.tracker import spread_rotations
 from finforce_contact.settings import TrackerSettings
 from finforce_twin.rendering.depth_camera import build_d405
@@ -67,6 +67,12 @@ def test_image_tells_seen_hidden_absent_and_unknown_apart():
     mask = np.ones(depth.shape, bool)
     mask[:, 250] = False
     comparison = DepthImage(depth, CAMERA, mask).compare_surface(surface, 0.003)
-    assert comparison.sights.tolist() == [Sight.SEEN, Sight.HIDDEN, Sight.ABSENT, Sight.UNKNOWN, Sight.HIDDEN]
+    assert comparison.sights.tolist() == [
+        Visibility.SEEN,
+        Visibility.HIDDEN,
+        Visibility.ABSENT,
+        Visibility.UNKNOWN,
+        Visibility.HIDDEN,
+    ]
     assert comparison.residuals[0] == pytest.approx(0.001, abs=1e-6)  # towards the camera, as the normal
     assert np.isnan(comparison.residuals[1:]).all()

@@ -138,7 +138,7 @@ def rename_entities(monkeypatch):
 
 
 def change_wait_set(monkeypatch):
-    monkeypatch.setattr(executor_module._Kept, "wait", lambda self: None)
+    monkeypatch.setattr(executor_module._KeptSet, "wait", lambda self: None)
 
 
 @pytest.mark.parametrize("change", [rename_event_handler, rename_entities, change_wait_set])

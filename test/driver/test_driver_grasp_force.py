@@ -14,7 +14,7 @@ from finforce_driver.grasp.checks import check_force_value
 from finforce_driver.grasp.controller import ForceGrasp
 from finforce_driver.grasp.force_feed import ForceFeed, ForceSample, TouchSample
 from finforce_driver.grasp.force_model import LEAST_STIFFNESS, ForceModel
-from finforce_driver.grasp.jaw_history import JawCourse, JawPlace
+from finforce_driver.grasp.jaw_history import JawHistory, JawPlace
 from finforce_driver.grasp.load_watch import LoadWatch, LocatedForce
 from finforce_driver.grasp.settings import GraspGoal, GraspSettings
 from finforce_driver.grasp.status import GraspPhase
@@ -190,7 +190,7 @@ def test_number_that_is_no_force_is_named(force):
 
 
 def test_course_snaps_towards_open():
-    course = JawCourse(resolution=STEP, closed_opening=0.01)
+    course = JawHistory(resolution=STEP, closed_opening=0.01)
     assert course.snap(0.01) == pytest.approx(0.01)
     assert course.snap(0.01 + 0.1 * STEP) == pytest.approx(0.01 + STEP)
     assert course.nearest(0.01 + 0.6 * STEP) == pytest.approx(0.01 + STEP)
@@ -199,7 +199,7 @@ def test_course_snaps_towards_open():
 
 
 def test_jaws_rest_after_their_way_and_not_before():
-    course = JawCourse(resolution=STEP, closed_opening=0.0)
+    course = JawHistory(resolution=STEP, closed_opening=0.0)
     course.command(10 * STEP, 0.004, 1.0, JawPlace(opening=31 * STEP, resting=False))  # 4 mm: one second
     assert not course.rests_at(1.9, 10 * STEP)
     assert course.rests_at(2.1, 11 * STEP)

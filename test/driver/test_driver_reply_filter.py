@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import decode_reply
 from finforce_driver.errors import CanMessageError
-from finforce_driver.machine.reply_filter import MOST_DOUBTS, Expectation, ReplyFilter, Sample
+from finforce_driver.machine.reply_filter import MOST_DOUBTS, Expectation, ReplyFilter, TimedReply
 
 REST = Expectation(drift=0.0, reach=100.0)
 SOON, POLL = 0.0015, 0.02  # [s]
@@ -20,12 +20,14 @@ def settled(first, time=0.0):
     """A filter that believes a reply."""
     judge = ReplyFilter(0.05)
     for index in range(4):
-        judge.take(Sample(reply=first, time=time - (3 - index) * SOON), REST)
+        judge.take(TimedReply(reply=first, time=time - (3 - index) * SOON), REST)
     return judge
 
 
 def feed(judge, replies, start=POLL, step=SOON, expected=REST):
-    return [judge.take(Sample(reply=item, time=start + index * step), expected) for index, item in enumerate(replies)]
+    return [
+        judge.take(TimedReply(reply=item, time=start + index * step), expected) for index, item in enumerate(replies)
+    ]
 
 
 def test_the_first_reply_is_believed_when_three_others_repeat_it():

@@ -13,7 +13,15 @@ import pytest
 from finforce.errors import MissingDependencyError
 from finforce_eval.bench import bench
 from finforce_eval.bench import live as bench_live
-from finforce_eval.bench.bench import PARTS, Part, format_rows, row_from_times, select_parts, time_calls, write_figures
+from finforce_eval.bench.bench import (
+    PARTS,
+    BenchPart,
+    format_rows,
+    row_from_times,
+    select_parts,
+    time_calls,
+    write_figures,
+)
 from finforce_eval.bench.live import MIRROR_MOMENT, LiveFigures, with_both_jaws
 from finforce_eval.bench.process import child_processes, resident_bytes
 from finforce_eval.cli.demo import RECORDING
@@ -47,7 +55,7 @@ def two_parts(monkeypatch):
             draw=lambda figures, path: path.write_text(figures),
         )
         monkeypatch.setitem(sys.modules, f"part_{name}", module)
-        return Part(name=name, module=f"part_{name}", title=f"Title of {name}", **options)
+        return BenchPart(name=name, module=f"part_{name}", title=f"Title of {name}", **options)
 
     parts = (make("first", takes_folder=True), make("second"), make("third", usual=False))
     monkeypatch.setattr(bench, "PARTS", parts)

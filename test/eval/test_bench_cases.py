@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finforce_eval.bench.camera import Camera
+from finforce_eval.bench.camera import NoisyCamera
 from finforce_eval.bench.cases import HEIGHTS, LEVELS, TRUTH, bench_finger, load_cases, record_press
 
 JAW = bench_finger()
@@ -20,7 +20,7 @@ def exact():
 
 @pytest.fixture(scope="module")
 def noisy():
-    return record_press(WIDE, JAW, Camera(), seed=3)
+    return record_press(WIDE, JAW, NoisyCamera(), seed=3)
 
 
 def stack(press):
@@ -64,11 +64,11 @@ def test_outline_is_the_cylinder_that_comes_into_the_face(exact, noisy):
 
 
 def test_noise_has_the_size_of_the_bench_across_and_along_the_sight():
-    press = record_press(CASES["Ø25 upper"], JAW, Camera(gross=0.0, holes=0.0), seed=5)
+    press = record_press(CASES["Ø25 upper"], JAW, NoisyCamera(gross=0.0, holes=0.0), seed=5)
     seen = [0, 1, 2, 3, 7, 8, 9]  # below the object, which hides none of them
     rest = stack(press)[:60, seen]
     scatter = (rest - rest.mean(axis=0)).reshape(-1, 3)
-    sight = JAW.keypoints[seen].mean(0) - Camera().place
+    sight = JAW.keypoints[seen].mean(0) - NoisyCamera().place
     along = scatter @ (sight / np.linalg.norm(sight))
     across = np.sqrt(((scatter**2).sum(1) - along**2).mean() / 2)
     # 420 samples: 3.5 % standard deviation of a standard deviation; 12 % is more than three
@@ -82,7 +82,9 @@ def test_points_behind_the_object_are_seen_on_it_and_mostly_doubted(noisy):
     doubted = np.flatnonzero((likelihood[rest] < 0.6).mean(0) > 0.5)
     # inner_4 to inner_7, outer_6, outer_7 and the tip, as in the recording of the same case
     assert doubted.tolist() == [3, 4, 5, 6, 12, 13, 14]
-    calm = stack(record_press(WIDE, JAW, Camera(noise=0, depth_noise=0, offset=0, depth_scale=0, gross=0, holes=0)))
+    calm = stack(
+        record_press(WIDE, JAW, NoisyCamera(noise=0, depth_noise=0, offset=0, depth_scale=0, gross=0, holes=0))
+    )
     axis = np.array([JAW.inner_face_x + WIDE.radius, WIDE.height])
     distance = np.linalg.norm(calm[0, doubted][:, [0, 2]] - axis, axis=1)
     on_side = np.abs(calm[0, doubted, 1]) < 0.03 - 1e-9
@@ -101,5 +103,5 @@ def test_some_points_have_no_depth_and_some_are_elsewhere(noisy, exact):
 
 
 def test_seed_decides_the_noise(noisy):
-    np.testing.assert_array_equal(stack(record_press(WIDE, JAW, Camera(), seed=3)), stack(noisy))
-    assert not np.array_equal(stack(record_press(WIDE, JAW, Camera(), seed=4)), stack(noisy), equal_nan=True)
+    np.testing.assert_array_equal(stack(record_press(WIDE, JAW, NoisyCamera(), seed=3)), stack(noisy))
+    assert not np.array_equal(stack(record_press(WIDE, JAW, NoisyCamera(), seed=4)), stack(noisy), equal_nan=True)

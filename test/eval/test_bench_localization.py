@@ -6,7 +6,7 @@ import pytest
 from finforce.errors import MissingDependencyError
 from finforce.stamps import NANOSECONDS
 from finforce_eval.bench import localization as bench
-from finforce_eval.bench.localization import Frame, build_cylinder, measure_methods, summarise
+from finforce_eval.bench.localization import LocatedImage, build_cylinder, measure_methods, summarise
 from finforce_eval.bench.localization_methods import METHODS
 from finforce_eval.cli.demo import RECORDING
 from finforce_eval.recordings.recording import read_recording
@@ -32,7 +32,7 @@ def missing(setup):
 @pytest.fixture
 def frames(monkeypatch):
     """Four images in contact, whose pose holds the true height."""
-    made = [Frame(T=np.eye(4), surface=np.zeros((1, 3)), wrench=None, true=0.0) for _ in range(4)]
+    made = [LocatedImage(T=np.eye(4), surface=np.zeros((1, 3)), wrench=None, true=0.0) for _ in range(4)]
     monkeypatch.setattr(bench, "follow", lambda recording, mesh, every: iter(made))
     monkeypatch.setattr(bench, "METHODS", {"near": at_truth, "absent": missing})
     return made

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from finforce.skipping import EVERYWHERE
-from finforce_eval.bench.scene_reel import Part, SceneReel, cut_sections, read_word
+from finforce_eval.bench.scene_reel import SceneReel, StreamPart, cut_sections, read_word
 from finforce_eval.bench.skipping import EACH, OF_NODE
 from finforce_eval.bench.skipping_figures import (
     OFF,
@@ -55,7 +55,7 @@ def test_sections_hold_the_images_of_their_phases_and_nothing_but_what_is_played
 
 def test_a_reel_repeats_a_section_with_rising_stamps_at_its_rate():
     sections = cut_sections(recording(), {"a:": "first", "c:": "last"})
-    parts = [Part(section="first", seconds=0.5, name="shown"), Part(section="last", seconds=0.1)]
+    parts = [StreamPart(section="first", seconds=0.5, name="shown"), StreamPart(section="last", seconds=0.1)]
     reel = SceneReel(sections, parts, rate=10.0)
     played = list(reel)
     assert len(played) == len(reel) == 6
@@ -66,7 +66,7 @@ def test_a_reel_repeats_a_section_with_rising_stamps_at_its_rate():
 
 def test_a_section_without_images_is_refused():
     with pytest.raises(RecordingError, match="no images of the section 'press'"):
-        SceneReel({}, [Part(section="press", seconds=1.0)])
+        SceneReel({}, [StreamPart(section="press", seconds=1.0)])
 
 
 def figures():

@@ -16,7 +16,7 @@ from finforce_eval.recordings.twin_writer import write_footage
 from finforce_eval.replay.playback import RawMessage
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_twin.footage import Footage
-from finforce_twin.rendering.photographer import Setting
+from finforce_twin.rendering.photographer import SceneSetting
 
 
 def message(slot, topic="/left/keypoints"):
@@ -32,7 +32,7 @@ SLOTS = [6 * cycle + slot for cycle in range(10) for slot in EVERY_RATE]
 def bag(tmp_path_factory):
     """A recording of seven states of the script, in images of 30, 60 and 90 Hz."""
     gripper = SmoothGripper(FakeGripper(count=7), EVERY_RATE)
-    setting = Setting(shapes={}, mesh=MESH, camera=CAMERA, T_gripper_camera=BENCH_CAMERA)
+    setting = SceneSetting(shapes={}, mesh=MESH, camera=CAMERA, T_gripper_camera=BENCH_CAMERA)
     footage = Footage(gripper, FakePhotographer(), setting, 0)
     return write_footage(footage, tmp_path_factory.mktemp("bags") / "twin")
 

@@ -13,7 +13,7 @@ from finforce_eval.stress.mechanics_jaw import MODULUS, Rig, build_jaw, build_ow
 from finforce_eval.stress.mechanics_meshes import CHANGES, parts_of, run_kind, try_mesh
 from finforce_eval.stress.stress import Plan
 from finforce_eval.stress.summary import summarise
-from finforce_ifea.contact_mechanics.forward_press import Cylinder, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import ContactError, MeshError
 from finforce_ifea.fem.factorisation import SparseFactor, factorise_banded
 from finforce_ifea.fem.locking import LockingWarning, measure_locking, measure_shape, warn_of_locking
@@ -48,7 +48,7 @@ def test_a_constant_penalty_would_not_go_with_the_modulus():
     mechanics = build_own_mechanics(COARSE, jaw)
     surface = mechanics.contact.surface
     soft = replace(surface, stiffness=surface.stiffness * (MODULUS / 1e12))
-    rigid = Cylinder(radius=0.0125)
+    rigid = RigidCylinder(radius=0.0125)
     right, wrong = (
         press_jaw(mechanics.model, s, jaw.inner_face_x, rigid, 0.04, [2e-3])[0].force for s in (surface, soft)
     )
@@ -88,7 +88,7 @@ def test_a_jaw_that_snaps_is_no_equilibrium(mesh, solver):
     """Near the tip the outer band gives way at 13 to 17 mm; what Newton's method finds beyond is another shape."""
     mechanics = bench_mechanics(mesh, solver)
     pressed = lambda depth: press_jaw(  # noqa: E731
-        mechanics.model, mechanics.contact.surface, BENCH.inner_face_x, Cylinder(radius=0.0125), 0.075, [depth]
+        mechanics.model, mechanics.contact.surface, BENCH.inner_face_x, RigidCylinder(radius=0.0125), 0.075, [depth]
     )
     with pytest.raises(ContactError, match="beyond a depth of 1[37]"):
         pressed(18e-3)

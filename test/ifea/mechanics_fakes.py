@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from finforce_ifea.contact_mechanics.forward_press import Cylinder, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.fem.solid import find_mirror_nodes
 from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
@@ -53,7 +53,7 @@ def bench_press(mesh, solver, diameter, height, depths):
     """Equilibria of the bench finger, mm for diameter, height and depths."""
     mechanics = bench_mechanics(mesh, solver)
     return press_jaw(
-        mechanics.model, mechanics.contact.surface, BENCH.inner_face_x, Cylinder(radius=0.5e-3 * diameter),
+        mechanics.model, mechanics.contact.surface, BENCH.inner_face_x, RigidCylinder(radius=0.5e-3 * diameter),
         1e-3 * height, tuple(1e-3 * depth for depth in depths),
     )  # fmt: skip
 

@@ -22,7 +22,7 @@ from estimator_fakes import (
 from mechanics_fakes import BENCH
 
 from finforce.errors import ObservationError
-from finforce_ifea.contact_mechanics.forward_press import Cylinder, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import CalibrationError, ContactError, JawFileError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.fem.mechanics import build_mechanics
@@ -246,7 +246,7 @@ def test_steel_finger_works_with_the_same_estimator():
         mechanics.model,
         mechanics.contact.surface,
         jaw.inner_face_x,
-        Cylinder(radius=0.02),
+        RigidCylinder(radius=0.02),
         0.065,
         [0.004, 0.008, 0.012],
     )

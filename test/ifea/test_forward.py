@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mechanics_fakes import BENCH, bench_mechanics, bench_press
 
-from finforce_ifea.contact_mechanics.forward_press import Box, Cylinder, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder, press_jaw
 from finforce_ifea.contact_mechanics.surface import build_contact_surface
 from finforce_ifea.errors import ContactError, MeshError
 
@@ -58,7 +58,7 @@ def test_elastic_forces_balance_the_contact_forces():
     model, surface = mechanics.model, mechanics.contact.surface
     result = bench_press("coarse", "solid", 25, 40, DEEP)[-1]
     points = model.positions(surface.probe, result.q)
-    forces = Cylinder(radius=0.0125).press(points, surface.stiffness, FACE, result.depth, 0.040).forces
+    forces = RigidCylinder(radius=0.0125).press(points, surface.stiffness, FACE, result.depth, 0.040).forces
     left = model.linearize(result.q, tangent=False).force - model.load(surface.probe, result.q, forces)
     assert np.abs(left).max() < 1e-6 * np.linalg.norm(result.force)
     np.testing.assert_allclose(forces.sum(0), result.force, atol=1e-12)
@@ -92,7 +92,7 @@ def test_force_leans_down_where_the_contact_has_moved_down():
 
 def test_box_touches_at_its_two_edges_when_the_finger_bends():
     """A box of 20 mm pressed 5 mm in: the finger bends away from its face and rests on its rounded edges."""
-    rigid = Box(size_x=0.02, size_z=0.020, edge_radius=0.002)
+    rigid = RigidBox(size_x=0.02, size_z=0.020, edge_radius=0.002)
     mechanics = bench_mechanics("default", "frame")
     result = press(rigid, 0.040, [1e-4, 5e-3], "default", "frame")[-1]
     points = mechanics.model.positions(mechanics.contact.surface.probe, result.q)
@@ -106,7 +106,7 @@ def test_box_touches_at_its_two_edges_when_the_finger_bends():
 
 def test_flat_box_touches_with_its_whole_face_first():
     """At a tenth of a millimetre the finger is still straight: the opposite of the claim about the edges."""
-    rigid = Box(size_x=0.02, size_z=0.006, edge_radius=0.0005)
+    rigid = RigidBox(size_x=0.02, size_z=0.006, edge_radius=0.0005)
     mechanics = bench_mechanics("default", "frame")
     result = press(rigid, 0.075, [5e-5], "default", "frame")[-1]
     points = mechanics.model.positions(mechanics.contact.surface.probe, result.q)
@@ -116,21 +116,21 @@ def test_flat_box_touches_with_its_whole_face_first():
 
 @pytest.mark.parametrize("depths", [[0.002, 0.004], [0.004]])
 def test_result_does_not_depend_on_the_steps(depths):
-    expected = press(Cylinder(radius=0.0125), 0.040, [0.001, 0.0015, 0.004])[-1]
-    result = press(Cylinder(radius=0.0125), 0.040, depths)[-1]
+    expected = press(RigidCylinder(radius=0.0125), 0.040, [0.001, 0.0015, 0.004])[-1]
+    result = press(RigidCylinder(radius=0.0125), 0.040, depths)[-1]
     np.testing.assert_allclose(result.force, expected.force, rtol=1e-6, atol=1e-6)
     assert result.depth == 0.004
 
 
 def test_untouched_jaw_feels_nothing():
-    result = press(Cylinder(radius=0.0125), 0.040, [0.0])[0]
+    result = press(RigidCylinder(radius=0.0125), 0.040, [0.0])[0]
     assert not result.force.any() and not result.q.any() and result.energy == 0.0
     assert np.isnan(result.pressure_centre[2])
 
 
 def test_no_equilibrium_is_an_error_that_names_the_depth():
     with pytest.raises(ContactError, match=r"beyond a depth of 2\d\.\d+ mm"):
-        press(Cylinder(radius=0.0075), 0.020, [0.050], "default", "frame")
+        press(RigidCylinder(radius=0.0075), 0.020, [0.050], "default", "frame")
 
 
 def test_surface_of_half_and_whole_finger_are_equally_stiff():

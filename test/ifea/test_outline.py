@@ -10,7 +10,7 @@ from outline_fakes import SHAPES, STDDEV, WEDGE, Pressed, box, circle, contact_w
 from test_tracking import settle
 
 from finforce_ifea.contact_mechanics.distance_field import CELL, build_distance_field, read_depth
-from finforce_ifea.contact_mechanics.forward_press import Box, Cylinder, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder, press_jaw
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
 from finforce_ifea.contact_mechanics.outline import ObjectOutline
 from finforce_ifea.contact_mechanics.penalty import press_field
@@ -96,7 +96,7 @@ def test_circle_presses_like_the_cylinder_that_it_is():
     mechanics = bench_mechanics("coarse", "solid")
     args = mechanics.model, mechanics.contact.surface, FACE
     by_outline = press_jaw(*args, Pressed(circle(0.0125, 720), 0.0), 0.030, [0.005])[-1]
-    by_radius = press_jaw(*args, Cylinder(radius=0.0125), 0.030, [0.005])[-1]
+    by_radius = press_jaw(*args, RigidCylinder(radius=0.0125), 0.030, [0.005])[-1]
     np.testing.assert_allclose(by_outline.force, by_radius.force, atol=0.003 * np.linalg.norm(by_radius.force))
     assert by_outline.pressure_place[2] == pytest.approx(by_radius.pressure_place[2], abs=0.1e-3)
 
@@ -105,7 +105,7 @@ def test_box_presses_like_a_box_with_slightly_rounded_edges():
     mechanics = bench_mechanics("coarse", "solid")
     args = mechanics.model, mechanics.contact.surface, FACE
     by_outline = press_jaw(*args, Pressed(box(0.010, 0.0125), 0.0), 0.040, [0.004])[-1]
-    rounded = press_jaw(*args, Box(size_x=0.020, size_z=0.025, edge_radius=0.001), 0.040, [0.004])[-1]
+    rounded = press_jaw(*args, RigidBox(size_x=0.020, size_z=0.025, edge_radius=0.001), 0.040, [0.004])[-1]
     np.testing.assert_allclose(by_outline.force, rounded.force, atol=0.03 * np.linalg.norm(rounded.force))
     assert by_outline.pressure_place[2] == pytest.approx(rounded.pressure_place[2], abs=0.5e-3)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finforce_ifea.contact_mechanics.forward_press import Box, Cylinder
+from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder
 from finforce_ifea.contact_mechanics.penalty import press_box, press_cylinder
 from finforce_ifea.errors import ContactError
 
@@ -101,7 +101,7 @@ def test_corner_of_a_box_is_rounded():
 def test_objects_reach_their_depth_below_the_face():
     face, depth, height = 0.014, 1e-3, 0.040
     ahead = np.array([[face - depth + shift, 0.0, height] for shift in (-1e-6, 1e-6)])
-    for rigid in (Cylinder(radius=0.0125), Box(size_x=0.02, size_z=0.03, edge_radius=0.002)):
+    for rigid in (RigidCylinder(radius=0.0125), RigidBox(size_x=0.02, size_z=0.03, edge_radius=0.002)):
         forces = rigid.press(ahead, np.full(2, STIFFNESS), face, depth, height).forces
         assert not forces[0].any()
         assert forces[1, 0] < 0
@@ -110,4 +110,4 @@ def test_objects_reach_their_depth_below_the_face():
 @pytest.mark.parametrize("edge", [0.0, -0.001, 0.0051, np.nan])
 def test_box_refuses_edges_that_are_none(edge):
     with pytest.raises(ContactError, match="edge_radius"):
-        Box(size_x=0.010, size_z=0.020, edge_radius=edge)
+        RigidBox(size_x=0.010, size_z=0.020, edge_radius=edge)

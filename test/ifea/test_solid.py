@@ -22,7 +22,7 @@ from mechanics_fakes import (
     wobble,
 )
 
-from finforce_ifea.contact_mechanics.forward_press import Cylinder, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.fem.solid import SolidModel, find_mirror_nodes
 from finforce_ifea.jaw.jaw import load_jaw
@@ -136,9 +136,9 @@ def test_halved_and_whole_finger_agree():
     half, whole = bench_mechanics("coarse"), bench_mechanics("coarse", axes="three")
     assert half.model.symmetric and not whole.model.symmetric
     results = [
-        press_jaw(part.model, part.contact.surface, BENCH.inner_face_x, Cylinder(radius=0.0125), 0.040, [0.002, 0.005])[
-            -1
-        ]
+        press_jaw(
+            part.model, part.contact.surface, BENCH.inner_face_x, RigidCylinder(radius=0.0125), 0.040, [0.002, 0.005]
+        )[-1]
         for part in (half, whole)
     ]
     # twice as many contact points over the same width: only rounding and the surface's own corners differ
@@ -217,7 +217,12 @@ def test_mesh_file_gives_the_same_jaw_as_the_drawing(tmp_path):
     jaw = replace(load_jaw(write_mesh_jaw(tmp_path)), material=TPU)
     mechanics = build_mechanics(jaw, EstimatorSettings())
     results = press_jaw(
-        mechanics.model, mechanics.contact.surface, jaw.inner_face_x, Cylinder(radius=0.0125), 0.040, [0.002, 0.008]
+        mechanics.model,
+        mechanics.contact.surface,
+        jaw.inner_face_x,
+        RigidCylinder(radius=0.0125),
+        0.040,
+        [0.002, 0.008],
     )
     expected = bench_press("coarse", "solid", 25, 40, (2, 8))
     for result, drawn in zip(results, expected, strict=True):

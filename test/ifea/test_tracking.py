@@ -7,7 +7,7 @@ import pytest
 from estimator_fakes import PERIOD, errors, make_estimator, ramp, record, run
 from mechanics_fakes import BENCH, bench_mechanics, bench_press
 
-from finforce_ifea.contact_mechanics.forward_press import Cylinder, press_jaw
+from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.observation import Contact
@@ -36,7 +36,7 @@ def pressed(request):
         mechanics.model,
         mechanics.contact.surface,
         BENCH.inner_face_x,
-        Cylinder(radius=radius),
+        RigidCylinder(radius=radius),
         PLACE[HEIGHT],
         [0.002, PLACE[DEPTH]],
     )[-1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from keypoint_node_fakes import COLOR, HEIGHT, OLD_COLOR, WIDTH, camera_info, image_of
 
-from finforce_keypoints.camera_feed import SILENCE, CameraFeed
+from finforce_keypoints.camera_feed import SILENCE, RgbdFeed
 from finforce_keypoints.errors import FrozenImageError
 from finforce_keypoints.parameters import DetectorParameters
 
@@ -21,7 +21,7 @@ class Camera:
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
     def __post_init__(self):
-        self.feed = CameraFeed(DetectorParameters(), lambda: self.now)
+        self.feed = RgbdFeed(DetectorParameters(), lambda: self.now)
         self.feed.take_info(camera_info())
 
     def shoot(self, topic, picture=None):

@@ -29,7 +29,7 @@ from training.losses import LossWeights, compute_losses
 from training.network import LOCREF_STD, STRIDE, KeypointNetwork, NetworkShape, fold_batch_norm
 from training.recipe import Recipe
 from training.scoring import Detections, fit_stddev, score_detections
-from training.trainer import CHECKPOINT, Pictures, Trainer, compute_rate, train
+from training.trainer import CHECKPOINT, Trainer, TrainingImages, compute_rate, train
 from training.weights import read_network
 
 NAMES = tuple(f"point_{k}" for k in range(16))
@@ -182,7 +182,7 @@ def test_every_picture_comes_once_a_round():
 
 def test_a_short_training_lowers_the_loss_and_can_go_on(tmp_path):
     dataset = write_blobs(tmp_path / "data", train=8, validation=4)
-    pictures = Pictures(train=load_pictures(dataset, "train"), validation=load_pictures(dataset, "val"))
+    pictures = TrainingImages(train=load_pictures(dataset, "train"), validation=load_pictures(dataset, "val"))
     recipe = Recipe(steps=12, batch=4, workers=0, evaluate_every=1000.0, rate=2e-3)
     trainer = Trainer(NAMES, recipe, LossWeights())
     batch = next(load_batches(pictures.train, STILL, LoadingSettings(size=4, workers=0)))

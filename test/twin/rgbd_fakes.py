@@ -11,7 +11,7 @@ from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_keypoints.errors import DetectionError
 from finforce_twin.footage import Footage
 from finforce_twin.gripper.gripper import JawState, TwinState
-from finforce_twin.rendering.photographer import Setting, Shot, TrueKeypoints
+from finforce_twin.rendering.photographer import SceneSetting, Shot, TrueKeypoints
 
 CAMERA = CameraIntrinsics(width=64, height=48, fx=43.0, fy=43.0, cx=31.5, cy=23.5, distortion=np.full(5, 0.01))
 KEYPOINTS = 4
@@ -93,7 +93,7 @@ def make_footage(gripper=None, photographer=None, seed=0):
     """Footage of 64 x 48 pixels."""
     gripper = gripper or FakeGripper()
     mesh = MESH if gripper.has_object else None
-    setting = Setting(shapes={}, mesh=mesh, camera=CAMERA, T_gripper_camera=BENCH_CAMERA)
+    setting = SceneSetting(shapes={}, mesh=mesh, camera=CAMERA, T_gripper_camera=BENCH_CAMERA)
     return Footage(gripper, photographer or FakePhotographer(), setting, seed)
 
 

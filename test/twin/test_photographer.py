@@ -8,7 +8,7 @@ from finforce.gripper_frames import ROBOT_CAMERA
 from finforce_twin.gripper.gripper import TwinGripper
 from finforce_twin.rendering.bodies import DrawnJaw
 from finforce_twin.rendering.depth_camera import build_d405_vga
-from finforce_twin.rendering.photographer import Photographer, Setting
+from finforce_twin.rendering.photographer import Photographer, SceneSetting
 from finforce_twin.scenes.scenarios import build_scenario
 
 
@@ -23,7 +23,7 @@ def setting(gripper):
         side: DrawnJaw(jaw=jaw, rest=gripper.rest_vertices(side), triangles=gripper.triangles(side))
         for side, jaw in gripper.jaws.items()
     }
-    return Setting(
+    return SceneSetting(
         shapes=shapes, mesh=gripper.object_mesh, camera=build_d405_vga(), T_gripper_camera=ROBOT_CAMERA, light="bright"
     )
 

@@ -5,15 +5,15 @@ import pytest
 
 from finforce.camera import CameraIntrinsics, project
 from finforce_twin.rendering.bodies import _BOX, _BOX_TRIANGLES
-from finforce_twin.rendering.lighting import Exposure, Light, Look, draw_background, draw_look
+from finforce_twin.rendering.lighting import Exposure, Light, Lighting, draw_background, draw_look
 from finforce_twin.rendering.paint import PATTERNS, Paint, draw_jaw_paint
-from finforce_twin.rendering.render import FAR, Body, Decal, Stage, Window
+from finforce_twin.rendering.render import FAR, Body, Decal, RenderedScene, Window
 from finforce_twin.rendering.sensor import expose, measure_depth
 
 CAMERA = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 WHITE = Paint(color=np.full(3, 0.8), gloss=0.0, grain=0.0)
 EVEN = Exposure(blur=0.4, vignetting=0.0, white=np.ones(3))
-PLAIN = Look(
+PLAIN = Lighting(
     ambient=np.full(3, 0.5),
     lights=(),
     background=np.zeros((384, 384, 3)),
@@ -28,7 +28,7 @@ def box(low, high, paint=WHITE, decals=()):
 
 
 def render(bodies, look=PLAIN, window=None):
-    return Stage(bodies, look, np.eye(3), np.zeros(3)).render(CAMERA, window)
+    return RenderedScene(bodies, look, np.eye(3), np.zeros(3)).render(CAMERA, window)
 
 
 SLAB = box([-0.02, -0.02, 0.10], [0.02, 0.02, 0.11])
@@ -55,10 +55,10 @@ def test_edge_pixels_mix_what_is_on_both_sides():
 
 def test_a_body_before_another_hides_it():
     near = box([-0.005, -0.02, 0.08], [0.005, 0.02, 0.09])
-    stage = Stage([SLAB, near], PLAIN, np.eye(3), np.zeros(3))
+    stage = RenderedScene([SLAB, near], PLAIN, np.eye(3), np.zeros(3))
     points = np.array([[0.0, 0.0, 0.10], [0.015, 0.0, 0.10]])
     np.testing.assert_array_equal(stage.sees(points), [False, True])
-    np.testing.assert_array_equal(Stage([SLAB], PLAIN, np.eye(3), np.zeros(3)).sees(points), [True, True])
+    np.testing.assert_array_equal(RenderedScene([SLAB], PLAIN, np.eye(3), np.zeros(3)).sees(points), [True, True])
 
 
 def test_a_lamp_casts_a_shadow_and_one_without_shadows_does_not():

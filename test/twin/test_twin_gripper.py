@@ -10,7 +10,7 @@ from finforce_eval.recordings.tracks import parse_phases
 from finforce_ifea.grasp_force import R_GRIPPER_JAW, combine_forces
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
-from finforce_twin.errors import GraspError, ScenarioError
+from finforce_twin.errors import BalanceError, ScenarioError
 from finforce_twin.gripper.gripper import TwinGripper
 from finforce_twin.mechanics.material import RelaxedWrench, draw_material, find_elastic_weight
 from finforce_twin.scenes.objects import place_object
@@ -185,12 +185,12 @@ def test_grasp_without_weight_has_opposite_forces_even_off_the_middle():
 
 
 def test_too_heavy_an_object_slips():
-    with pytest.raises(GraspError, match="slips"):
+    with pytest.raises(BalanceError, match="slips"):
         play("weight_turn", mass=0.8, turn_angle=0.0)
 
 
 def test_object_on_the_clamped_base_is_refused():
-    with pytest.raises(GraspError, match="base"):
+    with pytest.raises(BalanceError, match="base"):
         play("grasp_cylinder", object="cylinder")
 
 

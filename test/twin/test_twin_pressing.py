@@ -8,7 +8,7 @@ from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_ifea.grasp_force import R_GRIPPER_JAW, combine_forces
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.relaxation import apply_relaxation
-from finforce_twin.errors import GraspError
+from finforce_twin.errors import BalanceError
 from finforce_twin.gripper.gripper import TwinGripper
 from finforce_twin.gripper.pressing import JAMMED, PressedGrasp, RelaxedGrasp
 from finforce_twin.scenes.scenarios import build_scenario
@@ -152,10 +152,10 @@ def test_the_grasp_force_is_that_of_the_jaw_pressed_less():
 
 def test_a_grasp_that_never_finds_an_equilibrium_is_refused(monkeypatch):
     def refuse(*_):
-        raise GraspError("no equilibrium")
+        raise BalanceError("no equilibrium")
 
     monkeypatch.setattr("finforce_twin.mechanics.balance.HeldObject.follow", refuse)
-    with pytest.raises(GraspError, match="equilibrium"):
+    with pytest.raises(BalanceError, match="equilibrium"):
         PressedGrasp(build_scenario("grasp_cylinder"), SEED, "coarse")
 
 

@@ -7,7 +7,7 @@ from rgbd_fakes import CAMERA
 
 from finforce.camera import project
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
-from finforce_twin.rendering.photographer import Setting, Shot, TrueKeypoints, View
+from finforce_twin.rendering.photographer import SceneSetting, Shot, TrueKeypoints, WristView
 
 CAMERA_POSE = ROBOT_CAMERA
 
@@ -16,14 +16,14 @@ class FakeLens:
     """Takes what `Photographer` takes, of 64 x 48 pixels; every key point is visible."""
 
     def __init__(self):
-        self.setting = Setting(shapes={}, mesh=None, camera=CAMERA, T_gripper_camera=CAMERA_POSE)
+        self.setting = SceneSetting(shapes={}, mesh=None, camera=CAMERA, T_gripper_camera=CAMERA_POSE)
         self.looks = 0
         self._lock = Lock()
 
     def look(self, state):
         with self._lock:
             self.looks += 1
-        return View(picture=None, truth={side: self._find(state, side) for side in state.jaws})
+        return WristView(picture=None, truth={side: self._find(state, side) for side in state.jaws})
 
     def develop(self, view, stamp):
         rng = np.random.default_rng(round(stamp * 1e6))
