@@ -14,14 +14,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-from finforce_eval.bench.bench import write_figures
-from finforce_eval.cli.evaluate import EvaluationSetup, make_setup
-from finforce_eval.cli.main import add_jaw_options
+from finforce_eval.cli.parser import add_jaw_options
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_choice import parse_contacts
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.machine import write_figures
 from finforce_eval.evaluation.results import CaseResult
 from finforce_eval.evaluation.scoring import CaseScore
+from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 

@@ -33,7 +33,7 @@ from finforce_driver.errors import DriverError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
-from finforce_eval.bench.bench import describe_machine, write_figures
+from finforce_eval.evaluation.machine import describe_machine, write_figures
 
 PER_RUN = 100
 PERIOD = 0.4  # [s] in which one fault is injected

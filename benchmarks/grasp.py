@@ -25,7 +25,7 @@ from grasp_world import GraspCase, GraspTrace, NoisySensor, Plant, World, build_
 from tqdm import tqdm
 
 from finforce_driver.grasp.status import GraspPhase
-from finforce_eval.bench.bench import describe_machine, write_figures
+from finforce_eval.evaluation.machine import describe_machine, write_figures
 
 FORCES = (1.0, 2.0, 3.0, 4.0, 5.0)  # [N]
 SPEEDS = (0.004, 0.008)  # [m/s] of the opening: 4 mm/s of the opening, and of each jaw

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from finforce.errors import FinforceError
-from finforce_eval.bench.bench import write_figures
 from finforce_eval.bench.detection import time_product
 from finforce_eval.bench.scenes import FIRST_SEED, UNSEEN, record_unseen
 from finforce_eval.cli.main import main as finforce
+from finforce_eval.evaluation.machine import write_figures
 
 SOURCES = ("images", "truth")
 COLUMNS = (

@@ -8,8 +8,8 @@ other recordings the meshes are their own.
 
 import argparse
 
-from finforce_eval.bench.bench import write_figures
 from finforce_eval.bench.localization import as_json, draw, format_table, measure, measure_methods
+from finforce_eval.evaluation.machine import write_figures
 
 
 def main() -> None:

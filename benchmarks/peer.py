@@ -18,8 +18,8 @@ from peer_measure import DEFAULT, FULL, OUTLINE, measure_all
 from peer_rows import HEAD, Figures, join_names, list_rows
 from speed_page import fill_page, name_places
 
-from finforce_eval.bench.bench import describe_machine, write_figures
 from finforce_eval.bench.solvers import SOFA
+from finforce_eval.evaluation.machine import describe_machine, write_figures
 from finforce_eval.evaluation.markdown import markdown_rows
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -8,9 +8,9 @@ should run meanwhile; the table says what did.
 
 import argparse
 
-from finforce_eval.bench.bench import write_figures
 from finforce_eval.bench.skipping import EACH, SETTINGS, measure
 from finforce_eval.bench.skipping_figures import as_json, draw, format_each, format_table
+from finforce_eval.evaluation.machine import write_figures
 
 
 def main() -> None:

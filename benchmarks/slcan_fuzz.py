@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.slcan import LONGEST_LINE, SlcanParser, encode_message
-from finforce_eval.bench.bench import describe_machine, write_figures
+from finforce_eval.evaluation.machine import describe_machine, write_figures
 
 BATCH = 500  # lines that are fed as one stream, in pieces
 LARGEST_PIECE = 200  # [bytes]

@@ -19,9 +19,9 @@ from verification_page import ForwardCase, InverseCase, format_page
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw, load_jaw
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.settings import EstimatorSettings
 

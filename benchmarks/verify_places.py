@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_eval.bench.bench import write_figures
-from finforce_eval.cli.evaluate import EvaluationSetup, make_setup
 from finforce_eval.evaluation.evaluate import evaluate_recording
+from finforce_eval.evaluation.machine import write_figures
 from finforce_eval.evaluation.places import InnerSurface
+from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 

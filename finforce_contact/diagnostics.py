@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from finforce.health import Level, Outcome
+from finforce_contact.mesh.object_mesh import describe_mesh
 
 if TYPE_CHECKING:
     from finforce_contact.estimator import ContactEstimate
@@ -53,9 +54,3 @@ def _describe_object(mesh: ObjectMesh | None, pose: ObjectPose | None) -> dict[s
         return {"object": "unknown"}
     known = {"object": describe_mesh(mesh)}
     return known if pose is None else known | {"pose source": pose.source, "pose fitness": f"{pose.fitness:.2f}"}
-
-
-def describe_mesh(mesh: ObjectMesh) -> str:
-    """Return what an object's mesh is, and what was done to it, as sentences."""
-    kind = "watertight" if mesh.watertight else "not watertight"
-    return " ".join([f"{mesh.name}: {len(mesh.triangles)} triangles, {kind}.", *mesh.notes])

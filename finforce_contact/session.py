@@ -14,11 +14,10 @@ from finforce.messages import pose_from_message, stamp_of, wrench_from_message
 from finforce.skipping import CONTACT, RESTING, Skips
 from finforce.stamps import SECOND
 from finforce_contact.camera_feed import DepthFeed, StampedPose
-from finforce_contact.diagnostics import describe_mesh
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.jaw_contact import JawContact, TimedEstimate
-from finforce_contact.mesh.object_mesh import load_object_mesh
+from finforce_contact.mesh.object_mesh import describe_mesh, load_object_mesh
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.messages import surface_from_cloud
 from finforce_contact.parameters import ContactParameters, load_generated, load_jaws

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
-from finforce_ifea.fem.mechanics import Mechanics, build_chosen
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import (
     Contact,
     Observation,

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from finforce.errors import ObservationError
 from finforce.messages import check_cloud, check_frame
 from finforce.pointcloud import decode_columns, decode_keypoints
-from finforce_ifea.contact_mechanics.outline import ObjectOutline, are_same_polygons
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, Observation
+from finforce_ifea.outline import ObjectOutline, are_same_polygons
 
 
 def observation_from_cloud(cloud: Any, frame: str) -> Observation:

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
 from finforce.pointcloud import check_stddev
-from finforce_ifea.contact_mechanics.outline import ObjectOutline
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.outline import ObjectOutline
 
 TRUSTED = ("ok", "unloaded")
 

@@ -14,13 +14,13 @@ from finforce.camera import CameraIntrinsics
 from finforce.skipping import ALL, STILL, Skips
 from finforce.transforms import check_pose
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.detectors.pixel_finder import PixelFinder, PixelFinding
 from finforce_keypoints.errors import DetectionError, GeometryError, ImageOrderError, KeypointError
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints, JawLocalizer
 from finforce_keypoints.geometry.side_fit import DepthScale
 from finforce_keypoints.geometry.side_picture import find_side
 from finforce_keypoints.geometry.stillness import StillWatch
 from finforce_keypoints.images import RgbdImage, check_image
+from finforce_keypoints.pixel_finder import PixelFinder, PixelFinding
 from finforce_keypoints.settings import LOOK_EVERY, RULES, SEARCH_EVERY, SEARCHED, UNSEEN, DetectorSettings
 
 __all__ = ["JawKeypoints", "KeypointDetector"]

@@ -13,8 +13,8 @@ import numpy as np
 from finforce.health import Level, Outcome, Report
 
 if TYPE_CHECKING:
+    from finforce_keypoints.build import FinderCard
     from finforce_keypoints.camera_feed import RgbdFeed
-    from finforce_keypoints.detectors.build import FinderCard
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
 LEAST_VISIBLE = 3  # key points; a solver gives no force with fewer

@@ -24,8 +24,8 @@ from finforce.ros.heap import keep_heap
 from finforce.ros.raw_image import read_image
 from finforce.skipping import IDLE, LATE, UNHEARD, Skips
 from finforce.stamps import Idling, StampGate
+from finforce_keypoints.build import BuiltDetector, build_detector
 from finforce_keypoints.camera_feed import SECOND, RgbdFeed
-from finforce_keypoints.detectors.build import BuiltDetector, build_detector
 from finforce_keypoints.detectors.dots import DotSettings
 from finforce_keypoints.diagnostics import describe, outcome_of_keypoints, report_of_rest
 from finforce_keypoints.images import ImagePair

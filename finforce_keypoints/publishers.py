@@ -19,7 +19,7 @@ from finforce_keypoints.settings import ANNOTATED
 
 if TYPE_CHECKING:
     from finforce.skipping import Skips
-    from finforce_keypoints.detectors.build import FinderCard
+    from finforce_keypoints.build import FinderCard
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
 

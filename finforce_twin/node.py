@@ -18,11 +18,11 @@ from finforce.camera import CameraIntrinsics
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_twin.footage import Footage, TwinFrame, build_footage, parse_size
 from finforce_twin.gripper.coupled import CoupledGripper
+from finforce_twin.gripper.encoding import encode_depth, info_fields, sight_columns
+from finforce_twin.gripper.footage import Footage, TwinFrame, build_footage, parse_size
 from finforce_twin.gripper.live import LiveScene, build_live_scene
 from finforce_twin.parameters import TwinParameters
-from finforce_twin.rendering.encoding import encode_depth, info_fields, sight_columns
 from finforce_twin.rendering.sensor import Flicker
 from finforce_twin.scenes.script import RATE
 

@@ -10,8 +10,9 @@ from tqdm import tqdm
 
 from finforce.errors import FinforceError
 from finforce_ifea.contact_mechanics.forward_press import PressState, RigidBox, RigidCylinder, RigidObject, press_jaw
-from finforce_ifea.fem.mechanics import Mechanics, build_mechanics
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 
 DEPTHS = np.array([0.8, 2.0, 3.5, 5.0, 7.0, 9.0, 11.0, 13.0]) * 1e-3

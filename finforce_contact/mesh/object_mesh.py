@@ -188,3 +188,9 @@ def _note_crossings(mesh: ObjectMesh) -> ObjectMesh:
         return mesh
     note = "The surface crosses itself; what is inside twice counts as inside."
     return replace(mesh, notes=(*mesh.notes, note))
+
+
+def describe_mesh(mesh: ObjectMesh) -> str:
+    """Return what an object's mesh is, and what was done to it, as sentences."""
+    kind = "watertight" if mesh.watertight else "not watertight"
+    return " ".join([f"{mesh.name}: {len(mesh.triangles)} triangles, {kind}.", *mesh.notes])

@@ -5,26 +5,15 @@ Knows of no part what it measures: each is a module with `measure(quick)`, `form
 
 from __future__ import annotations
 
-import argparse
-import os
-import platform
-import subprocess
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.errors import FinforceError
 from finforce_eval.errors import OptionError
-
-LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh", "small_gicp", "coal")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,59 +100,6 @@ def time_calls(call: Callable[[], Any], count: int, clock: Callable[[], float] =
     return times
 
 
-def describe_machine() -> dict[str, Any]:
-    """Return processor, cores, versions of what is installed, and commit."""
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        **dict(_find_versions()),
-        "commit": _commit(),
-    }
-
-
-def write_figures(path: Path | str, figures: Mapping[str, Any]) -> None:
-    """Write figures as JSON with the machine, versions and commit that they are of; what is not finite becomes null."""
-    from finforce_eval.cli.evaluate import write_json
-
-    write_json(path, {"machine": describe_machine(), **_without_nan(figures)})
-
-
-def _without_nan(content: Any) -> Any:
-    """Return nested mappings and sequences with None for numbers that are not finite."""
-    if isinstance(content, Mapping):
-        return {name: _without_nan(value) for name, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_without_nan(value) for value in content]
-    return None if isinstance(content, float) and not np.isfinite(content) else content
-
-
-def _find_versions() -> Iterator[tuple[str, str]]:
-    """Yield the installed libraries with their versions."""
-    for name in LIBRARIES:
-        with suppress(PackageNotFoundError):
-            yield name, version(name)
-
-
-def _processor() -> str:
-    """Return the name of the processor."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
-
-
-def _commit() -> str:
-    """Return the commit of the sources, with a mark when they were changed since."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
-    folder = Path(__file__).parent
-    try:
-        return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
 def format_rows(rows: Sequence[Row]) -> str:
     """Return the table of the times [ms]."""
     width = max(len(row.name) for row in rows)
@@ -189,46 +125,3 @@ def select_parts(names: str | None) -> tuple[BenchPart, ...]:
         if name not in known:
             raise OptionError(f"--parts: there is no part {name!r}, expected some of {', '.join(known)}")
     return tuple(known[name] for name in dict.fromkeys(wanted))
-
-
-def run_bench(options: argparse.Namespace) -> None:
-    """Measure the parts, print each one's table, write the JSON and the pictures."""
-    parts, machine = select_parts(options.parts), describe_machine()
-    if options.folder and not any(part.takes_folder for part in parts):
-        raise OptionError(f"{options.folder}: none of the parts {', '.join(p.name for p in parts)} takes recordings")
-    content: dict[str, Any] = {}
-    for number, part in enumerate(parts):
-        begin = perf_counter()
-        try:
-            figures = _run_part(part, options, _picture_name(options.figure, part, first=number == 0))
-        except OptionError:
-            raise
-        except FinforceError as error:
-            print(f"not measured: {error}")
-            figures = {"not_measured": str(error)}
-        content[part.name] = {**figures, "took_s": round(perf_counter() - begin, 1)}
-        if options.json:
-            write_figures(options.json, content)
-    print(f"\n{machine['processor']}, {machine['cores']} cores, Python {machine['python']}, {machine['commit']}")
-
-
-def _run_part(part: BenchPart, options: argparse.Namespace, picture: Path | None) -> dict[str, Any]:
-    """Measure one part, print and draw it, and return it as plain values."""
-    module = import_module(part.module)
-    print(f"\n{part.title}\n")
-    taken = {"folder": options.folder} if part.takes_folder else {}
-    figures = module.measure(options.quick, **taken)
-    table = module.format_table(figures)
-    print(table)
-    if picture is not None:
-        picture.parent.mkdir(parents=True, exist_ok=True)
-        module.draw(figures, picture)
-        print(f"\nPicture: {picture}")
-    return {**module.as_json(figures), "table": table}
-
-
-def _picture_name(path: str | None, part: BenchPart, *, first: bool) -> Path | None:
-    """Return the picture's name as given for the first part, with the part's name added for the others."""
-    if not path:
-        return None
-    return Path(path) if first else Path(path).with_stem(f"{Path(path).stem}_{part.name}")

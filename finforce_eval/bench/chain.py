@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from finforce.stamps import NANOSECONDS
 from finforce.systems.options import ReplayOptions
 from finforce.systems.processes import Process, replay_processes
-from finforce_eval.bench.film import Film, film_images, film_keypoints
 from finforce_eval.bench.scenes import GRASP, GRASP_FAST, find_scene
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.evaluation.scoring import match_truth
@@ -28,6 +27,7 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import QUIET, NodeRun, describe_load, run_nodes
+from finforce_eval.replay.synthetic_stream import Film, film_images, film_keypoints
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 RATES = (30, 60, 90)  # [Hz]

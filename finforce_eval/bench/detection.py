@@ -29,7 +29,7 @@ from finforce_eval.figures.time_error import ErrorPoint, ErrorSeries, TimeStats,
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.detectors.build import build_detector
+from finforce_keypoints.build import build_detector
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import load_jaws

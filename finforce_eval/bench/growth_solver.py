@@ -17,12 +17,12 @@ from finforce_eval.bench.cases import PERIOD, bench_finger, load_cases, record_p
 from finforce_eval.bench.growth import Curve, Growth
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.jaw.meshing import MeshDensity
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.quadratic_program import solve_program
 from finforce_ifea.settings import SOLVERS, EstimatorSettings

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from finforce.stamps import NANOSECONDS
 from finforce_eval.bench.bench import Row, format_rows, row_from_times
-from finforce_eval.bench.process import child_processes, resident_bytes
-from finforce_eval.cli.demo import RECORDING
-from finforce_eval.cli.evaluate import make_setup
+from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.recordings.recording import SHIPPED as RECORDING
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_eval.recordings.writer import write_recording
+from finforce_eval.replay.cpu_share import child_processes, resident_bytes
 from finforce_eval.replay.replay import replay
 
 # a mirror image y -> -y; moments are axial vectors

@@ -18,7 +18,7 @@ from finforce.optional import import_library
 from finforce.transforms import pose_from_quaternion
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.detectors.build import SHIPPED
+from finforce_keypoints.build import SHIPPED
 from finforce_keypoints.detectors.side_plane import grid_from_metadata
 from finforce_keypoints.geometry.side_picture import find_side, map_picture, take_picture
 from finforce_keypoints.networks.metadata import METADATA_FILE

@@ -16,11 +16,11 @@ from typing import Any
 
 from finforce.systems.processes import Process
 from finforce_eval.bench.chain import SIDES, awaited_topics, chain_processes
-from finforce_eval.bench.film import MASK_TOPIC, OBJECT_TOPIC, Film, film_images, film_keypoints, film_mask
 from finforce_eval.bench.scenes import GRASP, find_scene
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import CLOUD, POSE, WRENCH, read_recording
 from finforce_eval.replay.node_run import Listener, NodeRun, describe_load, run_nodes
+from finforce_eval.replay.synthetic_stream import MASK_TOPIC, OBJECT_TOPIC, Film, film_images, film_keypoints, film_mask
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 RATE = 30  # [Hz]

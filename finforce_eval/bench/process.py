@@ -76,7 +76,7 @@ def _probe(solver: str, mesh: str, cache: str) -> dict[str, float]:
 def main(solver: str, mesh: str) -> None:
     """Builds and runs an estimator and prints what that took as JSON."""
     begin = perf_counter()
-    from finforce_eval.bench.process import resident_bytes
+    from finforce_eval.replay.cpu_share import resident_bytes
     from finforce_ifea.estimator import JawEstimator
     from finforce_ifea.jaw.jaw import load_jaw
     from finforce_ifea.settings import EstimatorSettings
@@ -106,20 +106,3 @@ def _press(estimator: Any) -> None:
 
 if __name__ == "__main__":
     main(*sys.argv[1:])
-
-
-def resident_bytes(process: str | int = "self") -> int:
-    """Return the resident memory of a process [bytes]; 0 when it has gone."""
-    try:
-        pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1])
-    except (FileNotFoundError, ProcessLookupError):
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
-
-
-def child_processes(parent: int) -> list[int]:
-    """Return the processes that a process has started itself."""
-    found: set[int] = set()
-    for path in Path(f"/proc/{parent}/task").glob("*/children"):
-        found.update(int(word) for word in path.read_text(encoding="ascii").split())
-    return sorted(found)

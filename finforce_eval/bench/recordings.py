@@ -10,11 +10,11 @@ import numpy as np
 
 from finforce.errors import FinforceError
 from finforce_eval.bench.tiers import Tier
-from finforce_eval.cli.evaluate import EvaluationSetup
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.contact_choice import parse_contacts
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.calibration import load_calibration

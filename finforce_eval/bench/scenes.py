@@ -22,11 +22,8 @@ if TYPE_CHECKING:
     from finforce_twin.gripper.gripper import JawState, TwinState
     from finforce_twin.scenes.scenarios import Scenario
 
-FINE_RATE = 180  # [Hz] of the slots in which images can lie; 30, 60 and 90 divide it
 SCRIPT_SLOTS = 6  # slots from one state of a script to the next
 EVERY_RATE = (0, 2, 3, 4)  # slots of those six that a camera of 30, 60 or 90 Hz sees
-POSE_SLOTS = 18  # the object is tracked at 10 Hz
-START = 1_000_000_000_000  # [ns] stamp of slot 0, as the twin has it
 SIZE = "640x480"
 FARTHEST = 0.4  # [m]; depth beyond it is left away, which makes a recording smaller
 
@@ -138,11 +135,6 @@ def _blend_poses(before: NDArray, after: NDArray, share: float) -> NDArray:
     return pose
 
 
-def slot_of(stamp: int) -> int:
-    """Return in which slot of 1/180 s a stamp [ns] of a scene lies."""
-    return round((stamp - START) * FINE_RATE / 1_000_000_000)
-
-
 def find_scene(scene: BenchScene, folder: Path | None = None) -> Path:
     """Return the recording of a scene, rendered under a progress bar unless it is there already.
 
@@ -190,7 +182,7 @@ def _render(scene: BenchScene, path: Path) -> None:
     from tqdm import tqdm
 
     from finforce_eval.recordings.twin_writer import RecordingForm, write_footage
-    from finforce_twin.footage import FINGER, Footage, parse_size, set_stage
+    from finforce_twin.gripper.footage import FINGER, Footage, parse_size, set_stage
     from finforce_twin.gripper.gripper import TwinGripper
     from finforce_twin.rendering.photographer import Photographer
 
@@ -209,9 +201,8 @@ def record_unseen(name: str, seed: int, folder: Path) -> Path:
     Raises:
         FinforceError: the scene cannot be recorded.
     """
-    from finforce_eval.cli.twin import record_scene
-    from finforce_eval.recordings.twin_writer import RecordingForm
-    from finforce_twin.footage import parse_size
+    from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
+    from finforce_twin.gripper.footage import parse_size
     from finforce_twin.scenes.scenarios import build_scenario
 
     scene, changes = UNSEEN[name]

@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING, Any
 from finforce.errors import MissingDependencyError
 from finforce.skipping import ALL, AWAY, CONTACT, EVERYWHERE, IDLE, SOLVER, STILL, UNCHANGED, UNHEARD, UNNEEDED
 from finforce_eval.bench.chain import SIDES, awaited_topics, chain_processes
-from finforce_eval.bench.cpu_share import CpuMeter, busy_seconds
-from finforce_eval.bench.process import resident_bytes
 from finforce_eval.bench.scene_reel import OBJECT_TOPIC, SceneReel, Span, StreamPart, cut_sections
 from finforce_eval.bench.scenes import BenchScene, find_scene
 from finforce_eval.bench.skipping_figures import (  # noqa: F401 - for those who print and draw
@@ -32,6 +30,7 @@ from finforce_eval.bench.skipping_figures import (  # noqa: F401 - for those who
     format_table,
 )
 from finforce_eval.recordings.recording import read_recording
+from finforce_eval.replay.cpu_share import CpuMeter, busy_seconds, resident_bytes
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import await_listeners, find_processes
 from finforce_eval.replay.playback import RawMessage, read_playback

@@ -9,23 +9,33 @@ from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
-from finforce_eval.cli.evaluate import make_setup
+from finforce_eval.cli.parser import CONTACT_HELP
 from finforce_eval.cli.replay import format_replay
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import IMAGES, KeypointSource
-from finforce_eval.evaluation.report import write_report
-from finforce_eval.recordings.recording import read_recording
+from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.figures.report import write_report
+from finforce_eval.recordings.recording import SHIPPED, read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.replay.replay import Replay, replay
 
-RECORDING, CALIBRATION = Path(__file__).parents[1] / "data" / "bench_cyl25_middle", "bench"
+CALIBRATION = "bench"
 # the synthetic scene of a run from images, and the calibration of its finger
 SCENE, SEED, FINGER, SCENE_CALIBRATION = "grasp_cylinder", 4, 0, "twin"
 SIZE = "640x480"
 FOLDER = "recording"  # in the folder of the report
 
 
-def run_demo(options: argparse.Namespace) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    text = "begin with images of a synthetic gripper, rendered into the report's folder at first use, or with the key "
+    text += "points of a bench (images)"
+    parser.add_argument("--from", dest="source", default="images", choices=("images", "keypoints"), help=text)
+    parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
+    parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")
+
+
+def run(options: argparse.Namespace) -> None:
     """Replay a recording, print the error of the force, write the report.
 
     Raises:
@@ -33,7 +43,7 @@ def run_demo(options: argparse.Namespace) -> None:
         ProcessError: a node cannot be started, or ended early.
     """
     from_images = options.source == IMAGES
-    recording = prepare_recording(Path(options.report) / FOLDER) if from_images else read_recording(RECORDING)
+    recording = prepare_recording(Path(options.report) / FOLDER) if from_images else read_recording(SHIPPED)
     calibration = SCENE_CALIBRATION if from_images else CALIBRATION
     stamps = recording.images.stamps if from_images else recording.jaw("left").keypoints.stamps
     way = "key point detector, contact estimator and solvers" if from_images else "contact estimator and solver"
@@ -134,9 +144,8 @@ def _is_synthetic(folder: Path) -> bool:
 
 def _render(folder: Path) -> None:
     """Render the demo's scene into a new folder, under a progress bar."""
-    from finforce_eval.cli.twin import record_scene
-    from finforce_eval.recordings.twin_writer import RecordingForm
-    from finforce_twin.footage import parse_size
+    from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
+    from finforce_twin.gripper.footage import parse_size
     from finforce_twin.scenes.scenarios import build_scenario
 
     record_scene(build_scenario(SCENE), SEED, folder, camera=parse_size(SIZE), form=RecordingForm(), finger=FINGER)

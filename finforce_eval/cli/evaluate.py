@@ -3,170 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
 
-from finforce.errors import FinforceError
-from finforce_eval.cli.options import parse_changes
-from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.contact_choice import ContactChoice, parse_contacts
-from finforce_eval.evaluation.contact_source import ContactSource, build_source
-from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
-from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.cli.parser import add_jaw_options, add_set, add_source_options
+from finforce_eval.evaluation.machine import write_json
+from finforce_eval.evaluation.setup import evaluate_all, make_setup, read_keypoints
 from finforce_eval.evaluation.tables import evaluation_json, format_table
-from finforce_eval.recordings.images import PAIRED
-from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import Recording
-from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.jaw.calibration import Calibration, load_calibration, name_mechanics, save_calibration
-from finforce_ifea.jaw.jaw import Jaw, load_jaw
-from finforce_ifea.settings import EstimatorSettings
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvaluationSetup:
-    """What an offline run needs beside the recordings."""
-
-    jaw: Jaw
-    settings: EstimatorSettings
-    calibration: Calibration | None
-    contacts: ContactChoice
-    about: Mapping[str, str]
-
-    def side(self, side: str) -> EvaluationSetup:
-        """Return the setup of the left or the right jaw; a jaw file describes the left one."""
-        return self if side == self.jaw.side else replace(self, jaw=self.jaw.mirrored())
-
-    def estimator(self) -> JawEstimator:
-        """Return a fresh estimator that has nothing left to compile."""
-        estimator = JawEstimator(self.jaw, settings=self.settings, calibration=self.calibration)
-        estimator.warm_up()
-        return estimator
-
-    @property
-    def density(self) -> str:
-        """Mesh density of the surface that the solver returns."""
-        return "coarse" if self.settings.solver == "paper" else self.settings.mesh
-
-    def source(self, recording: Recording) -> ContactSource:
-        """Return a fresh contact source for this jaw of a recording."""
-        jaw = self.calibration.apply(self.jaw) if self.calibration else self.jaw
-        return build_source(self.contacts, recording, jaw, self.density)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
+    add_jaw_options(parser)
+    add_source_options(parser)
+    calibration = "calibration file, or a shipped name; without it the jaw file's own material"
+    parser.add_argument("--calibration", metavar="FILE", help=calibration)
+    add_set(parser)
+    parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
+    parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
 
 
-def run_version(options: argparse.Namespace) -> None:
-    """Print the version."""
-    print(f"finforce {version()}")
-
-
-def version() -> str:
-    """Return the version of the installed package, or what the sources say."""
-    from importlib.metadata import PackageNotFoundError
-    from importlib.metadata import version as installed
-
-    try:
-        return installed("finforce")
-    except PackageNotFoundError:
-        return "not installed"
-
-
-def read_recordings(paths: Sequence[str], pairing: int = PAIRED, sides: Sequence[str] = ()) -> list[Recording]:
-    """Read recordings and give each a name of its own.
-
-    Args:
-        paths: of the recordings.
-        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
-        sides: jaws that are in the images, whether or not a topic tells of them.
-
-    Raises:
-        RecordingError: one of them cannot be read.
-        OptionError: one was given twice.
-    """
-    if len({Path(path).resolve() for path in paths}) < len(paths):
-        raise OptionError("a recording was given twice")
-    recordings = [read_recording(path, pairing, sides) for path in paths]
-    names = [recording.name for recording in recordings]
-    for recording in recordings:
-        for note in recording.notes:
-            print(f"note: {recording.name}: {note}", file=sys.stderr)
-    return [
-        recording if names.count(recording.name) == 1 else replace(recording, name=_long_name(recording))
-        for recording in recordings
-    ]
-
-
-def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> list[Recording]:
-    """Read the recordings with the key points that were asked for.
-
-    Args:
-        options: of the command line.
-        sides: jaws that are in the images, whether or not a topic tells of them.
-
-    Raises:
-        FinforceError: one of them cannot be read, or has no such key points.
-    """
-    source = parse_source(options)
-    recordings = []
-    for read in read_recordings(options.bags, source.pairing, sides):
-        recording = source.apply(read)
-        for note in recording.notes[len(read.notes) :]:
-            print(f"note: {recording.name}: {note}", file=sys.stderr)
-        recordings.append(recording)
-    return recordings
-
-
-def _long_name(recording: Recording) -> str:
-    """Return the name with the folders above it."""
-    return "/".join(recording.path.resolve().with_suffix("").parts[-3:])
-
-
-def make_setup(options: argparse.Namespace) -> EvaluationSetup:
-    """Load what the options name.
-
-    Raises:
-        FinforceError: the contact, the jaw or the calibration cannot be used.
-    """
-    contacts = parse_contacts(
-        options.contact,
-        object_file=getattr(options, "object", None),
-        object_unit=getattr(options, "object_unit", "m"),
-    )
-    jaw = load_jaw(options.jaw)
-    changes = getattr(options, "set", [])
-    settings = parse_settings(options.solver, options.mesh, changes)
-    calibration = load_calibration(options.calibration) if options.calibration else None
-    about = {
-        "jaw": jaw.name,
-        "solver": options.solver,
-        "mesh": options.mesh,
-        "keypoints": getattr(options, "source", None) or "keypoints where they were recorded, else images",
-        "contact": ", ".join(options.contact) or "estimate where mesh and poses are known, else fixed:case",
-        "settings": ", ".join(changes) or "as they come",
-        "calibration": options.calibration or "none",
-        "version": version(),
-    }
-    return EvaluationSetup(jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about)
-
-
-def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorSettings:
-    """Return the settings of the estimator with `NAME=VALUE` changes.
-
-    Raises:
-        OptionError: a name is unknown, or a value is not of the setting's type or out of its bounds.
-    """
-    values = parse_changes("--set", "setting", changes, asdict(EstimatorSettings()))
-    try:
-        return EstimatorSettings(**{"solver": solver, "mesh": mesh, **values})
-    except FinforceError as error:
-        raise OptionError(f"settings: {error}") from error
-
-
-def run_evaluate(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> None:
     """Evaluate recordings: print the table, write JSON and report."""
     setup = make_setup(options)
     recordings = read_keypoints(options)
@@ -175,7 +31,7 @@ def run_evaluate(options: argparse.Namespace) -> None:
     if options.json:
         write_json(options.json, evaluation_json(evaluation, **setup.about))
     if options.report:
-        from finforce_eval.evaluation.report import write_report
+        from finforce_eval.figures.report import write_report
 
         page = write_report(
             evaluation,
@@ -185,75 +41,3 @@ def run_evaluate(options: argparse.Namespace) -> None:
             recordings=recordings,
         )
         print(f"Report: {page}")
-
-
-def write_json(path: str, content: Mapping[str, Any]) -> None:
-    """Write one JSON object."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def evaluate_all(recordings: Sequence[Recording], setup: EvaluationSetup) -> Evaluation:
-    """Evaluate every jaw with ground truth of every recording, under one progress bar.
-
-    Raises:
-        FinforceError: one of them cannot be evaluated.
-    """
-    from tqdm import tqdm
-
-    for recording in recordings:
-        for side in truth_sides(recording):
-            check_keypoint_count(recording, side, setup.jaw)
-            setup.side(side).source(recording)
-    cases = [(recording, side) for recording in recordings for side in truth_sides(recording)]
-    frames = sum(len(recording.jaw(side).keypoints.stamps) for recording, side in cases)
-    results = []
-    with tqdm(total=frames, unit="frame", disable=None, leave=False) as bar:
-        for recording, side in cases:
-            bar.set_description(recording.name)
-            results.append(_evaluate_case(recording, side, setup.side(side), bar.update))
-    return score_results(results, recordings)
-
-
-def truth_sides(recording: Recording) -> list[str]:
-    """Return the jaws of a recording that have ground truth.
-
-    Raises:
-        RecordingError: there is none.
-    """
-    sides = [side for side, track in recording.jaws.items() if track.truth is not None]
-    if not sides:
-        recording.truth(next(iter(recording.jaws)))
-    return sides
-
-
-def _evaluate_case(recording: Recording, side: str, setup: EvaluationSetup, progress: Any) -> CaseResult:
-    """Evaluate one jaw of one recording."""
-    result = evaluate_recording(
-        recording,
-        setup.jaw,
-        setup.source(recording),
-        side=side,
-        factory=setup.estimator,
-        progress=progress,
-    )
-    return result if len(truth_sides(recording)) == 1 else replace(result, name=f"{recording.name}/{side}")
-
-
-def run_calibrate(options: argparse.Namespace) -> None:
-    """Identify the material and write the calibration."""
-    from finforce_eval.calibration.calibrate import calibrate, calibration_case, format_fit
-
-    options.calibration = None
-    setup = make_setup(options)
-    recordings = read_keypoints(options)
-    is_left = all("left" in truth_sides(recording) for recording in recordings)
-    setup = setup.side("left" if is_left else "right")
-    jaw, contacts = setup.jaw, setup.contacts
-    cases = [calibration_case(recording, jaw, contacts, setup.density) for recording in recordings]
-    Path(options.output).parent.mkdir(parents=True, exist_ok=True)
-    fit = calibrate(cases, jaw, setup.settings)
-    print(format_fit(fit, cases))
-    named = replace(fit.calibration, solver=name_mechanics(jaw, setup.settings.solver))
-    save_calibration(named, options.output, uncertainty=fit.uncertainty)
-    print(f"Calibration: {options.output}")

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from finforce.transforms import pose_numbers, rotation_between
-from finforce_eval.cli.evaluate import read_recordings
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.detection import Detector
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, parse_source
+from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, find_extrinsics
@@ -26,7 +26,20 @@ _STILL = 0.05e-3  # [m] below which another round changes nothing
 _OFTEN = 0.5  # share of the images in which a key point has to be seen
 
 
-def run_extrinsics(options: argparse.Namespace) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    parser.add_argument("bags", nargs=1, metavar="BAG", help="rosbag2 folder, .mcap or .db3 file with images")
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
+    parser.add_argument("--jaws", default="both", choices=("left", "right", "both"), help="in the images (both)")
+    text = "where the camera is about: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
+    parser.add_argument("--extrinsics", metavar="POSE", help=text)
+    text = "change a parameter of the key point detector, as model=FOLDER; repeatable"
+    parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
+    text = "how many images at the beginning show the jaws at rest (45)"
+    parser.add_argument("--images", type=int, default=45, metavar="N", help=text)
+
+
+def run(options: argparse.Namespace) -> None:
     """Find the camera's place from the first images of a recording, and print it as the nodes take it."""
     options.source = "images"
     if options.images < 5:

@@ -23,7 +23,23 @@ from finforce_eval.recordings.image_files import read_depth, read_generated_pose
 OUTPUTS = (".stl", ".ply", ".glb")
 
 
-def run_reconstruct(options: argparse.Namespace) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    parser.add_argument("--depth", required=True, metavar="FILE", help="16-bit PNG [mm], or .npy [m]")
+    parser.add_argument("--mask", required=True, metavar="FILE", help="the object's pixels: picture or .npy")
+    intrinsics = "fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a JSON or YAML file"
+    parser.add_argument("--intrinsics", required=True, nargs="+", metavar="NUMBER", help=intrinsics)
+    parser.add_argument("--color", metavar="FILE", help="colour picture, for the picture that is written")
+    parser.add_argument("--mesh", metavar="FILE", help="generated mesh (STL, OBJ, PLY, GLB), in any unit")
+    pose = "JSON of its place: rotation (w x y z), translation, scale as SAM-3D gives them, or a 4x4 matrix"
+    parser.add_argument("--pose", metavar="FILE", help=pose)
+    method = "default: robust with a generated mesh; without, a primitive where one fits, else a completion"
+    parser.add_argument("--method", choices=("robust", "paper", "primitive", "completion"), help=method)
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="mesh: .stl, .ply or .glb, in metres")
+    parser.add_argument("--picture", metavar="PNG", help="write a picture of the mesh over the depth")
+
+
+def run(options: argparse.Namespace) -> None:
     """Reconstruct, write mesh, pose and picture, and print what came out.
 
     Raises:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 
-from finforce_eval.cli.evaluate import EvaluationSetup, make_setup, write_json
-from finforce_eval.cli.main import Parser, add_jaw_options, add_source_options
+from finforce_eval.cli.parser import add_jaw_options, add_source_options
+from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.machine import write_json
+from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
 from finforce_eval.evaluation.tables import evaluation_json, format_table
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.replay import Playing, Replay, replay
@@ -41,10 +43,8 @@ def _largest(values: Mapping[int, float]) -> float:
     return max(values.values(), default=math.nan)
 
 
-def build_parser() -> Parser:
-    """Return the parser of `finforce replay`."""
-    text = "play a recording through the real nodes in real time and score it"
-    parser = Parser(prog="finforce replay", description=text)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add what names the recording and how it is played."""
     parser.add_argument("bag", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
     add_jaw_options(parser)
     add_source_options(parser)
@@ -57,21 +57,18 @@ def build_parser() -> Parser:
     parser.add_argument("--params", default="", metavar="FILE", help="further ROS parameters of the solvers")
     parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
     parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
-    return parser
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run `finforce replay`.
+def run(options: argparse.Namespace) -> None:
+    """Play a recording and score it.
 
     Raises:
         FinforceError: an option, the recording or a node fails.
     """
-    parser = build_parser()
-    options = parser.parse_args(argv)
     if not 0.01 <= options.rate <= 100.0:
-        parser.error(f"--rate {options.rate:g}: expected 0.01 to 100")
+        raise OptionError(f"--rate {options.rate:g}: expected 0.01 to 100")
     if options.domain is not None and not 0 <= options.domain <= 232:
-        parser.error(f"--domain {options.domain}: expected 0 to 232")
+        raise OptionError(f"--domain {options.domain}: expected 0 to 232")
     setup = make_setup(options)
     playing = Playing(
         rate=options.rate, sim_time=options.sim_time, domain=options.domain, parameter_file=options.params
@@ -81,7 +78,6 @@ def main(argv: Sequence[str]) -> int:
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
     print(format_replay(result))
     _write(result, setup, options)
-    return 0
 
 
 def _write(result: Replay, setup: EvaluationSetup, options: argparse.Namespace) -> None:
@@ -91,7 +87,7 @@ def _write(result: Replay, setup: EvaluationSetup, options: argparse.Namespace) 
         grasp = {"grasp": asdict(score.error), "grasp_delay": asdict(score.delay)}
         write_json(options.json, evaluation_json(result.evaluation, **grasp, **setup.about))
     if options.report:
-        from finforce_eval.evaluation.report import write_report
+        from finforce_eval.figures.report import write_report
 
         page = write_report(
             result.evaluation,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from finforce_eval.cli.parser import MESHES, SOLVERS
 from finforce_eval.errors import OptionError
 from finforce_eval.stress.stress import Family, Plan, Trial, find_families, run_family
 from finforce_eval.stress.summary import (
@@ -20,6 +21,17 @@ from finforce_eval.stress.summary import (
 )
 
 WORST = 5
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    parser.add_argument("--families", metavar="A,B", help="families of trials, all without; a wrong one lists them")
+    parser.add_argument("--count", type=int, metavar="N", help="trials per family; without, as many as each takes")
+    parser.add_argument("--seed", type=int, default=0, help="of everything that is drawn (0)")
+    parser.add_argument("--solver", default="default", choices=SOLVERS, help="model and objective")
+    parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
+    parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
+    parser.add_argument("--report", metavar="DIR", help="write a page with every family by level")
 
 
 def choose_families(names: str | None, known: Mapping[str, Family]) -> list[Family]:
@@ -72,13 +84,13 @@ def describe_trial(trial: Trial) -> str:
     return f"seed {trial.seed}, {trial.level}: {trial.outcome}, {error}{'; ' + trial.note if trial.note else ''}"
 
 
-def run_stress(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Run the families, print the table, write what was asked for.
 
     Returns:
         0; 1 when a rule is broken by a family that it is asked of.
     """
-    from finforce_eval.bench.bench import describe_machine, write_figures
+    from finforce_eval.evaluation.machine import describe_machine, write_figures
 
     if options.count is not None and options.count < 1:
         raise OptionError(f"--count {options.count}: expected at least 1")

@@ -7,15 +7,42 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from finforce_eval.cli.options import parse_changes
+from finforce_eval.cli.parser import Parser
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.figures.preview import Preview
-from finforce_eval.recordings.twin_writer import RecordingForm, write_footage
-from finforce_twin.footage import FINGER, build_footage, parse_size
+from finforce_eval.evaluation.changes import parse_changes
+from finforce_eval.recordings.twin_writer import PREVIEW, RecordingForm, record_scene
+from finforce_twin.gripper.footage import parse_size
 from finforce_twin.scenes.scenarios import SCENARIOS, Scenario, build_scenario
 from finforce_twin.scenes.script import write_script
 
-PREVIEW = "preview.jpg"
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True, parser_class=Parser)
+    listing = actions.add_parser("list", help="name the scenes")
+    listing.set_defaults(run=run_list)
+    record = actions.add_parser("record", help="render a scene and write it", description="render a scene and write it")
+    record.add_argument("scene", metavar="SCENE", help="a name that `finforce twin list` prints")
+    record.add_argument("-o", "--output", required=True, metavar="BAG", help="recording to be written, a new folder")
+    record.add_argument("--seed", type=int, default=0, help="of textures, light and noise (0)")
+    finger = "seed of the jaws' material; calibration twin is of finger 0 (0)"
+    steps = "of the depth in mm: 1 as the ROS driver gives it, 0.1 as the camera itself does (1)"
+    record.add_argument("--depth-step", type=float, default=1.0, choices=(1.0, 0.1), help=steps)
+    record.add_argument("--finger", type=int, default=0, metavar="SEED", help=finger)
+    record.add_argument("--light", metavar="WORD", help="bright, dim or any; without it that of the scene")
+    record.add_argument("--object", metavar="NAME", help="shape by name, or mesh file; without it that of the scene")
+    record.add_argument("--camera", choices=("robot", "bench"), help="two jaws on the wrist, or one on the bench")
+    record.add_argument("--size", default="640x480", metavar="WxH", help="of the images (640x480)")
+    text = "change a number of the scene, may be repeated; an unknown NAME lists them"
+    record.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
+    kind = record.add_mutually_exclusive_group()
+    kind.add_argument("--compressed", action="store_true", help="jpeg colour and png depth (as it is without --raw)")
+    kind.add_argument("--raw", action="store_true", help="plain images, 46 MB a second")
+    record.add_argument("--quality", type=int, default=90, metavar="N", help="of the jpegs, 1 to 95 (90)")
+    text = "leave depth beyond so many metres away, which makes a recording smaller"
+    record.add_argument("--farthest", type=float, default=float("inf"), metavar="M", help=text)
+    record.add_argument("--storage", default="mcap", choices=("mcap", "sqlite3"), help="format of the recording")
+    record.set_defaults(run=run_record)
 
 
 def run_list(options: argparse.Namespace) -> None:
@@ -88,31 +115,6 @@ def _not_made(folder: Path, error: OSError) -> RecordingError:
     return RecordingError(
         f"-o {folder}: cannot be made ({error.strerror}); expected a new folder where one may be written"
     )
-
-
-def record_scene(
-    scenario: Scenario, seed: int, folder: Path, *, camera: Any, form: RecordingForm, finger: int = FINGER
-) -> None:
-    """Render a scene of a finger into a new folder, under a progress bar."""
-    from tqdm import tqdm
-
-    footage = build_footage(scenario, seed, camera, finger=finger, depth_step=form.depth_step)
-    preview = Preview(len(footage))
-    case = {
-        "scene": scenario.name,
-        "seed": seed,
-        "finger": finger,
-        "light": scenario.light,
-        "object": {"kind": scenario.object},
-    }
-    with tqdm(total=len(footage), unit="image", desc=scenario.name, disable=None, leave=False) as bar:
-
-        def seen(frame: Any) -> None:
-            preview.take(frame)
-            bar.update()
-
-        write_footage(footage, folder, form=form, case=case, seen=seen)
-    preview.save(folder / PREVIEW)
 
 
 def scenario_from_options(options: argparse.Namespace) -> Scenario:

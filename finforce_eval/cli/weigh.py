@@ -10,13 +10,28 @@ import numpy as np
 from tqdm import tqdm
 
 from finforce_eval.calibration.weighing import estimate_pressing, find_holds, format_weighing, weigh
-from finforce_eval.cli.evaluate import make_setup, read_keypoints
+from finforce_eval.cli.parser import add_jaw_options, add_set, add_source_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.evaluate import check_keypoint_count
+from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_ifea.jaw.calibration import Calibration, name_mechanics, save_calibration
 
 
-def run_weigh(options: argparse.Namespace) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    parser.add_argument("bags", nargs=1, metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
+    add_jaw_options(parser)
+    add_source_options(parser)
+    parser.add_argument("--side", default="left", choices=("left", "right"), help="the jaw that pressed (left)")
+    text = "what the scale showed at the end of each hold, in their order; without it the holds are listed"
+    parser.add_argument("--grams", nargs="+", type=float, metavar="G", help=text)
+    text = "calibration that is scaled, a file or a shipped name; without it the jaw file's own material"
+    parser.add_argument("--calibration", metavar="FILE", help=text)
+    add_set(parser)
+    parser.add_argument("-o", "--output", metavar="FILE", help="calibration to be written; needs --grams")
+
+
+def run(options: argparse.Namespace) -> None:
     """Find the holds of a recording, and scale the stiffness by what a scale said of them."""
     if options.output and not options.grams:
         raise OptionError("-o needs --grams: the readings of the scale, one for each hold")

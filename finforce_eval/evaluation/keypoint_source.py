@@ -11,9 +11,8 @@ import numpy as np
 
 from finforce.errors import FinforceError
 from finforce.stamps import NANOSECONDS
-from finforce_eval.cli.main import SOURCES
-from finforce_eval.cli.options import parse_changes
 from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.evaluation.changes import parse_changes
 from finforce_eval.evaluation.detection import Detector, detect_keypoints
 from finforce_eval.recordings.images import PAIRED
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from finforce_keypoints.parameters import DetectorParameters
     from finforce_keypoints.settings import DetectorSettings
 
-IMAGES, KEYPOINTS, TRUTH = SOURCES
+SOURCES = IMAGES, KEYPOINTS, TRUTH = ("images", "keypoints", "truth")
 _BY_ENDS = "images of a recording are found by the ends of their topics"
 # parameters of the node that something else decides here
 DECIDED = {
@@ -109,7 +108,7 @@ class KeypointSource:
         Raises:
             FinforceError: a parameter, the jaw or the network cannot be used.
         """
-        from finforce_keypoints.detectors.build import build_detector
+        from finforce_keypoints.build import build_detector
         from finforce_keypoints.parameters import load_jaws
 
         live = next((name for name in LIVE if name in self.parameters), None)

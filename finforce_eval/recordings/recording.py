@@ -42,6 +42,8 @@ for _side in JAWS:
         f"/{_side}/{TRUE_POSE}": POSE,
     }
 
+SHIPPED = Path(__file__).parents[1] / "data" / "bench_cyl25_middle"  # a loading cycle of the bench
+
 
 class _Content(NamedTuple):
     """What lies in a bag: messages by topic, images, and notes on what was left aside."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,6 @@ from numpy.typing import NDArray
 
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, PhaseTrack, Recording, WrenchTrack, parse_phases
-from finforce_eval.recordings.writer import write_recording
 
 SHIPPED = Path(__file__).parents[1] / "data" / "steel" / "finray_steel_r20.json"
 HALF_BASE = 36.62  # mm, half the distance of the two strips at the base
@@ -91,16 +88,3 @@ def _phases(stamps: NDArray[np.int64], levels: NDArray[np.float64], name: str) -
     begins = np.stack([stamps[::FRAMES_PER_LEVEL], stamps[SETTLE_FRAMES::FRAMES_PER_LEVEL]], axis=1)
     texts = [f"0:load:{level:g}:{stage}" for level in levels for stage in ("settle", "record")]
     return parse_phases(begins.ravel().tolist(), texts, name)
-
-
-def run_convert(options: argparse.Namespace) -> None:
-    """Convert the measurement and write the recording."""
-    source = Path(options.source) if options.source else SHIPPED
-    try:
-        measurement = json.loads(source.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise RecordingError(f"{source}: not JSON: {error}") from error
-    output = Path(options.output)
-    folder = write_recording(recording_from_measurement(measurement), output, storage=options.storage)
-    print(f"Recording: {folder}")
-    print(f"Score it with: finforce evaluate {folder} --jaw steel")

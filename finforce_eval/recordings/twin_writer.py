@@ -24,11 +24,13 @@ from finforce_eval.recordings.image_messages import (
     compress_depth,
     encode_color,
 )
+from finforce_eval.recordings.preview import Preview
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, TRUE_KEYPOINTS, TRUE_POSE, WRENCH
 from finforce_eval.recordings.writer import Entry, MessageFactory, write_entries
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_twin.footage import Footage, TrueJaw, TwinFrame
-from finforce_twin.rendering.encoding import encode_depth, info_fields, sight_columns
+from finforce_twin.gripper.encoding import encode_depth, info_fields, sight_columns
+from finforce_twin.gripper.footage import FINGER, Footage, TrueJaw, TwinFrame, build_footage
+from finforce_twin.scenes.scenarios import Scenario
 
 FRAME = "camera_color_optical_frame"
 MESH = "object.stl"
@@ -179,3 +181,31 @@ def _truth_entries(stamp: int, side: str, jaw: TrueJaw, factory: MessageFactory)
 
 def _pose(stamp: int, pose: np.ndarray, factory: MessageFactory) -> Any:
     return factory.pose(stamp, FRAME, pose[:3, 3], quaternion_from_pose(pose))
+
+
+PREVIEW = "preview.jpg"
+
+
+def record_scene(
+    scenario: Scenario, seed: int, folder: Path, *, camera: Any, form: RecordingForm, finger: int = FINGER
+) -> None:
+    """Render a scene of a finger into a new folder, under a progress bar."""
+    from tqdm import tqdm
+
+    footage = build_footage(scenario, seed, camera, finger=finger, depth_step=form.depth_step)
+    preview = Preview(len(footage))
+    case = {
+        "scene": scenario.name,
+        "seed": seed,
+        "finger": finger,
+        "light": scenario.light,
+        "object": {"kind": scenario.object},
+    }
+    with tqdm(total=len(footage), unit="image", desc=scenario.name, disable=None, leave=False) as bar:
+
+        def seen(frame: Any) -> None:
+            preview.take(frame)
+            bar.update()
+
+        write_footage(footage, folder, form=form, case=case, seen=seen)
+    preview.save(folder / PREVIEW)

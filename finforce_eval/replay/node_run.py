@@ -13,12 +13,11 @@ from time import monotonic, time_ns
 from typing import TYPE_CHECKING, Protocol
 
 from finforce.errors import MissingDependencyError
-from finforce_eval.bench.cpu_share import CpuMeter, busy_seconds
-from finforce_eval.bench.film import Film
-from finforce_eval.bench.process import child_processes, resident_bytes
+from finforce_eval.replay.cpu_share import CpuMeter, busy_seconds, child_processes, resident_bytes
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.processes import ProcessError, ProcessGroup
+from finforce_eval.replay.synthetic_stream import Film
 
 if TYPE_CHECKING:
     from finforce_eval.replay.node import PlayerNode

@@ -17,7 +17,6 @@ from finforce.errors import MissingDependencyError
 from finforce.skipping import IDLE
 from finforce.systems.options import ReplayOptions
 from finforce.systems.processes import Process, replay_processes
-from finforce_eval.cli.evaluate import EvaluationSetup, truth_sides
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_choice import FIXED, ContactChoice
 from finforce_eval.evaluation.detection import awaiting_keypoints, with_detections
@@ -25,6 +24,7 @@ from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, 
 from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSource
 from finforce_eval.evaluation.results import CaseResult
 from finforce_eval.evaluation.scoring import GraspScore, score_grasp
+from finforce_eval.evaluation.setup import EvaluationSetup, truth_sides
 from finforce_eval.recordings.objects import find_mesh, require_mesh
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import write_recording

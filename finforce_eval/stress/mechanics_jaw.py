@@ -12,13 +12,13 @@ from finforce_eval.stress.press import OWN_MECHANICS
 from finforce_eval.stress.stress import Plan, Trial
 from finforce_ifea.contact_mechanics.forward_press import PressState, RigidCylinder, RigidObject, press_jaw
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact, measure_penalty_energy
-from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.errors import ContactError
 from finforce_ifea.fem.factorisation import sparse_from_banded
-from finforce_ifea.fem.mechanics import Mechanics, build_mechanics
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw, load_jaw
 from finforce_ifea.jaw.jaw_file import Material
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.paper_inverse import Problem, surface_normals
 from finforce_ifea.settings import EstimatorSettings
 

@@ -13,9 +13,9 @@ from finforce_ifea.contact_mechanics.forward_press import PressState, RigidCylin
 from finforce_ifea.contact_mechanics.penalty import measure_penalty_energy
 from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 
 # The truth comes from the estimator's own mechanics: no more than this share of a force is left to it.

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from finforce_eval.bench.process import resident_bytes
+from finforce_eval.replay.cpu_share import resident_bytes
 from finforce_eval.stress.press import Bench
 from finforce_eval.stress.session import PERIOD, Session, SessionStep, open_session, take_another
 from finforce_eval.stress.stress import Family, Plan, Trial

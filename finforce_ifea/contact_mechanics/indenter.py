@@ -18,9 +18,9 @@ from finforce_ifea.contact_mechanics.distance_field import (
     find_leading,
     read_depth,
 )
-from finforce_ifea.contact_mechanics.outline import ObjectOutline, are_same_polygons
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact, press_cylinder, press_field
 from finforce_ifea.observation import Contact
+from finforce_ifea.outline import ObjectOutline, are_same_polygons
 from finforce_ifea.settings import EstimatorSettings
 
 DEPTH, SHAPE, HEIGHT = 0, 1, 2

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from finforce_ifea.contact_mechanics.indenter import Indenter, RoundIndenter
 from finforce_ifea.contact_mechanics.surface import ContactSurface
 from finforce_ifea.fem.model import JawModel
+from finforce_ifea.jaw.mesh import VolumeMesh
 
 # Where along the surface the line loads stand, as shares of its points.
 _HEIGHTS = (0.25, 0.5, 0.75)
@@ -159,3 +160,12 @@ def limit_step(model: JawModel, step: NDArray) -> NDArray:
     """Returns a step of the unknowns shortened so that none exceeds the model's reach."""
     largest = measure_step(model, step)
     return step if largest <= 1.0 else step / largest
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mechanics:
+    """A jaw's mesh, its model, and the model with its contact surface."""
+
+    mesh: VolumeMesh
+    model: JawModel
+    contact: RollingContact

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from finforce_ifea.fem.attachment import attach_points
 from finforce_ifea.fem.corotation import (
     add_probe_springs,
     corotational_elements,
@@ -19,6 +18,7 @@ from finforce_ifea.fem.corotation import (
 from finforce_ifea.fem.elements import centre_gradient, elasticity_matrix, hex_stiffness, tet_stiffness
 from finforce_ifea.fem.factorisation import Factor, SparseFactor, factorise_banded, sparse_from_banded
 from finforce_ifea.fem.model import LARGEST_MOVE, Linearization
+from finforce_ifea.jaw.attachment import attach_points
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
 

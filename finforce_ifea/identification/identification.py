@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from finforce_ifea.contact_mechanics.indenter import DEPTH, ExpectedObject, expect_object
-from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
-from finforce_ifea.fem.mechanics import Mechanics, build_mechanics, choose_full
 from finforce_ifea.identification.force_history import (
     BRANCH_HIGH,
     BRANCH_LOW,
@@ -28,6 +27,7 @@ from finforce_ifea.identification.force_history import (
 from finforce_ifea.identification.plateaus import INSTANTS, CalibrationCase, Plateau, find_plateaus
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
+from finforce_ifea.mechanics import build_mechanics, choose_full
 from finforce_ifea.relaxation import invert_relaxation
 from finforce_ifea.settings import EstimatorSettings
 

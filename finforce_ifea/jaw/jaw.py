@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import JawFileError, MeshError
-from finforce_ifea.fem.attachment import attach_points, attach_surface_points
+from finforce_ifea.jaw.attachment import attach_points, attach_surface_points
 from finforce_ifea.jaw.drawing import Drawing
 from finforce_ifea.jaw.jaw_file import (
     Material,

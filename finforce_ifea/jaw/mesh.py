@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from finforce_ifea.errors import MeshError
-from finforce_ifea.fem.elements import EDGES_TET10, shape_gradients
+from finforce_ifea.jaw.shape_functions import EDGES_TET10, shape_gradients
 
 FACES_HEX = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
 FACES_TET = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])

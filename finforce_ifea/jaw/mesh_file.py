@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from finforce.errors import MissingDependencyError
 from finforce_ifea.errors import MeshError
-from finforce_ifea.fem.elements import EDGES_TET10
 from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, check_connection
+from finforce_ifea.jaw.shape_functions import EDGES_TET10
 
 _VOLUME_CELLS = ("tetra", "tetra10", "hexahedron")
 # Cells of fewer dimensions that mesh generators write beside the volume.

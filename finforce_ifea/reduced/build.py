@@ -13,9 +13,8 @@ from scipy.linalg import eigh
 from scipy.sparse.linalg import splu
 
 from finforce_ifea.contact_mechanics.indenter import RoundIndenter
-from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RollingContact, limit_step
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, PressedState, RollingContact, limit_step
 from finforce_ifea.errors import ContactError
-from finforce_ifea.fem.mechanics import Mechanics
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.reduced.equilibria import STENCIL, Manifold
 

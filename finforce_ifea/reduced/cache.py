@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.fem.frame import FrameModel
-from finforce_ifea.fem.mechanics import Mechanics
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.reduced import build as manifold_build
 from finforce_ifea.reduced.build import build_manifold, build_rest

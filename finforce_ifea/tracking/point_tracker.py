@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.errors import NotEnoughDataError, UnobservableError
-from finforce_ifea.fem.mechanics import Mechanics
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.observation import Contact
 from finforce_ifea.paper_inverse import InverseResult, Problem, solve_inverse

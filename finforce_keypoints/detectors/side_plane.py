@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import OpeningRange
-from finforce_keypoints.detectors.pixel_finder import REFERENCE, PixelFinding
 from finforce_keypoints.errors import ModelError
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
+from finforce_keypoints.pixel_finder import REFERENCE, PixelFinding
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.detectors.pixel_finder import PixelFinding
 from finforce_keypoints.geometry.depth import DepthEvidence, build_side_samples, sample_depths, weigh_depths
 from finforce_keypoints.geometry.jaw_pose import Origin, OriginFinder, OriginTrack
 from finforce_keypoints.geometry.reference_patch import ReferencePatch
@@ -25,6 +24,7 @@ from finforce_keypoints.geometry.side_fit import (
     rays_through,
 )
 from finforce_keypoints.images import RgbdImage, lie_inside
+from finforce_keypoints.pixel_finder import PixelFinding
 from finforce_keypoints.settings import DetectorSettings
 
 _LEAST_SEEN = 3  # points, or all there are: fewer likely ones are no jaw

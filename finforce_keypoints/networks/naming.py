@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.detectors.pixel_finder import REFERENCE
 from finforce_keypoints.errors import NamingError
+from finforce_keypoints.pixel_finder import REFERENCE
 
 IGNORED = "-"  # what a body part is mapped to that belongs to no jaw
 

@@ -13,7 +13,7 @@ from finforce.camera import CameraIntrinsics
 from finforce.transforms import invert_pose
 from finforce_driver.emulator.settings import EmulatorSettings
 from finforce_twin.errors import ScenarioError
-from finforce_twin.footage import FINGER, TRACKED_EVERY, TwinFrame, disturb_pose, set_stage
+from finforce_twin.gripper.footage import FINGER, TRACKED_EVERY, TwinFrame, disturb_pose, set_stage
 from finforce_twin.gripper.pressing import PressedGrasp, RelaxedGrasp, Wrench
 from finforce_twin.gripper.reel import Reel, choose_openings, film_grasp
 from finforce_twin.rendering.depth_camera import build_d405_vga

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.jaw.meshing import MeshDensity
 from finforce_twin.errors import BalanceError
-from finforce_twin.footage import FINGER
+from finforce_twin.gripper.footage import FINGER
 from finforce_twin.gripper.gripper import JawState, TwinState
 from finforce_twin.mechanics.assembly import Assembly
 from finforce_twin.mechanics.material import RelaxedWrench

@@ -13,7 +13,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_twin.footage import TwinFrame, true_jaw
+from finforce_twin.gripper.footage import TwinFrame, true_jaw
 from finforce_twin.gripper.pressing import PressedGrasp
 from finforce_twin.rendering.photographer import Photographer
 

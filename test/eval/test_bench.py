@@ -13,21 +13,14 @@ import pytest
 from finforce.errors import MissingDependencyError
 from finforce_eval.bench import bench
 from finforce_eval.bench import live as bench_live
-from finforce_eval.bench.bench import (
-    PARTS,
-    BenchPart,
-    format_rows,
-    row_from_times,
-    select_parts,
-    time_calls,
-    write_figures,
-)
+from finforce_eval.bench.bench import PARTS, BenchPart, format_rows, row_from_times, select_parts, time_calls
 from finforce_eval.bench.live import MIRROR_MOMENT, LiveFigures, with_both_jaws
-from finforce_eval.bench.process import child_processes, resident_bytes
-from finforce_eval.cli.demo import RECORDING
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.machine import write_figures
+from finforce_eval.recordings.recording import SHIPPED as RECORDING
 from finforce_eval.recordings.recording import read_recording
+from finforce_eval.replay.cpu_share import child_processes, resident_bytes
 from finforce_ifea.jaw.jaw import load_jaw
 
 ROOT = Path(__file__).parents[2]

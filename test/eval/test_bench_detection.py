@@ -41,7 +41,7 @@ def detectors(monkeypatch, bag):
 
     def begin(way, recording):
         made[way.name] = Watched(recording, lost=range(0, 12, 2) if way.name == "blind" else ())
-        return bench._Run(way=way, detector=made[way.name], logs={"left": bench.SideLog()})
+        return bench._DetectionRun(way=way, detector=made[way.name], logs={"left": bench.SideLog()})
 
     monkeypatch.setattr(bench, "_begin", begin)
     monkeypatch.setattr(bench, "find_scene", lambda scene: bag)

@@ -18,8 +18,8 @@ from finforce_eval.bench.growth_solver import (
     mesh_jaw,
     spread_keypoints,
 )
-from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 
 JAW = bench_finger()

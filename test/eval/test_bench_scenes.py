@@ -8,8 +8,10 @@ from rgbd_fakes import FakeGripper
 from scipy.spatial.transform import Rotation
 
 from finforce_eval.bench import scenes
-from finforce_eval.bench.scenes import EVERY_RATE, FINE_RATE, GRASP, SmoothGripper, blend_states, find_scene, slot_of
-from finforce_twin.footage import START
+from finforce_eval.bench.scenes import EVERY_RATE, GRASP, SmoothGripper, blend_states, find_scene
+from finforce_eval.replay import synthetic_stream
+from finforce_eval.replay.synthetic_stream import FINE_RATE, slot_of
+from finforce_twin.gripper.footage import START
 
 
 def turned(state, angle):
@@ -52,7 +54,7 @@ def test_states_of_the_script_are_not_changed():
 
 
 def test_slots_are_those_of_the_stamps_that_a_scene_is_recorded_with():
-    assert scenes.START == START
+    assert synthetic_stream.START == START
     assert slot_of(START + round(1e9 * 7 / FINE_RATE)) == 7
 
 

@@ -32,7 +32,7 @@ def bag(tmp_path):
 def exact(monkeypatch):
     """Estimates that are a tenth above the truth."""
     forces = bench_recording().jaws["left"].truth.force * 1.1
-    monkeypatch.setattr("finforce_eval.cli.evaluate.JawEstimator", lambda *_, **__: FakeEstimator(forces))
+    monkeypatch.setattr("finforce_eval.evaluation.setup.JawEstimator", lambda *_, **__: FakeEstimator(forces))
 
 
 def assert_refused(capsys, arguments, reason):
@@ -74,7 +74,7 @@ def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path, exact,
 
 def test_note_about_unknown_types_goes_to_stderr(tmp_path, exact, capsys, monkeypatch):
     noted = replace(bench_recording(), notes=("/odd skipped: unknown type own_msgs/msg/Odd",))
-    monkeypatch.setattr("finforce_eval.cli.evaluate.read_recording", lambda *_: noted)
+    monkeypatch.setattr("finforce_eval.evaluation.setup.read_recording", lambda *_: noted)
     assert main(["evaluate", "pressed"]) == 0
     assert capsys.readouterr().err == "note: pressed: /odd skipped: unknown type own_msgs/msg/Odd\n"
 
@@ -159,7 +159,7 @@ def test_object_that_cannot_be_used_is_refused(capsys, bag, tmp_path):
 
 def test_units_are_those_of_the_mesh_reader():
     from finforce_contact.mesh.object_mesh import UNITS as READ
-    from finforce_eval.cli.main import UNITS
+    from finforce_eval.cli.parser import UNITS
 
     assert set(UNITS) == set(READ)
 
@@ -190,7 +190,7 @@ def test_setting_that_cannot_be_is_refused(capsys, bag, change):
 
 
 def test_settings_take_the_type_of_their_default():
-    from finforce_eval.cli.evaluate import parse_settings
+    from finforce_eval.evaluation.setup import parse_settings
 
     settings = parse_settings("solid", "coarse", ["iterations=3", "gate=2", "automatic_tare=No"])
     assert (settings.solver, settings.mesh) == ("solid", "coarse")
@@ -199,7 +199,7 @@ def test_settings_take_the_type_of_their_default():
 
 
 def test_all_key_points_hidden_is_refused(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("finforce_eval.cli.evaluate.JawEstimator", lambda *_, **__: FakeEstimator([None] * 60))
+    monkeypatch.setattr("finforce_eval.evaluation.setup.JawEstimator", lambda *_, **__: FakeEstimator([None] * 60))
     bag = write_recording(bench_recording(), tmp_path / "bag")
     assert_refused(capsys, ["evaluate", bag], "none of the frames to be scored was solved")
 

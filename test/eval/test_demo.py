@@ -11,7 +11,6 @@ from eval_fakes import FakeEstimator, FakeJaw
 from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 
 from finforce_eval.cli import demo
-from finforce_eval.cli import twin as twin_commands
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import GivenContact
 from finforce_eval.evaluation.detection import detect_keypoints
@@ -32,7 +31,7 @@ def rendered(monkeypatch):
         calls.append((scenario.name, seed, finger))
         return make_footage(seed=seed)
 
-    monkeypatch.setattr(twin_commands, "build_footage", build)
+    monkeypatch.setattr("finforce_eval.recordings.twin_writer.build_footage", build)
     return calls
 
 
@@ -159,7 +158,7 @@ def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered,
 
     monkeypatch.setattr(demo, "replay", play)
     monkeypatch.setattr(demo, "write_report", report)
-    demo.run_demo(Namespace(source="images", contact=[], report=str(tmp_path / "report")))
+    demo.run(Namespace(source="images", contact=[], report=str(tmp_path / "report")))
     assert asked["recording"].path == tmp_path / "report" / "recording"
     assert (asked["calibration"], asked["source"], asked["about"]["contact"]) == ("twin", "images", "estimate")
     assert asked["recordings"] == [played]

@@ -8,14 +8,24 @@ from rgbd_fakes import CAMERA, MESH, FakeGripper, FakePhotographer
 
 from finforce.gripper_frames import BENCH_CAMERA
 from finforce.messages import read_stamp
-from finforce_eval.bench.film import MASK_TOPIC, OBJECT_TOPIC, film_images, film_keypoints, film_mask, thin_messages
-from finforce_eval.bench.scenes import EVERY_RATE, FINE_RATE, START, SmoothGripper, slot_of
+from finforce_eval.bench.scenes import EVERY_RATE, SmoothGripper
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.image_messages import IMAGE
 from finforce_eval.recordings.twin_writer import write_footage
 from finforce_eval.replay.playback import RawMessage
+from finforce_eval.replay.synthetic_stream import (
+    FINE_RATE,
+    MASK_TOPIC,
+    OBJECT_TOPIC,
+    START,
+    film_images,
+    film_keypoints,
+    film_mask,
+    slot_of,
+    thin_messages,
+)
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_twin.footage import Footage
+from finforce_twin.gripper.footage import Footage
 from finforce_twin.rendering.photographer import SceneSetting
 
 

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("onnx")
 
 from finforce_eval.bench.network_variants import SIZES, _resize_maps, write_dynamic, write_small, write_static
-from finforce_keypoints.detectors.build import SHIPPED
+from finforce_keypoints.build import SHIPPED
 from finforce_keypoints.detectors.side_plane import grid_from_metadata
 from finforce_keypoints.networks.model import KeypointModel
 

@@ -6,12 +6,12 @@ import sys
 
 import pytest
 
-from finforce_eval.bench.film import Film
 from finforce_eval.recordings.recording import POSE
 from finforce_eval.recordings.writer import MessageFactory
 from finforce_eval.replay.node_run import Listener, describe_load, find_processes, run_nodes
 from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.processes import ProcessError
+from finforce_eval.replay.synthetic_stream import Film
 
 TOPIC = "/left/jaw_pose"
 

@@ -16,7 +16,7 @@ import pytest
 
 from finforce.transforms import pose_from_quaternion, quaternion_from_pose
 from finforce_eval.bench.live import with_both_jaws
-from finforce_eval.cli.evaluate import make_setup
+from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay import replay as replaying

@@ -10,7 +10,7 @@ from eval_fakes import BOX, BOX_TRIANGLES, FakeEstimator, FakeJaw, make_recordin
 
 from finforce_eval.evaluation.contact_source import GivenContact
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
-from finforce_eval.evaluation.report import write_report
+from finforce_eval.figures.report import write_report
 
 pytest.importorskip("matplotlib")
 

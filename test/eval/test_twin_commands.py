@@ -30,7 +30,7 @@ def asked(monkeypatch):
         calls.append((scenario, seed, camera, finger, depth_step))
         return make_footage(seed=seed)
 
-    monkeypatch.setattr(twin_commands, "build_footage", build)
+    monkeypatch.setattr("finforce_eval.recordings.twin_writer.build_footage", build)
     return calls
 
 

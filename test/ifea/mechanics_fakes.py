@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
-from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.fem.solid import find_mirror_nodes
 from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import build_volume_mesh
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 
 MODULUS = 30e6

@@ -25,8 +25,8 @@ from finforce.errors import ObservationError
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import CalibrationError, ContactError, JawFileError
 from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, load_jaw
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.settings import EstimatorSettings
 

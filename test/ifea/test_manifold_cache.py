@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from mechanics_fakes import BENCH, bench_mechanics
 
-from finforce_ifea.fem.mechanics import build_mechanics
 from finforce_ifea.jaw.drawing import Drawing
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.reduced import cache as manifold_cache
 from finforce_ifea.reduced.cache import cache_folder, fetch_manifold, hash_parts, name_manifold
 from finforce_ifea.reduced.equilibria import Manifold

@@ -12,9 +12,9 @@ from test_tracking import settle
 from finforce_ifea.contact_mechanics.distance_field import CELL, build_distance_field, read_depth
 from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder, press_jaw
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
-from finforce_ifea.contact_mechanics.outline import ObjectOutline
 from finforce_ifea.contact_mechanics.penalty import press_field
 from finforce_ifea.errors import ContactError
+from finforce_ifea.outline import ObjectOutline
 
 FACE = BENCH.inner_face_x
 

@@ -11,9 +11,9 @@ from reduced_fakes import box, press, settle
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.errors import ContactError, JawFileError
-from finforce_ifea.fem.mechanics import build_chosen, build_mechanics
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.mechanics import build_chosen, build_mechanics
 from finforce_ifea.observation import Contact
 from finforce_ifea.paper_inverse import Problem, solve_inverse
 from finforce_ifea.settings import EstimatorSettings

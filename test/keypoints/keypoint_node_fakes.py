@@ -13,7 +13,7 @@ from std_msgs.msg import Header
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.ros import node as ros
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.detectors.build import BuiltDetector, FinderCard
+from finforce_keypoints.build import BuiltDetector, FinderCard
 from finforce_keypoints.node import KeypointDetectorNode
 from finforce_keypoints.parameters import DetectorParameters
 

@@ -11,8 +11,8 @@ from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detector import KeypointDetector
-from finforce_keypoints.detectors.pixel_finder import PixelFinding
 from finforce_keypoints.images import RgbdImage
+from finforce_keypoints.pixel_finder import PixelFinding
 from finforce_keypoints.settings import DetectorSettings
 from finforce_twin.rendering.depth_camera import D405_DISTORTION, DepthNoise, disturb_depth
 

@@ -14,7 +14,7 @@ from finforce_eval.recordings.twin_writer import write_footage
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.geometry.extrinsics import SeenJaw, find_extrinsics
-from finforce_twin.footage import Footage, build_footage
+from finforce_twin.gripper.footage import Footage, build_footage
 from finforce_twin.rendering.depth_camera import build_d405_vga
 from finforce_twin.scenes.scenarios import build_scenario
 

@@ -6,8 +6,8 @@ from hashlib import sha256
 import pytest
 from keypoint_fakes import Fake, small_jaws, write_model
 
+from finforce_keypoints.build import build_detector, build_finder, load_model
 from finforce_keypoints.detector import KeypointDetector
-from finforce_keypoints.detectors.build import build_detector, build_finder, load_model
 from finforce_keypoints.detectors.dots import DotFinder
 from finforce_keypoints.detectors.side_plane import PlaneFinder
 from finforce_keypoints.detectors.whole_image import FrameFinder

@@ -6,7 +6,7 @@ import numpy as np
 from keypoint_node_fakes import COUNT, JAW, FakeKeypoints
 
 from finforce.health import Level
-from finforce_keypoints.detectors.build import FinderCard
+from finforce_keypoints.build import FinderCard
 from finforce_keypoints.diagnostics import build_skeleton, describe_names, outcome_of_keypoints
 from finforce_keypoints.overlay import COLORS, LINE, draw_keypoints
 

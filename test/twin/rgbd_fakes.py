@@ -9,7 +9,7 @@ from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import BENCH_CAMERA, jaw_in_camera
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_keypoints.errors import DetectionError
-from finforce_twin.footage import Footage
+from finforce_twin.gripper.footage import Footage
 from finforce_twin.gripper.gripper import JawState, TwinState
 from finforce_twin.rendering.photographer import SceneSetting, Shot, TrueKeypoints
 

@@ -21,12 +21,12 @@ from finforce.ros import node as ros
 from finforce.settings import ParameterError
 from finforce_twin import node as twin_node
 from finforce_twin.errors import ScenarioError
-from finforce_twin.footage import parse_size
+from finforce_twin.gripper.encoding import encode_depth
+from finforce_twin.gripper.footage import parse_size
 from finforce_twin.gripper.live import LiveScene
 from finforce_twin.gripper.pressing import PressedGrasp
 from finforce_twin.node import TwinCameraNode
 from finforce_twin.parameters import TwinParameters
-from finforce_twin.rendering.encoding import encode_depth
 from finforce_twin.scenes.scenarios import build_scenario
 
 COLOR = "/camera/camera/color/image_raw"

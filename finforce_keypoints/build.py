@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_keypoints.detector import KeypointDetector
     from finforce_keypoints.detectors.dots import DotSettings
-    from finforce_keypoints.detectors.pixel_finder import PixelFinder
     from finforce_keypoints.networks.model import KeypointModel
     from finforce_keypoints.parameters import DetectorParameters
+    from finforce_keypoints.pixel_finder import PixelFinder
     from finforce_keypoints.settings import DetectorSettings
 
-SHIPPED = Path(__file__).parents[1] / "models" / "plane"
+SHIPPED = Path(__file__).parent / "models" / "plane"
 ANSWERS = {"auto": None, "yes": True, "no": False}
 
 

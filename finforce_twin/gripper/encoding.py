@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
-from finforce_twin.footage import TrueJaw
+from finforce_twin.gripper.footage import TrueJaw
 
 FARTHEST = 65535.0  # steps in 16 bits
 

@@ -16,7 +16,6 @@ from finforce.stamps import NANOSECONDS
 from finforce.transforms import pose_from_quaternion
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.views import MeshView
-from finforce_eval.bench.scenes import FINE_RATE, POSE_SLOTS, slot_of
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import TRUTH, KeypointSource
 from finforce_eval.recordings.image_messages import IMAGE
@@ -137,3 +136,17 @@ def film_mask(source: Path) -> RawMessage:
     )
     data = bytes(factory.typestore.serialize_cdr(message, IMAGE))
     return RawMessage(stamp, MASK_TOPIC, IMAGE, data, True)
+
+
+FINE_RATE = 180  # [Hz] of the slots in which images can lie; 30, 60 and 90 divide it
+
+
+POSE_SLOTS = 18  # the object is tracked at 10 Hz
+
+
+START = 1_000_000_000_000  # [ns] stamp of slot 0, as the twin has it
+
+
+def slot_of(stamp: int) -> int:
+    """Return in which slot of 1/180 s a stamp [ns] of a scene lies."""
+    return round((stamp - START) * FINE_RATE / 1_000_000_000)

@@ -1,9 +1,9 @@
 """The mechanics of a jaw by name: mesh, model and contact surface."""
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from finforce_ifea.contact_mechanics.pressed_jaw import RollingContact
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact
 from finforce_ifea.contact_mechanics.surface import Across, build_contact_surface
 from finforce_ifea.errors import ContactError, JawFileError
 from finforce_ifea.fem.locking import warn_of_locking
@@ -11,20 +11,9 @@ from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.fem.tetrahedra import to_tet4
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_ifea.jaw.mesh import VolumeMesh
-from finforce_ifea.reduced.evaluation import ReducedContact
 from finforce_ifea.settings import EstimatorSettings
 
 _REDUCED = ("reduced", "linear")
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Mechanics:
-    """A jaw's mesh, its model, and the model with its contact surface."""
-
-    mesh: VolumeMesh
-    model: JawModel
-    contact: RollingContact | ReducedContact
 
 
 def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:

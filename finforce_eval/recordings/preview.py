@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_twin.footage import TwinFrame
+from finforce_twin.gripper.footage import TwinFrame
 
 COUNT, COLUMNS = 6, 2
 WIDEST = 320  # [px] of an image in the picture

@@ -1,0 +1,39 @@
+"""`finforce calibrate`: the material of a finger from recordings with ground truth."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from finforce_eval.cli.parser import add_jaw_options, add_set, add_source_options
+from finforce_eval.evaluation.setup import make_setup, read_keypoints, truth_sides
+from finforce_ifea.jaw.calibration import name_mechanics, save_calibration
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
+    add_jaw_options(parser)
+    add_source_options(parser)
+    add_set(parser)
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="calibration to be written")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Identify the material and write the calibration."""
+    from finforce_eval.calibration.calibrate import calibrate, calibration_case, format_fit
+
+    options.calibration = None
+    setup = make_setup(options)
+    recordings = read_keypoints(options)
+    is_left = all("left" in truth_sides(recording) for recording in recordings)
+    setup = setup.side("left" if is_left else "right")
+    jaw, contacts = setup.jaw, setup.contacts
+    cases = [calibration_case(recording, jaw, contacts, setup.density) for recording in recordings]
+    Path(options.output).parent.mkdir(parents=True, exist_ok=True)
+    fit = calibrate(cases, jaw, setup.settings)
+    print(format_fit(fit, cases))
+    named = replace(fit.calibration, solver=name_mechanics(jaw, setup.settings.solver))
+    save_calibration(named, options.output, uncertainty=fit.uncertainty)
+    print(f"Calibration: {options.output}")

@@ -1,0 +1,52 @@
+"""Options that several subcommands share, and a parser whose complaints are one line."""
+
+from __future__ import annotations
+
+import argparse
+from typing import NoReturn
+
+SOLVERS = ("default", "reduced", "solid", "frame", "linear", "paper")
+MESHES = ("default", "coarse", "fine")
+UNITS = ("m", "cm", "mm", "inch")
+SOURCES = ("images", "keypoints", "truth")
+CONTACT_HELP = (
+    "contact: estimate, closest or paper, from the object's mesh and pose; fixed:Z_MM, the height of first touch above "
+    "the clamped base; fixed:case takes it from the case.json beside each recording; NAME=Z_MM gives it for one "
+    "recording and may be repeated. Without it estimate for a recording with mesh and poses, else fixed:case"
+)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose complaints are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit with 2."""
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def add_jaw_options(parser: argparse.ArgumentParser) -> None:
+    """Add what names the jaw, the solver and the contact."""
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
+    parser.add_argument("--solver", default="default", choices=SOLVERS, help="model and objective")
+    parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
+    parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
+    mesh = "object mesh (STL, OBJ, PLY, GLB) in its own frame; without it the one that each case.json names"
+    parser.add_argument("--object", metavar="MESH", help=mesh)
+    parser.add_argument("--object-unit", default="m", choices=UNITS, help="unit of the mesh (m)")
+
+
+def add_source_options(parser: argparse.ArgumentParser) -> None:
+    """Add what names the key points and their detector."""
+    text = "key points: images, by the detector; keypoints, as recorded; truth, of a synthetic recording. Without it "
+    text += "keypoints where they were recorded, else images"
+    parser.add_argument("--from", dest="source", choices=SOURCES, help=text)
+    text = "change a parameter of the key point detector, as model=FOLDER or detector.gate=0.004; repeatable"
+    parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
+    text = "the camera in the gripper: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
+    parser.add_argument("--extrinsics", metavar="POSE", help=text)
+
+
+def add_set(parser: argparse.ArgumentParser) -> None:
+    """Add changes of single settings."""
+    text = "change a setting of the estimator, may be repeated; an unknown NAME lists them"
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)

@@ -1,0 +1,14 @@
+"""`finforce version`."""
+
+import argparse
+
+from finforce_eval.evaluation.setup import version
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add nothing."""
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print the version."""
+    print(f"finforce {version()}")

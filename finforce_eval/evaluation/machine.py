@@ -1,0 +1,75 @@
+"""Figures as JSON, with the machine, the versions and the commit that they are of."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return processor, cores, versions of what is installed, and commit."""
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        **dict(_find_versions()),
+        "commit": _commit(),
+    }
+
+
+def write_figures(path: Path | str, figures: Mapping[str, Any]) -> None:
+    """Write figures as JSON with the machine, versions and commit that they are of; what is not finite becomes null."""
+    write_json(path, {"machine": describe_machine(), **_without_nan(figures)})
+
+
+def _processor() -> str:
+    """Return the name of the processor."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def _commit() -> str:
+    """Return the commit of the sources, with a mark when they were changed since."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
+    folder = Path(__file__).parent
+    try:
+        return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def _without_nan(content: Any) -> Any:
+    """Return nested mappings and sequences with None for numbers that are not finite."""
+    if isinstance(content, Mapping):
+        return {name: _without_nan(value) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_without_nan(value) for value in content]
+    return None if isinstance(content, float) and not np.isfinite(content) else content
+
+
+def _find_versions() -> Iterator[tuple[str, str]]:
+    """Yield the installed libraries with their versions."""
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):
+            yield name, version(name)
+
+
+LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh", "small_gicp", "coal")
+
+
+def write_json(path: str, content: Mapping[str, Any]) -> None:
+    """Write one JSON object."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,0 +1,205 @@
+"""What an offline run needs beside the recordings: jaw, settings, calibration, contact; and the run itself."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as installed
+from pathlib import Path
+from typing import Any
+
+from finforce.errors import FinforceError
+from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.changes import parse_changes
+from finforce_eval.evaluation.contact_choice import ContactChoice, parse_contacts
+from finforce_eval.evaluation.contact_source import ContactSource, build_source
+from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
+from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.recordings.images import PAIRED
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import Recording
+from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.jaw.calibration import Calibration, load_calibration
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_ifea.settings import EstimatorSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationSetup:
+    """What an offline run needs beside the recordings."""
+
+    jaw: Jaw
+    settings: EstimatorSettings
+    calibration: Calibration | None
+    contacts: ContactChoice
+    about: Mapping[str, str]
+
+    def side(self, side: str) -> EvaluationSetup:
+        """Return the setup of the left or the right jaw; a jaw file describes the left one."""
+        return self if side == self.jaw.side else replace(self, jaw=self.jaw.mirrored())
+
+    def estimator(self) -> JawEstimator:
+        """Return a fresh estimator that has nothing left to compile."""
+        estimator = JawEstimator(self.jaw, settings=self.settings, calibration=self.calibration)
+        estimator.warm_up()
+        return estimator
+
+    @property
+    def density(self) -> str:
+        """Mesh density of the surface that the solver returns."""
+        return "coarse" if self.settings.solver == "paper" else self.settings.mesh
+
+    def source(self, recording: Recording) -> ContactSource:
+        """Return a fresh contact source for this jaw of a recording."""
+        jaw = self.calibration.apply(self.jaw) if self.calibration else self.jaw
+        return build_source(self.contacts, recording, jaw, self.density)
+
+
+def version() -> str:
+    """Return the version of the installed package."""
+    try:
+        return installed("finforce")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def read_recordings(paths: Sequence[str], pairing: int = PAIRED, sides: Sequence[str] = ()) -> list[Recording]:
+    """Read recordings and give each a name of its own.
+
+    Args:
+        paths: of the recordings.
+        pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
+        sides: jaws that are in the images, whether or not a topic tells of them.
+
+    Raises:
+        RecordingError: one of them cannot be read.
+        OptionError: one was given twice.
+    """
+    if len({Path(path).resolve() for path in paths}) < len(paths):
+        raise OptionError("a recording was given twice")
+    recordings = [read_recording(path, pairing, sides) for path in paths]
+    names = [recording.name for recording in recordings]
+    for recording in recordings:
+        for note in recording.notes:
+            print(f"note: {recording.name}: {note}", file=sys.stderr)
+    return [
+        recording if names.count(recording.name) == 1 else replace(recording, name=_long_name(recording))
+        for recording in recordings
+    ]
+
+
+def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> list[Recording]:
+    """Read the recordings with the key points that were asked for.
+
+    Args:
+        options: of the command line.
+        sides: jaws that are in the images, whether or not a topic tells of them.
+
+    Raises:
+        FinforceError: one of them cannot be read, or has no such key points.
+    """
+    source = parse_source(options)
+    recordings = []
+    for read in read_recordings(options.bags, source.pairing, sides):
+        recording = source.apply(read)
+        for note in recording.notes[len(read.notes) :]:
+            print(f"note: {recording.name}: {note}", file=sys.stderr)
+        recordings.append(recording)
+    return recordings
+
+
+def _long_name(recording: Recording) -> str:
+    """Return the name with the folders above it."""
+    return "/".join(recording.path.resolve().with_suffix("").parts[-3:])
+
+
+def make_setup(options: argparse.Namespace) -> EvaluationSetup:
+    """Load what the options name.
+
+    Raises:
+        FinforceError: the contact, the jaw or the calibration cannot be used.
+    """
+    contacts = parse_contacts(
+        options.contact,
+        object_file=getattr(options, "object", None),
+        object_unit=getattr(options, "object_unit", "m"),
+    )
+    jaw = load_jaw(options.jaw)
+    changes = getattr(options, "set", [])
+    settings = parse_settings(options.solver, options.mesh, changes)
+    calibration = load_calibration(options.calibration) if options.calibration else None
+    about = {
+        "jaw": jaw.name,
+        "solver": options.solver,
+        "mesh": options.mesh,
+        "keypoints": getattr(options, "source", None) or "keypoints where they were recorded, else images",
+        "contact": ", ".join(options.contact) or "estimate where mesh and poses are known, else fixed:case",
+        "settings": ", ".join(changes) or "as they come",
+        "calibration": options.calibration or "none",
+        "version": version(),
+    }
+    return EvaluationSetup(jaw=jaw, settings=settings, calibration=calibration, contacts=contacts, about=about)
+
+
+def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorSettings:
+    """Return the settings of the estimator with `NAME=VALUE` changes.
+
+    Raises:
+        OptionError: a name is unknown, or a value is not of the setting's type or out of its bounds.
+    """
+    values = parse_changes("--set", "setting", changes, asdict(EstimatorSettings()))
+    try:
+        return EstimatorSettings(**{"solver": solver, "mesh": mesh, **values})
+    except FinforceError as error:
+        raise OptionError(f"settings: {error}") from error
+
+
+def evaluate_all(recordings: Sequence[Recording], setup: EvaluationSetup) -> Evaluation:
+    """Evaluate every jaw with ground truth of every recording, under one progress bar.
+
+    Raises:
+        FinforceError: one of them cannot be evaluated.
+    """
+    from tqdm import tqdm
+
+    for recording in recordings:
+        for side in truth_sides(recording):
+            check_keypoint_count(recording, side, setup.jaw)
+            setup.side(side).source(recording)
+    cases = [(recording, side) for recording in recordings for side in truth_sides(recording)]
+    frames = sum(len(recording.jaw(side).keypoints.stamps) for recording, side in cases)
+    results = []
+    with tqdm(total=frames, unit="frame", disable=None, leave=False) as bar:
+        for recording, side in cases:
+            bar.set_description(recording.name)
+            results.append(_evaluate_case(recording, side, setup.side(side), bar.update))
+    return score_results(results, recordings)
+
+
+def truth_sides(recording: Recording) -> list[str]:
+    """Return the jaws of a recording that have ground truth.
+
+    Raises:
+        RecordingError: there is none.
+    """
+    sides = [side for side, track in recording.jaws.items() if track.truth is not None]
+    if not sides:
+        recording.truth(next(iter(recording.jaws)))
+    return sides
+
+
+def _evaluate_case(recording: Recording, side: str, setup: EvaluationSetup, progress: Any) -> CaseResult:
+    """Evaluate one jaw of one recording."""
+    result = evaluate_recording(
+        recording,
+        setup.jaw,
+        setup.source(recording),
+        side=side,
+        factory=setup.estimator,
+        progress=progress,
+    )
+    return result if len(truth_sides(recording)) == 1 else replace(result, name=f"{recording.name}/{side}")
