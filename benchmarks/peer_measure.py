@@ -17,9 +17,8 @@ from tqdm import tqdm
 
 from finforce_eval.bench.bench import row_from_times, time_calls
 from finforce_eval.bench.cases import LEVELS, ReplayedPress, bench_finger, load_cases, record_press
-from finforce_eval.bench.growth_solver import factorise_sparse
-from finforce_eval.bench.scores import score_shapes
-from finforce_eval.bench.tiers import TIERS, Run, Tier, run_tier
+from finforce_eval.bench.growth import factorise_sparse
+from finforce_eval.bench.tiers import TIERS, Run, Tier, run_tier, score_shapes
 from finforce_eval.replay.processes import ProcessError
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import load_jaw

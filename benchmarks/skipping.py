@@ -8,8 +8,7 @@ should run meanwhile; the table says what did.
 
 import argparse
 
-from finforce_eval.bench.skipping import EACH, SETTINGS, measure
-from finforce_eval.bench.skipping_figures import as_json, draw, format_each, format_table
+from finforce_eval.bench.skipping import EACH, SETTINGS, as_json, draw, format_each, format_table, measure
 from finforce_eval.evaluation.machine import write_figures
 
 

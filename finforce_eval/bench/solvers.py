@@ -1,8 +1,13 @@
-"""Run time against force error of every solver tier: nine presses of an independent program, one thread, one run."""
+"""Run time against force error of every solver tier: nine presses of an independent program, one thread, one run.
+
+The solver tiers' figures as tables in Markdown, aligned for a terminal.
+
+The picture of run time against force error; figures in, a matplotlib figure out.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import thread_time
@@ -13,12 +18,12 @@ from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
 from finforce_eval.bench.bench import Row, row_from_times, time_calls
-from finforce_eval.bench.camera import NoisyCamera
-from finforce_eval.bench.cases import ReplayedPress, bench_finger, load_cases, record_press
+from finforce_eval.bench.cases import NoisyCamera, ReplayedPress, bench_finger, load_cases, record_press
 from finforce_eval.bench.process import Start, measure_start
 from finforce_eval.bench.recordings import RecordedFigures, find_recordings, measure_recordings
-from finforce_eval.bench.scores import Accuracy, ShapeErrors, score_runs, score_shapes
-from finforce_eval.bench.tiers import Tier, list_tiers, run_tier
+from finforce_eval.bench.tiers import Accuracy, ShapeErrors, Tier, list_tiers, run_tier, score_runs, score_shapes
+from finforce_eval.evaluation.markdown import align_rows
+from finforce_eval.figures.figures import BLACK, BLUE, GREEN, GREY, ORANGE, new_figure, style_axes
 from finforce_eval.figures.time_error import ErrorPoint, find_front
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import load_jaw
@@ -161,8 +166,6 @@ def mean_yardstick(figures: SolverFigures) -> float:
 
 def as_json(figures: SolverFigures) -> dict[str, Any]:
     """Returns the figures as plain values, with what is quoted."""
-    from finforce_eval.bench.tables import format_tables
-
     fronts = {kind: [point.text for point in front] for kind, front in find_fronts(figures).items()}
     return {
         "yardstick_ms": mean_yardstick(figures),
@@ -203,13 +206,122 @@ def find_fronts(figures: SolverFigures) -> dict[str, list[ErrorPoint]]:
 
 def format_table(figures: SolverFigures) -> str:
     """Returns times, errors, memory and set-up of every tier as tables in Markdown."""
-    from finforce_eval.bench.tables import format_tables
-
     return "\n\n".join([*format_tables(figures).values(), *figures.notes])
 
 
 def draw(figures: SolverFigures, path: Path | str) -> None:
     """Draws run time against force error, with the front, and writes it."""
-    from finforce_eval.bench.pareto import draw_pareto
-
     draw_pareto(figures).savefig(path)
+
+
+def format_tables(figures: SolverFigures) -> Mapping[str, str]:
+    """Returns the tables by name: "tiers", "cases", "peer" and, where there are recordings, "recorded"."""
+    tables = {"tiers": _tiers(figures.tiers), "cases": _cases(figures.tiers), "peer": _peer(figures.tiers)}
+    return {**tables, "recorded": _recorded(figures.recorded)} if figures.recorded else tables
+
+
+def _tiers(tiers: Sequence[TierFigures]) -> str:
+    head = ("tier", "p50/ms", "p99", "CPU p50", "CPU p99", "SuperLU/ms", "noise-free/N", "unanswered", "noisy/N",
+            "unanswered", "memory/MB", "set-up/s", "anew/s")  # fmt: skip
+    rows = []
+    for tier in tiers:
+        times = (tier.step.p50, tier.step.p99, tier.cpu.p50, tier.cpu.p99)
+        row = [tier.tier.name, *(f"{time:.3f}" for time in times), f"{tier.yardstick.p50:.1f}"]
+        for accuracy in (tier.exact, tier.noisy):
+            row += [f"{accuracy.rmse:.3f}", f"{accuracy.lost:.1%}"]
+        rows.append(row + _start_cells(tier))
+    return align_rows(head, rows)
+
+
+def _start_cells(tier: TierFigures) -> list[str]:
+    """Returns memory and set-up of a process; empty cells where another tier has the same."""
+    start = tier.start
+    if start is None:
+        return [""] * 3
+    anew = "" if start.build_uncached is None else f"{start.build_uncached:.1f}"
+    return [f"{start.memory:.0f}", f"{start.imports + start.build:.2f}", anew]
+
+
+def _cases(tiers: Sequence[TierFigures]) -> str:
+    """Returns the RMSE of every case, noise-free and noisy."""
+    names = list(tiers[0].exact.by_case) if tiers else []
+    rows = [
+        [tier.tier.name, *(f"{tier.exact.by_case[name]:.2f} / {tier.noisy.by_case[name]:.2f}" for name in names)]
+        for tier in tiers
+    ]
+    return align_rows(("noise-free / noisy, N", *names), rows)
+
+
+def _peer(tiers: Sequence[TierFigures]) -> str:
+    """Returns the errors at the held shapes beside those that are quoted of the peer."""
+    heights = ("lower", "middle", "upper")
+    head = ("noise-free shapes", "shapes", "solved", "nothing fitted/N", *heights, "one factor/N",
+            "a factor per height/N", "rate, times SOFA's", "by the yardstick", "share of SOFA's error")  # fmt: skip
+    rows = []
+    for tier in tiers:
+        shapes, compared = tier.shapes, compare_with_sofa(tier)
+        row = [tier.tier.name, str(shapes.n), str(shapes.solved), f"{shapes.rmse:.3f}"]
+        row += [f"{shapes.by_height[name]:.3f}" if name in shapes.by_height else "" for name in heights]
+        row += [f"{shapes.one_factor:.3f}", f"{shapes.factor_per_height:.3f}"]
+        rates = (compared["rate"], compared["rate_by_yardstick"])
+        rows.append(row + [*(f"{rate:.1f}" for rate in rates), f"{compared['error_share']:.0%}"])
+    quoted = [f"{SOFA['rmse_N']:g}", "", "", "", f"{SOFA['one_factor_N']:g}", f"{SOFA['factor_per_height_N']:g}"]
+    return align_rows(head, [*rows, ["SOFA, quoted", "45", "45", *quoted, "1", "1", "100%"]])
+
+
+def _recorded(recorded: Sequence[RecordedFigures]) -> str:
+    head = ("recordings", "p50/ms", "p99", "RMSE/N", "bias/N", "unanswered", "not solved at all")
+    rows = [
+        [row.tier, f"{row.p50:.3f}", f"{row.p99:.3f}", f"{row.rmse:.3f}", f"{row.bias:+.3f}", f"{row.lost:.1%}",
+         str(len(row.unsolved))]
+        for row in recorded
+    ]  # fmt: skip
+    return align_rows(head, rows)
+
+
+_STYLES = {"exact": (BLUE, "o", "noise-free key points"), "noisy": (ORANGE, "s", "noisy key points")}
+
+
+def draw_pareto(figures: SolverFigures) -> Any:
+    """Returns the figure: milliseconds per step against RMSE, both logarithmic, p99 as a whisker."""
+    figure = new_figure(10.5, 6.2)
+    axes = figure.subplots()
+    style_axes(axes)
+    axes.set(xscale="log", yscale="log", xlabel="time per step, one thread [ms]", ylabel="RMSE of the force [N]")
+    points, fronts = front_points(figures), find_fronts(figures)
+    for kind, (colour, marker, label) in _STYLES.items():
+        for tier, point in zip(figures.tiers, points[kind], strict=True):
+            face = colour if is_complete(getattr(tier, kind)) else "white"
+            axes.plot([point.time, point.slow], [point.error] * 2, color=colour, linewidth=0.8, alpha=0.6)
+            axes.plot(point.time, point.error, marker, color=colour, markerfacecolor=face, markersize=6)
+        axes.plot([], [], marker, color=colour, linestyle="none", label=label)
+        steps = [(point.time, point.error) for point in fronts[kind]]
+        if steps:
+            axes.step(*zip(*steps, strict=True), where="post", color=colour, linewidth=4, alpha=0.25, zorder=0)
+    for tier, exact, noisy in zip(figures.tiers, points["exact"], points["noisy"], strict=True):
+        axes.plot([exact.time, noisy.time], [exact.error, noisy.error], color=GREY, linewidth=0.6, zorder=1)
+        # the tiers with an outline lie beside those without: one kind is named above its points, the other below
+        is_above = tier.tier.contact == "height"
+        place = (max if is_above else min)((exact, noisy), key=lambda point: point.error)
+        style = {"textcoords": "offset points", "fontsize": 8, "color": BLACK if is_above else GREY}
+        axes.annotate(tier.tier.name, (place.time, place.error), (4, 6) if is_above else (4, -12), **style)
+    _draw_quoted(axes, figures)
+    axes.set_title("Run time against force error: nine presses of an independent program", loc="left", fontsize=11)
+    axes.plot([], [], "D", color=GREY, markerfacecolor="white", linestyle="none",
+              label="hollow: leaves more than 1 % of the frames unanswered, on no front")  # fmt: skip
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    return figure
+
+
+def _draw_quoted(axes: Any, figures: SolverFigures) -> None:
+    """Marks what others state: SOFA as quoted and scaled to this machine, the paper's rate and range of errors."""
+    error, step = SOFA["factor_per_height_N"], SOFA["step_ms"]
+    here = step * mean_yardstick(figures) / SOFA["yardstick_ms"]
+    axes.plot(step, error, "*", color=GREEN, markersize=13, linestyle="none",
+              label=f"SOFA, quoted: {step:g} ms, {error:g} N after one factor per height")  # fmt: skip
+    axes.plot(here, error, "*", markeredgecolor=GREEN, color="white", markersize=13, linestyle="none",
+              label=f"SOFA, its time scaled by the yardstick: {here:.1f} ms")  # fmt: skip
+    period = 1e3 / PAPER["rate_Hz"]
+    low, high = PAPER["least_N"], PAPER["largest_N"]
+    axes.plot([period, period], [low, high], color=BLACK, linewidth=2.5, solid_capstyle="butt",
+              label=f"the paper, quoted: {PAPER['rate_Hz']:g} Hz, {low:g} to {high:g} N on its own finger")  # fmt: skip

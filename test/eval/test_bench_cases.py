@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from finforce_eval.bench.camera import NoisyCamera
-from finforce_eval.bench.cases import HEIGHTS, LEVELS, TRUTH, bench_finger, load_cases, record_press
+from finforce_eval.bench.cases import HEIGHTS, LEVELS, TRUTH, NoisyCamera, bench_finger, load_cases, record_press
 
 JAW = bench_finger()
 CASES = {case.name: case for case in load_cases()}

@@ -7,13 +7,19 @@ import pytest
 
 from finforce_eval.bench import growth as bench_growth
 from finforce_eval.bench.cases import bench_finger
-from finforce_eval.bench.growth import Curve, Growth, GrowthFigures, as_json, fit_slope, format_table
-from finforce_eval.bench.growth_object import build_sphere, grow_triangles
-from finforce_eval.bench.growth_solver import (
+from finforce_eval.bench.growth import (
+    Curve,
+    Growth,
+    GrowthFigures,
     _density,
     _measure_density,
     _measure_keypoints,
     _measure_program,
+    as_json,
+    build_sphere,
+    fit_slope,
+    format_table,
+    grow_triangles,
     list_densities,
     mesh_jaw,
     spread_keypoints,
@@ -82,7 +88,7 @@ def test_sphere_has_the_triangles_that_it_is_asked_for():
 
 
 def test_images_of_spheres_are_measured_at_every_size(monkeypatch):
-    monkeypatch.setattr("finforce_eval.bench.growth_object.SUBDIVISIONS", (1, 2))
+    monkeypatch.setattr("finforce_eval.bench.growth.SUBDIVISIONS", (1, 2))
     growth = grow_triangles(quick=True)
     assert [list(curve.sizes) for curve in growth.curves] == [[80, 320]] * 4
     assert all(min(curve.seconds) > 0 for curve in growth.curves)

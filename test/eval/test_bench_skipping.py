@@ -6,8 +6,9 @@ import pytest
 
 from finforce.skipping import EVERYWHERE
 from finforce_eval.bench.scene_reel import SceneReel, StreamPart, cut_sections, read_word
-from finforce_eval.bench.skipping import EACH, OF_NODE
-from finforce_eval.bench.skipping_figures import (
+from finforce_eval.bench.skipping import (
+    EACH,
+    OF_NODE,
     OFF,
     ON,
     SceneCost,

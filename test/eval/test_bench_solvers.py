@@ -15,9 +15,8 @@ from finforce_eval.bench.bench import row_from_times
 from finforce_eval.bench.cases import bench_finger, load_cases, record_press
 from finforce_eval.bench.process import Start, measure_start
 from finforce_eval.bench.recordings import find_recordings, measure_recordings
-from finforce_eval.bench.scores import rms, score_runs, score_shapes
 from finforce_eval.bench.solvers import SolverFigures, TierFigures, as_json, compare_with_sofa, find_fronts
-from finforce_eval.bench.tiers import TIERS, Run, Tier, list_tiers, run_tier
+from finforce_eval.bench.tiers import TIERS, Run, Tier, list_tiers, rms, run_tier, score_runs, score_shapes
 from finforce_eval.errors import OptionError
 from finforce_eval.recordings.recording import SHIPPED as RECORDING
 from finforce_eval.replay.processes import ProcessError
