@@ -1,6 +1,7 @@
 """The `finforce bench` command: parts measured one after the other, each with a table, figures and a picture.
 
-Knows of no part what it measures: each is a module with `measure(quick)`, `format_table`, `as_json` and `draw`.
+Knows of no part what it measures: each is a module with `measure(quick)`, `format_table`, `as_json` and, if it has a
+picture, `draw`.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ PARTS = (
         title="Run time against force error of the solver tiers",
         takes_folder=True,
     ),
+    BenchPart(name="peer", module="finforce_eval.bench.peer", title="Noise, and targets that no force reaches"),
     BenchPart(name="growth", module="finforce_eval.bench.growth", title="How cost grows"),
     BenchPart(
         name="localization",
@@ -67,18 +69,9 @@ PARTS = (
     ),
     BenchPart(name="chain", module="finforce_eval.bench.chain", title="Latency against force error of the whole chain"),
     BenchPart(
-        name="nodes", module="finforce_eval.bench.nodes", title="Share of a core that each node takes", usual=False
-    ),
-    BenchPart(
         name="skipping",
         module="finforce_eval.bench.skipping",
         title="Share of a core that each node takes on three scenes, with what need not be done and without",
-        usual=False,
-    ),
-    BenchPart(
-        name="live",
-        module="finforce_eval.bench.live",
-        title="Key points out to wrench in, one solver node per jaw",
         usual=False,
     ),
 )

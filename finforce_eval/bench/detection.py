@@ -5,23 +5,20 @@ All ways look at a second of images each, one way after the other, so that a bus
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
 
 from finforce.camera import ImageError
-from finforce.errors import MissingDependencyError
 from finforce.skipping import ALL, Skips
 from finforce_eval.bench.painted_dots import paint_dots
-from finforce_eval.bench.scenes import CALIBRATION, DIM, GRASP, BenchScene, find_scene
+from finforce_eval.bench.scenes import DIM, GRASP, BenchScene, find_scene
 from finforce_eval.evaluation.detection import Detector, SideLog, with_detections
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records
 from finforce_eval.evaluation.sight_scoring import SightSeries, SightStats, compare_sight, sight_stats
@@ -58,6 +55,15 @@ class Way:
     dots: bool = False
 
 
+WAYS = (
+    Way(name="network"),
+    Way(name="network, 1 thread", parameters={"threads": 1}),
+    Way(name="network, searching", searches=True),
+    Way(name="network, resting", rests=True),
+    Way(name="dots", parameters={"finder": "dots"}, dots=True),
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class DetectionRow:
     """One way, from image to key points of both jaws.
@@ -79,11 +85,10 @@ class DetectionRow:
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionFigures:
-    """What was measured, a yardstick of the machine [ms], and what could not be measured."""
+    """What was measured, and a yardstick of the machine [ms]."""
 
     rows: Sequence[DetectionRow]
     yardstick: TimeStats
-    notes: Sequence[str] = ()
 
 
 @dataclass(kw_only=True)
@@ -121,56 +126,16 @@ def measure(quick: bool) -> DetectionFigures:
     Raises:
         FinforceError: a scene cannot be rendered.
     """
-    with TemporaryDirectory() as folder:
-        notes: list[str] = []
-        ways = list_ways(Path(folder), notes)
-        return measure_ways(ways, [GRASP] if quick else [GRASP, DIM], QUICK_IMAGES if quick else None, notes)
+    return measure_ways(WAYS, [GRASP] if quick else [GRASP, DIM], QUICK_IMAGES if quick else None)
 
 
-def list_ways(folder: Path, notes: list[str]) -> list[Way]:
-    """Return the ways, with networks written into a folder; of what cannot be made there is a note instead."""
-    ways = [
-        Way(name="network"),
-        Way(name="network, 1 thread", parameters={"threads": 1}),
-        Way(name="network, searching", searches=True),
-        Way(name="network, resting", rests=True),
-    ]
-    for name, write in _network_forms().items():
-        try:
-            model = write(folder / name.replace(" ", "_"))
-        except MissingDependencyError as error:
-            notes.append(f"network, {name}: not measured: {error}")
-            continue
-        ways.append(Way(name=f"network, {name}, 1 thread", parameters={"threads": 1, "model": str(model)}))
-    return [*ways, Way(name="dots", parameters={"finder": "dots"}, dots=True)]
-
-
-def _network_forms() -> dict[str, Callable[[Path], Path]]:
-    """Return what writes other forms of the shipped network into a folder, by name."""
-    from finforce_eval.bench.network_variants import SIZES, write_dynamic, write_small
-
-    smaller = {f"{1e3 * scale:.2f} mm/px": partial(write_small, scale=scale) for scale in SIZES}
-    return {**smaller, "int8 dynamic": write_dynamic, "int8 static": _write_static}
-
-
-def _write_static(folder: Path) -> Path:
-    """Write the network in 8 bits, its ranges taken from a scene that is used for nothing else."""
-    from finforce_eval.bench.network_variants import cut_pictures, require_onnx, write_static
-
-    require_onnx()
-    return write_static(folder, cut_pictures(read_recording(find_scene(CALIBRATION))))
-
-
-def measure_ways(
-    ways: Sequence[Way], scenes: Sequence[BenchScene], count: int | None = None, notes: Sequence[str] = ()
-) -> DetectionFigures:
+def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int | None = None) -> DetectionFigures:
     """Return times and pixel errors of some ways on scenes.
 
     Args:
         ways: to be compared.
         scenes: whose images they look at.
         count: images of each scene at most; all without.
-        notes: of the figures.
     """
     seconds: dict[str, list[float]] = {way.name: [] for way in ways}
     cpu: dict[str, list[float]] = {way.name: [] for way in ways}
@@ -195,7 +160,7 @@ def measure_ways(
         )
         for name, spent in seconds.items()
     ]
-    return DetectionFigures(rows=rows, yardstick=time_stats(yardstick), notes=tuple(notes))
+    return DetectionFigures(rows=rows, yardstick=time_stats(yardstick))
 
 
 def _look_at(recording: Recording, ways: Sequence[Way], yardstick: list[float]) -> list[_DetectionRun]:
@@ -232,8 +197,8 @@ def time_product(size: int = 512) -> float:
 
 
 def format_table(figures: DetectionFigures) -> str:
-    """Return the rows as a table in Markdown, with the yardstick and the notes below."""
-    return "\n".join([*_lines(figures), *figures.notes])
+    """Return the rows as a table in Markdown, with the yardstick below."""
+    return "\n".join(_lines(figures))
 
 
 def _lines(figures: DetectionFigures) -> Iterator[str]:

@@ -18,7 +18,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     text = "recordings of the bench finger to be solved, too; without it shapes of an independent program alone"
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
-    text = "solvers, growth, localization, detection, chain, nodes, live; without it those that take minutes together"
+    text = "solvers, peer, growth, localization, detection, chain, skipping; without it those of `make bench`"
     parser.add_argument("--parts", metavar="A,B", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     text = "draw the first part, and every other beside it with its name added"
@@ -55,7 +55,7 @@ def _run_part(part: BenchPart, options: argparse.Namespace, picture: Path | None
     figures = module.measure(options.quick, **taken)
     table = module.format_table(figures)
     print(table)
-    if picture is not None:
+    if picture is not None and hasattr(module, "draw"):
         picture.parent.mkdir(parents=True, exist_ok=True)
         module.draw(figures, picture)
         print(f"\nPicture: {picture}")
