@@ -27,8 +27,7 @@ from finforce_contact.paper_contact import IntersectionLocalizer
 from finforce_contact.pose.filter import FilteredPose, PoseFilter
 from finforce_contact.settings import ContactSettings
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_ifea.observation import Contact
-from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.observation import Contact, ObjectOutline
 
 STATUSES = ("touching", "apart", "no_object", "no_pose")
 

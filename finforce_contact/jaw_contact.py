@@ -15,7 +15,7 @@ from finforce.stamps import SECOND
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.pose.pairing import DEPTH, PosePairing, PoseStep
-from finforce_ifea.tracking.clearance import is_away
+from finforce_ifea.tracking.rest_response import is_away
 
 AWAY_FOR = 10  # images in a row, after which the object is taken to stay away: a second, of the ten that are looked at
 ValueT = TypeVar("ValueT")

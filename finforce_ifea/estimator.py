@@ -1,10 +1,20 @@
-"""Key points and a contact in, force out, one image after the other: the entry for nodes and for evaluation."""
+"""Key points and a contact in, force out, one image after the other: the entry for nodes and for evaluation.
 
+Images of an unloaded jaw that an estimator takes before the first true one, so that all is compiled by then.
+
+Which key points of a frame may be used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from finforce.errors import ObservationError
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
 from finforce_ifea.jaw.calibration import Calibration
@@ -17,18 +27,15 @@ from finforce_ifea.observation import (
     blank_solution,
     check_contact,
     check_observation,
+    sketch_contact,
 )
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import TareKeeper, TareReport
-from finforce_ifea.tracking.clearance import AwayWatch
-from finforce_ifea.tracking.keypoint_gate import KeypointGate
 from finforce_ifea.tracking.place_tracker import PlaceTracker
 from finforce_ifea.tracking.point_tracker import PointTracker
-from finforce_ifea.tracking.track import Track
-from finforce_ifea.tracking.uncertainty import find_numbers
-from finforce_ifea.tracking.validity import find_doubt
-from finforce_ifea.warm_up import rehearse
+from finforce_ifea.tracking.rest_response import AwayWatch
+from finforce_ifea.tracking.track import Track, find_doubt, find_numbers
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 
@@ -280,3 +287,91 @@ class JawEstimator:
             converged=track.converged,
             condition=track.condition,
         )
+
+
+_STDDEV = 0.3e-3
+_NOISE = 0.05e-3
+_EACH = 3
+Update = Callable[[Observation, Contact], object]
+
+
+def rehearse(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None]) -> None:
+    """Gives an estimator images with each kind of contact, with stated standard deviations and without.
+
+    Args:
+        jaw: the jaw.
+        tare_frames: that are taken before the first force.
+        update: of the estimator.
+        reset: of the same, left reset in the end.
+    """
+    random = np.random.default_rng(0)
+    for stddev in (None, np.full(jaw.keypoints.shape, _STDDEV)):
+        reset()
+        contacts = list(_imagine_contacts(jaw))
+        course = [contacts[0]] * tare_frames + [contact for contact in contacts for _ in range(_EACH)]
+        for count, contact in enumerate(course):
+            update(_imagine_image(jaw, count / 30.0, stddev, random), contact)
+    reset()
+
+
+def _imagine_contacts(jaw: Jaw) -> Iterator[Contact]:
+    """Yields a contact by its height, one by its points, and one by an outline."""
+    fixed = Contact.fixed(jaw, float(np.median(jaw.candidates[:, 2])))
+    yield from (fixed, replace(fixed, free=False), sketch_contact(jaw))
+
+
+def _imagine_image(jaw: Jaw, stamp: float, stddev: NDArray | None, random: np.random.Generator) -> Observation:
+    points = jaw.keypoints + _NOISE * random.standard_normal(jaw.keypoints.shape)
+    return Observation(stamp=stamp, points=points, likelihood=np.ones(len(points)), stddev=stddev)
+
+
+_PRESENCE_GAIN = 0.1
+_LEAST_PRESENCE = 0.5
+
+
+class KeypointGate:
+    """Switches key points off that are hidden, without depth, outside the workspace, ignored, or seen rarely.
+
+    A hidden point comes through now and then with a high likelihood, on the surface of what hides it. A point that was
+    not there in half of the last frames is therefore not believed when it appears.
+    """
+
+    def __init__(self, jaw: Jaw, settings: EstimatorSettings) -> None:
+        """Keeps the key points at rest and the thresholds.
+
+        Raises:
+            ObservationError: A name to be ignored is no key point of the jaw.
+        """
+        self._rest = jaw.keypoints
+        self._threshold = settings.likelihood_threshold
+        self._margin = settings.workspace_margin
+        self._allowed = np.ones(len(jaw.keypoints), bool)
+        for name in filter(None, (part.strip() for part in settings.ignored_keypoints.split(","))):
+            if name not in jaw.keypoint_names:
+                raise ObservationError(f"ignored_keypoints: {name!r} is no key point of the jaw {jaw.name!r}")
+            self._allowed[jaw.keypoint_names.index(name)] = False
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets which points were seen."""
+        self._presence: NDArray | None = None
+
+    def accept(self, observation: Observation) -> NDArray:
+        """Returns the points (K, 3) [m] with NaN in the rows that must not be used."""
+        points = np.array(observation.points, float)
+        likelihood = np.asarray(observation.likelihood, float)
+        if self._presence is None:
+            self._presence = (likelihood >= self._threshold).astype(float)
+        _close(points, likelihood, self._rest, self._allowed, self._presence, self._threshold, self._margin)
+        return points
+
+
+@njit(cache=True)
+def _close(points, likelihood, rest, allowed, presence, threshold, margin):
+    """Updates the presence (K,) and makes the points (K, 3) [m] that must not be used NaN."""
+    for k in range(len(points)):
+        visible = likelihood[k] >= threshold
+        presence[k] += _PRESENCE_GAIN * ((1.0 if visible else 0.0) - presence[k])
+        far = np.abs(points[k] - rest[k]).max()
+        if not (visible and presence[k] >= _LEAST_PRESENCE and allowed[k] and far <= margin):
+            points[k] = np.nan

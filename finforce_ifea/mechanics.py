@@ -3,8 +3,7 @@
 import logging
 from dataclasses import replace
 
-from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact
-from finforce_ifea.contact_mechanics.surface import Across, build_contact_surface
+from finforce_ifea.contact_mechanics.pressed_jaw import Across, Mechanics, RollingContact, build_contact_surface
 from finforce_ifea.errors import ContactError, JawFileError
 from finforce_ifea.fem.locking import warn_of_locking
 from finforce_ifea.fem.model import JawModel

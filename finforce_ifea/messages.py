@@ -15,8 +15,7 @@ from finforce.errors import ObservationError
 from finforce.messages import check_cloud, check_frame
 from finforce.pointcloud import decode_columns, decode_keypoints
 from finforce_ifea.errors import ContactError
-from finforce_ifea.observation import Contact, Observation
-from finforce_ifea.outline import ObjectOutline, are_same_polygons
+from finforce_ifea.observation import Contact, ObjectOutline, Observation, are_same_polygons
 
 
 def observation_from_cloud(cloud: Any, frame: str) -> Observation:

@@ -20,12 +20,11 @@ from finforce.messages import read_stamp, stamp_of
 from finforce.ros import node as ros
 from finforce.skipping import AWAY, IDLE, LATE, SOLVER, Skips
 from finforce.stamps import Idling, StampGate
-from finforce_ifea.diagnostics import describe_solution, outcome_of_solution, peer_alarms
 from finforce_ifea.grasp_force import ForcePairing, single_jaw_grasp
 from finforce_ifea.messages import force_from_wrench, observation_from_cloud
 from finforce_ifea.observation import Solution
 from finforce_ifea.parameters import NodeParameters, build_contact_feed, build_estimator, load_parameter_jaw
-from finforce_ifea.publishers import SolverOutputs
+from finforce_ifea.publishers import SolverOutputs, describe_solution, outcome_of_solution, peer_alarms
 from finforce_ifea.settings import EstimatorSettings
 
 SLOW = 4.0  # s of preparation, after which somebody may wonder

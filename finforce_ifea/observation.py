@@ -1,4 +1,9 @@
-"""What goes into an estimator and what comes out."""
+"""What goes into an estimator and what comes out.
+
+The outline of a rigid object in the plane of the finger, and where it is now.
+"""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -9,7 +14,6 @@ from finforce.errors import ObservationError
 from finforce.pointcloud import check_stddev
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_ifea.outline import ObjectOutline
 
 TRUSTED = ("ok", "unloaded")
 
@@ -51,7 +55,7 @@ class Contact:
     outline: ObjectOutline | None = None
 
     @classmethod
-    def fixed(cls, jaw: Jaw, z: float) -> "Contact":
+    def fixed(cls, jaw: Jaw, z: float) -> Contact:
         """Returns the contact of an object that first touches at height z [m].
 
         Raises:
@@ -187,3 +191,50 @@ def sketch_contact(jaw: Jaw) -> Contact:
     square = 0.01 * np.array([[0.0, -1.0], [2.0, -1.0], [2.0, 1.0], [0.0, 1.0]])
     outline = ObjectOutline(polygons=(square,), origin=middle[0, ::2], tilt=0.0, stddev=np.array([1e-3, 1e-3, 0.1]))
     return Contact(points=middle, weights=np.ones(1), outline=outline)
+
+
+_LARGEST = 1.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectOutline:
+    """What an object shows to a finger that bends in the x-z plane.
+
+    Attributes:
+        polygons: (n, 2) each, x and z [m] about the outline's origin; outer ones counterclockwise, holes clockwise.
+        origin: x and z [m] of that origin in the jaw frame.
+        tilt: turn of the polygons about the origin [rad]; positive turns x towards z.
+        stddev: (3,) of the origin's x and z [m] and of the tilt [rad].
+    """
+
+    polygons: tuple[NDArray, ...]
+    origin: NDArray
+    tilt: float
+    stddev: NDArray
+
+    def __post_init__(self) -> None:
+        """Refuses what is no outline.
+
+        Raises:
+            ContactError: No polygon, fewer than three corners, numbers that are not finite or not metres.
+        """
+        if not self.polygons or any(p.ndim != 2 or p.shape[1] != 2 or len(p) < 3 for p in self.polygons):
+            shapes = [p.shape for p in self.polygons]
+            raise ContactError(f"outline of polygons {shapes}, expected at least one of shape (n >= 3, 2)")
+        numbers = np.concatenate([p.ravel() for p in self.polygons] + [np.ravel(self.origin), [self.tilt]])
+        if np.shape(self.origin) != (2,) or not np.isfinite(numbers).all() or np.abs(numbers[:-1]).max() > _LARGEST:
+            raise ContactError("outline with coordinates that are not finite or beyond a metre, expected metres")
+        spread = np.asarray(self.stddev)
+        if spread.shape != (3,) or not (np.isfinite(spread) & (spread > 0)).all():
+            raise ContactError(f"outline with standard deviations {self.stddev}, expected three finite ones above zero")
+
+    def placed(self) -> tuple[NDArray, ...]:
+        """Returns the polygons (n, 2) [m] in x and z of the jaw frame."""
+        c, s = np.cos(self.tilt), np.sin(self.tilt)
+        turn = np.array([[c, s], [-s, c]])
+        return tuple(p @ turn + self.origin for p in self.polygons)
+
+
+def are_same_polygons(first: tuple[NDArray, ...], second: tuple[NDArray, ...]) -> bool:
+    """Returns whether two sets of polygons (n, 2) are equal, so that what was computed from one holds for the other."""
+    return first is second or (len(first) == len(second) and all(map(np.array_equal, first, second)))

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 from finforce.errors import ObservationError
 from finforce.settings import TimeParameters, setting
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
-from finforce_ifea.observation import Contact
-from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.observation import Contact, ObjectOutline
 
 if TYPE_CHECKING:
     from finforce_ifea.estimator import JawEstimator

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
-from finforce_ifea.observation import Contact, Observation
-from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.observation import Contact, ObjectOutline, Observation
 
 TRUTH = Path(__file__).parents[1] / "data" / "pressed_bench.npz"
 YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from finforce_eval.stress.mechanics_jaw import Rig, build_jaw, measure_condition
 from finforce_eval.stress.stress import Family, Plan, Trial, attempt
 from finforce_ifea.contact_mechanics.forward_press import PressState
-from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact
-from finforce_ifea.contact_mechanics.surface import build_contact_surface
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact, build_contact_surface
 from finforce_ifea.fem.locking import warn_of_locking
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.fem.tetrahedra import to_tet10

@@ -12,8 +12,7 @@ from finforce.errors import FinforceError
 from finforce_eval.stress.press import Bench
 from finforce_eval.stress.session import Session, open_session, take_another
 from finforce_eval.stress.stress import Family, Plan, Trial
-from finforce_ifea.observation import Contact
-from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.observation import Contact, ObjectOutline
 
 KINDS = ("height", "outline", "fixed", "none", "no rows", "regions")
 WRONG = (

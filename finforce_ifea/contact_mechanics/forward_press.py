@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact, measure_penalty_energy, press_box, press_cylinder
-from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
-from finforce_ifea.contact_mechanics.surface import ContactSurface
+from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, limit_step
 from finforce_ifea.errors import ContactError
 from finforce_ifea.fem.model import JawModel
 

@@ -19,8 +19,7 @@ from finforce_ifea.contact_mechanics.distance_field import (
     read_depth,
 )
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact, press_cylinder, press_field
-from finforce_ifea.observation import Contact
-from finforce_ifea.outline import ObjectOutline, are_same_polygons
+from finforce_ifea.observation import Contact, ObjectOutline, are_same_polygons
 from finforce_ifea.settings import EstimatorSettings
 
 DEPTH, SHAPE, HEIGHT = 0, 1, 2

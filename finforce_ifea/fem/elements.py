@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.jaw.shape_functions import shape_gradients
+from finforce_ifea.jaw.mesh import shape_gradients
 
 
 def elasticity_matrix(young_modulus: float, poisson_ratio: float) -> NDArray:

@@ -10,8 +10,7 @@ from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.fem.tetrahedra import to_tet10
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.jaw_file import Material
-from finforce_ifea.jaw.mesh import VolumeMesh
-from finforce_ifea.jaw.shape_functions import shape_gradients
+from finforce_ifea.jaw.mesh import VolumeMesh, shape_gradients
 
 # At this Poisson's ratio 10-node tetrahedra do not lock; the stiffness of bands at others follows from plane strain.
 _EASY_RATIO = 0.3

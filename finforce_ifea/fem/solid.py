@@ -1,20 +1,26 @@
-"""The jaw as a geometrically nonlinear solid: co-rotational hexahedra or tetrahedra, clamped at the base."""
+"""The jaw as a geometrically nonlinear solid: co-rotational hexahedra or tetrahedra, clamped at the base.
+
+Compiled element loops of the co-rotational solid.
+
+With F = sum (X_i + u_i) g_i^T = R U, x' = R^T x and d = x' - X (about the element's centroid) an element's energy is
+d.K0.d / 2. Its gradient is f_i = R (f'_i - G_i^T m) with f' = K0 d, m = sum x'_i x f'_i and
+G_i = (tr(U) I - U)^-1 [g_i]; the spin of the element is sum G_i R^T du_i. The tangent is
+R (P^T K0 P - [p] G - G^T [f']^T P) R^T, symmetrised, with P = I - S G and S w = w x x'. As K0 does not feel rotations
+of the undeformed shape, K0 S is formed from d alone.
+
+Source: Felippa, Haugen, A unified formulation of small-strain corotational finite elements, CMAME 194 (2005).
+
+Compiled loops over material points given as weighted sums of unknowns.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from finforce_ifea.fem.corotation import (
-    add_probe_springs,
-    corotational_elements,
-    probe_loads,
-    probe_motions,
-    probe_positions,
-    scatter_lower,
-)
 from finforce_ifea.fem.elements import centre_gradient, elasticity_matrix, hex_stiffness, tet_stiffness
 from finforce_ifea.fem.factorisation import Factor, SparseFactor, factorise_banded, sparse_from_banded
 from finforce_ifea.fem.model import LARGEST_MOVE, Linearization
@@ -195,3 +201,295 @@ def find_mirror_nodes(mesh: VolumeMesh) -> NDArray | None:
     present = {tuple(row) for row in np.sort(mesh.elements, axis=1)}
     images = np.sort(mirror[mesh.elements], axis=1)
     return mirror if all(tuple(row) in present for row in images) else None
+
+
+_OPTIONS = {"cache": True, "fastmath": {"contract", "reassoc", "nsz", "arcp"}, "error_model": "numpy"}
+_POLAR_ITERATIONS = 30
+_POLAR_TOLERANCE = 1e-14
+
+
+@njit(**_OPTIONS)
+def _invert(A, out):
+    """Writes the inverse of a 3 x 3 matrix; returns its determinant."""
+    a = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
+    b = A[1, 2] * A[2, 0] - A[1, 0] * A[2, 2]
+    c = A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0]
+    det = A[0, 0] * a + A[0, 1] * b + A[0, 2] * c
+    s = 1.0 / det
+    out[0, 0], out[1, 0], out[2, 0] = a * s, b * s, c * s
+    out[0, 1] = (A[0, 2] * A[2, 1] - A[0, 1] * A[2, 2]) * s
+    out[1, 1] = (A[0, 0] * A[2, 2] - A[0, 2] * A[2, 0]) * s
+    out[2, 1] = (A[0, 1] * A[2, 0] - A[0, 0] * A[2, 1]) * s
+    out[0, 2] = (A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]) * s
+    out[1, 2] = (A[0, 2] * A[1, 0] - A[0, 0] * A[1, 2]) * s
+    out[2, 2] = (A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]) * s
+    return det
+
+
+@njit(**_OPTIONS)
+def _rotate(F, R, inverse):
+    """Writes the rotation R of F = R U by Newton's iteration R <- (R + R^-T) / 2; returns det F."""
+    R[:] = F
+    det = 1.0
+    for iteration in range(_POLAR_ITERATIONS):
+        now = _invert(R, inverse)
+        if iteration == 0:
+            det = now
+        change = 0.0
+        for i in range(3):
+            for j in range(3):
+                value = 0.5 * (R[i, j] + inverse[j, i])
+                change = max(change, abs(value - R[i, j]))
+                R[i, j] = value
+        if change < _POLAR_TOLERANCE:
+            break
+    return det
+
+
+@njit(**_OPTIONS)
+def _shape(u, nodes, X, g, F, R, scratch, x, d):
+    """Writes F, R, the turned-back coordinates x (k, 3) and the deformation d (3 k); returns det F."""
+    k = len(nodes)
+    F[:] = 0.0
+    F[0, 0] = F[1, 1] = F[2, 2] = 1.0
+    mean0 = mean1 = mean2 = 0.0
+    for i in range(k):
+        u0, u1, u2 = u[nodes[i], 0], u[nodes[i], 1], u[nodes[i], 2]
+        for b in range(3):
+            F[0, b] += u0 * g[i, b]
+            F[1, b] += u1 * g[i, b]
+            F[2, b] += u2 * g[i, b]
+        mean0, mean1, mean2 = mean0 + u0 / k, mean1 + u1 / k, mean2 + u2 / k
+    det = _rotate(F, R, scratch)
+    for i in range(k):
+        w0, w1, w2 = X[i, 0] + u[nodes[i], 0], X[i, 1] + u[nodes[i], 1], X[i, 2] + u[nodes[i], 2]
+        w0, w1, w2 = w0 - mean0, w1 - mean1, w2 - mean2
+        for a in range(3):
+            x[i, a] = R[0, a] * w0 + R[1, a] * w1 + R[2, a] * w2
+            d[3 * i + a] = x[i, a] - X[i, a]
+    return det
+
+
+@njit(**_OPTIONS)
+def _spin_matrix(F, R, U, H):
+    """Writes H = (tr(U) I - U)^-1 with U = R^T F."""
+    for a in range(3):
+        for b in range(3):
+            U[a, b] = -(R[0, a] * F[0, b] + R[1, a] * F[1, b] + R[2, a] * F[2, b])
+    trace = -(U[0, 0] + U[1, 1] + U[2, 2])
+    for a in range(3):
+        U[a, a] += trace
+    _invert(U, H)
+
+
+@njit(**_OPTIONS)
+def _forces(K0, x, d, g, H, fl, p):
+    """Writes f' = K0 d and p = f' - G^T m, both (3 k); returns the energy."""
+    k, energy = len(x), 0.0
+    for i in range(3 * k):
+        s = 0.0
+        for j in range(3 * k):
+            s += K0[i, j] * d[j]
+        fl[i] = s
+        energy += 0.5 * s * d[i]
+    m0 = m1 = m2 = 0.0
+    for i in range(k):
+        f0, f1, f2 = fl[3 * i], fl[3 * i + 1], fl[3 * i + 2]
+        m0 += x[i, 1] * f2 - x[i, 2] * f1
+        m1 += x[i, 2] * f0 - x[i, 0] * f2
+        m2 += x[i, 0] * f1 - x[i, 1] * f0
+    h0 = H[0, 0] * m0 + H[1, 0] * m1 + H[2, 0] * m2
+    h1 = H[0, 1] * m0 + H[1, 1] * m1 + H[2, 1] * m2
+    h2 = H[0, 2] * m0 + H[1, 2] * m1 + H[2, 2] * m2
+    for i in range(k):
+        p[3 * i] = fl[3 * i] + g[i, 1] * h2 - g[i, 2] * h1
+        p[3 * i + 1] = fl[3 * i + 1] + g[i, 2] * h0 - g[i, 0] * h2
+        p[3 * i + 2] = fl[3 * i + 2] + g[i, 0] * h1 - g[i, 1] * h0
+    return energy
+
+
+@njit(**_OPTIONS)
+def _spins(g, H, G):
+    """Writes G = H [g_i], (3, 3 k)."""
+    for i in range(len(g)):
+        for a in range(3):
+            G[a, 3 * i] = H[a, 1] * g[i, 2] - H[a, 2] * g[i, 1]
+            G[a, 3 * i + 1] = H[a, 2] * g[i, 0] - H[a, 0] * g[i, 2]
+            G[a, 3 * i + 2] = H[a, 0] * g[i, 1] - H[a, 1] * g[i, 0]
+
+
+@njit(**_OPTIONS)
+def _couplings(K0, x, d, fl, p, L, B):
+    """Writes L = K0 S + ([p] + [f']) / 2, (3 k, 3), and B = S^T K0 S + (sum x f'^T symmetrised) - (sum x.f') I."""
+    k = len(x)
+    B[:] = 0.0
+    for i in range(3 * k):
+        s0 = s1 = s2 = 0.0
+        for j in range(k):
+            k0, k1, k2 = K0[i, 3 * j], K0[i, 3 * j + 1], K0[i, 3 * j + 2]
+            s0 += k2 * d[3 * j + 1] - k1 * d[3 * j + 2]
+            s1 += k0 * d[3 * j + 2] - k2 * d[3 * j]
+            s2 += k1 * d[3 * j] - k0 * d[3 * j + 1]
+        L[i, 0], L[i, 1], L[i, 2] = s0, s1, s2
+    for i in range(k):
+        dot = x[i, 0] * fl[3 * i] + x[i, 1] * fl[3 * i + 1] + x[i, 2] * fl[3 * i + 2]
+        for a in range(3):
+            up, down = (a + 1) % 3, (a + 2) % 3
+            B[a, a] -= dot
+            for b in range(3):
+                B[a, b] += d[3 * i + up] * L[3 * i + down, b] - d[3 * i + down] * L[3 * i + up, b]
+                B[a, b] += 0.5 * (x[i, a] * fl[3 * i + b] + x[i, b] * fl[3 * i + a])
+    for i in range(k):
+        q0, q1 = 0.5 * (p[3 * i] + fl[3 * i]), 0.5 * (p[3 * i + 1] + fl[3 * i + 1])
+        q2 = 0.5 * (p[3 * i + 2] + fl[3 * i + 2])
+        L[3 * i, 1] -= q2
+        L[3 * i, 2] += q1
+        L[3 * i + 1, 0] += q2
+        L[3 * i + 1, 2] -= q0
+        L[3 * i + 2, 0] -= q1
+        L[3 * i + 2, 1] += q0
+
+
+@njit(**_OPTIONS)
+def _tangent(K0, G, L, B, R, T, scratch, Ke):
+    """Writes R (K0 + (G^T B - L) G - G^T L^T) R^T, lower 3 x 3 blocks only."""
+    n = len(K0)
+    for i in range(n):
+        l0, l1, l2 = G[0, i], G[1, i], G[2, i]
+        b0 = l0 * B[0, 0] + l1 * B[1, 0] + l2 * B[2, 0] - L[i, 0]
+        b1 = l0 * B[0, 1] + l1 * B[1, 1] + l2 * B[2, 1] - L[i, 1]
+        b2 = l0 * B[0, 2] + l1 * B[1, 2] + l2 * B[2, 2] - L[i, 2]
+        for j in range(3 * (i // 3) + 3):
+            T[i, j] = K0[i, j] + b0 * G[0, j] + b1 * G[1, j] + b2 * G[2, j]
+            T[i, j] -= l0 * L[j, 0] + l1 * L[j, 1] + l2 * L[j, 2]
+    for i in range(0, n, 3):
+        for j in range(0, i + 3, 3):
+            for a in range(3):
+                for b in range(3):
+                    scratch[a, b] = R[a, 0] * T[i, j + b] + R[a, 1] * T[i + 1, j + b] + R[a, 2] * T[i + 2, j + b]
+            for a in range(3):
+                for b in range(3):
+                    Ke[i + a, j + b] = scratch[a, 0] * R[b, 0] + scratch[a, 1] * R[b, 1] + scratch[a, 2] * R[b, 2]
+
+
+@njit(**_OPTIONS)
+def corotational_elements(u, conn, X, K0, g, with_tangent, f, Ke):
+    """Adds internal forces to f and writes element tangents.
+
+    Args:
+        u: displacements (n, 3) [m].
+        conn: element nodes (m, k).
+        X: element node coordinates about their centroid (m, k, 3) [m].
+        K0: element stiffness (m, 3 k, 3 k) [N/m].
+        g: shape function gradients at the centre (m, k, 3) [1/m].
+        with_tangent: whether to fill Ke.
+        f: internal forces (n, 3) [N], added to.
+        Ke: element tangents (m, 3 k, 3 k) [N/m], overwritten (lower 3 x 3 blocks only).
+
+    Returns:
+        Elastic energy [J] and the smallest det F of all elements.
+    """
+    m, k = conn.shape
+    n = 3 * k
+    F, R, U, H = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    scratch, B = np.empty((3, 3)), np.empty((3, 3))
+    x, d, fl, p = np.empty((k, 3)), np.empty(n), np.empty(n), np.empty(n)
+    G, L, T = np.empty((3, n)), np.empty((n, 3)), np.empty((n, n))
+    energy, smallest = 0.0, 1e300
+    for e in range(m):
+        smallest = min(smallest, _shape(u, conn[e], X[e], g[e], F, R, scratch, x, d))
+        _spin_matrix(F, R, U, H)
+        energy += _forces(K0[e], x, d, g[e], H, fl, p)
+        for i in range(k):
+            for a in range(3):
+                f[conn[e, i], a] += R[a, 0] * p[3 * i] + R[a, 1] * p[3 * i + 1] + R[a, 2] * p[3 * i + 2]
+        if with_tangent:
+            _spins(g[e], H, G)
+            _couplings(K0[e], x, d, fl, p, L, B)
+            _tangent(K0[e], G, L, B, R, T, scratch, Ke[e])
+    return energy, smallest
+
+
+_EXACT = {"cache": True, "error_model": "numpy"}
+
+
+@njit(**_EXACT)
+def scatter_lower(values, source, row, col, storage):
+    """Adds values[source[i]] to storage[row[i], col[i]] for all i."""
+    for i in range(len(source)):
+        storage[row[i], col[i]] += values[source[i]]
+
+
+@njit(**_EXACT)
+def probe_positions(points, dof, weights, q):
+    """Returns points (p, 3) moved by sum_m weights (p, m, 3) q[dof (p, m, 3)], shape (p, 3)."""
+    out = points.copy()
+    n = len(q)
+    for p in range(dof.shape[0]):
+        for m in range(dof.shape[1]):
+            for a in range(3):
+                if dof[p, m, a] < n:
+                    out[p, a] += weights[p, m, a] * q[dof[p, m, a]]
+    return out
+
+
+@njit(**_EXACT)
+def probe_motions(dof, weights, modes):
+    """Returns the motions (p, 3, k) of the points for changes modes (n, k) of the unknowns."""
+    n, k = modes.shape
+    out = np.zeros((dof.shape[0], 3, k))
+    for p in range(dof.shape[0]):
+        for m in range(dof.shape[1]):
+            for a in range(3):
+                d = dof[p, m, a]
+                if d < n:
+                    for c in range(k):
+                        out[p, a, c] += weights[p, m, a] * modes[d, c]
+    return out
+
+
+@njit(**_EXACT)
+def probe_loads(dof, weights, forces, n):
+    """Returns the generalised load (n,) of forces (p, 3)."""
+    out = np.zeros(n)
+    for p in range(dof.shape[0]):
+        if forces[p, 0] == 0.0 and forces[p, 1] == 0.0 and forces[p, 2] == 0.0:
+            continue
+        for m in range(dof.shape[1]):
+            for a in range(3):
+                if dof[p, m, a] < n:
+                    out[dof[p, m, a]] += weights[p, m, a] * forces[p, a]
+    return out
+
+
+@njit(**_EXACT)
+def _add_banded_springs(dof, weights, blocks, n, storage):
+    for p in range(dof.shape[0]):
+        if blocks[p, 0, 0] == 0.0 and blocks[p, 1, 1] == 0.0 and blocks[p, 2, 2] == 0.0:
+            continue
+        for m in range(dof.shape[1]):
+            for a in range(3):
+                row = dof[p, m, a]
+                if row >= n or weights[p, m, a] == 0.0:
+                    continue
+                for k in range(dof.shape[1]):
+                    for b in range(3):
+                        col = dof[p, k, b]
+                        if col <= row and weights[p, k, b] != 0.0:
+                            storage[row - col, col] += weights[p, m, a] * blocks[p, a, b] * weights[p, k, b]
+
+
+def add_probe_springs(dof: NDArray, weights: NDArray, blocks: NDArray, size: int, tangent) -> None:
+    """Adds sum_p W_p^T blocks_p W_p, blocks (p, 3, 3) [N/m], to a lower tangent, banded or sparse, in place."""
+    if isinstance(tangent, np.ndarray):
+        _add_banded_springs(dof, weights, blocks, size, tangent)
+        return
+    active = np.flatnonzero(np.abs(blocks).max((1, 2)) > 0)
+    rows = dof[active].reshape(len(active), -1)
+    values = np.einsum("pma,pab,pkb->pmakb", weights[active], blocks[active], weights[active])
+    values = values.reshape(*rows.shape, rows.shape[1])
+    row, col = np.broadcast_arrays(rows[:, :, None], rows[:, None, :])
+    keep = (row < size) & (col <= row)
+    extra = sparse.coo_matrix((values[keep], (row[keep], col[keep])), (size, size)).tocsc()
+    total = tangent + extra
+    tangent.data, tangent.indices, tangent.indptr = total.data, total.indices, total.indptr

@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.jaw.mesh import FACES_HEX, VolumeMesh, build_volume_mesh, split_faces
-from finforce_ifea.jaw.shape_functions import EDGES_TET10
+from finforce_ifea.jaw.mesh import EDGES_TET10, FACES_HEX, VolumeMesh, build_volume_mesh, split_faces
 
 # Row v turns a hexahedron so that its corner v comes first.
 _TURNS_HEX = np.array(

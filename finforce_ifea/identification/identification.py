@@ -3,7 +3,13 @@
 Shape tells the geometry, force the modulus, and the forces' course at steady shape the relaxation. All are found
 together by least squares over the steady loads; the depth of each load and of each recording the object's radius, or
 the tilt of its known outline, are found along the way.
+
+Recordings with true forces cut into steady loads and their mean key points.
+
+Modulus and relaxation from the whole course of force in recordings, ramps included.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,20 +22,19 @@ from scipy.optimize import least_squares
 from finforce_ifea.contact_mechanics.indenter import DEPTH, ExpectedObject, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
-from finforce_ifea.identification.force_history import (
-    BRANCH_HIGH,
-    BRANCH_LOW,
-    BRANCH_PRIOR,
-    BRANCH_STDDEV,
-    branches_from_parameters,
-    fit_course,
-)
-from finforce_ifea.identification.plateaus import INSTANTS, CalibrationCase, Plateau, find_plateaus
+from finforce_ifea.estimator import JawEstimator, KeypointGate
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import build_mechanics, choose_full
-from finforce_ifea.relaxation import invert_relaxation
+from finforce_ifea.observation import Contact, Observation
+from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation, invert_relaxation
 from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tare import compute_tare
+
+BRANCH_PRIOR = np.array([0.1, np.log(1.0), 0.1, np.log(10.0)])
+BRANCH_STDDEV = np.array([0.3, 1.5, 0.3, 1.5])
+BRANCH_LOW = np.array([0.0, np.log(0.02), 0.0, np.log(0.1)])
+BRANCH_HIGH = np.array([2.0, np.log(1e3), 2.0, np.log(1e4)])
 
 _NAMES = (
     "young_modulus",
@@ -297,3 +302,221 @@ class _PlateauSolver:
         if start is not None:
             return self.solve(plateau, item, shape, None)
         raise CalibrationError("calibration: no shape of the jaw comes near the key points; is it the right jaw file?")
+
+
+_UNLOADED = 0.01
+_LEAST_FORCE = 0.15
+_STEADY_SPAN = 10
+_STEADY_CHANGE = 0.02
+_LEAST_FRAMES = 20
+_FARTHEST = 1.8e-3
+INSTANTS = 5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CalibrationCase:
+    """One recording with ground truth.
+
+    Attributes:
+        name: of the recording.
+        observations: its key points, in order.
+        contact: height of first touch.
+        stamps_true: (n,) [s].
+        forces_true: (n, 3) [N], jaw frame.
+    """
+
+    name: str
+    observations: Sequence[Observation]
+    contact: Contact
+    stamps_true: NDArray
+    forces_true: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plateau:
+    """A steady load.
+
+    Attributes:
+        case: number of the recording.
+        keypoints: mean displacements (K, 2) along x and z [m], NaN where too seldom seen.
+        variance: of each mean (K,) [m^2].
+        instants: indices into the case's true forces, spread over the plateau.
+        force: mean true magnitude [N].
+    """
+
+    case: int
+    keypoints: NDArray
+    variance: NDArray
+    instants: NDArray
+    force: float
+
+
+def find_plateaus(
+    cases: Sequence[CalibrationCase], jaw: Jaw, settings: EstimatorSettings, *, per_case: int
+) -> list[Plateau]:
+    """Returns at most `per_case` steady loads of each recording.
+
+    Raises:
+        CalibrationError: A recording has no unloaded start or no steady load.
+    """
+    plateaus = []
+    for number, case in enumerate(cases):
+        found = _plateaus_of_case(number, case, jaw, settings)
+        chosen = np.unique(np.linspace(0, len(found) - 1, per_case).round().astype(int))
+        plateaus += [found[i] for i in chosen]
+    return plateaus
+
+
+def _plateaus_of_case(number: int, case: CalibrationCase, jaw: Jaw, settings: EstimatorSettings) -> list[Plateau]:
+    gate = KeypointGate(jaw, settings)
+    stamps = np.array([observation.stamp for observation in case.observations])
+    points = np.stack([gate.accept(observation) for observation in case.observations])
+    magnitude = np.linalg.norm(case.forces_true, axis=1)
+    at = np.searchsorted(case.stamps_true, stamps).clip(0, len(magnitude) - 1)
+    force = magnitude[at]
+    loaded = np.flatnonzero(force > _UNLOADED)
+    start = loaded[0] if len(loaded) else len(force)
+    tare = compute_tare(list(points[:start]), jaw.keypoints) if start >= settings.tare_frames // 2 else None
+    if tare is None:
+        raise CalibrationError(f"{case.name}: expected at least a second without load at the start, for the tare")
+    rest = np.where(tare.counts[:, None] > 0, jaw.keypoints + tare.offsets, np.nan)
+    found = []
+    for first, last in _steady_runs(force):
+        mean, count = _robust_mean(points[first:last] - rest)
+        mean[count < 0.5 * (last - first)] = np.nan
+        variance = np.trace(tare.noise) / 3.0 * (1.0 / np.maximum(count, 1) + 1.0 / np.maximum(tare.counts, 1))
+        instants = at[np.linspace(first, last - 1, INSTANTS).round().astype(int)]
+        found.append(
+            Plateau(
+                case=number,
+                keypoints=mean[:, [0, 2]],
+                variance=variance,
+                instants=instants,
+                force=float(force[first:last].mean()),
+            )
+        )
+    if not found:
+        raise CalibrationError(f"{case.name}: no load is held steady for {_LEAST_FRAMES} frames; hold each for seconds")
+    return found
+
+
+def _steady_runs(force: NDArray) -> list[tuple[int, int]]:
+    """Returns the ranges of frames over which the force hardly changes."""
+    later = np.r_[force[_STEADY_SPAN:], np.full(_STEADY_SPAN, force[-1])]
+    steady = (np.abs(later - force) < _STEADY_CHANGE * np.maximum(force, 0.3) + 0.01) & (force > _LEAST_FORCE)
+    edges = np.flatnonzero(np.diff(np.r_[0, steady.astype(int), 0]))
+    return [(a, b) for a, b in edges.reshape(-1, 2) if b - a >= _LEAST_FRAMES]
+
+
+def _robust_mean(samples: NDArray) -> tuple[NDArray, NDArray]:
+    """Returns the mean (K, 3) of samples (n, K, 3) without gross errors, and the counts behind it (K,)."""
+    samples = samples.copy()
+    seen = np.isfinite(samples[..., 0]).any(0)
+    middle = np.zeros(samples.shape[1:])
+    middle[seen] = np.nanmedian(samples[:, seen], axis=0)
+    samples[np.linalg.norm(samples - middle, axis=2) > _FARTHEST] = np.nan
+    count = np.isfinite(samples[..., 0]).sum(0)
+    mean = np.nansum(samples, axis=0) / np.maximum(count, 1)[:, None]
+    return mean, count
+
+
+# Two branches, each a share [-] and a log time constant [s]: prior means, standard deviations and bounds.
+_LARGEST_SCALE = 3.0
+_LOADED_FORCE = 0.3
+_RELATIVE_ERROR, _ABSOLUTE_ERROR = 0.02, 0.03
+# Errors of neighbouring frames are alike; this many count as one.
+_CORRELATED_FRAMES = 30
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CourseFit:
+    """The outcome.
+
+    Attributes:
+        scale: factor on the modulus.
+        terms: branches of the relaxation.
+        stddev: standard deviations of share, time constant [s], share, time constant (4,).
+        force_rms: root mean square force residual of loaded frames [N].
+        relative: robust relative standard deviation of forces that is left.
+    """
+
+    scale: float
+    terms: tuple[RelaxationTerm, ...]
+    stddev: NDArray
+    force_rms: float
+    relative: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _ForceHistory:
+    """Stamps [s], elastic force estimates and true forces (n,) [N] of one recording."""
+
+    stamps: NDArray
+    elastic: NDArray
+    true: NDArray
+
+
+def branches_from_parameters(x: NDArray) -> tuple[RelaxationTerm, ...]:
+    """Returns the branches of parameters (4,), the faster one first."""
+    terms = [RelaxationTerm(share=float(x[k]), time_constant=float(np.exp(x[k + 1]))) for k in (0, 2)]
+    return tuple(sorted(terms, key=lambda term: term.time_constant))
+
+
+def fit_course(
+    jaw: Jaw,
+    cases: Sequence[CalibrationCase],
+    settings: EstimatorSettings,
+    calibration: Calibration,
+    progress: Callable[[float], None],
+) -> CourseFit:
+    """Fits modulus and relaxation at a given geometry.
+
+    Raises:
+        CalibrationError: The estimator trusts hardly a loaded frame of the recordings.
+    """
+    courses = []
+    for case in cases:
+        courses.append(_track_course(jaw, case, settings, calibration))
+        progress(float("nan"))
+    fit = least_squares(
+        _residuals,
+        np.r_[0.0, BRANCH_PRIOR],
+        bounds=(np.r_[-_LARGEST_SCALE, BRANCH_LOW], np.r_[_LARGEST_SCALE, BRANCH_HIGH]),
+        x_scale=np.r_[1.0, BRANCH_STDDEV],
+        args=(courses,),
+    )
+    errors = np.concatenate([_model(fit.x, course) - course.true for course in courses])
+    true = np.concatenate([course.true for course in courses])
+    loaded = true > _LOADED_FORCE
+    stddev = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac + 1e-12 * np.eye(5))))[1:]
+    return CourseFit(
+        scale=float(np.exp(fit.x[0])),
+        terms=branches_from_parameters(fit.x[1:]),
+        stddev=stddev * [1.0, np.exp(fit.x[2]), 1.0, np.exp(fit.x[4])],
+        force_rms=float(np.sqrt(np.mean(errors[loaded] ** 2))),
+        relative=float(1.48 * np.median(np.abs(errors[loaded] / true[loaded]))),
+    )
+
+
+def _track_course(
+    jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration
+) -> _ForceHistory:
+    """Estimates the elastic force of every frame."""
+    estimator = JawEstimator(jaw, settings=settings, calibration=replace(calibration, relaxation=()))
+    solutions = [estimator.update(observation, case.contact) for observation in case.observations]
+    trusted = [solution for solution in solutions if solution.trusted]
+    if sum(solution.status == "ok" for solution in trusted) < _CORRELATED_FRAMES:
+        raise CalibrationError(f"{case.name}: hardly a loaded frame can be trusted; {solutions[-1].message}")
+    stamps = np.array([solution.stamp for solution in trusted])
+    true = np.interp(stamps, case.stamps_true, np.linalg.norm(case.forces_true, axis=1))
+    return _ForceHistory(stamps=stamps, elastic=np.array([np.linalg.norm(s.force) for s in trusted]), true=true)
+
+
+def _model(x: NDArray, course: _ForceHistory) -> NDArray:
+    return np.exp(x[0]) * apply_relaxation(course.elastic, course.stamps, branches_from_parameters(x[1:]))
+
+
+def _residuals(x: NDArray, courses: Sequence[_ForceHistory]) -> NDArray:
+    """Returns the force residuals of all frames over their standard deviations, and those of the prior."""
+    rows = [(_model(x, c) - c.true) / (_RELATIVE_ERROR * c.true + _ABSOLUTE_ERROR) for c in courses]
+    return np.concatenate([np.concatenate(rows) / np.sqrt(_CORRELATED_FRAMES), (x[1:] - BRANCH_PRIOR) / BRANCH_STDDEV])

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import MeshError
-from finforce_ifea.jaw.mesh import VolumeMesh
-from finforce_ifea.jaw.shape_functions import shape_gradients, shape_values
+from finforce_ifea.jaw.mesh import VolumeMesh, shape_gradients, shape_values
 
 _NEWTON_STEPS = 12
 # How far a point may lie outside its element's reference domain and still count as inside [-].

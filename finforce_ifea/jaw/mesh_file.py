@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from finforce.errors import MissingDependencyError
 from finforce_ifea.errors import MeshError
-from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, check_connection
-from finforce_ifea.jaw.shape_functions import EDGES_TET10
+from finforce_ifea.jaw.mesh import EDGES_TET10, VolumeMesh, build_volume_mesh, check_connection
 
 _VOLUME_CELLS = ("tetra", "tetra10", "hexahedron")
 # Cells of fewer dimensions that mesh generators write beside the volume.

@@ -14,8 +14,16 @@ from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
-from finforce_ifea.tracking.place_update import Average, Forecast, PlaceUpdate, forecast_place, update_place
-from finforce_ifea.tracking.residuals import Residuals, Uncertainty, weigh_residuals
+from finforce_ifea.tracking.place_update import (
+    Average,
+    Forecast,
+    PlaceUpdate,
+    Residuals,
+    Uncertainty,
+    forecast_place,
+    update_place,
+    weigh_residuals,
+)
 from finforce_ifea.tracking.rest_response import measure_rest
 from finforce_ifea.tracking.track import Track, explain_offsets
 

@@ -1,12 +1,18 @@
-"""What a tracker says of one frame, and whether offsets look like a load."""
+"""What a tracker says of one frame, and whether offsets look like a load.
+
+When a force must not be reported.
+
+Compiled numbers of a solution: standard deviations and moments of a force that was tracked.
+"""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from finforce_ifea.tare import Tare
-from finforce_ifea.tracking.uncertainty import measure_along
 
 # Standard deviation of an offset that all key points share [m]: a depth scale wrong by 1 % at 0.15 m.
 _COMMON_OFFSET = 1.5e-3
@@ -103,3 +109,129 @@ def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
     seen = tare.counts > 0
     fit = fit_load(modes[seen], np.sqrt(offset_stddev**2 + tare.offset_variance(0.0)[seen]))
     return float(fit.gain @ tare.offsets[seen][:, [0, 2]].ravel() / fit.stddev)
+
+
+# Beyond these a force is not reported: misfit of the shape, stiffening, standard deviation [N], its share of the force.
+_LARGEST_MISFIT = 2.0
+_LARGEST_STIFFENING = 5.0
+_VAGUE_FORCE, _VAGUE_SHARE = 1.0, 0.25
+# Shapes so many times as far from the stored ones as they are good for.
+_STRANGEST = 2.0
+# Share of the key points: what no majority says is not believed.
+_MAJORITY = 0.5
+# A contact that is so surely another one, and at least so far from where it was said to be [m].
+_MISTAKEN, _LEAST_AWAY = 0.99, 4e-3
+
+
+def find_doubt(track: Track, *, settles: bool) -> str:
+    """Returns why a track must not be believed, empty when it may.
+
+    Args:
+        track: of one frame.
+        settles: whether the solver iterates until nothing changes, so that one that has not is in doubt.
+    """
+    if settles and not track.converged:
+        return f"the shape has not settled within {track.iterations} iterations; is the contact's place right?"
+    if track.extrapolation > _STRANGEST:
+        return "the jaw's shape is too far from the stored ones; solver solid or frame knows any shape"
+    if track.misfit > _LARGEST_MISFIT:
+        return f"the key points do not fit this contact ({track.misfit:.1f} standard deviations); is its place right?"
+    if track.stiffening > _LARGEST_STIFFENING:
+        return f"the jaw seems {track.stiffening:.0f} times as stiff as at the given height; is the contact elsewhere?"
+    if track.agreement <= _MAJORITY:
+        return f"only {100 * track.agreement:.0f} % of the key points agree with the jaw's shape"
+    if track.mistaken > _MISTAKEN and abs(track.away) > _LEAST_AWAY:
+        return f"the contact is not where it was said to be: the key points have it {1e3 * track.away:+.0f} mm away"
+    magnitude = float(np.linalg.norm(track.force))
+    stddev = compute_magnitude_stddev(track.force, track.force_modes, track.covariance)
+    if not stddev <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
+        return f"the visible key points tell the force only within {stddev:.2g} N"
+    return ""
+
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+
+
+class SolutionNumbers(NamedTuple):
+    """What belongs to one force.
+
+    Attributes:
+        magnitude: of the force [N].
+        magnitude_stddev: [N].
+        torque: about the jaw frame's origin (3,) [N m].
+        force_stddev: (3,) [N].
+        torque_stddev: (3,) [N m].
+        contact_point: in the jaw's plane (3,) [m], NaN without a force.
+        contact_place: the same on the undeformed surface (3,) [m], NaN without a force.
+        normal: direction of the force (3,), NaN without a force.
+    """
+
+    magnitude: float
+    magnitude_stddev: float
+    torque: NDArray
+    force_stddev: NDArray
+    torque_stddev: NDArray
+    contact_point: NDArray
+    contact_place: NDArray
+    normal: NDArray
+
+
+@njit(**_OPTIONS)
+def measure_along(force, modes, covariance):
+    """Returns the standard deviation [N] of a force (3,) along itself, along -x when it is none.
+
+    Args:
+        force: (3,) [N].
+        modes: derivative of the force by what was estimated (3, m).
+        covariance: of what was estimated (m, m).
+    """
+    magnitude = np.sqrt((force * force).sum())
+    direction = force / magnitude if magnitude > 0.0 else np.array([-1.0, 0.0, 0.0])
+    m, total = modes.shape[1], 0.0
+    mode = np.zeros(m)
+    for i in range(m):
+        for a in range(3):
+            mode[i] += direction[a] * modes[a, i]
+    for i in range(m):
+        for j in range(m):
+            total += mode[i] * covariance[i, j] * mode[j]
+    return np.sqrt(total)
+
+
+@njit(**_OPTIONS)
+def find_numbers(force, elastic, modes, covariance, pressure, place, place_stddev, share, lean):
+    """Returns what belongs to a force; see `SolutionNumbers`.
+
+    Args:
+        force: that the material gives now (3,) [N].
+        elastic: that the shape asks for (3,) [N].
+        modes: derivative of the elastic force by what was estimated (3, m).
+        covariance: of what was estimated (m, m).
+        pressure: pressure centre on the deformed surface (3,) [m].
+        place: the same on the undeformed surface (3,) [m].
+        place_stddev: of its height [m].
+        share: relative standard deviation of the mechanics; it errs in the direction as in the magnitude.
+        lean: share of a force that nobody has seen along z.
+    """
+    fit, magnitude = measure_along(elastic, modes, covariance), np.sqrt((force * force).sum())
+    stddev = np.zeros(3)
+    for a in range(3):
+        for i in range(modes.shape[1]):
+            for j in range(modes.shape[1]):
+                stddev[a] += modes[a, i] * covariance[i, j] * modes[a, j]
+    stddev[0] += (share * magnitude) ** 2
+    stddev[2] += (share * magnitude) ** 2
+    # a larger force leans more: where it is hardly known, its direction is not known either
+    stddev[2] += (lean * fit**2 / max(magnitude + fit, 1e-300)) ** 2
+    stddev = np.sqrt(stddev)
+    arm, undeformed = pressure.copy(), place.copy()
+    arm[1] = undeformed[1] = 0.0
+    moment = np.hypot(arm[0] * stddev[2], arm[2] * stddev[0])
+    torque = np.array([-arm[2] * force[1], arm[2] * force[0] - arm[0] * force[2], arm[0] * force[1]])
+    torque_stddev = np.array([0.0, np.hypot(moment, elastic[0] * place_stddev), 0.0])
+    if magnitude > 0.0:
+        normal = force / magnitude
+    else:
+        arm, undeformed, normal = np.full(3, np.nan), np.full(3, np.nan), np.full(3, np.nan)
+    spread = np.hypot(fit, share * magnitude)
+    return SolutionNumbers(magnitude, spread, torque, stddev, torque_stddev, arm, undeformed, normal)

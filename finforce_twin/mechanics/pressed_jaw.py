@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact, press_field
-from finforce_ifea.contact_mechanics.surface import build_contact_surface
+from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw

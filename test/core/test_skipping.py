@@ -13,9 +13,8 @@ from finforce import skipping as rules
 from finforce.skipping import ALL, EVERYWHERE, SkippingError, Skips
 from finforce.stamps import Idling
 from finforce_contact.estimator import ContactEstimator
-from finforce_ifea.observation import Contact
-from finforce_ifea.outline import ObjectOutline
-from finforce_ifea.tracking.clearance import AWAY, is_away
+from finforce_ifea.observation import Contact, ObjectOutline
+from finforce_ifea.tracking.rest_response import AWAY, is_away
 from finforce_keypoints.settings import RULES as DETECTOR
 
 RADIUS, HEIGHT = 0.0125, 0.040

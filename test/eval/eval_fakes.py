@@ -1,6 +1,6 @@
 """A small recording and an estimator that answers by rule, for the tests of the evaluation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from finforce_ifea.observation import Contact
 
 PERIOD = 33_333_333
 START = 1_000_000_000_000
+MIRROR, MIRROR_MOMENT = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # y -> -y; moments are axial vectors
 
 
 def make_phases(frames, *, cycles=2, name="case"):
@@ -166,3 +167,15 @@ class FakeContactEstimator:
         points = np.array([[0.014, 0.0, self._pose[2, 3] - 1e-3], [0.014, 0.0, self._pose[2, 3] + 3e-3]])
         contact = Contact(points=points, weights=np.array([0.75, 0.25]), touching=touching, free=True)
         return FakeEstimate(contact, touching, "touching" if touching else "apart")
+
+
+def with_both_jaws(recording, seconds):
+    """The first seconds of a recording of the left jaw, with its mirror image as the right jaw."""
+    start = int(recording.jaw("left").keypoints.stamps[0])
+    part = recording.between(start, start + int(seconds * 1e9))
+    left, truth = part.jaw("left"), part.truth("left")
+    right = JawTrack(
+        keypoints=replace(left.keypoints, points=left.keypoints.points * MIRROR),
+        truth=replace(truth, force=truth.force * MIRROR, torque=truth.torque * MIRROR_MOMENT),
+    )
+    return replace(part, jaws={"left": left, "right": right})

@@ -12,9 +12,7 @@ import pytest
 
 from finforce.errors import MissingDependencyError
 from finforce_eval.bench import bench
-from finforce_eval.bench import live as bench_live
 from finforce_eval.bench.bench import PARTS, BenchPart, format_rows, row_from_times, select_parts, time_calls
-from finforce_eval.bench.live import MIRROR_MOMENT, LiveFigures, with_both_jaws
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.machine import write_figures
@@ -90,18 +88,6 @@ def test_process_takes_memory_and_knows_its_children():
     assert resident_bytes(child.pid) == 0
 
 
-def test_right_jaw_is_the_mirror_image_of_the_left(recording):
-    both = with_both_jaws(recording, 5.0)
-    left, right = both.jaws["left"], both.jaws["right"]
-    assert len(left.keypoints.stamps) == len(right.keypoints.stamps) == 150
-    np.testing.assert_array_equal(right.keypoints.points[..., 1], -left.keypoints.points[..., 1])
-    np.testing.assert_array_equal(right.truth.force[:, [0, 2]], left.truth.force[:, [0, 2]])
-    arm = np.array([0.014, 0.003, 0.04])
-    force = np.array([-1.0, 0.2, 0.3])
-    mirrored = np.cross(arm * [1, -1, 1], force * [1, -1, 1])
-    np.testing.assert_allclose(mirrored, np.cross(arm, force) * MIRROR_MOMENT)
-
-
 def test_usual_parts_are_measured_unless_others_are_named(two_parts):
     assert [part.name for part in select_parts(None)] == ["first", "second"]
     assert [part.name for part in select_parts("third, first,third")] == ["third", "first"]
@@ -112,7 +98,7 @@ def test_usual_parts_are_measured_unless_others_are_named(two_parts):
 def test_every_listed_part_keeps_the_contract():
     for part in PARTS:
         module = __import__(part.module, fromlist=["measure"])
-        assert all(callable(getattr(module, name)) for name in ("measure", "format_table", "as_json", "draw")), part
+        assert all(callable(getattr(module, name)) for name in ("measure", "format_table", "as_json")), part
 
 
 def test_command_prints_tables_and_writes_json_and_a_picture_for_each_part(two_parts, tmp_path, capsys):
@@ -157,34 +143,25 @@ def test_figures_are_written_with_where_they_are_from_and_null_for_what_is_not_f
     assert {"processor", "cores", "python", "commit"} <= set(content["machine"])
 
 
-def test_latency_of_live_jaws_becomes_a_row_and_a_picture(tmp_path):
-    figures = LiveFigures(latency=np.linspace(4e-3, 6e-3, 11), memory=150_000_000)
-    assert bench_live.as_json(figures)["latency_ms"]["p50"] == pytest.approx(5.0)
-    assert bench_live.as_json(figures)["node_MB"] == 150.0
-    assert "150 MB" in bench_live.format_table(figures)
-    bench_live.draw(figures, tmp_path / "live.png")
-    assert (tmp_path / "live.png").stat().st_size > 1000
+@pytest.fixture
+def fill_pages(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    return __import__("fill_pages")
 
 
-def test_page_takes_its_tables_from_the_figures_and_keeps_what_they_do_not_hold(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    page = __import__("speed_page")
-    blocks = page.list_blocks(
-        {
-            "machine": {"commit": "abc", "processor": "P", "cores": 2, "python": "3"},
-            "solvers": {"table": "| a |\n|---|\nnote", "tables": {"tiers": "| t |"}},
-            "chain": {"not_measured": "no ROS"},
-        }
-    )
-    text = "x\n<!-- begin solvers -->\nold\n<!-- end solvers -->\n<!-- begin nodes -->\nkept\n<!-- end nodes -->\n"
-    filled = page.fill_page(text, blocks)
-    assert filled == text.replace("old", "| a |\n|---|\n\nnote")
-    assert page.fill_page(filled, blocks) == filled
-    assert blocks["solvers.tiers"] == "| t |" and "no ROS" in blocks["chain"] and "abc" in blocks["machine"]
+def test_page_takes_its_tables_from_the_figures_and_keeps_what_they_do_not_hold(fill_pages, tmp_path):
+    machine = {"commit": "abc", "processor": "P", "cores": 2, "python": "3"}
+    content = {"machine": machine, "solvers": {"tables": {"tiers": "| t |"}}}
+    (tmp_path / "bench.json").write_text(json.dumps(content))
+    texts = fill_pages.read_texts(tmp_path / "bench.json")
+    assert texts["solvers.tables.tiers"] == "| t |" and "abc" in texts["machine.solvers"]
+    block = "x\n<!-- begin {0} -->\nold\n<!-- end {0} -->\n"
+    page = block.format("solvers.tables.tiers") + block.format("nodes")
+    filled = fill_pages.fill(page, texts)
+    assert filled == page.replace("old", "| t |", 1)
+    assert fill_pages.fill(filled, texts) == filled
 
 
-def test_page_asks_for_tables_that_the_benchmark_has(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    asked = __import__("speed_page").name_places((ROOT / "docs" / "speed.md").read_text(encoding="utf-8"))
-    assert "solvers.tiers" in asked
-    assert {name.split(".")[0] for name in asked} <= {"machine", *(part.name for part in PARTS)}
+def test_a_file_of_one_benchmark_is_named_after_it(fill_pages, tmp_path):
+    (tmp_path / "verification.json").write_text(json.dumps({"tables": {"summary": "| s |"}}))
+    assert fill_pages.read_texts(tmp_path / "verification.json") == {"verification.tables.summary": "| s |"}

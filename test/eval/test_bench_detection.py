@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from rgbd_fakes import FakeDetector, FakePhotographer, make_footage
 
-from finforce.errors import MissingDependencyError
 from finforce_eval.bench import detection as bench
 from finforce_eval.bench.detection import Way, measure_ways
 from finforce_eval.recordings.recording import read_recording
@@ -77,17 +76,6 @@ def test_dots_are_shown_to_their_own_way_only(detectors, bag):
     recorded = [image.color for _, image in read_recording(bag).images]
     assert all(np.array_equal(*pair) for pair in zip(detectors["plain"].seen, recorded, strict=True))
     assert not any(np.array_equal(*pair) for pair in zip(detectors["dots"].seen, recorded, strict=True))
-
-
-def test_what_cannot_be_written_is_a_note_and_the_rest_is_measured(tmp_path, monkeypatch):
-    def fails(folder):
-        raise MissingDependencyError("needs onnx")
-
-    monkeypatch.setattr(bench, "_network_forms", lambda: {"int8": fails, "small": lambda folder: folder})
-    notes = []
-    names = [way.name for way in bench.list_ways(tmp_path, notes)]
-    assert notes == ["network, int8: not measured: needs onnx"]
-    assert "network, small, 1 thread" in names and "network, int8, 1 thread" not in names
 
 
 def test_rules_are_applied_by_the_resting_way_only(monkeypatch):

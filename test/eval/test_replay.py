@@ -13,9 +13,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from eval_fakes import with_both_jaws
 
 from finforce.transforms import pose_from_quaternion, quaternion_from_pose
-from finforce_eval.bench.live import with_both_jaws
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording

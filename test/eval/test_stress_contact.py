@@ -14,8 +14,7 @@ from finforce_eval.stress.summary import summarise
 from finforce_ifea.contact_mechanics.distance_field import build_distance_field
 from finforce_ifea.contact_mechanics.indenter import expect_object
 from finforce_ifea.errors import ContactError
-from finforce_ifea.observation import Contact
-from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.observation import Contact, ObjectOutline
 from finforce_ifea.settings import EstimatorSettings
 
 SCENES = {scene.name: scene for scene in build_scenes()}

@@ -9,8 +9,7 @@ from mechanics_fakes import BENCH, bench_mechanics
 from finforce_ifea.contact_mechanics.forward_press import press_jaw
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
-from finforce_ifea.observation import Contact, Observation
-from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.observation import Contact, ObjectOutline, Observation
 
 STDDEV = np.array([1e-4, 1e-4, 3e-3])
 

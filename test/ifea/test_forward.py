@@ -7,7 +7,7 @@ import pytest
 from mechanics_fakes import BENCH, bench_mechanics, bench_press
 
 from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder, press_jaw
-from finforce_ifea.contact_mechanics.surface import build_contact_surface
+from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface
 from finforce_ifea.errors import ContactError, MeshError
 
 FACE = BENCH.inner_face_x

@@ -5,9 +5,9 @@ import pytest
 from mechanics_fakes import BENCH
 
 from finforce.errors import ObservationError
+from finforce_ifea.estimator import KeypointGate
 from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tracking.keypoint_gate import KeypointGate
 
 
 def make_gate(**options):

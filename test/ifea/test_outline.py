@@ -14,7 +14,7 @@ from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinde
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
 from finforce_ifea.contact_mechanics.penalty import press_field
 from finforce_ifea.errors import ContactError
-from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.observation import ObjectOutline
 
 FACE = BENCH.inner_face_x
 

@@ -9,7 +9,7 @@ from finforce.errors import ObservationError
 from finforce.pointcloud import encode_cloud
 from finforce_ifea.errors import ContactError
 from finforce_ifea.messages import columns_from_outline, outline_from_columns
-from finforce_ifea.outline import ObjectOutline
+from finforce_ifea.observation import ObjectOutline
 from finforce_ifea.parameters import MOST_CORNERS, MOST_ROWS, ContactFeed
 
 MS = 1_000_000
