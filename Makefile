@@ -8,7 +8,7 @@ SET_UP := tools/setup_venv.sh
 DESCRIBED := setup.py setup.cfg pyproject.toml $(SET_UP)
 ROS := $(if $(AMENT_PREFIX_PATH),ament,plain)
 
-.PHONY: demo test lint bench build clean
+.PHONY: demo test lint bench docs build clean
 
 demo: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main demo --report report
@@ -24,6 +24,9 @@ lint: .venv/.$(ROS)-lint
 bench: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main bench --json report/bench.json
 
+docs: .venv/.$(ROS)-docs
+	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict --quiet
+
 build: .venv/.$(ROS)-build
 	$(PYTHON) -m colcon build --event-handlers console_cohesion+
 
@@ -31,5 +34,5 @@ build: .venv/.$(ROS)-build
 	$(SET_UP) $* $@
 
 clean:
-	rm -rf .venv build install log report *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv build install log report site *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -59,7 +59,7 @@ setup(
         "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
-        "test": ["pytest", "pytest-xdist", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0"],
+        "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0"],
         "lint": ["ruff", "import-linter"],
     },
     entry_points={

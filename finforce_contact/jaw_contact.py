@@ -1,4 +1,4 @@
-"""One jaw's contact estimator with what it is fed: poses in pairs, a surface and a wrench while they are fresh."""
+"""The contact of one jaw in the loop with its solver: the same offline, in nodes and from a Python prompt."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from finforce.stamps import SECOND
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.pose.pairing import DEPTH, PosePairing, PoseStep
+from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.observation import Observation, Solution
 from finforce_ifea.tracking.rest_response import is_away
 
 AWAY_FOR = 10  # images in a row, after which the object is taken to stay away: a second, of the ten that are looked at
@@ -35,8 +37,135 @@ class PassedImage(NamedTuple):
     read: Callable[[], NDArray]
 
 
-class JawContact:
-    """Turns the poses of images into contacts on one jaw, one per image.
+class ContactLoop:
+    """The contact estimator of one jaw in the loop with the solver of that jaw.
+
+    The contact of an image is found with the object's last pose, on the deformed jaw that the solver found in the image
+    before. Offline and live run this same loop; live, its ends are topics.
+
+    Args:
+        estimator: of this jaw.
+        max_age: greatest distance between the stamps of an image and of the surface and wrench used for it [ns].
+    """
+
+    def __init__(self, estimator: ContactEstimator, *, max_age: int = 200_000_000) -> None:
+        self.estimator = estimator
+        self._max_age = max_age
+        self._start()
+
+    def _start(self) -> None:
+        self.last: TimedEstimate | None = None
+        self._surface: tuple[int, NDArray] | None = None
+        self._wrench: tuple[int, tuple[NDArray, NDArray]] | None = None
+        self._posed: int | None = None
+        self._away = 0
+
+    def reset(self) -> None:
+        """Forget everything but the object's mesh."""
+        self.estimator.reset()
+        self._start()
+
+    @property
+    def is_away(self) -> bool:
+        """Whether the object stood out of the jaw's reach in the last image."""
+        return self._away > 0
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing happens: the object is out of reach, or held still."""
+        return self.is_away or self.estimator.resting
+
+    def take_pose(
+        self, stamp: int, T_jaw_object: NDArray, covariance: NDArray | None = None, camera: NDArray | None = None
+    ) -> None:
+        """Take the object's pose (4, 4) in an image [ns]; one that is not newer than the last is left out.
+
+        Args:
+            stamp: of the image [ns].
+            T_jaw_object: (4, 4) [m].
+            covariance: (6, 6) [m, rad], along the jaw's axes; None when unknown.
+            camera: place (3,) of the camera in the jaw frame [m].
+
+        Raises:
+            PoseError: the pose makes no sense.
+        """
+        if self._posed is None or stamp > self._posed:
+            self.estimator.take_pose(SECOND * stamp, T_jaw_object, covariance, camera=camera)
+            self._posed = stamp
+
+    def keep_surface(self, stamp: int, surface: NDArray) -> None:
+        """Keep the deformed vertices (n, 3) [m] that the solver found in an image [ns]."""
+        self._surface = stamp, surface
+
+    def take_wrench(self, stamp: int, wrench: tuple[NDArray, NDArray]) -> None:
+        """Keep force (3,) [N] and torque (3,) [N m] of an image [ns]."""
+        self._wrench = stamp, wrench
+
+    def update(self, stamp: int) -> TimedEstimate | None:
+        """Return the contact of an image [ns]; None when it is not newer than the last.
+
+        Raises:
+            MeshError: the surface is not that of the jaw's mesh.
+        """
+        if self.last is not None and stamp <= self.last.stamp:
+            return None
+        surface, wrench = self._fresh(self._surface, stamp), self._fresh(self._wrench, stamp)
+        self.last = TimedEstimate(stamp, self.estimator.update(SECOND * stamp, surface, wrench))
+        contact = self.last.estimate.contact
+        away = contact is not None and is_away(contact, self.estimator.jaw.inner_face_x)
+        self._away = self._away + 1 if away else 0
+        return self.last
+
+    def _fresh(self, kept: tuple[int, ValueT] | None, stamp: int) -> ValueT | None:
+        return kept[1] if kept and abs(stamp - kept[0]) <= self._max_age else None
+
+    def has_surface(self) -> bool:
+        """Say whether the last contact was found on the deformed jaw; else the undeformed one stood for it."""
+        return self.last is not None and self._fresh(self._surface, self.last.stamp) is not None
+
+    def pose_age(self) -> float:
+        """Return the time from the object's last pose to the last contact [s], NaN before the first."""
+        if self.last is None or self._posed is None:
+            return float("nan")
+        return SECOND * (self.last.stamp - self._posed)
+
+
+class ForceLoop:
+    """Contact and force of one jaw, image after image: the contact estimator and the solver, each fed by the other.
+
+    Args:
+        contact: the contact estimator, with the object's mesh and the jaw as calibrated (`force.jaw`).
+        force: the solver of that jaw, with the same mesh density.
+    """
+
+    def __init__(self, contact: ContactEstimator, force: JawEstimator) -> None:
+        self.contact, self.force = ContactLoop(contact), force
+
+    def take_pose(self, stamp: float, T_jaw_object: NDArray) -> None:
+        """Take the object's pose (4, 4) [m] in the jaw frame, in an image [s].
+
+        Raises:
+            PoseError: the pose makes no sense.
+        """
+        self.contact.take_pose(round(stamp / SECOND), T_jaw_object)
+
+    def update(self, observation: Observation) -> Solution:
+        """Return the force in an image.
+
+        Raises:
+            ObservationError: the key points are not those of the jaw.
+        """
+        stamp = round(observation.stamp / SECOND)
+        estimate = self.contact.update(stamp)
+        solution = self.force.update(observation, estimate.estimate.contact if estimate else None)
+        self.contact.keep_surface(stamp, self.force.surface())
+        if solution.trusted:
+            self.contact.take_wrench(stamp, (solution.force, solution.torque))
+        return solution
+
+
+class JawContact(ContactLoop):
+    """The loop with poses in the camera's frame, which come late or not at all.
 
     A jaw pose makes the contact of its image due. Images without one, where poses are rarer than key points, are due
     with the surface that the solver found in them.
@@ -48,23 +177,15 @@ class JawContact:
     """
 
     def __init__(self, estimator: ContactEstimator, *, tolerance: int, max_age: int) -> None:
-        self.estimator = estimator
-        self.last: TimedEstimate | None = None
         self._pairing = PosePairing(tolerance)
-        self._max_age = max_age
-        self.reset()
+        super().__init__(estimator, max_age=max_age)
 
-    def reset(self) -> None:
-        """Forget everything but the object's mesh."""
-        self.estimator.reset()
+    def _start(self) -> None:
+        super()._start()
         self._pairing.reset()
-        self.last = None
-        self._surface: tuple[int, NDArray] | None = None
-        self._wrench: tuple[int, tuple[NDArray, NDArray]] | None = None
-        self._posed: int | None = None
         self._passed: deque[PassedImage] = deque(maxlen=DEPTH)
         self._over: deque[int] = deque(maxlen=DEPTH)
-        self._away, self._is_driven = 0, False
+        self._is_driven = False
 
     def set_object(self, mesh: ObjectMesh | None) -> None:
         """Take another object; its pose is not known yet.
@@ -78,16 +199,6 @@ class JawContact:
         self._pairing.reset()
         self._passed.clear()
         self._posed = None
-
-    @property
-    def is_away(self) -> bool:
-        """Whether the object stood out of the jaw's reach in the last image."""
-        return self._away > 0
-
-    @property
-    def is_idle(self) -> bool:
-        """Whether nothing happens: the object is out of reach, or held still."""
-        return self.is_away or self.estimator.resting
 
     @property
     def needs_surface(self) -> bool:
@@ -110,15 +221,11 @@ class JawContact:
         Raises:
             MeshError: the surface is not that of the jaw's mesh.
         """
-        self._surface = stamp, surface
+        self.keep_surface(stamp, surface)
         known = self._posed is not None and not self._pairing.is_waiting(stamp) and stamp not in self._over
-        estimates = self._update(stamp) if known else []
+        estimates = self._due(stamp) if known else []
         self._is_driven |= bool(estimates)
         return estimates
-
-    def take_wrench(self, stamp: int, wrench: tuple[NDArray, NDArray]) -> None:
-        """Keep force (3,) [N] and torque (3,) [N m] of an image [ns]."""
-        self._wrench = stamp, wrench
 
     def take_jaw_pose(self, stamp: int, T_camera_jaw: NDArray) -> list[TimedEstimate]:
         """Take the jaw's pose (4, 4) in an image [ns]; return the contacts that are known now.
@@ -155,37 +262,16 @@ class JawContact:
         """Hand poses on and update for the images that are due."""
         estimates = []
         for step in steps:
-            if step.T_jaw_object is not None and (self._posed is None or step.stamp > self._posed):
+            if step.T_jaw_object is not None:
                 covariance = turn_covariance(step.covariance, step.T_jaw_camera)
-                camera = step.T_jaw_camera[:3, 3]
-                self.estimator.take_pose(SECOND * step.stamp, step.T_jaw_object, covariance, camera=camera)
-                self._posed = step.stamp
+                self.take_pose(step.stamp, step.T_jaw_object, covariance, step.T_jaw_camera[:3, 3])
             if step.is_due:
-                estimates += self._update(step.stamp)
+                estimates += self._due(step.stamp)
         return estimates
 
-    def _update(self, stamp: int) -> list[TimedEstimate]:
-        if self.last is not None and stamp <= self.last.stamp:
-            return []
-        surface, wrench = self._fresh(self._surface, stamp), self._fresh(self._wrench, stamp)
-        self.last = TimedEstimate(stamp, self.estimator.update(SECOND * stamp, surface, wrench))
-        contact = self.last.estimate.contact
-        away = contact is not None and is_away(contact, self.estimator.jaw.inner_face_x)
-        self._away = self._away + 1 if away else 0
-        return [self.last]
-
-    def _fresh(self, kept: tuple[int, ValueT] | None, stamp: int) -> ValueT | None:
-        return kept[1] if kept and abs(stamp - kept[0]) <= self._max_age else None
-
-    def has_surface(self) -> bool:
-        """Say whether the last contact was found on the deformed jaw; else the undeformed one stood for it."""
-        return self.last is not None and self._fresh(self._surface, self.last.stamp) is not None
-
-    def pose_age(self) -> float:
-        """Return the time from the object's last pose to the last contact [s], NaN before the first."""
-        if self.last is None or self._posed is None:
-            return float("nan")
-        return SECOND * (self.last.stamp - self._posed)
+    def _due(self, stamp: int) -> list[TimedEstimate]:
+        estimate = self.update(stamp)
+        return [estimate] if estimate else []
 
 
 def turn_covariance(covariance: NDArray | None, T_jaw_camera: NDArray) -> NDArray | None:

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Makes or refreshes the virtual environment .venv for one purpose:
-#   tools/setup_venv.sh lint|run|test|build [STAMP]
+#   tools/setup_venv.sh lint|docs|run|test|build [STAMP]
 # A sourced ROS 2 is used as it is; without one, ROS 2 Jazzy comes from wheels. Needs nothing but Python.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-purpose=${1:?lint, run, test or build}
+purpose=${1:?lint, docs, run, test or build}
 stamp=${2:-.venv/.$purpose}
 venv=.venv
 
@@ -84,6 +84,7 @@ if has_sourced_ros; then ros=sourced; fi
 if ! fits "$venv/bin/python" || [ "$(cat "$venv/.ros" 2>/dev/null)" != "$ros" ]; then make_venv; fi
 case $purpose in
   lint) install ruff import-linter ;;
+  docs) install mkdocs mkdocs-material "mkdocstrings[python]" ;;
   run) check_system_libraries; install_product "" ;;
   test) check_system_libraries; install_product test ;;
   build) install_product ""; install colcon-common-extensions ;;

@@ -1,8 +1,10 @@
-"""How Fast DDS is to carry images."""
+"""How Fast DDS is to carry images, and which domain is free."""
 
 from __future__ import annotations
 
 import os
+import random
+import socket
 from pathlib import Path
 
 TRANSPORT = Path(__file__).with_name("fastdds.xml")
@@ -14,3 +16,21 @@ def provide_transport() -> None:
     """Have Fast DDS carry images, which its default loses, unless somebody has chosen how it works already."""
     if TRANSPORT.is_file() and not any(os.environ.get(name) for name in CHOICES):
         os.environ[PROFILES] = str(TRANSPORT)
+
+
+def free_domain() -> int:
+    """Return a ROS_DOMAIN_ID from 1 to 99 on which no participant of this machine is, by chance.
+
+    The first participant of a domain holds the UDP port 7410 + 250 times its number (DDSI-RTPS 2.3, 9.6.1.1).
+    """
+    domains = random.sample(range(1, 100), 99)
+    return next((domain for domain in domains if _is_free(7410 + 250 * domain)), domains[0])
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", port))
+        except OSError:
+            return False
+        return True

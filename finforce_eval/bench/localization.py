@@ -24,7 +24,7 @@ from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.figures.time_error import ErrorPoint, ErrorSeries, TimeStats, draw_time_error, time_stats
 from finforce_eval.recordings.objects import track_object
-from finforce_eval.recordings.recording import SHIPPED as RECORDING
+from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.estimator import JawEstimator

@@ -8,7 +8,6 @@ What the benchmark of skipped work found: its records, tables and picture.
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from finforce.errors import MissingDependencyError
+from finforce.ros.transport import free_domain
 from finforce.skipping import ALL, AWAY, CONTACT, EVERYWHERE, IDLE, SOLVER, STILL, UNCHANGED, UNHEARD, UNNEEDED
 from finforce_eval.bench.chain import SIDES, awaited_topics, chain_processes
 from finforce_eval.bench.scene_reel import OBJECT_TOPIC, SceneReel, Span, StreamPart, cut_sections
@@ -169,7 +169,7 @@ def _run(nodes: Sequence[Process], reel: SceneReel, setting: str) -> _Run:
         from finforce_eval.replay.node import open_player
     except ImportError as error:
         raise MissingDependencyError(f"running nodes needs ROS 2: pip install 'finforce[ros]' ({error})") from error
-    domain, log, run = random.randint(1, 99), ReplayLog(SIDES), _Run()
+    domain, log, run = free_domain(), ReplayLog(SIDES), _Run()
     awaited = [*awaited_topics(images=True), OBJECT_TOPIC]
     with ExitStack() as stack:
         player = stack.enter_context(open_player(domain))

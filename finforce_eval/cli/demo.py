@@ -15,7 +15,7 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import IMAGES, KeypointSource
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.figures.report import write_report
-from finforce_eval.recordings.recording import SHIPPED, read_recording
+from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.replay.replay import Replay, replay
 
@@ -33,6 +33,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from", dest="source", default="images", choices=("images", "keypoints"), help=text)
     parser.add_argument("--contact", action="append", default=[], metavar="CONTACT", help=CONTACT_HELP)
     parser.add_argument("--report", default="report", metavar="DIR", help="folder of the report (report)")
+    parser.add_argument(
+        "--movie", metavar="FILE", help="also make a moving picture, FILE.webp or FILE.gif, of the images"
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -43,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
         ProcessError: a node cannot be started, or ended early.
     """
     from_images = options.source == IMAGES
-    recording = prepare_recording(Path(options.report) / FOLDER) if from_images else read_recording(SHIPPED)
+    recording = prepare_recording(Path(options.report) / FOLDER) if from_images else read_recording(DEMO)
     calibration = SCENE_CALIBRATION if from_images else CALIBRATION
     stamps = recording.images.stamps if from_images else recording.jaw("left").keypoints.stamps
     way = "key point detector, contact estimator and solvers" if from_images else "contact estimator and solver"
@@ -68,6 +71,12 @@ def run(options: argparse.Namespace) -> None:
         recordings=[result.recording],
         title="From images to forces through the nodes" if from_images else "One loading cycle through the nodes",
     )
+    if options.movie:
+        from finforce_eval.figures.movie import write_movie
+        from finforce_keypoints.diagnostics import build_skeleton
+
+        skeleton = build_skeleton(setup.jaw.keypoint_names)
+        write_movie(result.recording, list(result.evaluation.results.values()), options.movie, skeleton)
     print(f"\n{format_summary(result)}\nReport: {page}")
 
 

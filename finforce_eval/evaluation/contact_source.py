@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import PoseError
+from finforce.stamps import SECOND
+from finforce_contact.jaw_contact import ContactLoop
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_choice import ESTIMATED, FIXED, ContactChoice
 from finforce_eval.evaluation.contact_scoring import ONSET_FORCE
@@ -64,7 +66,7 @@ class GivenContact:
 
 
 class EstimatedContact:
-    """The contact estimator, fed as its node is: poses as they come, then surface and wrench of the image before.
+    """The contact estimator's loop, given the poses of a recording as they come.
 
     Args:
         estimator: a fresh ContactEstimator.
@@ -76,10 +78,10 @@ class EstimatedContact:
         """Start before the first pose."""
         self.name = name
         self.estimate: Any = None
-        self._estimator, self._track, self._next = estimator, track, 0
+        self._loop, self._track, self._next = ContactLoop(estimator), track, 0
 
     def contact_at(self, stamp: int) -> Contact | None:
-        """Give the poses up to an image to the estimator, and return what it said last.
+        """Give the poses up to an image to the estimator, and return what it says of the image.
 
         Raises:
             RecordingError: the estimator refuses a pose.
@@ -87,22 +89,24 @@ class EstimatedContact:
         while self._next < len(self._track.stamps) and self._track.stamps[self._next] <= stamp:
             self._take_pose(self._next)
             self._next += 1
-        if self.estimate is None:
-            self.estimate = self._estimator.update(stamp * 1e-9)
+        self._loop.update(stamp)
+        self.estimate = self._loop.last.estimate
         return self.estimate.contact
 
     def _take_pose(self, index: int) -> None:
         """Give one pose to the estimator."""
-        time = float(self._track.stamps[index] * 1e-9)
+        stamp = int(self._track.stamps[index])
         camera = None if self._track.cameras is None else self._track.cameras[index]
         try:
-            self._estimator.take_pose(time, self._track.poses[index], camera=camera)
+            self._loop.take_pose(stamp, self._track.poses[index], camera=camera)
         except PoseError as error:
-            raise RecordingError(f"object pose at {time:.3f} s: {error}") from error
+            raise RecordingError(f"object pose at {SECOND * stamp:.3f} s: {error}") from error
 
     def learn(self, stamp: int, surface: NDArray[np.float64], wrench: Wrench | None) -> None:
-        """Locate the contact on the deformed jaw, for the next image."""
-        self.estimate = self._estimator.update(stamp * 1e-9, surface, wrench)
+        """Keep what the solver found, for the next image."""
+        self._loop.keep_surface(stamp, surface)
+        if wrench is not None:
+            self._loop.take_wrench(stamp, wrench)
 
 
 # Poses from which the place of first touch is averaged at least.

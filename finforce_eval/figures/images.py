@@ -96,7 +96,7 @@ def draw_images(recording: Recording, results: Sequence[CaseResult], skeleton: S
     largest = max(snapshots, key=lambda taken: float(np.linalg.norm(taken.force)), default=None)
     stamps = choose_images(recording.images.stamps, largest and largest.stamp)
     camera = recording.images.camera
-    region = find_region(_known_pixels(recording, stamps), camera.width, camera.height)
+    region = find_region(known_pixels(recording, stamps), camera.width, camera.height)
     lines = -(-len(stamps) // COLUMNS)
     figure = new_figure(WIDTH, lines * (WIDTH / COLUMNS * region.height / region.width + 0.3) + 0.4)
     panels = figure.subplots(lines, COLUMNS, squeeze=False).ravel()
@@ -104,27 +104,27 @@ def draw_images(recording: Recording, results: Sequence[CaseResult], skeleton: S
         axes.set_axis_off()
     reasons: set[str] = set()
     for axes, taken in zip(panels, recording.images.at(stamps), strict=False):
-        found = [_found_at(track.detection, taken.stamp) for track in _detected(recording).values()]
+        found = [found_at(track.detection, taken.stamp) for track in detected_jaws(recording).values()]
         picture, scale = enlarge(taken.image.color, region)
-        axes.imshow(draw_keypoints(picture, [_moved(entry, region, scale) for entry in found], skeleton, radius=RADIUS))
-        for track in _detected(recording).values():
+        axes.imshow(draw_keypoints(picture, [moved(entry, region, scale) for entry in found], skeleton, radius=RADIUS))
+        for track in detected_jaws(recording).values():
             _draw_truth(axes, track, taken.stamp, (region, scale))
         is_largest = largest is not None and taken.stamp == largest.stamp
         axes.set_title(describe_image(recording, results, taken.stamp, is_largest), loc="left", fontsize=9)
         reasons |= {str(reason) for entry in found for reason in entry.reasons[np.isfinite(entry.pixels).all(axis=1)]}
-    _explain(figure, reasons, has_truth=any(track.sight is not None for track in _detected(recording).values()))
+    _explain(figure, reasons, has_truth=any(track.sight is not None for track in detected_jaws(recording).values()))
     return figure
 
 
-def _detected(recording: Recording) -> Mapping[str, JawTrack]:
+def detected_jaws(recording: Recording) -> Mapping[str, JawTrack]:
     """Return the jaws that a detector looked for."""
     return {side: track for side, track in recording.jaws.items() if track.detection is not None}
 
 
-def _known_pixels(recording: Recording, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+def known_pixels(recording: Recording, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return where the key points truly are, where that is known, else where they were found and used (n, 2) [px]."""
     pixels = [np.zeros((0, 2))]
-    for track in _detected(recording).values():
+    for track in detected_jaws(recording).values():
         known = track.sight or track.detection
         chosen = np.isin(known.stamps, stamps)[:, None] & (track.sight.visible if track.sight else known.accepted)
         pixels.append(known.pixels[chosen])
@@ -146,11 +146,12 @@ def place_pixels(pixels: NDArray[np.float64], region: Region, scale: int) -> NDA
     return (pixels - [region.left, region.top] + 0.5) * scale - 0.5
 
 
-def _moved(found: FoundPixels, region: Region, scale: int) -> FoundPixels:
+def moved(found: FoundPixels, region: Region, scale: int) -> FoundPixels:
+    """Return what was found in an image at its places in the enlarged part."""
     return found._replace(pixels=place_pixels(found.pixels, region, scale))
 
 
-def _found_at(detection: DetectionTrack, stamp: int) -> FoundPixels:
+def found_at(detection: DetectionTrack, stamp: int) -> FoundPixels:
     """Return what was found in the image at a stamp [ns]."""
     row = int(np.searchsorted(detection.stamps, stamp))
     return FoundPixels(detection.pixels[row], detection.accepted[row], detection.reasons[row])
@@ -213,7 +214,7 @@ def draw_detection(recording: Recording) -> Any:
     Returns:
         A matplotlib figure.
     """
-    jaws = _detected(recording)
+    jaws = detected_jaws(recording)
     drawn = [_draw_counts, _draw_likelihood]
     if any(track.sight is not None for track in jaws.values()):
         drawn.insert(0, _draw_pixel_error)

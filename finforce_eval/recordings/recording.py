@@ -42,7 +42,7 @@ for _side in JAWS:
         f"/{_side}/{TRUE_POSE}": POSE,
     }
 
-SHIPPED = Path(__file__).parents[1] / "data" / "bench_cyl25_middle"  # a loading cycle of the bench
+DEMO = Path(__file__).parents[1] / "data" / "bench_cyl25_middle"  # a loading cycle of the bench
 
 
 class _Content(NamedTuple):

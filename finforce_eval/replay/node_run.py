@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -13,6 +12,7 @@ from time import monotonic, time_ns
 from typing import TYPE_CHECKING, Protocol
 
 from finforce.errors import MissingDependencyError
+from finforce.ros.transport import free_domain
 from finforce_eval.replay.cpu_share import CpuMeter, busy_seconds, child_processes, resident_bytes
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.playback import RawMessage
@@ -103,7 +103,7 @@ def run_nodes(
         from finforce_eval.replay.node import open_player
     except ImportError as error:
         raise MissingDependencyError(f"running nodes needs ROS 2: pip install 'finforce[ros]' ({error})") from error
-    domain, log = random.randint(1, 99), ReplayLog(tuple(sides))
+    domain, log = free_domain(), ReplayLog(tuple(sides))
     with ExitStack() as stack:
         player = stack.enter_context(open_player(domain))
         nodes = stack.enter_context(ProcessGroup(processes, {"ROS_DOMAIN_ID": str(domain)}))

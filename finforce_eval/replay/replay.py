@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from typing import Any
 from tqdm import tqdm
 
 from finforce.errors import MissingDependencyError
+from finforce.ros.transport import free_domain
 from finforce.skipping import IDLE
 from finforce.systems.options import ReplayOptions
 from finforce.systems.processes import Process, replay_processes
@@ -214,7 +214,7 @@ def _run(processes: Sequence[Process], messages: Playback, log: ReplayLog, playi
         from finforce_eval.replay.node import open_player
     except ImportError as error:
         raise MissingDependencyError(f"replay needs ROS 2: pip install 'finforce[ros]' ({error})") from error
-    domain = random.randint(1, 99) if playing.domain is None else playing.domain
+    domain = free_domain() if playing.domain is None else playing.domain
     awaited = [f"/{side}/keypoints" for side in log.jaws]
     detects = any(process.executable == "keypoint_detector" for process in processes)
     if detects:

@@ -117,7 +117,7 @@ def list_shipped_jaws() -> tuple[str, ...]:
 
 
 def load_jaw(name_or_path: str | Path, side: Literal["left", "right"] = "left") -> Jaw:
-    """Load a jaw from its YAML file, see docs/jaw_file.md.
+    """Load a jaw from its YAML file, see docs/your_finger.md.
 
     Args:
         name_or_path: a shipped name ("bench", "steel") or the path of a file.

@@ -13,7 +13,7 @@ from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.pose.filter import PoseFilter
 from finforce_contact.settings import ContactSettings
 from finforce_eval.recordings.objects import track_object
-from finforce_eval.recordings.recording import SHIPPED as RECORDING
+from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
 from finforce_ifea.errors import ContactError, MeshError
 from finforce_ifea.estimator import JawEstimator

@@ -1,7 +1,6 @@
 """A DDS domain of its own with a probe that talks to nodes, and an estimator that answers by rule."""
 
 import os
-import random
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import monotonic, time_ns
@@ -18,6 +17,7 @@ from std_msgs.msg import Header
 
 from finforce.errors import ObservationError
 from finforce.ros import node as ros
+from finforce.ros.transport import free_domain
 from finforce_ifea.errors import UnderLoadError
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.node import IfeaSolverNode
@@ -131,7 +131,7 @@ def ros_domain():
     """Give a probe with an executor and a context of its own; solvers are added by `start_solver`."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=random.randint(1, 99))
+    rclpy.init(context=context, domain_id=free_domain())
     executor = SingleThreadedExecutor(context=context)
     probe = Probe(executor, context=context)
     probe.hear("/diagnostics", DiagnosticArray)

@@ -1,10 +1,11 @@
 """Nodes as processes of their own, on a DDS domain of their own."""
 
 import os
-import random
 import subprocess
 import sys
 import threading
+
+from finforce.ros.transport import free_domain
 
 PATIENCE = 240.0  # s; a first start compiles
 
@@ -16,7 +17,7 @@ def command_of(name, *parameters):
 
 
 def environment():
-    own = {"ROS_DOMAIN_ID": str(random.randint(1, 99)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    own = {"ROS_DOMAIN_ID": str(free_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     return {**os.environ, **own}
 
 

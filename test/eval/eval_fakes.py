@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -149,6 +150,9 @@ class FakeEstimate:
 
 class FakeContactEstimator:
     """Puts the contact at the height of the object it knows, from its first update on; notes every call in order."""
+
+    jaw = SimpleNamespace(inner_face_x=0.014)
+    resting = False
 
     def __init__(self, touching=lambda update: True):
         self.calls = []

@@ -8,7 +8,7 @@ from finforce.stamps import NANOSECONDS
 from finforce_eval.bench import localization as bench
 from finforce_eval.bench.localization import LocatedImage, build_cylinder, measure_methods, summarise
 from finforce_eval.bench.localization_methods import METHODS
-from finforce_eval.recordings.recording import SHIPPED as RECORDING
+from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
 
 MESH = build_cylinder(0.0125, 0.06, 16, 2)

@@ -18,7 +18,7 @@ from finforce_eval.bench.recordings import find_recordings, measure_recordings
 from finforce_eval.bench.solvers import SolverFigures, TierFigures, as_json, compare_with_sofa, find_fronts
 from finforce_eval.bench.tiers import TIERS, Run, Tier, list_tiers, rms, run_tier, score_runs, score_shapes
 from finforce_eval.errors import OptionError
-from finforce_eval.recordings.recording import SHIPPED as RECORDING
+from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.replay.processes import ProcessError
 from finforce_ifea.settings import SOLVERS
 

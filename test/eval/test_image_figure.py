@@ -8,6 +8,7 @@ import pytest
 from eval_fakes import FakeEstimator, FakeJaw, make_recording
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 
+from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import GivenContact
 from finforce_eval.evaluation.detection import detect_keypoints
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
@@ -30,6 +31,7 @@ from finforce_eval.figures.images import (
     find_region,
     place_pixels,
 )
+from finforce_eval.figures.movie import write_movie
 
 STAMPS = 1_000 + 10 * np.arange(100)
 LOST = (3,)
@@ -166,3 +168,22 @@ def test_a_recording_without_truth_is_drawn_without_crosses(recording, result):
     blind = replace(recording, jaws={"left": track})
     assert not draw_images(blind, [result]).axes[0].get_lines()
     assert len(draw_detection(blind).axes) == 2
+
+
+def test_a_movie_shows_the_recording_in_its_own_time(recording, result, tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    write_movie(recording, [result], tmp_path / "a" / "movie.webp")
+    with image.open(tmp_path / "a" / "movie.webp") as movie:
+        seconds = 1e-9 * (recording.images.stamps[-1] - recording.images.stamps[0])
+        assert movie.n_frames == max(2, round(10 * seconds))
+        first = np.asarray(movie.convert("RGB"), float)
+        movie.seek(movie.n_frames - 1)
+        last = np.asarray(movie.convert("RGB"), float)
+    assert np.abs(first - last).max() > 100  # the curve has grown
+
+
+def test_a_movie_of_no_known_kind_is_refused(recording, result, tmp_path):
+    with pytest.raises(RecordingError, match=r"movie .*film\.mp4: expected a name that ends in \.webp or \.gif"):
+        write_movie(recording, [result], tmp_path / "film.mp4")
+    with pytest.raises(RecordingError, match="no images to make a movie of"):
+        write_movie(replace(recording, images=None), [result], tmp_path / "film.gif")

@@ -25,7 +25,7 @@ BENCH_KEYPOINTS = [
     (6.6, 10.0, 66.0),
     (12.0, 10.0, 80.0),
 ]
-DOCUMENT = Path(__file__).parents[2] / "docs" / "jaw_file.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "your_finger.md"
 
 
 def test_bench_keypoints_are_those_of_the_independent_program():

@@ -1,0 +1,38 @@
+"""Claims about the door: what most programs need comes from `finforce`, and only what is asked for is loaded."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import finforce
+
+README = Path(__file__).parents[2] / "README.md"
+
+
+@pytest.mark.parametrize("name", finforce.__all__)
+def test_every_name_of_the_door_is_there_and_named_in_its_docstring(name):
+    assert getattr(finforce, name) is not None
+    assert name in finforce.__doc__
+
+
+def test_the_door_itself_loads_no_library():
+    code = "import sys; before = set(sys.modules); import finforce; print(*set(sys.modules) - before)"
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    assert "finforce" in loaded
+    assert not {name.split(".")[0] for name in loaded} - {"finforce", *sys.stdlib_module_names}
+
+
+def test_an_unknown_name_is_refused_with_the_known_ones():
+    with pytest.raises(AttributeError, match=r"no attribute 'load_jaws'; it has .*load_jaw,"):
+        finforce.load_jaws  # noqa: B018 - the look-up is the claim
+
+
+def test_the_example_of_the_front_page_runs_and_says_what_it_prints(capsys):
+    code, printed = re.search(r"```python\n(.*?)```\n.*?```text\n(.*?)```", README.read_text("utf-8"), re.S).groups()
+    assert len(code.splitlines()) <= 12
+    assert code.count("import ") == 1
+    exec(compile(code, "README.md", "exec"), {})
+    assert capsys.readouterr().out.endswith(printed)
