@@ -5,7 +5,7 @@ Forces of a tier against the truth of presses, as numbers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from gc import collect, disable, enable
 from time import perf_counter, thread_time
@@ -91,7 +91,9 @@ class Run:
         return np.linalg.norm(self.force, axis=1) - np.linalg.norm(self.press.force, axis=1)
 
 
-def run_tier(tier: Tier, jaw: Jaw, presses: Sequence[ReplayedPress], progress=lambda: None) -> list[Run]:
+def run_tier(
+    tier: Tier, jaw: Jaw, presses: Sequence[ReplayedPress], progress: Callable[[], object] = lambda: None
+) -> list[Run]:
     """Runs one estimator over presses, each from the start; what compiles is compiled before.
 
     Args:

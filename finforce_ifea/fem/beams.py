@@ -112,7 +112,7 @@ def _fill_forms(ends, chord, bend_s, bend_a, forms):
 
 
 @njit(**_OPTIONS)
-def add_beams(beams, q, with_tangent, force, storage):
+def add_beams(beams: Beams, q: NDArray, with_tangent: bool, force: NDArray, storage: NDArray) -> tuple[float, float]:
     """Adds internal forces to force (n + 1,) and tangents to lower banded storage.
 
     With the chord's length l, the rotations p_1 and p_2 of the ends from the chord, s = (p_1 - p_2) / 2 and

@@ -373,7 +373,9 @@ def _tangent(K0, G, L, B, R, T, scratch, Ke):
 
 
 @njit(**_OPTIONS)
-def corotational_elements(u, conn, X, K0, g, with_tangent, f, Ke):
+def corotational_elements(
+    u: NDArray, conn: NDArray, X: NDArray, K0: NDArray, g: NDArray, with_tangent: bool, f: NDArray, Ke: NDArray
+) -> tuple[float, float]:
     """Adds internal forces to f and writes element tangents.
 
     Args:

@@ -53,7 +53,7 @@ class Manifold:
 
 
 @njit(**_OPTIONS)
-def weigh_cubic(x, count, weights, slopes):
+def weigh_cubic(x: float, count: int, weights: NDArray, slopes: NDArray) -> int:
     """Writes the four weights of cubic Lagrange interpolation at x on 0 ... count - 1 and their derivatives.
 
     Returns:

@@ -9,7 +9,7 @@ Compiled loops over the rows and points of a jaw of stored equilibria.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -477,7 +477,9 @@ def _hold_base(q, compliance, face, contact, steps):
 
 
 @njit(**_OPTIONS)
-def step_contact(q, tables, face, moves, points, contact):
+def step_contact(
+    q: NDArray, tables: tuple[NDArray, NDArray, NDArray], face: FaceRows, moves: NDArray, points: NDArray, contact: Any
+) -> ContactStep:
     """Returns one linearised equilibrium with an object; see `ContactStep`.
 
     Args:

@@ -8,6 +8,8 @@ for the residuals averaged over the last frames, whose bias (errors of mechanics
 Compiled in-plane residuals of key points about a place, and how far each can be believed.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np
@@ -56,7 +58,7 @@ def measure_condition(covariance):
 
 
 @njit(**_OPTIONS)
-def doubt_place(away, spread, prior_variance, offset):
+def doubt_place(away: float, spread: float, prior_variance: float, offset: float) -> tuple[float, float]:
     """Returns the probability that a contact is not where it was said to be, and what that adds to its variance [m^2].
 
     The key points alone have it D = away from there, with the variance s^2 = spread. It is another contact, N(0, R^2),
@@ -81,7 +83,9 @@ def doubt_place(away, spread, prior_variance, offset):
 
 
 @njit(**_OPTIONS)
-def doubt_height(hessian, gradient, offset, prior_variance):
+def doubt_height(
+    hessian: NDArray, gradient: NDArray, offset: float, prior_variance: float
+) -> tuple[float, float, float]:
     """Returns the height that the key points alone ask for [m], the probability of a mistake, and its variance [m^2].
 
     Args:
@@ -102,7 +106,7 @@ def doubt_height(hessian, gradient, offset, prior_variance):
 
 
 @njit(**_OPTIONS)
-def find_rift(data, deeper, information):
+def find_rift(data: Residuals, deeper: float, information: float) -> float:
     """Returns how far the depth would move if points that are half believed were not believed at all [m].
 
     With w the weights, h the motions by depth, r what is left of the residuals and I the information,
@@ -330,7 +334,9 @@ def _allow_for_manoeuvre(forecast, innovation, noise):
 
 
 @njit(**_OPTIONS)
-def forecast_place(motion, covariance, slow, dt, acceleration, drift, sudden):
+def forecast_place(
+    motion: NDArray, covariance: NDArray, slow: NDArray, dt: float, acceleration: float, drift: float, sudden: bool
+) -> Forecast:
     """Returns the place dt [s] later: constant speed of the depth under white acceleration; see `Forecast`.
 
     Args:
@@ -352,7 +358,15 @@ def forecast_place(motion, covariance, slow, dt, acceleration, drift, sudden):
 
 
 @njit(**_OPTIONS)
-def update_place(data, average, forecast, prior, prior_variance, memory, largest):
+def update_place(
+    data: Residuals,
+    average: Average,
+    forecast: Forecast,
+    prior: NDArray,
+    prior_variance: NDArray,
+    memory: float,
+    largest: NDArray,
+) -> PlaceUpdate:
     """Returns the place after one frame; see `PlaceUpdate`.
 
     Args:
@@ -481,7 +495,15 @@ def _square_distance(r0, r1, h0, h1, noise, bias, depth_variance):
 
 
 @njit(**_OPTIONS)
-def weigh_residuals(measured, positions, rest, motions, moved, below, chance):
+def weigh_residuals(
+    measured: NDArray,
+    positions: NDArray,
+    rest: NDArray,
+    motions: NDArray,
+    moved: NDArray,
+    below: float,
+    chance: Uncertainty,
+) -> Residuals:
     """Returns the in-plane residuals about the reference place and the weights of key points; see `Residuals`.
 
     Weights are those of the residuals that are left at the model's own place: w = 1 / (1 + d^2 / gate^2)^2 (Geman and

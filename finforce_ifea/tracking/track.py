@@ -177,7 +177,7 @@ class SolutionNumbers(NamedTuple):
 
 
 @njit(**_OPTIONS)
-def measure_along(force, modes, covariance):
+def measure_along(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
     """Returns the standard deviation [N] of a force (3,) along itself, along -x when it is none.
 
     Args:
@@ -199,7 +199,17 @@ def measure_along(force, modes, covariance):
 
 
 @njit(**_OPTIONS)
-def find_numbers(force, elastic, modes, covariance, pressure, place, place_stddev, share, lean):
+def find_numbers(
+    force: NDArray,
+    elastic: NDArray,
+    modes: NDArray,
+    covariance: NDArray,
+    pressure: NDArray,
+    place: NDArray,
+    place_stddev: float,
+    share: float,
+    lean: float,
+) -> SolutionNumbers:
     """Returns what belongs to a force; see `SolutionNumbers`.
 
     Args:
