@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from finforce_eval.cli.parser import add_jaw_options
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_choice import parse_contacts
+from finforce_eval.evaluation.contact_source import parse_contacts
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.machine import write_figures
 from finforce_eval.evaluation.results import CaseResult

@@ -18,10 +18,9 @@ import numpy as np
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
-from finforce_driver.grasp.force_feed import ForceSample, TouchSample
-from finforce_driver.grasp.run import hold_force
-from finforce_driver.grasp.settings import GraspGoal
-from finforce_driver.grasp.status import GraspPhase, GraspStatus
+from finforce_driver.grasp.load_watch import ForceSample, TouchSample
+from finforce_driver.grasp.session import hold_force
+from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspStatus
 from finforce_driver.gripper import Gripper
 from finforce_driver.state import Phase
 from finforce_ifea.relaxation import Relaxation, RelaxationTerm

@@ -31,7 +31,7 @@ from finforce_eval.evaluation.machine import write_figures
 from finforce_twin.rendering.depth_camera import build_d405
 from finforce_twin.scenes.guesses import GuessError, draw_guess, place_mesh
 from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
-from finforce_twin.scenes.table import TableScene, draw_scene, roughen_mask
+from finforce_twin.scenes.pose_sequences import TableScene, draw_scene, roughen_mask
 
 DISTANCES = (13e-3, 16e-3)  # [m] of the guess from the truth
 ALONE = "alone"  # the choice between primitive and completion

@@ -13,15 +13,18 @@ from numpy.typing import NDArray
 from finforce.errors import ObservationError, PoseError
 from finforce.skipping import AWAY, CONTACT, STILL, Skips
 from finforce.transforms import check_pose, invert_pose
-from finforce_contact.checks import check_stamp, check_wrench
-from finforce_contact.localization.closest import ClosestLocalizer
-from finforce_contact.localization.gaps import count_inside
+from finforce_contact.errors import check_stamp, check_wrench
 from finforce_contact.localization.inner_face import build_inner_face
-from finforce_contact.localization.outline_localizer import ContactScene, Localizer, OutlineLocalizer, Place
-from finforce_contact.localization.section import Section, SectionKeeper
-from finforce_contact.localization.stillness import RestWatch
-from finforce_contact.localization.touch import SURELY_BENT, TouchBelief, describe_conflict
-from finforce_contact.mesh.enclosure import surrounds
+from finforce_contact.localization.outline_localizer import (
+    ClosestLocalizer,
+    ContactScene,
+    Localizer,
+    OutlineLocalizer,
+    Place,
+)
+from finforce_contact.localization.section import Section, SectionKeeper, count_inside
+from finforce_contact.localization.touch import SURELY_BENT, RestWatch, TouchBelief, describe_conflict
+from finforce_contact.mesh.object_mesh import surrounds
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.paper_contact import IntersectionLocalizer
 from finforce_contact.pose.filter import FilteredPose, PoseFilter

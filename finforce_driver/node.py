@@ -23,7 +23,13 @@ from finforce.optional import import_library
 from finforce.ros import node as ros
 from finforce_driver.actions import GripperCommandAction
 from finforce_driver.clock import MessageTimes
-from finforce_driver.diagnostics import (
+from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.session import GraspSession
+from finforce_driver.grasp.settings import GraspSettings
+from finforce_driver.messages import goal_from_joint_state, move_from_joint_state
+from finforce_driver.parameters import DriverParameters, build_gripper
+from finforce_driver.publishers import (
+    DriverOutputs,
     GripperHealth,
     describe_grasp,
     describe_state,
@@ -31,12 +37,6 @@ from finforce_driver.diagnostics import (
     news_of_state,
     outcome_of_state,
 )
-from finforce_driver.grasp.force_feed import ForceSample
-from finforce_driver.grasp.session import GraspSession
-from finforce_driver.grasp.settings import GraspSettings
-from finforce_driver.messages import goal_from_joint_state, move_from_joint_state
-from finforce_driver.parameters import DriverParameters, build_gripper
-from finforce_driver.publishers import DriverOutputs
 from finforce_driver.services import GripperTasks
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState

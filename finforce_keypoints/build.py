@@ -121,7 +121,7 @@ def load_model(parameters: DetectorParameters) -> KeypointModel:
 def _build_frame_finder(model: KeypointModel, jaws: Mapping[str, Jaw], parameters: DetectorParameters) -> PixelFinder:
     """Return the finder of a network that sees the image, under the names that the parameters give."""
     from finforce_keypoints.detectors.whole_image import FrameFinder
-    from finforce_keypoints.networks.naming import build_name_map, parse_mapping
+    from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
 
     mapping = parse_mapping(entry for entry in parameters.names if entry)
     return FrameFinder(model, build_name_map(model.names, jaws, mapping), jaws, allow_resize=parameters.allow_resize)

@@ -15,8 +15,8 @@ from finforce.skipping import ALL, STILL, Skips
 from finforce.transforms import check_pose
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.errors import DetectionError, GeometryError, ImageOrderError, KeypointError
+from finforce_keypoints.geometry.depth import DepthScale
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints, JawLocalizer
-from finforce_keypoints.geometry.side_fit import DepthScale
 from finforce_keypoints.geometry.side_picture import find_side
 from finforce_keypoints.geometry.stillness import StillWatch
 from finforce_keypoints.images import RgbdImage, check_image

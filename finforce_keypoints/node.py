@@ -20,8 +20,8 @@ from finforce.errors import FinforceError
 from finforce.health import Health, Outcome, Report
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
-from finforce.ros.heap import keep_heap
 from finforce.ros.raw_image import read_image
+from finforce.ros.transport import keep_heap
 from finforce.skipping import IDLE, LATE, UNHEARD, Skips
 from finforce.stamps import Idling, StampGate
 from finforce_keypoints.build import BuiltDetector, build_detector

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
-from finforce_keypoints.diagnostics import build_skeleton, describe_names
+from finforce_keypoints.diagnostics import build_skeleton, describe_names, draw_keypoints
 from finforce_keypoints.geometry.jaw_localizer import REASONS
-from finforce_keypoints.overlay import draw_keypoints
 from finforce_keypoints.parameters import DetectorParameters
 from finforce_keypoints.settings import ANNOTATED
 

@@ -18,13 +18,19 @@ from finforce.camera import CameraIntrinsics
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_twin.gripper.coupled import CoupledGripper
-from finforce_twin.gripper.encoding import encode_depth, info_fields, sight_columns
-from finforce_twin.gripper.footage import Footage, TwinFrame, build_footage, parse_size
-from finforce_twin.gripper.live import LiveScene, build_live_scene
+from finforce_twin.gripper.footage import (
+    Footage,
+    TwinFrame,
+    build_footage,
+    encode_depth,
+    info_fields,
+    parse_size,
+    sight_columns,
+)
+from finforce_twin.gripper.live import CoupledGripper, LiveScene, build_live_scene
 from finforce_twin.parameters import TwinParameters
 from finforce_twin.rendering.sensor import Flicker
-from finforce_twin.scenes.script import RATE
+from finforce_twin.scenes.scenarios import RATE
 
 PIXEL_TYPES = {"rgb8": np.uint8, "16UC1": np.uint16}
 TOLD_EVERY = 5.0  # s between two words on how far the rendering is

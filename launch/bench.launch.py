@@ -8,7 +8,7 @@ from pathlib import Path
 
 from finforce.systems.launch import describe_launch
 from finforce.systems.live import bench_processes
-from finforce.systems.options import BenchOptions
+from finforce.systems.processes import BenchOptions
 
 SHARE = Path(__file__).resolve().parents[1]
 

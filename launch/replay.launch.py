@@ -7,8 +7,7 @@ points in the images of the recording.
 from pathlib import Path
 
 from finforce.systems.launch import describe_launch
-from finforce.systems.options import ReplayOptions
-from finforce.systems.processes import replay_processes
+from finforce.systems.processes import ReplayOptions, replay_processes
 
 SHARE = Path(__file__).resolve().parents[1]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from finforce.systems.launch import describe_launch
 from finforce.systems.live import robot_processes
-from finforce.systems.options import RobotOptions
+from finforce.systems.processes import RobotOptions
 
 SHARE = Path(__file__).resolve().parents[1]
 

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from finforce.gripper_frames import SIDES
 from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.networks.naming import build_name_map, parse_mapping
+from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
 from training.arguments import one_line_errors
 from training.dataset import TRAIN, LabelledPictures, join_pictures, load_pictures
 from training.errors import LabelFileError

@@ -12,10 +12,13 @@ from typing import Any, TypeVar
 import yaml
 
 from finforce.gripper_frames import ROBOT_CAMERA
-from finforce.systems.options import BenchOptions, GripperOptions, RobotOptions, SolverOptions
 from finforce.systems.processes import (
+    BenchOptions,
+    GripperOptions,
     Include,
     Process,
+    RobotOptions,
+    SolverOptions,
     contact_processes,
     detector_processes,
     given,

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_contact.checks import to_floats
+from finforce_contact.errors import to_floats
 from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh

@@ -19,8 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from finforce.optional import import_manifold3d, import_open3d
 from finforce_contact.errors import ObjectMeshError
-from finforce_contact.mesh.solids import solid_from_triangles, triangles_of_solid
-from finforce_contact.mesh.triangles import ObjectMesh, compute_volumes
+from finforce_contact.mesh.triangles import ObjectMesh, compute_volumes, solid_from_triangles, triangles_of_solid
 
 
 def chain_loops(starts: NDArray, stops: NDArray) -> list[NDArray]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from finforce.errors import PoseError
 from finforce.transforms import check_pose, move_pose, step_between
-from finforce_contact.checks import check_stamp, to_floats
+from finforce_contact.errors import check_stamp, to_floats
 from finforce_contact.settings import ContactSettings
 
 _X = 0

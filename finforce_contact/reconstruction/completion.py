@@ -13,8 +13,7 @@ from finforce_contact.errors import ReconstructionError
 from finforce_contact.mesh.object_mesh import prepare_object_mesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.reconstruction.evidence import EDGE_BAND, ImageEvidence
-from finforce_contact.reconstruction.result import Reconstruction, Report, check_agreement
-from finforce_contact.reconstruction.shape_score import HIDING_STEP, score_shape
+from finforce_contact.reconstruction.result import HIDING_STEP, Reconstruction, Report, check_agreement, score_shape
 
 GRID_POINTS = 4000
 DEPTH_SMOOTHING = 2.0  # [px] standard deviation

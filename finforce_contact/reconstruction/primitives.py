@@ -13,8 +13,14 @@ from scipy.spatial.transform import Rotation
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.reconstruction.evidence import ImageEvidence
 from finforce_contact.reconstruction.result import Reconstruction, Report
-from finforce_contact.reconstruction.shape_fit import Placement, ScaleFreedom, scale_mesh
-from finforce_contact.reconstruction.shape_search import SearchFreedom, ShapeFit, search_shape
+from finforce_contact.reconstruction.shape_search import (
+    Placement,
+    ScaleFreedom,
+    SearchFreedom,
+    ShapeFit,
+    scale_mesh,
+    search_shape,
+)
 
 SEGMENTS = 64
 BALL_POINTS = 600

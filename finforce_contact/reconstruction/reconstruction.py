@@ -16,10 +16,14 @@ from finforce_contact.reconstruction.completion import complete_surface
 from finforce_contact.reconstruction.evidence import ImageEvidence
 from finforce_contact.reconstruction.paper_alignment import align_as_paper
 from finforce_contact.reconstruction.primitives import fit_primitive
-from finforce_contact.reconstruction.result import GeneratedMesh, Reconstruction, Report, check_agreement
-from finforce_contact.reconstruction.shape_fit import Placement, ScaleFreedom
-from finforce_contact.reconstruction.shape_score import score_shape
-from finforce_contact.reconstruction.shape_search import SearchFreedom, search_shape, turn_starts
+from finforce_contact.reconstruction.result import GeneratedMesh, Reconstruction, Report, check_agreement, score_shape
+from finforce_contact.reconstruction.shape_search import (
+    Placement,
+    ScaleFreedom,
+    SearchFreedom,
+    search_shape,
+    turn_starts,
+)
 
 METHODS = ("robust", "paper", "primitive", "completion")
 FROM_GENERATED = ("robust", "paper")

@@ -1,28 +1,253 @@
-"""The best placement of a mesh from many starts."""
+"""The best placement of a mesh from many starts.
+
+Where a mesh is and how large, axis by axis: rotation, translation and scale as one record.
+
+Rotation, translation and scale of a mesh that explain a masked depth image.
+
+Depth gives the surface, in metres, and the mask gives the outline: the two together leave only what neither shows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.mesh.views import MeshView
+from finforce_contact.mesh.views import MeshSight, MeshView
 from finforce_contact.reconstruction.evidence import ImageEvidence
-from finforce_contact.reconstruction.result import Report
-from finforce_contact.reconstruction.shape_fit import (
-    COARSE,
-    FINE,
-    MIDDLE,
-    UNIFORM,
-    Placement,
-    ScaleFreedom,
-    fit_shape,
-    scale_mesh,
+from finforce_contact.reconstruction.result import Report, ShapeScore, score_shape
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placement:
+    """A point x of the mesh lies at R diag(exp(log_scale)) x + t in the camera frame.
+
+    Attributes:
+        rotation: (3, 3) R.
+        translation: (3,) t [m].
+        log_scale: (3,) natural logarithm of the scale along the mesh's axes.
+    """
+
+    rotation: NDArray
+    translation: NDArray
+    log_scale: NDArray = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def affine(self) -> NDArray:
+        """The map (4, 4) of mesh coordinates into the camera frame."""
+        A = np.eye(4)
+        A[:3, :3] = self.rotation * np.exp(self.log_scale)
+        A[:3, 3] = self.translation
+        return A
+
+    @property
+    def pose(self) -> NDArray:
+        """The rigid part (4, 4), the pose of the mesh once the scale is baked into it."""
+        T = np.eye(4)
+        T[:3, :3] = self.rotation
+        T[:3, 3] = self.translation
+        return T
+
+    def moved(self, step: NDArray, basis: NDArray) -> Placement:
+        """Return the placement after a step: rotation vector (3,), translation (3,) and scales (k,) of basis (3, k)."""
+        return Placement(
+            rotation=Rotation.from_rotvec(step[:3]).as_matrix() @ self.rotation,
+            translation=self.translation + step[3:6],
+            log_scale=self.log_scale + basis @ step[6:],
+        )
+
+    def compute_rows(self, points: NDArray, directions: NDArray, basis: NDArray) -> NDArray:
+        """Return (n, 6 + k) derivatives, by the step, of the movement of mesh points along directions.
+
+        d(g . x) = g . (w x (x - t) + dt + R diag(R^T (x - t)) B ds)
+
+        Args:
+            points: (n, 3) points x of the placed mesh, camera frame [m].
+            directions: (n, 3) directions g.
+            basis: (3, k) B, what each free scale does to the three logarithms.
+        """
+        arms = points - self.translation
+        stretch = (directions @ self.rotation) * (arms @ self.rotation)
+        return np.hstack((np.cross(arms, directions), directions, stretch @ basis))
+
+
+FACING = 0.2  # least cosine between a measured normal and the mesh's, else the point is on another side of a wall
+NEAR = 3e-4  # [m] from the surface, below which the direction to it is its normal
+OUTLINE_WEIGHT = 0.5  # of all outline pixels together, that of all surface points being one
+STEP_TOLERANCE = 2e-5  # [rad], [m] or in the logarithm
+DAMPING = 1e-4
+LARGEST_TURN, LARGEST_MOVE, LARGEST_STRETCH = 0.3, 0.03, 0.2  # of one step [rad], [m], in the logarithm
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitStage:
+    """One pass of the fit: grid of the view [px], iterations, points used and the width of the loss [m]."""
+
+    step: int
+    iterations: int
+    points: int
+    width: float
+
+
+COARSE = (FitStage(step=8, iterations=8, points=250, width=15e-3),)
+MIDDLE = (
+    FitStage(step=4, iterations=12, points=500, width=8e-3),
+    FitStage(step=2, iterations=8, points=1000, width=4e-3),
 )
-from finforce_contact.reconstruction.shape_score import ShapeScore, score_shape
+FINE = (
+    FitStage(step=1, iterations=12, points=2000, width=2e-3),
+    FitStage(step=1, iterations=8, points=2000, width=1e-3),
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScaleFreedom:
+    """Which scales are free, and how stiffly the axes keep their proportions.
+
+    Attributes:
+        basis: (3, k) what each free scale does to the logarithms of the three.
+        stiffness: misfit [m], over the size of the object, that a deviation by a factor e from the given
+            proportions is worth.
+    """
+
+    basis: NDArray = field(default_factory=lambda: np.ones((3, 1)))
+    stiffness: float = 0.0
+
+
+UNIFORM = ScaleFreedom()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pull:
+    """What draws points of the mesh: points (n, 3) [m], unit directions (n, 3), ways to go (n,) [m], weights (n,)."""
+
+    points: NDArray
+    directions: NDArray
+    residuals: NDArray
+    weights: NDArray
+
+
+def fit_shape(
+    mesh: ObjectMesh,
+    start: Placement,
+    evidence: ImageEvidence,
+    stages: Iterable[FitStage],
+    freedom: ScaleFreedom = UNIFORM,
+) -> Placement:
+    """Return the placement of the mesh that explains the image best, near a start.
+
+    Gauss-Newton on the sum of rho(distance of measured points) and rho(distance of the outlines), with the
+    Geman-McClure loss rho and a weak pull towards the mesh's own proportions.
+
+    Args:
+        mesh: as given; its own units and frame.
+        start: where to begin.
+        evidence: of the image.
+        stages: passes, from coarse to fine.
+        freedom: the scales that are free.
+    """
+    placement = start
+    for stage in stages:
+        fit = _StageFit(mesh, placement, evidence, stage, freedom)
+        for _ in range(stage.iterations):
+            step = fit.solve_step(placement, placement.log_scale - start.log_scale)
+            placement = placement.moved(step, freedom.basis)
+            if np.abs(step).max() < STEP_TOLERANCE:
+                break
+    return placement
+
+
+class _StageFit:
+    """The equations of one stage, for a mesh into which the scale so far has gone."""
+
+    def __init__(
+        self, mesh: ObjectMesh, placement: Placement, evidence: ImageEvidence, stage: FitStage, freedom: ScaleFreedom
+    ) -> None:
+        # only then does "nearest on the mesh" mean nearest in metres
+        self._baked = placement.log_scale
+        scaled = scale_mesh(mesh, self._baked)
+        self._view = MeshView(scaled)
+        self._size = float(np.ptp(scaled.vertices, axis=0).mean())
+        self._evidence, self._stage, self._freedom = evidence, stage, freedom
+        self._stride = max(1, len(evidence.points) // stage.points)
+
+    def solve_step(self, placement: Placement, stretched: NDArray) -> NDArray:
+        """Return the Gauss-Newton step (6 + k,) from a placement stretched by (3,) from the given proportions."""
+        affine = replace(placement, log_scale=placement.log_scale - self._baked).affine
+        basis = self._freedom.basis
+        H = np.zeros((6 + basis.shape[1],) * 2)
+        gradient = np.zeros(len(H))
+        for pull in (self._pull_surface(affine), self._pull_outline(affine)):
+            J = placement.compute_rows(pull.points, pull.directions, basis)
+            weighted = J * pull.weights[:, None]
+            H += weighted.T @ J
+            gradient += weighted.T @ pull.residuals
+        # deviations from the given proportions: what is common to the axes is free
+        common = np.eye(3) - np.full((3, 3), 1.0 / 3.0)
+        stiff = (self._freedom.stiffness * self._size) ** 2
+        H[6:, 6:] += stiff * basis.T @ common @ basis
+        gradient[6:] -= stiff * basis.T @ common @ stretched
+        H[np.diag_indices_from(H)] += DAMPING * np.diag(H) + 1e-12
+        return _limit_step(np.linalg.solve(H, gradient))
+
+    def _pull_surface(self, affine: NDArray) -> Pull:
+        """Return the pull of the measured points on the nearest points of the mesh, along the distance's gradient."""
+        measured = self._evidence.points[:: self._stride]
+        nearest = self._view.closest(measured, affine)
+        offset = measured - nearest.points
+        distance = np.linalg.norm(offset, axis=1)
+        side = np.where(np.einsum("ij,ij->i", offset, nearest.normals) < 0.0, -1.0, 1.0)
+        apart = (side / np.maximum(distance, 1e-12))[:, None] * offset
+        directions = np.where(distance[:, None] < NEAR, nearest.normals, apart)
+        residuals = np.einsum("ij,ij->i", offset, directions)
+        facing = np.einsum("ij,ij->i", nearest.normals, self._evidence.normals[:: self._stride]) > FACING
+        weights = facing * _weigh(residuals, self._stage.width) / len(measured)
+        return Pull(points=nearest.points, directions=directions, residuals=residuals, weights=weights)
+
+    def _pull_outline(self, affine: NDArray) -> Pull:
+        """Return the pull of the mask's outline on the rim of the mesh, across the outline."""
+        step, evidence = self._stage.step, self._evidence
+        view = self._view.render(affine, evidence.camera, step)
+        rim = _find_rim(view)
+        points, (columns, rows) = view.points[rim], view.pixels[rim].T
+        z = points[:, 2]
+        weights = evidence.edge_weight[rows, columns]
+        # the rim's pixels lie half a step inside the mesh's outline
+        residuals = -(evidence.edge_distance[rows, columns] + 0.5 * step) * z / evidence.camera.fx
+        slope = evidence.edge_slope[rows, columns]
+        directions = np.column_stack((slope, -(slope * points[:, :2]).sum(axis=1) / z))
+        weights = OUTLINE_WEIGHT * weights * _weigh(residuals, self._stage.width) / max(len(rim), 1)
+        return Pull(points=points, directions=directions, residuals=residuals, weights=weights)
+
+
+def _find_rim(view: MeshSight) -> NDArray:
+    """Return which points of a view lie at its outline, holes included."""
+    hit = np.isfinite(view.depth)
+    rim = hit & ~binary_erosion(hit, border_value=0)
+    return np.flatnonzero(rim[hit])
+
+
+def _weigh(residuals: NDArray, width: float) -> NDArray:
+    """Return the Geman-McClure weights w = (c^2 / (c^2 + r^2))^2."""
+    return (width**2 / (width**2 + residuals**2)) ** 2
+
+
+def _limit_step(step: NDArray) -> NDArray:
+    """Return a step (6 + k,) shortened so that none of its parts is too long."""
+    parts = (np.linalg.norm(step[:3]) / LARGEST_TURN, np.linalg.norm(step[3:6]) / LARGEST_MOVE)
+    stretch = np.abs(step[6:]).max(initial=0.0) / LARGEST_STRETCH
+    return step / max(1.0, *parts, stretch)
+
+
+def scale_mesh(mesh: ObjectMesh, log_scale: NDArray) -> ObjectMesh:
+    """Return the mesh stretched along its axes by exp(log_scale) (3,)."""
+    return replace(mesh, vertices=mesh.vertices * np.exp(log_scale))
+
 
 HIDDEN_SHARE = 0.15  # of the outline, above which the mask says too little about the size
 HIDDEN_GROWTH = 0.35

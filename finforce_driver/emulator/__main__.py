@@ -2,6 +2,6 @@
 
 import sys
 
-from finforce_driver.emulator.server import main
+from finforce_driver.emulator.pty_port import main
 
 sys.exit(main())

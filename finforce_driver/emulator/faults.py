@@ -13,7 +13,7 @@ from random import Random
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.emulator import broken_lines
 from finforce_driver.emulator.adapter import EmulatedAdapter
-from finforce_driver.emulator.protection import Fault
+from finforce_driver.emulator.firmware import Fault
 from finforce_driver.errors import TargetError
 
 _LINE = re.compile(rb"[^\r\a]*[\r\a]")  # of the adapter

@@ -1,14 +1,25 @@
-"""Whether the jaws are loaded, and which measured forces may be believed."""
+"""Whether the jaws are loaded, and which measured forces may be believed.
+
+Forces and touches as a camera sends them: which may be believed, how late and how often.
+
+The grasp force as a line over the opening, learnt while closing.
+
+Between two images the opening changes by d (closing: d > 0) and the force by k d, where neither stays what it was:
+fingers relax, contact spreads. A Kalman filter follows both,
+
+    F <- F + k d,   k <- k,   Q_FF = drift^2 dt + (k s_d)^2,   Q_kk = growth^2 |d|,
+
+with the variance s_d^2 of d, and measures F with a noise that it learns from its innovations.
+"""
 
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
 from statistics import median
 
 from finforce_driver.errors import GraspError
-from finforce_driver.grasp.force_model import ForceModel
 from finforce_driver.grasp.settings import GraspSettings
 
 _LARGEST_OFFSET = 0.2  # [N] that an unloaded estimate may show
@@ -152,3 +163,222 @@ class LoadWatch:
             raise GraspError(
                 f"the force of {self.peak:.2f} N has gone: the object slipped out or broke; open, look, and grasp anew"
             )
+
+
+_AHEAD = 0.005  # [s] that a stamp may lie ahead of its arrival: the two clocks are read one after the other
+_PERIOD = 1.0 / 30.0  # [s] of a D405, until it is measured
+_LATENCY = 0.1  # [s] until it is measured
+_KNOWN = 8  # samples after which the latency is known
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceSample:
+    """The grasp force of one image.
+
+    Attributes:
+        stamp: time of the image [s], on the driver's clock.
+        arrived: when the force was there [s], on the same clock.
+        force: [N].
+    """
+
+    stamp: float
+    arrived: float
+    force: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TouchSample:
+    """Whether the jaws were said to touch in the image at `stamp` [s], on the driver's clock."""
+
+    stamp: float
+    touching: bool
+
+
+class ForceFeed:
+    """Admits samples once, in order and with times that can be; measures latency and period.
+
+    Args:
+        stale_after: age of an image after which it is not admitted [s].
+
+    Attributes:
+        stamp: of the newest admitted image with a force [s]; NaN before the first.
+        touch: the newest word on touching; None before the first.
+        touched_since: time of the first image of those in a row that show touching [s]; NaN while none does.
+        refused: samples that were not admitted, by reason.
+    """
+
+    def __init__(self, stale_after: float) -> None:
+        self._stale_after = stale_after
+        self.stamp = math.nan
+        self.touch: TouchSample | None = None
+        self.touched_since = math.nan
+        self.refused: Counter[str] = Counter()
+        self._latencies: deque[float] = deque(maxlen=31)
+        self._periods: deque[float] = deque(maxlen=31)
+
+    @property
+    def heard(self) -> bool:
+        """Whether any force was admitted."""
+        return not math.isnan(self.stamp)
+
+    def is_touching(self, now: float) -> bool:
+        """Whether the newest fresh word says that the jaws touch."""
+        return self.touch is not None and self.touch.touching and now - self.touch.stamp <= self._stale_after
+
+    @property
+    def latency(self) -> float:
+        """Median time from image to arrival [s]."""
+        return median(self._latencies) if self._latencies else _LATENCY
+
+    @property
+    def period(self) -> float:
+        """Median time between images with a force [s]."""
+        return median(self._periods) if self._periods else _PERIOD
+
+    def age(self, now: float) -> float:
+        """Return the age of the newest image with a force [s]; infinite before the first."""
+        return now - self.stamp if self.heard else math.inf
+
+    def admit(self, sample: ForceSample) -> bool:
+        """Take a force if its times can be; otherwise count why not."""
+        reason = self._doubt(sample)
+        if reason:
+            self.refused[reason] += 1
+            return False
+        if self.heard:
+            self._periods.append(sample.stamp - self.stamp)
+        self._latencies.append(sample.arrived - sample.stamp)
+        self.stamp = sample.stamp
+        return True
+
+    def admit_touch(self, sample: TouchSample, now: float) -> bool:
+        """Take a word on touching if it is newer than the last one and fresh."""
+        newest = self.touch is None or sample.stamp > self.touch.stamp
+        if not (newest and -_AHEAD <= now - sample.stamp <= self._stale_after):
+            self.refused["touch out of time"] += 1
+            return False
+        self.touch = sample
+        if not sample.touching:
+            self.touched_since = math.nan
+        elif math.isnan(self.touched_since):
+            self.touched_since = sample.stamp
+        return True
+
+    def _doubt(self, sample: ForceSample) -> str:
+        """Return why the times of a sample cannot be; empty when they can."""
+        latency = sample.arrived - sample.stamp
+        if not math.isfinite(latency):
+            return "no time"
+        if latency < -_AHEAD:
+            return "from the future"
+        if latency > self._stale_after:
+            return "too old"
+        if self.heard and sample.stamp <= self.stamp:
+            return "out of order"
+        # a clock that was set makes images seem newer than they are, and jaws farther than they were
+        if len(self._latencies) >= _KNOWN and latency < 0.25 * self.latency:
+            return "sooner than can be"
+        return ""
+
+
+LEAST_STIFFNESS = 50.0  # [N/m] a jaw that gives way more than this holds nothing
+
+# Fingers of TPU lose up to 0.3 N/s just after a press of 5 N; half of that per sqrt(s) follows them within 0.3 s.
+_DRIFT = 0.15  # [N/sqrt(s)]
+# A finger stiffens from 0.4 to 1.3 N/mm within 5 mm.
+_GROWTH = 9e3  # [N/m per sqrt(m)], 0.28 N/mm after one millimetre
+_NOISE_MEMORY = 0.05  # share of a new innovation
+_LEAST_NOISE, _LARGEST_NOISE = 0.02, 0.25  # [N]
+
+
+class ForceModel:
+    """What force the fingers have at the opening of the newest image, and how it would change with the opening.
+
+    Args:
+        stiffness: expected at first [N/m], better too large than too small.
+        noise: standard deviation of the force expected at first [N].
+
+    Attributes:
+        force: [N] at `opening`.
+        stiffness: change of the force per metre of closing [N/m].
+        noise: standard deviation of one measured force [N], as learnt.
+        opening: of the newest image [m]; NaN before the first.
+    """
+
+    def __init__(self, *, stiffness: float, noise: float) -> None:
+        self.force = self.stamp = self.opening = math.nan
+        self.stiffness = stiffness
+        self._noise_variance = noise**2
+        self._force_variance = noise**2
+        self._stiffness_variance = (0.5 * stiffness) ** 2
+        self._covariance = 0.0
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of one measured force [N]."""
+        return math.sqrt(self._noise_variance)
+
+    @property
+    def force_stddev(self) -> float:
+        """Standard deviation of `force` [N]."""
+        return math.sqrt(self._force_variance)
+
+    @property
+    def stiffness_stddev(self) -> float:
+        """Standard deviation of `stiffness` [N/m]."""
+        return math.sqrt(self._stiffness_variance)
+
+    @property
+    def safe_stiffness(self) -> float:
+        """A stiffness that is hardly exceeded on the way to come [N/m]: two deviations and a tenth more."""
+        return 1.1 * self.stiffness + 2.0 * self.stiffness_stddev
+
+    @property
+    def likely_stiffness(self) -> float:
+        """A stiffness that a single step hardly exceeds [N/m]: a quarter of a deviation and a twentieth more."""
+        return 1.05 * self.stiffness + 0.25 * self.stiffness_stddev
+
+    def begin(self, opening: float, force: float, stamp: float) -> None:
+        """Start from the force [N] of an image at `stamp` [s] and its opening [m]."""
+        self.opening, self.force, self.stamp = opening, force, stamp
+        self._force_variance = self._noise_variance
+
+    def predict(self, opening: float) -> float:
+        """Return the force [N] at another opening [m], never below zero."""
+        return max(0.0, self.force + self.stiffness * (self.opening - opening))
+
+    def surprise(self, opening: float, force: float) -> float:
+        """Return by how much a force [N] differs from the predicted one beyond four standard deviations [N], signed."""
+        way = self.opening - opening
+        spread = self._force_variance + way**2 * self._stiffness_variance + self._noise_variance
+        beyond = force - self.predict(opening)
+        return math.copysign(max(0.0, abs(beyond) - 4.0 * math.sqrt(spread)), beyond)
+
+    def update(self, opening: float, force: float, stamp: float, way_stddev: float) -> None:
+        """Take the force [N] of a later image at `stamp` [s].
+
+        Args:
+            opening: at the time of the image [m].
+            force: measured [N].
+            stamp: time of the image [s].
+            way_stddev: standard deviation of the change of the opening since the last image [m].
+        """
+        way, dt = self.opening - opening, max(0.0, stamp - self.stamp)
+        forces, mixed, stiffnesses = self._force_variance, self._covariance, self._stiffness_variance
+        forces += 2.0 * way * mixed + way**2 * stiffnesses + _DRIFT**2 * dt + (self.stiffness * way_stddev) ** 2
+        mixed += way * stiffnesses
+        stiffnesses += _GROWTH**2 * abs(way)
+        innovation = force - (self.force + self.stiffness * way)
+        self._learn_noise(innovation, forces)
+        total = forces + self._noise_variance
+        self.force += self.stiffness * way + forces / total * innovation
+        self.stiffness = max(LEAST_STIFFNESS, self.stiffness + mixed / total * innovation)
+        self._stiffness_variance = stiffnesses - mixed**2 / total
+        self._covariance = mixed * (1.0 - forces / total)
+        self._force_variance = forces * (1.0 - forces / total)
+        self.opening, self.stamp = opening, stamp
+
+    def _learn_noise(self, innovation: float, expected: float) -> None:
+        """Move the noise towards what an innovation [N] leaves beyond its expected variance [N^2]."""
+        seen = min(max(innovation**2 - expected, _LEAST_NOISE**2), _LARGEST_NOISE**2)
+        self._noise_variance += _NOISE_MEMORY * (seen - self._noise_variance)

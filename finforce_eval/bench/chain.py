@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.stamps import NANOSECONDS
-from finforce.systems.options import ReplayOptions
-from finforce.systems.processes import Process, replay_processes
+from finforce.systems.processes import Process, ReplayOptions, replay_processes
 from finforce_eval.bench.scenes import GRASP, GRASP_FAST, find_scene
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.evaluation.scoring import match_truth

@@ -26,14 +26,14 @@ from finforce_contact.mesh.object_mesh import prepare_object_mesh
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_eval.bench.bench import time_calls
 from finforce_eval.bench.cases import PERIOD, bench_finger, load_cases, record_press
-from finforce_eval.evaluation.markdown import align_rows
+from finforce_eval.evaluation.tables import align_rows
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
+from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
-from finforce_ifea.jaw.meshing import MeshDensity
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.quadratic_program import solve_program

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from finforce_eval.bench.cases import LEVELS, ReplayedPress, bench_finger, load_cases, record_press
 from finforce_eval.bench.tiers import TIERS, Run, Tier, run_tier
-from finforce_eval.evaluation.markdown import align_rows
+from finforce_eval.evaluation.tables import align_rows
 
 SEED = 1
 NOISE = 0.2e-3  # [m] in every direction on every key point: that of SOFA's quoted errors

@@ -76,7 +76,7 @@ def _probe(solver: str, mesh: str, cache: str) -> dict[str, float]:
 def main(solver: str, mesh: str) -> None:
     """Builds and runs an estimator and prints what that took as JSON."""
     begin = perf_counter()
-    from finforce_eval.replay.cpu_share import resident_bytes
+    from finforce_eval.replay.processes import resident_bytes
     from finforce_ifea.estimator import JawEstimator
     from finforce_ifea.jaw.jaw import load_jaw
     from finforce_ifea.settings import EstimatorSettings

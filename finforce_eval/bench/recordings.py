@@ -11,7 +11,7 @@ import numpy as np
 from finforce.errors import FinforceError
 from finforce_eval.bench.tiers import Tier
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.contact_choice import parse_contacts
+from finforce_eval.evaluation.contact_source import parse_contacts
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.results import CaseResult
 from finforce_eval.evaluation.setup import EvaluationSetup

@@ -21,14 +21,12 @@ from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
 from finforce.skipping import ALL, AWAY, CONTACT, EVERYWHERE, IDLE, SOLVER, STILL, UNCHANGED, UNHEARD, UNNEEDED
 from finforce_eval.bench.chain import SIDES, awaited_topics, chain_processes
-from finforce_eval.bench.scene_reel import OBJECT_TOPIC, SceneReel, Span, StreamPart, cut_sections
-from finforce_eval.bench.scenes import BenchScene, find_scene
+from finforce_eval.bench.scenes import OBJECT_TOPIC, BenchScene, SceneReel, Span, StreamPart, cut_sections, find_scene
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.replay.cpu_share import CpuMeter, busy_seconds, resident_bytes
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import await_listeners, find_processes
 from finforce_eval.replay.playback import RawMessage, read_playback
-from finforce_eval.replay.processes import ProcessGroup
+from finforce_eval.replay.processes import CpuMeter, ProcessGroup, busy_seconds, resident_bytes
 from finforce_keypoints.settings import ANNOTATED, RULES
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from finforce_eval.bench.cases import NoisyCamera, ReplayedPress, bench_finger, 
 from finforce_eval.bench.process import Start, measure_start
 from finforce_eval.bench.recordings import RecordedFigures, find_recordings, measure_recordings
 from finforce_eval.bench.tiers import Accuracy, ShapeErrors, Tier, list_tiers, run_tier, score_runs, score_shapes
-from finforce_eval.evaluation.markdown import align_rows
+from finforce_eval.evaluation.tables import align_rows
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, GREY, ORANGE, new_figure, style_axes
 from finforce_eval.figures.time_error import ErrorPoint, find_front
 from finforce_ifea.fem.solid import SolidModel

@@ -7,8 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from finforce_eval.evaluation.contact_choice import ContactChoice
-from finforce_eval.evaluation.contact_source import first_touch
+from finforce_eval.evaluation.contact_source import ContactChoice, first_touch
 from finforce_eval.evaluation.evaluate import check_keypoint_count
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.tracks import Recording

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactSource
-from finforce_eval.evaluation.steps import Estimator
+from finforce_eval.evaluation.evaluate import Estimator
 from finforce_eval.recordings.tracks import Recording
 
 GRAVITY = 9.80665  # [m/s^2] by which kitchen scales turn weight into grams

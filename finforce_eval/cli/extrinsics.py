@@ -13,8 +13,7 @@ from tqdm import tqdm
 
 from finforce.transforms import pose_numbers, rotation_between
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.detection import Detector
-from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, parse_source
+from finforce_eval.evaluation.keypoint_source import Detector, KeypointSource, build_records, parse_source
 from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_ifea.jaw.jaw import Jaw, load_jaw

@@ -11,11 +11,15 @@ from tqdm import tqdm
 
 from finforce_eval.cli.parser import MESHES, SOLVERS
 from finforce_eval.errors import OptionError
-from finforce_eval.stress.stress import Family, Plan, Trial, find_families, run_family
-from finforce_eval.stress.summary import (
+from finforce_eval.stress.stress import (
+    Family,
+    Plan,
     Summary,
+    Trial,
+    find_families,
     format_summaries,
     markdown_summaries,
+    run_family,
     summarise_family,
     summarise_levels,
 )

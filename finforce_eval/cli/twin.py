@@ -9,11 +9,10 @@ from typing import Any
 
 from finforce_eval.cli.parser import Parser
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.changes import parse_changes
+from finforce_eval.evaluation.results import parse_changes
 from finforce_eval.recordings.twin_writer import PREVIEW, RecordingForm, record_scene
 from finforce_twin.gripper.footage import parse_size
-from finforce_twin.scenes.scenarios import SCENARIOS, Scenario, build_scenario
-from finforce_twin.scenes.script import write_script
+from finforce_twin.scenes.scenarios import SCENARIOS, Scenario, build_scenario, write_script
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -1,21 +1,27 @@
-"""An estimator over recordings, offline, one frame after the other."""
+"""An estimator over recordings, offline, one frame after the other.
+
+One case step by step: contact to estimator, estimate to contact, and what both said.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from time import perf_counter
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from finforce.errors import FinforceError, ObservationError
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactSource
-from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.evaluation.places import InnerSurface, true_lines
+from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_sight
 from finforce_eval.evaluation.scoring import CaseScore, force_range, match_truth, score_case
-from finforce_eval.evaluation.steps import Estimator, StepLog
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.observation import Contact, Observation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,3 +136,171 @@ def score_results(results: Sequence[CaseResult], recordings: Sequence[Recording]
         total=score_case(results, span),
         span=span,
     )
+
+
+class Estimator(Protocol):
+    """What is asked of an estimator; `JawEstimator` satisfies it."""
+
+    surface_triangles: NDArray[np.integer]
+
+    def update(self, observation: Observation, contact: Contact | None) -> Any:
+        """Return the Solution for one observation."""
+
+    def surface(self) -> NDArray[np.float64]:
+        """Return the deformed vertices (n, 3) [m]."""
+
+
+class StepLog:
+    """Runs the steps of one case and keeps what they said.
+
+    Args:
+        recording: with key points and ground truth of that side.
+        side: "left" or "right".
+        jaw: the jaw of that side.
+        estimator: a fresh one.
+        source: where the contact comes from.
+    """
+
+    def __init__(self, recording: Recording, side: str, jaw: Any, estimator: Estimator, source: ContactSource) -> None:
+        """Make room for every image."""
+        self.name, self.side, self.jaw, self.estimator = recording.name, side, jaw, estimator
+        self._jaw_track = recording.jaw(side)
+        self.track = track = self._jaw_track.keypoints
+        self.phases = recording.phases_at(track.stamps)
+        frames = len(track.stamps)
+        self.force = np.full((frames, 3), np.nan)
+        self.place = np.full((frames, 3), np.nan)
+        self.stddev = np.full(frames, np.nan)
+        self.residual = np.full(frames, np.nan)
+        self.used = np.zeros((frames, track.count), dtype=bool)
+        self.status = np.full(frames, "", dtype="U32")
+        self.step_ms = np.zeros(frames)
+        self.surface0 = np.array(estimator.surface())
+        self.contacts = ContactLog(recording, side, source, InnerSurface(self.surface0, jaw.inner_face_x))
+        self.snapshot: Snapshot | None = None
+        self.largest = 0.0
+        self.message = ""
+
+    def step(self, index: int) -> None:
+        """Give image `index` to estimator and contact source."""
+        contact = self.contacts.before(index)
+        observation = self.track.observation(index)
+        begin = perf_counter()
+        solution = self.estimator.update(observation, contact)
+        self.step_ms[index] = 1e3 * (perf_counter() - begin)
+        self.status[index] = solution.status
+        self.used[index] = solution.keypoints_used
+        self.residual[index] = solution.residual
+        self.contacts.after(index, self.estimator.surface(), solution)
+        if solution.trusted:
+            self._keep(index, solution, contact)
+        else:
+            self.message = solution.message
+
+    def _keep(self, index: int, solution: Any, contact: Contact | None) -> None:
+        """Keep a trusted estimate."""
+        self.force[index] = solution.force
+        self.place[index] = solution.contact_place
+        self.stddev[index] = solution.magnitude_stddev
+        magnitude = float(np.linalg.norm(solution.force))
+        # two per cent: the surface is copied now and then, not on every frame of a rising force
+        if self.phases.scored[index] and magnitude > 1.02 * self.largest:
+            self.largest = magnitude
+            self.snapshot = self._picture(index, solution, contact)
+
+    def _picture(self, index: int, solution: Any, contact: Contact | None) -> Snapshot:
+        """Keep the jaw and the object as they are now."""
+        known = contact is not None and contact.outline is not None
+        return Snapshot(
+            stamp=int(self.track.stamps[index]),
+            surface0=self.surface0,
+            surface=np.array(self.estimator.surface()),
+            triangles=np.asarray(self.estimator.surface_triangles),
+            keypoints0=np.asarray(self.jaw.keypoints),
+            keypoints=self.track.points[index],
+            used=np.array(solution.keypoints_used),
+            contact_point=np.array(solution.contact_point),
+            force=np.array(solution.force),
+            outline=contact.outline.placed() if known else (),
+        )
+
+    def result(self, truth: NDArray[np.float64]) -> CaseResult:
+        """Return the time series, with the true forces (n, 3) [N]."""
+        return CaseResult(
+            name=self.name,
+            side=self.side,
+            stamps=self.track.stamps,
+            truth=truth,
+            force=self.force,
+            place=self.place,
+            stddev=self.stddev,
+            residual=self.residual,
+            used=self.used,
+            status=self.status,
+            step_ms=self.step_ms,
+            cycle=self.phases.cycle,
+            direction=self.phases.direction,
+            scored=self.phases.scored,
+            snapshot=self.snapshot,
+            message=self.message,
+            contact=self.contacts.series(),
+            **self._seen(),
+        )
+
+    def _seen(self) -> dict[str, Any]:
+        """Return how the key points were seen, where this call has found them in images."""
+        detection, sight = self._jaw_track.detection, self._jaw_track.sight
+        if detection is None:
+            return {}
+        return {
+            "sight": None if sight is None else compare_sight(detection, sight),
+            "detector_ms": detection.step_ms,
+            "latency_ms": self.step_ms + detection.step_ms,
+        }
+
+
+class ContactLog:
+    """Asks the contact source around each step and keeps what it said, and where the truth was."""
+
+    def __init__(self, recording: Recording, side: str, source: ContactSource, surface: InnerSurface) -> None:
+        """Make room for every image."""
+        self._source, self._surface = source, surface
+        self._stamps = recording.jaw(side).keypoints.stamps
+        self._lines = true_lines(recording, side, self._stamps, surface.face_x)
+        frames = len(self._stamps)
+        self._given, self._truth, self._ms = (np.full(frames, np.nan) for _ in range(3))
+        self._touching = np.zeros(frames, dtype=bool)
+        self._status = np.full(frames, "", dtype="U16")
+
+    def before(self, index: int) -> Contact | None:
+        """Return the contact for an image."""
+        begin = perf_counter()
+        contact = self._source.contact_at(int(self._stamps[index]))
+        self._ms[index] = 1e3 * (perf_counter() - begin)
+        if contact is not None and len(contact.points):
+            self._given[index] = np.average(contact.points[:, 2], weights=contact.weights)
+        return contact
+
+    def after(self, index: int, surface: NDArray[np.float64], solution: Any) -> None:
+        """Hand the solver's answer to the source and find the true place on the deformed surface."""
+        wrench = (solution.force, solution.torque) if solution.trusted else None
+        begin = perf_counter()
+        self._source.learn(int(self._stamps[index]), surface, wrench)
+        self._ms[index] += 1e3 * (perf_counter() - begin)
+        if self._source.estimate is not None:
+            self._touching[index] = self._source.estimate.touching
+            self._status[index] = self._source.estimate.status
+        self._truth[index] = self._surface.cut(surface, self._lines.points[index], self._lines.directions[index])
+
+    def series(self) -> ContactSeries:
+        """Return the time series."""
+        is_estimated = self._source.estimate is not None
+        nothing = np.full(len(self._stamps), np.nan)
+        return ContactSeries(
+            source=self._source.name,
+            given=self._given,
+            truth=self._truth,
+            touching=self._touching if is_estimated else None,
+            status=self._status,
+            step_ms=self._ms if is_estimated else nothing,
+        )

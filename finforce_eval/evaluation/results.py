@@ -1,14 +1,233 @@
-"""What an estimator said about a recording, frame by frame."""
+"""What an estimator said about a recording, frame by frame.
+
+`NAME=VALUE` texts of a command line as values of the types of a record's defaults.
+
+How long a force takes from its true onset to a published estimate.
+
+How well key points were seen: pixels, places, what was accepted and lost, and time.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.evaluation.delay_scoring import Delay, onset_delays
-from finforce_eval.evaluation.sight_scoring import SightSeries
+from finforce_eval.errors import OptionError
+from finforce_eval.recordings.tracks import DetectionTrack, SightTrack
+
+TRUTH_VALUES = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+
+
+def parse_changes(option: str, kind: str, texts: Sequence[str], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `NAME=VALUE` texts as values by name, each of the type of the default that it changes.
+
+    Args:
+        option: of the command line, for messages.
+        kind: what a name is the name of, for messages.
+        texts: as they were given.
+        defaults: by name; a list takes its values with commas between.
+
+    Raises:
+        OptionError: a name is not known, or a value is not of its type.
+    """
+    changes = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if name not in defaults:
+            raise OptionError(f"{option} {text}: unknown {kind}; expected one of {', '.join(defaults)}")
+        changes[name] = _parse_value(f"{option} {text}", value, defaults[name])
+    return changes
+
+
+def _parse_value(given: str, text: str, default: Any) -> Any:
+    """Return a text as a value of the type of a default."""
+    if isinstance(default, tuple | list):
+        kind = type(default[0]) if default else str
+        return [_parse_value(given, part, kind()) for part in text.split(",")]
+    try:
+        return TRUTH_VALUES[text.lower()] if isinstance(default, bool) else type(default)(text)
+    except (KeyError, ValueError):
+        raise OptionError(f"{given}: '{text}' is no {type(default).__name__}") from None
+
+
+ONSET = 0.02  # [N] of true force, from which on something presses
+SHOWN = 0.10  # [N] of estimated force, from which on it shows
+FREE = 5  # images without true force before an onset counts as one
+WAITED = 1.0  # [s] after which a force that did not show is missed
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelayStats:
+    """Delays over the onsets of the true force; None without any.
+
+    Attributes:
+        n: onsets after which the estimate showed.
+        missed: onsets after which it did not within a second.
+        median_ms: from the true onset until the estimate is above 0.1 N and has been computed.
+        max_ms: the largest of them.
+        rise_ms: median of what the true force itself takes from its onset to 0.1 N.
+    """
+
+    n: int
+    missed: int
+    median_ms: float | None
+    max_ms: float | None
+    rise_ms: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delay:
+    """One onset: seconds until the estimate showed and until the true force reached as much; NaN if never."""
+
+    shown: float
+    risen: float
+
+
+def force_delays(
+    times: NDArray[np.float64], truth: NDArray[np.float64], estimate: NDArray[np.float64], lag: NDArray[np.float64]
+) -> list[Delay]:
+    """Return the delay after each onset of the true force.
+
+    The onset lies between two images, where the line through their true forces crosses 0.02 N.
+
+    Args:
+        times: (n,) of the images [s].
+        truth: (n,) magnitude of the true force [N], NaN where it is not known.
+        estimate: (n,) magnitude of the estimate [N], NaN where there is none.
+        lag: (n,) from the image to the estimate [s]; NaN counts as none.
+    """
+    known = np.nan_to_num(truth)
+    loaded = known > ONSET
+    delays = []
+    for index in np.flatnonzero(loaded[1:] & ~loaded[:-1]) + 1:
+        if index < FREE or loaded[index - FREE : index].any():
+            continue
+        onset = _crossing(times, known, index, ONSET)
+        later = slice(index, int(np.searchsorted(times, onset + WAITED)))
+        shown = np.flatnonzero(np.nan_to_num(estimate[later]) > SHOWN)
+        risen = np.flatnonzero(known[later] > SHOWN)
+        row = index + int(shown[0]) if shown.size else None
+        delays.append(
+            Delay(
+                shown=np.nan if row is None else times[row] + float(np.nan_to_num(lag[row])) - onset,
+                risen=_crossing(times, known, index + int(risen[0]), SHOWN) - onset if risen.size else np.nan,
+            )
+        )
+    return delays
+
+
+def _crossing(times: NDArray[np.float64], values: NDArray[np.float64], index: int, level: float) -> float:
+    """Return when values that are above a level at `index` and not before rose through it [s]."""
+    before, after = values[index - 1], values[index]
+    return float(times[index - 1] + (level - before) / (after - before) * (times[index] - times[index - 1]))
+
+
+def delay_stats(delays: Sequence[Delay]) -> DelayStats:
+    """Return the statistics of delays."""
+    shown = 1e3 * np.array([delay.shown for delay in delays if np.isfinite(delay.shown)])
+    risen = 1e3 * np.array([delay.risen for delay in delays if np.isfinite(delay.risen)])
+    return DelayStats(
+        n=shown.size,
+        missed=len(delays) - shown.size,
+        median_ms=float(np.median(shown)) if shown.size else None,
+        max_ms=float(shown.max()) if shown.size else None,
+        rise_ms=float(np.median(risen)) if risen.size else None,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SightSeries:
+    """A detection against the truth, image by image; n images that have both, K key points.
+
+    Attributes:
+        pixel_error: (n, K) distance in the image [px]; NaN where the point was hidden, or no pixel was named.
+        point_error: (n, K) distance in the jaw frame [m]; NaN where the point was not accepted.
+        visible: (n, K) the camera could see the point.
+        accepted: (n, K) it was handed on to the solver.
+    """
+
+    pixel_error: NDArray[np.float64]
+    point_error: NDArray[np.float64]
+    visible: NDArray[np.bool_]
+    accepted: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SightStats:
+    """How well the key points of a case, or of all cases together, were seen; None where nothing can be said.
+
+    Attributes:
+        n_visible: points that the camera could see, over all images.
+        n_hidden: the others.
+        pixel_median_px: of the distances in the image, over the points that were visible.
+        pixel_p95_px: of the same.
+        point_median_mm: of the distances in the jaw frame, over the points that were accepted.
+        point_p95_mm: of the same.
+        hidden_accepted_pct: share of the hidden points that were accepted.
+        visible_lost_pct: share of the visible points that were not.
+    """
+
+    n_visible: int
+    n_hidden: int
+    pixel_median_px: float | None
+    pixel_p95_px: float | None
+    point_median_mm: float | None
+    point_p95_mm: float | None
+    hidden_accepted_pct: float | None
+    visible_lost_pct: float | None
+
+
+def compare_sight(detection: DetectionTrack, sight: SightTrack) -> SightSeries:
+    """Return a detection against the truth, at the images that both know."""
+    _, ours, theirs = np.intersect1d(detection.stamps, sight.stamps, return_indices=True)
+    visible, accepted = sight.visible[theirs], detection.accepted[ours]
+    pixel_error = np.linalg.norm(detection.pixels[ours] - sight.pixels[theirs], axis=2)
+    point_error = np.linalg.norm(detection.points[ours] - sight.points[theirs], axis=2)
+    return SightSeries(
+        pixel_error=np.where(visible, pixel_error, np.nan),
+        point_error=np.where(accepted, point_error, np.nan),
+        visible=visible,
+        accepted=accepted,
+    )
+
+
+def sight_stats(series: Sequence[SightSeries]) -> SightStats:
+    """Return the statistics of several series together."""
+    visible, accepted = (
+        np.concatenate([np.zeros(0, dtype=bool), *(getattr(entry, name).ravel() for entry in series)])
+        for name in ("visible", "accepted")
+    )
+    pixels = _percentiles([entry.pixel_error for entry in series], 1.0)
+    points = _percentiles([entry.point_error for entry in series], 1e3)
+    return SightStats(
+        n_visible=int(visible.sum()),
+        n_hidden=int((~visible).sum()),
+        pixel_median_px=pixels[0],
+        pixel_p95_px=pixels[1],
+        point_median_mm=points[0],
+        point_p95_mm=points[1],
+        hidden_accepted_pct=_share(accepted[~visible]),
+        visible_lost_pct=_share(~accepted[visible]),
+    )
+
+
+def _percentiles(errors: Sequence[NDArray[np.float64]], scale: float) -> tuple[float | None, float | None]:
+    """Return the median and the 95th percentile of what is finite."""
+    values = np.concatenate([np.zeros(0), *(error.ravel() for error in errors)])
+    values = scale * values[np.isfinite(values)]
+    if not values.size:
+        return None, None
+    median, p95 = (float(value) for value in np.percentile(values, [50, 95]))
+    return median, p95
+
+
+def _share(chosen: NDArray[np.bool_]) -> float | None:
+    """Return the share of what is true [%]."""
+    return 100.0 * float(chosen.mean()) if chosen.size else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +358,7 @@ class CaseResult:
     def delays(self) -> list[Delay]:
         """What the estimate took to show after each onset of the true force."""
         lag = 1e-3 * (self.step_ms if self.latency_ms is None else self.latency_ms)
-        return onset_delays(self.stamps * 1e-9, self.true_magnitude, self.magnitude, lag)
+        return force_delays(self.stamps * 1e-9, self.true_magnitude, self.magnitude, lag)
 
     @property
     def counted(self) -> NDArray[np.bool_]:

@@ -13,12 +13,10 @@ from typing import Any
 
 from finforce.errors import FinforceError
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.changes import parse_changes
-from finforce_eval.evaluation.contact_choice import ContactChoice, parse_contacts
-from finforce_eval.evaluation.contact_source import ContactSource, build_source
+from finforce_eval.evaluation.contact_source import ContactChoice, ContactSource, build_source, parse_contacts
 from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.evaluation.results import CaseResult, parse_changes
 from finforce_eval.recordings.images import PAIRED
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording

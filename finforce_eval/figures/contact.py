@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from finforce_eval.evaluation.contact_scoring import LEAST_FORCE, ONSET_FORCE
 from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.evaluation.scoring import LEAST_FORCE, ONSET_FORCE
 from finforce_eval.figures.figures import (
     BLACK,
     BLUE,

@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.evaluation.results import CaseResult
-from finforce_eval.evaluation.sight_scoring import compare_sight
+from finforce_eval.evaluation.results import CaseResult, compare_sight
 from finforce_eval.figures.figures import BLUE, GREEN, GREY, ORANGE, new_figure, style_axes
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, Recording
-from finforce_keypoints.overlay import COLORS, draw_keypoints
+from finforce_keypoints.diagnostics import COLORS, draw_keypoints
 
 COUNT, COLUMNS = 6, 2
 WIDTH = 11.0  # [in] of a figure
@@ -41,7 +40,7 @@ class Region(NamedTuple):
 
 
 class FoundPixels(NamedTuple):
-    """Key points of one jaw in a picture, as `finforce_keypoints.overlay` draws them."""
+    """Key points of one jaw in a picture, as `finforce_keypoints.diagnostics` draws them."""
 
     pixels: NDArray
     valid: NDArray

@@ -23,7 +23,7 @@ from finforce_eval.figures.images import (
     moved,
 )
 from finforce_eval.recordings.tracks import Recording
-from finforce_keypoints.overlay import draw_keypoints
+from finforce_keypoints.diagnostics import draw_keypoints
 
 RATE = 10.0  # images a second
 SIZE = (4.6, 3.9)  # [in], at 120 px

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from finforce_eval.evaluation.evaluate import Evaluation
 from finforce_eval.evaluation.results import CaseResult
-from finforce_eval.evaluation.sight_table import markdown_sight
-from finforce_eval.evaluation.tables import markdown_contact_table, markdown_table, summary_lines
+from finforce_eval.evaluation.tables import markdown_contact_table, markdown_sight, markdown_table, summary_lines
 from finforce_eval.recordings.tracks import Recording
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, decode_depth
 from finforce.errors import MissingDependencyError, PoseError
-from finforce_contact.reconstruction.generator_axes import affine_from_generator
+from finforce_contact.reconstruction.paper_alignment import affine_from_generator
 from finforce_eval.errors import OptionError
 
 FARTHEST = 10.0  # [m] of the median depth; more means that the numbers are no metres

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from finforce.messages import pose_from_message
 from finforce.pointcloud import decode_columns, decode_keypoints
 from finforce.stamps import NANOSECONDS
-from finforce_eval.evaluation.detection import SideLog
+from finforce_eval.evaluation.keypoint_source import SideLog
 from finforce_eval.evaluation.places import InnerSurface, true_lines
-from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot
+from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_sight
 from finforce_eval.evaluation.scoring import match_truth
-from finforce_eval.evaluation.sight_scoring import compare_sight
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_keypoints.geometry.jaw_localizer import REASONS

@@ -1,10 +1,14 @@
-"""The player of recordings: messages out at the pace of their receipt, results in."""
+"""The player of recordings: messages out at the pace of their receipt, results in.
+
+The parameters of the player node.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from itertools import groupby
 from operator import attrgetter
@@ -21,11 +25,10 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from finforce.ros import node as ros
+from finforce.settings import setting
 from finforce_eval.recordings.tracks import JAWS
 from finforce_eval.replay.live import ReplayLog
-from finforce_eval.replay.parameters import PlayerParameters
-from finforce_eval.replay.playback import Playback, RawMessage, read_playback
-from finforce_eval.replay.read_ahead import ReadAhead
+from finforce_eval.replay.playback import Playback, RawMessage, ReadAhead, read_playback
 from finforce_keypoints.parameters import COLOR_TOPIC
 
 # what is heard while messages are being sent waits its turn; nothing of it may be lost
@@ -200,3 +203,16 @@ def main(args: Sequence[str] | None = None) -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlayerParameters:
+    """What the player is told; units stand in the metadata."""
+
+    bag: str = setting("", "recording to be played: rosbag2 folder, .mcap or .db3")
+    rate: float = setting(1.0, "speed of playing, 1 as recorded", "", 0.01, 100.0)
+    awaits_poses: bool = setting(False, "wait for listeners to the poses of the jaws, too")
+    awaits_images: bool = setting(
+        False, "wait for who finds key points in the images, and for those who use the key points"
+    )
+    patience: float = setting(120.0, "wait for listeners, which compile first", "s", 0.0, 3600.0)

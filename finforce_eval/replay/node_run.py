@@ -13,10 +13,16 @@ from typing import TYPE_CHECKING, Protocol
 
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
-from finforce_eval.replay.cpu_share import CpuMeter, busy_seconds, child_processes, resident_bytes
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.playback import RawMessage
-from finforce_eval.replay.processes import ProcessError, ProcessGroup
+from finforce_eval.replay.processes import (
+    CpuMeter,
+    ProcessError,
+    ProcessGroup,
+    busy_seconds,
+    child_processes,
+    resident_bytes,
+)
 from finforce_eval.replay.synthetic_stream import Film
 
 if TYPE_CHECKING:

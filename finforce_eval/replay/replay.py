@@ -15,13 +15,11 @@ from tqdm import tqdm
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
 from finforce.skipping import IDLE
-from finforce.systems.options import ReplayOptions
-from finforce.systems.processes import Process, replay_processes
+from finforce.systems.processes import Process, ReplayOptions, replay_processes
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_choice import FIXED, ContactChoice
-from finforce_eval.evaluation.detection import awaiting_keypoints, with_detections
+from finforce_eval.evaluation.contact_source import FIXED, ContactChoice
 from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, score_results
-from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSource
+from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSource, awaiting_keypoints, with_detections
 from finforce_eval.evaluation.results import CaseResult
 from finforce_eval.evaluation.scoring import GraspScore, score_grasp
 from finforce_eval.evaluation.setup import EvaluationSetup, truth_sides

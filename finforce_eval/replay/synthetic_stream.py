@@ -18,7 +18,7 @@ from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.views import MeshView
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import TRUTH, KeypointSource
-from finforce_eval.recordings.image_messages import IMAGE
+from finforce_eval.recordings.images import IMAGE
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import FRAME

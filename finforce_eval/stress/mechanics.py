@@ -1,4 +1,9 @@
-"""Stress of the mechanics: the energy weight, stiffness from 1e3 to 1e12 Pa, nu near 0.5, loads into buckling."""
+"""Stress of the mechanics: the energy weight, stiffness from 1e3 to 1e12 Pa, nu near 0.5, loads into buckling.
+
+Jaws under known loads, and how good such an equilibrium is.
+
+Stress of the quadratic program: badly scaled, nearly singular and bounded ones, beside a second solver.
+"""
 
 from __future__ import annotations
 
@@ -7,28 +12,29 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+from scipy.sparse.linalg import LinearOperator, onenormest
 
-from finforce_eval.stress.mechanics_jaw import (
-    MODULUS,
-    Pushed,
-    Pusher,
-    Rig,
-    build_jaw,
-    build_own_mechanics,
-    measure_condition,
-)
-from finforce_eval.stress.press import Bench
-from finforce_eval.stress.session import open_session, update
+from finforce_eval.stress.session import OWN_MECHANICS, Bench, open_session, update
 from finforce_eval.stress.stress import Family, Plan, Trial, attempt
-from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder
+from finforce_ifea.contact_mechanics.forward_press import PressState, RigidBox, RigidCylinder, RigidObject, press_jaw
+from finforce_ifea.contact_mechanics.penalty import PenaltyContact, measure_penalty_energy
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.errors import ContactError
+from finforce_ifea.fem.factorisation import sparse_from_banded
 from finforce_ifea.fem.locking import warn_of_locking
+from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
-from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw, load_jaw
+from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
+from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Solution
-from finforce_ifea.paper_inverse import InverseResult, solve_inverse
+from finforce_ifea.paper_inverse import InverseResult, Problem, solve_inverse, surface_normals
+from finforce_ifea.quadratic_program import UNBOUNDED, ProgramSolution, solve_program
+from finforce_ifea.settings import EstimatorSettings
 
 FORMS = ("paper", "sofa")
 WEIGHTS = (0.0, *10.0 ** np.arange(-6, 7))
@@ -268,6 +274,266 @@ def run_buckling(plan: Plan) -> Iterator[Trial]:
             q = pushed.q
 
 
+MODULUS, RATIO = 30e6, 0.45
+_NEIGHBOUR = 1e-3
+_ITERATIONS = 80
+_SETTLED = 1e-12
+# Ways to both sides of a depth over which energies are compared, as a share of it.
+_LITTLE = 1e-3
+# Gauss points across half of the bench finger's width [m].
+_SIDES = (-0.00577, 0.00577)
+
+
+def build_jaw(modulus: float = MODULUS, ratio: float = RATIO) -> Jaw:
+    """Returns the bench jaw of a material, Young's modulus [Pa] and Poisson's ratio."""
+    return replace(load_jaw("bench"), material=Material(young_modulus=modulus, poisson_ratio=ratio))
+
+
+def build_own_mechanics(plan: Plan, jaw: Jaw, **settings) -> Mechanics:
+    """Returns the mechanics of the plan's solver, the solid's where that has no tangent of its own."""
+    solver = plan.solver if plan.solver in OWN_MECHANICS else "solid"
+    return build_mechanics(jaw, EstimatorSettings(solver=solver, mesh=plan.mesh, **settings))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pushed:
+    """A jaw in equilibrium with forces that stand at material points.
+
+    Attributes:
+        model: its mechanics.
+        problem: the inverse problem of its key points.
+        q: unknowns.
+        force: the sum of the forces (3,) [N].
+    """
+
+    model: JawModel
+    problem: Problem
+    q: NDArray
+    force: NDArray
+
+
+class Pusher:
+    """Pushes a jaw at the height of a contact, or pulls it along, and poses the inverse problem of that place."""
+
+    def __init__(self, mechanics: Mechanics, jaw: Jaw, height: float, *, axes: str = "normal") -> None:
+        """Attaches contact points, their neighbours along the finger and the key points."""
+        self.model = mechanics.model
+        sides = _SIDES if self.model.rotations is None else (0.0,)
+        points = np.array([[jaw.inner_face_x, y, height] for y in sides])
+        around = np.repeat(points, 2, axis=0)
+        around[::2, 2] -= _NEIGHBOUR
+        around[1::2, 2] += _NEIGHBOUR
+        self._count = len(points)
+        self.problem = Problem(
+            effectors=self.model.attach(jaw.keypoints, KEYPOINT_DISTANCE),
+            targets=jaw.keypoints,
+            contacts=self.model.attach(points, 1e-3),
+            neighbours=self.model.attach(around, 1e-3),
+            weights=np.ones(self._count),
+            axes=axes,
+        )
+        self._rest = self.model.positions(self.problem.contacts, np.zeros(self.model.size))
+
+    def push(self, size: float, steps: int = 10) -> Pushed:
+        """Returns the equilibrium with a force of `size` [N] against the surface, reached in `steps`.
+
+        Raises:
+            ContactError: There is none that Newton's method finds.
+        """
+        q = np.zeros(self.model.size)
+        for share in np.linspace(0.0, 1.0, steps + 1)[1:]:
+            q = self._balance(q, share * size)
+        force = self._forces(q, size).sum(0)
+        return self._describe(q, force)
+
+    def pull(self, direction: NDArray, way: float, q: NDArray) -> Pushed:
+        """Returns the equilibrium in which the points have moved by `way` [m] along a direction (3,), from q.
+
+        A stiff spring along the direction holds them there, so that loads beyond a limit point are reached.
+
+        Raises:
+            ContactError: There is none that Newton's method finds.
+        """
+        model, probe = self.model, self.problem.contacts
+        spring = 1e3 * MODULUS * 1e-3
+        blocks = np.tile(spring * np.outer(direction, direction), (self._count, 1, 1))
+        for _ in range(_ITERATIONS):
+            moved = (model.positions(probe, q) - self._rest) @ direction
+            forces = (spring * (way - moved))[:, None] * direction
+            state = model.linearize(q)
+            model.stiffen(state.tangent, probe, q, blocks)
+            step = model.factorise(state.tangent).solve(model.load(probe, q, forces) - state.force)
+            q = q + limit_step(model, step)
+            if np.abs(step).max() < 1e-10:
+                return self._describe(q, forces.sum(0))
+        raise ContactError(f"no equilibrium at {1e3 * way:g} mm along {direction.tolist()}")
+
+    def is_contact(self, pushed: Pushed) -> bool:
+        """Whether the surface is pressed and not pulled on, as a contact that cannot pull has it."""
+        normals = surface_normals(self.model, self.problem.neighbours, pushed.q)
+        return bool((normals @ pushed.force < 0.0).all())
+
+    def _describe(self, q: NDArray, force: NDArray) -> Pushed:
+        targets = self.model.positions(self.problem.effectors, q)
+        return Pushed(model=self.model, problem=replace(self.problem, targets=targets), q=q, force=force)
+
+    def _forces(self, q: NDArray, size: float) -> NDArray:
+        return -size / self._count * surface_normals(self.model, self.problem.neighbours, q)
+
+    def _balance(self, q: NDArray, size: float) -> NDArray:
+        for _ in range(_ITERATIONS):
+            state = self.model.linearize(q)
+            if not state.smallest_det > 0:
+                break
+            load = self.model.load(self.problem.contacts, q, self._forces(q, size))
+            step = self.model.factorise(state.tangent).solve(load - state.force)
+            q = q + limit_step(self.model, step)
+            if np.abs(step).max() < _SETTLED:
+                return q
+        raise ContactError(f"no equilibrium with {size:g} N")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rig:
+    """A jaw and the rigid object that is pressed into it at a height [m]."""
+
+    mechanics: Mechanics
+    jaw: Jaw
+    height: float
+    rigid: RigidObject = RigidCylinder(radius=0.0125)
+
+    def press(self, depth: float) -> list[PressState]:
+        """Returns the equilibria a little before a depth [m], at it and a little beyond."""
+        surface, face = self.mechanics.contact.surface, self.jaw.inner_face_x
+        depths = [share * depth for share in (1.0 - _LITTLE, 1.0, 1.0 + _LITTLE)]
+        return press_jaw(self.mechanics.model, surface, face, self.rigid, self.height, depths)
+
+    def judge(self, presses: list[PressState], expected: NDArray, tolerance: float) -> Trial:
+        """Returns how a press compares with an expected force (3,) [N], within three times a share of it.
+
+        The residual is what is left of the equilibrium, over the force. The energy balance is that of the way from the
+        first to the last of the presses: the work -F_x dx less what jaw and surface store, over the work.
+        """
+        model, surface, middle = self.mechanics.model, self.mechanics.contact.surface, presses[1]
+        contact = self._press(middle)
+        state = model.linearize(middle.q)
+        left = np.abs(model.load(surface.probe, middle.q, contact.forces) - state.force).max()
+        size = float(np.linalg.norm(middle.force))
+        before, after = (self._measure_energy(press) for press in (presses[0], presses[2]))
+        work = -middle.force[0] * (presses[2].depth - presses[0].depth)
+        return Trial(
+            converged=True,
+            sure=True,
+            residual=float(left) / max(size, 1e-300),
+            force_error=float(np.linalg.norm(middle.force - expected)),
+            stddev=tolerance * size / 3.0,
+            condition=measure_condition(model, middle.q),
+            energy_balance=(work - (after - before)) / max(abs(work), 1e-300),
+            nan=not np.isfinite(middle.force).all(),
+            note=f"{size:.4g} N",
+        )
+
+    def _press(self, press: PressState) -> PenaltyContact:
+        surface = self.mechanics.contact.surface
+        points = self.mechanics.model.positions(surface.probe, press.q)
+        return self.rigid.press(points, surface.stiffness, self.jaw.inner_face_x, press.depth, self.height)
+
+    def _measure_energy(self, press: PressState) -> float:
+        return press.energy + measure_penalty_energy(
+            self._press(press).forces, self.mechanics.contact.surface.stiffness
+        )
+
+
+def measure_condition(model: JawModel, q: NDArray) -> float:
+    """Returns an estimate of the condition number of the tangent stiffness at q in the 1-norm."""
+    stored = model.linearize(q).tangent
+    matrix = sparse_from_banded(stored) if isinstance(stored, np.ndarray) else model.sparse_tangent(stored)
+    factor = model.factorise(stored)
+    inverse = LinearOperator(matrix.shape, matvec=factor.solve, rmatvec=factor.solve, dtype=float)
+    return float(onenormest(matrix) * onenormest(inverse))
+
+
+KINDS = ("plain", "badly scaled", "nearly singular", "two forces nearly at one place", "tiny or huge", "on its bounds")
+MOST = 42
+# Objectives agree to this share of their size; forming H = A^T A adds its rounding times its condition.
+AGREED, EPSILON = 1e-9, 1e-15
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Program:
+    """min |A x + b|^2 / 2 over x >= lower: A (k, m), b (k,), lower (m,)."""
+
+    A: NDArray
+    b: NDArray
+    lower: NDArray
+
+    def measure(self, x: NDArray) -> float:
+        """Returns the objective less its constant part, |A x|^2 / 2 + b A x."""
+        moved = self.A @ x
+        return float(0.5 * moved @ moved + self.b @ moved)
+
+
+def draw_program(random: np.random.Generator, kind: str) -> Program:
+    """Draws a program with 1 to 42 unknowns of which none, some or all are bounded."""
+    m = int(random.integers(1, MOST + 1))
+    rows = int(random.integers(m, 3 * m + 3))
+    A, b = random.normal(size=(rows, m)), random.normal(size=rows)
+    if kind == "badly scaled":
+        A = A * 10.0 ** random.uniform(-6, 6, m)
+    elif kind == "nearly singular":
+        U, _, V = np.linalg.svd(A, full_matrices=False)
+        A = U @ np.diag(np.logspace(0, -random.uniform(0, 6), m)) @ V
+    elif kind == "two forces nearly at one place":
+        A[:, -1] = A[:, 0] + 10.0 ** random.uniform(-6, -1) * A[:, -1]
+    elif kind == "tiny or huge":
+        A, b = A * 10.0 ** random.uniform(-9, 9), b * 10.0 ** random.uniform(-8, 8)
+    elif kind == "on its bounds":
+        b = -A @ np.where(random.random(m) < 0.5, 0.0, np.abs(random.normal(size=m)))
+    lower = np.where(random.random(m) < random.choice([0.0, 0.3, 1.0]), -UNBOUNDED, 0.0)
+    return Program(A=A, b=b, lower=lower)
+
+
+def solve_second(program: Program) -> NDArray:
+    """Returns what SciPy's bounded-variable least squares finds (m,)."""
+    scale = np.linalg.norm(program.A, axis=0)
+    bounds = (np.where(program.lower <= -UNBOUNDED, -np.inf, 0.0), np.inf)
+    return lsq_linear(program.A / scale, -program.b, bounds, tol=1e-14, method="bvls").x / scale
+
+
+def judge_program(solution: ProgramSolution, program: Program) -> Trial:
+    """Returns a trial whose error is that of the objective, relative to its size, beside the second solver's."""
+    x, other = solution.multipliers, solve_second(program)
+    scale = np.linalg.norm(program.A, axis=0)
+    condition = float(np.linalg.cond(program.A / scale)) ** 2
+    ours, theirs = program.measure(x), program.measure(other)
+    worse = max(0.0, ours - theirs) / max(0.5 * float(program.b @ program.b), 1e-300)
+    feasible = bool((x >= program.lower).all())
+    return Trial(
+        converged=True,
+        sure=True,
+        kkt=solution.kkt,
+        force_error=worse if feasible and solution.kkt <= 1e-8 else np.inf,
+        stddev=(AGREED + EPSILON * condition) / 3.0,
+        condition=condition,
+        nan=not np.isfinite(x).all(),
+    )
+
+
+def run_programs(plan: Plan) -> Iterator[Trial]:
+    """Yields programs of every kind; the KKT residual of each answer is below 1e-8 and its objective is the least."""
+    for seed in range(plan.share(3000)):
+        kind = KINDS[seed % len(KINDS)]
+        program = draw_program(plan.random("programs", seed), kind)
+        hessian, gradient = program.A.T @ program.A, program.A.T @ program.b
+        trial = attempt(
+            seed,
+            lambda H=hessian, g=gradient, p=program: solve_program(H, g, p.lower),
+            lambda got, p=program: judge_program(got, p),
+            level=kind,
+        )
+        yield replace(trial, level=kind)
+
+
 FAMILIES = (
     Family(name="epsilon", what="the energy weight from 0 to 1e6 in both its forms", run=run_epsilon, timed=False),
     Family(name="modulus", what="Young's modulus from 1e3 to 1e12 Pa", run=run_modulus, least_sure=0.9, timed=False),
@@ -276,4 +542,5 @@ FAMILIES = (
     ),
     Family(name="pressing", what="presses from 1e-4 to 1e3 N and into buckling", run=run_pressing, timed=False),
     Family(name="buckling", what="loads through the finger's limit points", run=run_buckling, timed=False),
+    Family(name="programs", what="quadratic programs of 1 to 42 forces", run=run_programs, least_sure=0.9, timed=False),
 )

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.stress.mechanics_jaw import Rig, build_jaw, measure_condition
+from finforce_eval.stress.mechanics import Rig, build_jaw, measure_condition
 from finforce_eval.stress.stress import Family, Plan, Trial, attempt
 from finforce_ifea.contact_mechanics.forward_press import PressState
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact, build_contact_surface

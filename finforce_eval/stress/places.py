@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from finforce_eval.stress.press import Bench
-from finforce_eval.stress.session import Session, open_session, take_another
+from finforce_eval.stress.session import Bench, Session, open_session, take_another
 from finforce_eval.stress.stress import Family, Plan, Trial
 from finforce_ifea.observation import Contact, ObjectOutline
 

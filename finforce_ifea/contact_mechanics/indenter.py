@@ -11,14 +11,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.distance_field import (
+from finforce_ifea.contact_mechanics.penalty import (
     CELL,
     DistanceField,
+    PenaltyContact,
     build_distance_field,
     find_leading,
+    press_cylinder,
+    press_field,
     read_depth,
 )
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact, press_cylinder, press_field
 from finforce_ifea.observation import Contact, ObjectOutline, are_same_polygons
 from finforce_ifea.settings import EstimatorSettings
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.errors import JawFileError, MeshError
 from finforce_ifea.jaw.attachment import attach_points, attach_surface_points
-from finforce_ifea.jaw.drawing import Drawing
+from finforce_ifea.jaw.drawing import Drawing, MeshDensity, mesh_drawing
 from finforce_ifea.jaw.jaw_file import (
     Material,
     MeshFile,
@@ -24,7 +24,6 @@ from finforce_ifea.jaw.jaw_file import (
 )
 from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.jaw.mesh_file import read_volume_mesh
-from finforce_ifea.jaw.meshing import MeshDensity, mesh_drawing
 
 __all__ = ["Jaw", "Material", "list_shipped_jaws", "load_jaw"]
 

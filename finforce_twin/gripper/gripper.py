@@ -6,12 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.jaw.meshing import MeshDensity
-from finforce_twin.mechanics.assembly import Assembly
-from finforce_twin.mechanics.material import RelaxedWrench, find_elastic_weight
+from finforce_ifea.jaw.drawing import MeshDensity
+from finforce_twin.mechanics.assembly import Assembly, RelaxedWrench, find_elastic_weight
 from finforce_twin.mechanics.pressed_jaw import TWIN_DENSITY, JawShape
-from finforce_twin.scenes.scenarios import Scenario
-from finforce_twin.scenes.script import RATE, Posture, write_script
+from finforce_twin.scenes.scenarios import RATE, Posture, Scenario, write_script
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

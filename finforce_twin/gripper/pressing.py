@@ -10,15 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.jaw.meshing import MeshDensity
+from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_twin.errors import BalanceError
 from finforce_twin.gripper.footage import FINGER
 from finforce_twin.gripper.gripper import JawState, TwinState
-from finforce_twin.mechanics.assembly import Assembly
-from finforce_twin.mechanics.material import RelaxedWrench
+from finforce_twin.mechanics.assembly import Assembly, RelaxedWrench
 from finforce_twin.mechanics.pressed_jaw import TWIN_DENSITY, JawShape
-from finforce_twin.scenes.scenarios import Scenario
-from finforce_twin.scenes.script import Posture
+from finforce_twin.scenes.scenarios import Posture, Scenario
 
 STEP = 1e-4  # [m] of each jaw from one solved grasp to the next
 JAMMED = 5e4  # [N/m] of opening, by which the force grows where jaws find no equilibrium any more

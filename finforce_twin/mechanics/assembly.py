@@ -1,6 +1,10 @@
-"""The jaws of a synthetic gripper and the object that they shut on, as they are put together."""
+"""The jaws of a synthetic gripper and the object that they shut on, as they are put together.
 
-from collections.abc import Mapping
+The material of a synthetic gripper, drawn anew for every seed as printed parts differ.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,15 +12,15 @@ from numpy.typing import NDArray
 from finforce.gripper_frames import BENCH_ORIGIN_X
 from finforce_contact.localization.section import cut_outline
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
+from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
-from finforce_ifea.jaw.meshing import MeshDensity
+from finforce_ifea.jaw.jaw_file import Material
+from finforce_ifea.relaxation import Relaxation, RelaxationTerm, invert_relaxation
 from finforce_twin.errors import ScenarioError
 from finforce_twin.mechanics.balance import GraspSetting, HeldObject
-from finforce_twin.mechanics.material import PrintedMaterial, draw_material
 from finforce_twin.mechanics.pressed_jaw import TWIN_DENSITY, JawShape, PressedJaw
 from finforce_twin.scenes.objects import place_object
-from finforce_twin.scenes.scenarios import Scenario
-from finforce_twin.scenes.script import Posture
+from finforce_twin.scenes.scenarios import Posture, Scenario
 
 WIDEST = 0.058  # [m] of a jaw's origin from the middle; fingers of 14 mm half depth leave 88 mm between them
 _EMPTY_GAP = 0.002  # [m] from each inner face to the middle where jaws with nothing between them stop
@@ -136,3 +140,56 @@ class Assembly:
                 f"{2e3 * (WIDEST - face - scenario.clearance):.0f} mm; give a scale, a turn or another object"
             )
         return origin
+
+
+# Printed parts are stiffer than the data sheet says; two parts of one print differ less than two prints.
+_STIFFER, _PART_STDDEV = (1.1, 1.4), 0.02
+_SHARE = (0.04, 0.09)
+_TIMES = ((1.5, 3.0), (7.0, 14.0))  # [s]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PrintedMaterial:
+    """What the jaws of one gripper are made of.
+
+    Attributes:
+        elastic: of each side.
+        terms: of the relaxation, the same in both jaws, so that relaxed forces balance as elastic ones do.
+    """
+
+    elastic: Mapping[str, Material]
+    terms: tuple[RelaxationTerm, ...]
+
+
+def draw_material(datasheet: Material, sides: Sequence[str], rng: np.random.Generator) -> PrintedMaterial:
+    """Returns a material about that of the data sheet, with two branches of relaxation."""
+    modulus = datasheet.young_modulus * rng.uniform(*_STIFFER)
+    parts = {side: float(modulus * np.exp(_PART_STDDEV * rng.standard_normal())) for side in sides}
+    terms = tuple(
+        RelaxationTerm(share=float(rng.uniform(*_SHARE)), time_constant=float(rng.uniform(*times))) for times in _TIMES
+    )
+    elastic = {
+        side: Material(young_modulus=value, poisson_ratio=datasheet.poisson_ratio) for side, value in parts.items()
+    }
+    return PrintedMaterial(elastic=elastic, terms=terms)
+
+
+def find_elastic_weight(weight: NDArray, stamps: NDArray, terms: Sequence[RelaxationTerm]) -> NDArray:
+    """Returns the loads (n, 3) [N] that an elastic jaw must carry so that the relaxed forces are the weight (n, 3) [N].
+
+    Under a steady weight the jaws creep: their shape is that of a load which grows from less than the weight to it.
+    """
+    return np.stack([invert_relaxation(column, stamps, terms) for column in weight.T], axis=1)
+
+
+class RelaxedWrench:
+    """Force and torque on one jaw as its material gives way; both by the same linear filter."""
+
+    def __init__(self, terms: Sequence[RelaxationTerm]) -> None:
+        """Starts relaxed."""
+        self._force, self._torque = Relaxation(terms), Relaxation(terms)
+
+    def update(self, force: NDArray, torque: NDArray, dt: float) -> tuple[NDArray, NDArray]:
+        """Returns force (3,) [N] and torque (3,) [N m] for the elastic ones, dt [s] later; no torque without force."""
+        relaxed, turned = self._force.update(force, dt), self._torque.update(torque, dt)
+        return relaxed, turned if relaxed.any() else np.zeros(3)

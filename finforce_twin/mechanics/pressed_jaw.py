@@ -11,9 +11,9 @@ from finforce_ifea.contact_mechanics.penalty import PenaltyContact, press_field
 from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
+from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.jaw.jaw_file import Material
-from finforce_ifea.jaw.meshing import MeshDensity
 
 # Finer along bands and ribs than the mesh that the estimator takes by default.
 TWIN_DENSITY = MeshDensity(between_ribs=10, through_band=1, along_rib=10, through_rib=1, tip=2, across_width=2)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_twin.rendering.paint import Paint, draw_color, draw_jaw_paint, draw_paint
+from finforce_twin.rendering.lighting import Paint, draw_color, draw_jaw_paint, draw_paint
 from finforce_twin.rendering.render import Body, Decal
 
 # Boxes (low, high) [m]: the holder in the jaw frame, flush with the jaw's sides, and the palm in the gripper frame.

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, compute_rays, rays_from_pixels
 from finforce.optional import import_open3d
-from finforce_twin.rendering.lighting import TEXTURE_SIZE, TEXTURE_SPAN, Light, Lighting
-from finforce_twin.rendering.paint import Paint
+from finforce_twin.rendering.lighting import TEXTURE_SIZE, TEXTURE_SPAN, Light, Lighting, Paint
 
 SUBPIXELS = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])  # rotated grid
 EDGE_STEP = 0.6e-3  # [m] of depth between neighbours that the slope of a surface does not explain

@@ -13,7 +13,7 @@ from finforce.optional import import_trimesh
 from finforce_contact.mesh.chamfer import compute_chamfer
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.reconstruction.result import GeneratedMesh
-from finforce_twin.scenes.table import TableScene
+from finforce_twin.scenes.pose_sequences import TableScene
 
 EDGE_LENGTH = 4e-3  # [m] of the triangles before they are bent
 WAVES = 12

@@ -11,7 +11,7 @@ from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_twin.rendering.depth_camera import build_d405
 from finforce_twin.scenes.guesses import GuessError, draw_guess, place_mesh
 from finforce_twin.scenes.objects import build_object
-from finforce_twin.scenes.table import draw_scene
+from finforce_twin.scenes.pose_sequences import draw_scene
 
 
 @dataclass(frozen=True)

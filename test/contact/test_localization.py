@@ -6,19 +6,27 @@ from localization_fakes import FACE, JAW, bent, box, cylinder, joined, opened, p
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.errors import ObjectMeshError
-from finforce_contact.localization.closest import ClosestLocalizer
-from finforce_contact.localization.contact_patch import (
+from finforce_contact.localization.inner_face import build_inner_face
+from finforce_contact.localization.outline_localizer import (
+    ClosestLocalizer,
+    ContactScene,
+    OutlineLocalizer,
     Rows,
     cross_line_of_action,
     overlap_of,
     rows_from_overlap,
     tilt_rows,
 )
-from finforce_contact.localization.gaps import compute_gaps, count_inside, distances_to, edges_of, place_edges
-from finforce_contact.localization.inner_face import build_inner_face
-from finforce_contact.localization.outline_localizer import ContactScene, OutlineLocalizer
-from finforce_contact.localization.section import SectionKeeper, split_turn
-from finforce_contact.mesh.enclosure import surrounds
+from finforce_contact.localization.section import (
+    SectionKeeper,
+    compute_gaps,
+    count_inside,
+    distances_to,
+    edges_of,
+    place_edges,
+    split_turn,
+)
+from finforce_contact.mesh.object_mesh import surrounds
 from finforce_contact.paper_contact import IntersectionLocalizer, NearSolid, centre_of_volume, intersect
 from finforce_contact.settings import ContactSettings
 from finforce_ifea.errors import MeshError

@@ -12,8 +12,7 @@ from finforce.errors import FinforceError, MissingDependencyError
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.mesh import object_mesh
 from finforce_contact.mesh.object_mesh import UNITS, load_object_mesh, prepare_object_mesh, read_triangles
-from finforce_contact.mesh.solids import to_manifold
-from finforce_contact.mesh.triangles import compute_volumes
+from finforce_contact.mesh.triangles import compute_volumes, to_manifold
 
 CYLINDER_VOLUME = np.pi * 0.03**2 * 0.08
 # 256 facets leave out 1 - sin(t)/t of a circle, t = 2 pi / 256; STL adds single precision.

@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.estimator import blank_estimate
-from finforce_contact.jaw_contact import JawContact, turn_covariance
-from finforce_contact.pose.pairing import PosePairing
+from finforce_contact.jaw_contact import JawContact, PosePairing, turn_covariance
 
 MS = 1_000_000
 FRAME = 33 * MS

@@ -13,17 +13,16 @@ from finforce_contact.mesh.chamfer import compute_chamfer
 from finforce_contact.mesh.closing import build_poisson_mesh, close_mesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.reconstruction.evidence import collect_evidence
-from finforce_contact.reconstruction.generator_axes import (
+from finforce_contact.reconstruction.paper_alignment import (
     affine_from_generator,
     camera_from_pytorch3d,
     canonical_from_glb,
     glb_from_canonical,
+    scale_coarsely,
 )
-from finforce_contact.reconstruction.paper_alignment import scale_coarsely
 from finforce_contact.reconstruction.reconstruction import reconstruct
-from finforce_contact.reconstruction.result import GeneratedMesh, check_agreement
-from finforce_contact.reconstruction.shape_fit import Placement
-from finforce_contact.reconstruction.shape_score import ShapeScore, score_shape
+from finforce_contact.reconstruction.result import GeneratedMesh, ShapeScore, check_agreement, score_shape
+from finforce_contact.reconstruction.shape_search import Placement
 from finforce_twin.scenes.guesses import place_mesh
 from finforce_twin.scenes.objects import build_object
 

@@ -15,14 +15,13 @@ from finforce.gripper_frames import BENCH_CAMERA
 from finforce.settings import TimeParameters
 from finforce.systems.launch import options_from_texts
 from finforce.systems.live import bench_processes
-from finforce.systems.options import BenchOptions, ReplayOptions, RobotOptions
-from finforce.systems.processes import Process, replay_processes
+from finforce.systems.processes import BenchOptions, Process, ReplayOptions, RobotOptions, replay_processes
 from finforce_contact.parameters import ContactParameters
 from finforce_contact.settings import ContactSettings
 from finforce_driver.grasp.settings import GraspSettings
 from finforce_driver.parameters import DriverParameters
 from finforce_driver.settings import GripperSettings
-from finforce_eval.replay.parameters import PlayerParameters
+from finforce_eval.replay.node import PlayerParameters
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.detectors.dots import DotSettings

@@ -28,7 +28,7 @@ from finforce_contact.settings import ContactSettings, TrackerSettings
 from finforce_driver.grasp.settings import GraspSettings
 from finforce_driver.parameters import DriverParameters
 from finforce_driver.settings import GripperSettings
-from finforce_eval.replay.parameters import PlayerParameters
+from finforce_eval.replay.node import PlayerParameters
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.detectors.dots import DotSettings

@@ -16,8 +16,7 @@ from finforce.systems.live import (
     camera_pose,
     robot_processes,
 )
-from finforce.systems.options import BenchOptions, RobotOptions
-from finforce.systems.processes import Include
+from finforce.systems.processes import BenchOptions, Include, RobotOptions
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.parameters import ContactParameters
 from finforce_driver.parameters import DriverParameters

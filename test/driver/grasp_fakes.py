@@ -10,9 +10,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from finforce_driver.grasp.controller import ForceGrasp
-from finforce_driver.grasp.force_feed import ForceSample
-from finforce_driver.grasp.settings import GraspGoal, GraspSettings
-from finforce_driver.grasp.status import GraspPhase, GraspStatus
+from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
 from finforce_driver.state import GripperState, Phase
 
 STEP = 0.048 / 255

@@ -6,7 +6,7 @@ from driver_faults import FaultRun, choose_kinds
 
 from finforce_driver.emulator.faults import FaultKind
 from finforce_driver.machine.exchange import Exchange
-from finforce_driver.machine.reply_filter import ReplyFilter
+from finforce_driver.machine.knowledge import ReplyFilter
 
 
 def total(tally):

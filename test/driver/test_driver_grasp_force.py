@@ -10,14 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from finforce_driver.errors import GraspError, TargetError
-from finforce_driver.grasp.checks import check_force_value
-from finforce_driver.grasp.controller import ForceGrasp
-from finforce_driver.grasp.force_feed import ForceFeed, ForceSample, TouchSample
-from finforce_driver.grasp.force_model import LEAST_STIFFNESS, ForceModel
-from finforce_driver.grasp.jaw_history import JawHistory, JawPlace
-from finforce_driver.grasp.load_watch import LoadWatch, LocatedForce
-from finforce_driver.grasp.settings import GraspGoal, GraspSettings
-from finforce_driver.grasp.status import GraspPhase
+from finforce_driver.grasp.controller import ForceGrasp, check_force_value
+from finforce_driver.grasp.load_watch import (
+    LEAST_STIFFNESS,
+    ForceFeed,
+    ForceModel,
+    ForceSample,
+    LoadWatch,
+    LocatedForce,
+    TouchSample,
+)
+from finforce_driver.grasp.plan import JawHistory, JawPlace
+from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
 from finforce_driver.state import GripperState, Phase
 
 STEP = 0.048 / 255

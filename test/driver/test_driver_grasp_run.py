@@ -11,10 +11,9 @@ from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
 from finforce_driver.errors import GraspError
-from finforce_driver.grasp.force_feed import ForceSample, TouchSample
-from finforce_driver.grasp.run import ForceInbox, hold_force
-from finforce_driver.grasp.settings import GraspGoal
-from finforce_driver.grasp.status import GraspPhase
+from finforce_driver.grasp.load_watch import ForceSample, TouchSample
+from finforce_driver.grasp.session import ForceInbox, hold_force
+from finforce_driver.grasp.settings import GraspGoal, GraspPhase
 from finforce_driver.gripper import Gripper
 from finforce_driver.state import Phase
 

@@ -6,9 +6,8 @@ from dataclasses import replace
 import pytest
 from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, spring
 
-from finforce_driver.grasp.force_feed import ForceSample
-from finforce_driver.grasp.settings import GraspGoal, GraspSettings
-from finforce_driver.grasp.status import GraspPhase
+from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
 from finforce_driver.state import Phase
 
 STIFF = 1300.0

@@ -9,10 +9,9 @@ from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import Command, Flag, Move, encode_poll
 from finforce_driver.machine.calibration import CalibrationRun, CalibrationStep
 from finforce_driver.machine.exchange import MARKERS, Exchange, Request
-from finforce_driver.machine.knowledge import History
+from finforce_driver.machine.knowledge import History, Telemetry
 from finforce_driver.machine.move import GRACE, Goal, MoveJob, MoveWatch
 from finforce_driver.machine.orders import Orders
-from finforce_driver.machine.telemetry import Telemetry
 from finforce_driver.state import MoveOutcome
 from finforce_driver.units import Pace
 

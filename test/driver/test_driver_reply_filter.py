@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import decode_reply
 from finforce_driver.errors import CanMessageError
-from finforce_driver.machine.reply_filter import MOST_DOUBTS, Expectation, ReplyFilter, TimedReply
+from finforce_driver.machine.knowledge import MOST_DOUBTS, Expectation, ReplyFilter, TimedReply
 
 REST = Expectation(drift=0.0, reach=100.0)
 SOON, POLL = 0.0015, 0.02  # [s]

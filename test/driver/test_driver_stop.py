@@ -5,7 +5,7 @@ from driver_rig_fakes import VARIANTS, Rig
 
 from finforce_driver.can.protocol import Command, Flag
 from finforce_driver.emulator.faults import FaultKind
-from finforce_driver.emulator.protection import Fault
+from finforce_driver.emulator.firmware import Fault
 from finforce_driver.errors import GripperStateError
 from finforce_driver.state import MoveOutcome, Phase
 

@@ -8,10 +8,9 @@ from driver_node_fakes import READY, Caller, FakeGoal, FakeGripper
 
 from finforce_driver.actions import GripperCommandAction
 from finforce_driver.errors import DriverError, GraspError, GripperStateError, TargetError
-from finforce_driver.grasp.force_feed import ForceSample
+from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import GraspSession
-from finforce_driver.grasp.settings import GraspGoal, GraspSettings
-from finforce_driver.grasp.status import GraspPhase
+from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
 from finforce_driver.messages import move_from_joint_state
 from finforce_driver.parameters import DriverParameters
 from finforce_driver.services import GripperTasks

@@ -5,8 +5,7 @@ from emulator_fakes import CALIBRATE, CLEAR, ESTOP, IDLE, VARIANTS, Host, calibr
 
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.emulator.control import Endpoints, Mode, Order
-from finforce_driver.emulator.firmware import EmulatedGripper
-from finforce_driver.emulator.protection import Fault
+from finforce_driver.emulator.firmware import EmulatedGripper, Fault
 from finforce_driver.errors import TargetError
 
 

@@ -4,8 +4,7 @@ from emulator_fakes import VARIANTS
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, PlannedFault, draw_plan
-from finforce_driver.emulator.firmware import EmulatedGripper
-from finforce_driver.emulator.protection import Fault
+from finforce_driver.emulator.firmware import EmulatedGripper, Fault
 from finforce_driver.errors import TargetError
 
 REPLY = b"t078400000030\r"

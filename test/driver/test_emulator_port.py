@@ -14,8 +14,7 @@ import serial
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.faults import FaultKind, FaultyAdapter
 from finforce_driver.emulator.firmware import EmulatedGripper
-from finforce_driver.emulator.pty_port import PtyPort
-from finforce_driver.emulator.server import build_adapter, build_parser, main
+from finforce_driver.emulator.pty_port import PtyPort, build_adapter, build_parser, main
 from finforce_driver.errors import LinkError, TargetError
 
 REPLY = b"t078400000030\r"

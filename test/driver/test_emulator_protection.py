@@ -2,7 +2,7 @@ import pytest
 from emulator_fakes import CALIBRATE, CLEAR, ESTOP, RESET, VARIANTS, Host, calibrated_host
 
 from finforce_driver.emulator.control import Mode
-from finforce_driver.emulator.protection import Fault
+from finforce_driver.emulator.firmware import Fault
 from finforce_driver.emulator.settings import EmulatorSettings
 
 

@@ -18,7 +18,7 @@ from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.machine import write_figures
 from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.replay.cpu_share import child_processes, resident_bytes
+from finforce_eval.replay.processes import child_processes, resident_bytes
 from finforce_ifea.jaw.jaw import load_jaw
 
 ROOT = Path(__file__).parents[2]

@@ -6,8 +6,7 @@ import pytest
 from finforce.errors import MissingDependencyError
 from finforce.stamps import NANOSECONDS
 from finforce_eval.bench import localization as bench
-from finforce_eval.bench.localization import LocatedImage, build_cylinder, measure_methods, summarise
-from finforce_eval.bench.localization_methods import METHODS
+from finforce_eval.bench.localization import METHODS, LocatedImage, build_cylinder, measure_methods, summarise
 from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from finforce.skipping import EVERYWHERE
-from finforce_eval.bench.scene_reel import SceneReel, StreamPart, cut_sections, read_word
+from finforce_eval.bench.scenes import SceneReel, StreamPart, cut_sections, read_word
 from finforce_eval.bench.skipping import (
     EACH,
     OF_NODE,

@@ -11,7 +11,7 @@ from finforce.transforms import pose_from_quaternion
 from finforce_eval.calibration.calibrate import calibration_case, fitted_values, format_fit
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.contact_choice import ContactChoice, parse_contacts
+from finforce_eval.evaluation.contact_source import ContactChoice, parse_contacts
 from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import load_jaw

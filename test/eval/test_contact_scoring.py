@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 from test_scoring import make_result
 
-from finforce_eval.evaluation.contact_scoring import (
-    given_distance,
-    onset_delays,
-    onset_stats,
-    place_stats,
-    solved_distance,
-)
 from finforce_eval.evaluation.results import ContactSeries
+from finforce_eval.evaluation.scoring import given_distance, onset_delays, onset_stats, place_stats, solved_distance
 
 
 def contact_result(truth, *, touching=None, given=None, place=None, cycle=None, pressure=0.040):

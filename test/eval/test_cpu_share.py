@@ -8,7 +8,7 @@ from time import perf_counter
 
 import pytest
 
-from finforce_eval.replay.cpu_share import TICKS, CpuMeter, busy_seconds, cpu_seconds
+from finforce_eval.replay.processes import TICKS, CpuMeter, busy_seconds, cpu_seconds
 
 
 class FakeProcesses:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finforce_eval.evaluation.delay_scoring import delay_stats, onset_delays
+from finforce_eval.evaluation.results import delay_stats, force_delays
 
 PERIOD = 1 / 30
 TIMES = PERIOD * np.arange(60)
@@ -12,7 +12,7 @@ RISE = np.clip(0.1 * (np.arange(60) - 20), 0.0, 1.0)
 
 
 def delays(estimate, truth=RISE, lag=0.0):
-    return onset_delays(TIMES, np.asarray(truth), np.asarray(estimate), np.full(60, lag))
+    return force_delays(TIMES, np.asarray(truth), np.asarray(estimate), np.full(60, lag))
 
 
 def test_the_onset_lies_between_the_images():

@@ -13,8 +13,8 @@ from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 from finforce_eval.cli import demo
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import GivenContact
-from finforce_eval.evaluation.detection import detect_keypoints
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.scoring import score_grasp
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
@@ -158,7 +158,7 @@ def test_the_demo_plays_its_recording_and_ends_with_figures_and_report(rendered,
 
     monkeypatch.setattr(demo, "replay", play)
     monkeypatch.setattr(demo, "write_report", report)
-    demo.run(Namespace(source="images", contact=[], report=str(tmp_path / "report")))
+    demo.run(Namespace(source="images", contact=[], report=str(tmp_path / "report"), movie=None))
     assert asked["recording"].path == tmp_path / "report" / "recording"
     assert (asked["calibration"], asked["source"], asked["about"]["contact"]) == ("twin", "images", "estimate")
     assert asked["recordings"] == [played]

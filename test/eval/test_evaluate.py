@@ -8,8 +8,7 @@ from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJ
 
 from finforce.errors import FinforceError, ObservationError
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.contact_choice import parse_contacts
-from finforce_eval.evaluation.contact_source import EstimatedContact, GivenContact
+from finforce_eval.evaluation.contact_source import EstimatedContact, GivenContact, parse_contacts
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.tables import evaluation_json, format_table, markdown_contact_table, markdown_table
 from finforce_eval.recordings.objects import track_object

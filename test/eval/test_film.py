@@ -10,7 +10,7 @@ from finforce.gripper_frames import BENCH_CAMERA
 from finforce.messages import read_stamp
 from finforce_eval.bench.scenes import EVERY_RATE, SmoothGripper
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.image_messages import IMAGE
+from finforce_eval.recordings.images import IMAGE
 from finforce_eval.recordings.twin_writer import write_footage
 from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.synthetic_stream import (

@@ -10,14 +10,14 @@ from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import GivenContact
-from finforce_eval.evaluation.detection import detect_keypoints
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.figures.report import write_report
 from finforce_eval.recordings.images import ImageTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
+from finforce_keypoints.diagnostics import COLORS
 from finforce_keypoints.images import ImageWatch
-from finforce_keypoints.overlay import COLORS
 
 pytest.importorskip("matplotlib")
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from finforce.camera import ImageError
-from finforce_eval.evaluation.detection import Reasons
-from finforce_eval.recordings.image_messages import color_from_message, compress_depth, depth_from_message, encode_color
+from finforce_eval.evaluation.keypoint_source import Reasons
+from finforce_eval.recordings.images import color_from_message, compress_depth, depth_from_message, encode_color
 
 DEPTH = np.random.default_rng(1).integers(100, 200, (48, 64), dtype=np.uint16)
 COLOR = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)

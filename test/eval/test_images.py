@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from finforce.camera import ImageError
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.image_messages import compress_depth, depth_from_message, depth_steps, encode_color
+from finforce_eval.recordings.images import compress_depth, depth_from_message, depth_steps, encode_color
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import ImageFactory, RecordingForm, _footage_entries, write_footage
 from finforce_eval.recordings.writer import MessageFactory, write_entries
 from finforce_eval.replay.playback import read_playback
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_twin.gripper.encoding import encode_depth
+from finforce_twin.gripper.footage import encode_depth
 
 FORMS = {
     "jpeg": RecordingForm(),

@@ -8,7 +8,7 @@ from eval_fakes import PERIOD, START, make_poses, make_recording
 from scipy.spatial.transform import Rotation
 
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_choice import parse_contacts
+from finforce_eval.evaluation.contact_source import parse_contacts
 from finforce_eval.recordings.objects import find_mesh, has_object, mean_pose, require_mesh, track_object
 from finforce_eval.recordings.tracks import PoseTrack
 from finforce_eval.recordings.writer import write_recording

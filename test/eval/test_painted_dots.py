@@ -7,7 +7,7 @@ from rgbd_fakes import CAMERA
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import quaternion_from_pose
-from finforce_eval.bench.painted_dots import paint_dots
+from finforce_eval.bench.detection import paint_dots
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, PoseTrack, SightTrack
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detectors.dots import DotSettings, find_dots

@@ -10,10 +10,8 @@ from std_msgs.msg import String
 
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.writer import write_recording
-from finforce_eval.replay.node import find_awaited
-from finforce_eval.replay.parameters import PlayerParameters
-from finforce_eval.replay.playback import RawMessage, read_playback
-from finforce_eval.replay.read_ahead import ReadAhead
+from finforce_eval.replay.node import PlayerParameters, find_awaited
+from finforce_eval.replay.playback import RawMessage, ReadAhead, read_playback
 from finforce_keypoints.parameters import COLOR_TOPIC
 
 

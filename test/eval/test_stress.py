@@ -11,8 +11,18 @@ from stress_fakes import answers, divide, fail_with, family_of, refuse
 from finforce_eval.cli.main import main
 from finforce_eval.cli.stress import choose_families, worst_trials, write_page
 from finforce_eval.errors import OptionError
-from finforce_eval.stress.stress import Plan, Trial, attempt, find_families, measure_longest, run_family
-from finforce_eval.stress.summary import format_summaries, summarise, summarise_family, summarise_levels
+from finforce_eval.stress.stress import (
+    Plan,
+    Trial,
+    attempt,
+    find_families,
+    format_summaries,
+    measure_longest,
+    run_family,
+    summarise,
+    summarise_family,
+    summarise_levels,
+)
 
 
 def broken(trials, **rules):

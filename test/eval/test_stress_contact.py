@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from finforce_contact.localization.section import cut_outline
-from finforce_eval.stress.contact import CLEAR, plan_depths, play_scene, press_scene
-from finforce_eval.stress.contact_objects import build_scenes
-from finforce_eval.stress.press import Bench
-from finforce_eval.stress.stress import Plan
-from finforce_eval.stress.summary import summarise
-from finforce_ifea.contact_mechanics.distance_field import build_distance_field
+from finforce_eval.stress.contact import CLEAR, build_scenes, plan_depths, play_scene, press_scene
+from finforce_eval.stress.session import Bench
+from finforce_eval.stress.stress import Plan, summarise
 from finforce_ifea.contact_mechanics.indenter import expect_object
+from finforce_ifea.contact_mechanics.penalty import build_distance_field
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline
 from finforce_ifea.settings import EstimatorSettings

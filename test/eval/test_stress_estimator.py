@@ -6,10 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from finforce_eval.stress.press import Bench
-from finforce_eval.stress.session import judge, open_session, update
-from finforce_eval.stress.stress import Plan, find_families, run_family
-from finforce_eval.stress.summary import summarise_family
+from finforce_eval.stress.session import Bench, judge, open_session, update
+from finforce_eval.stress.stress import Plan, find_families, run_family, summarise_family
 from finforce_ifea.errors import CalibrationError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import Calibration

@@ -8,11 +8,17 @@ import pytest
 from mechanics_fakes import BENCH, bench_mechanics, block
 
 from finforce.errors import FinforceError
-from finforce_eval.stress.mechanics import estimate_press, run_buckling, run_epsilon
-from finforce_eval.stress.mechanics_jaw import MODULUS, Rig, build_jaw, build_own_mechanics
+from finforce_eval.stress.mechanics import (
+    MODULUS,
+    Rig,
+    build_jaw,
+    build_own_mechanics,
+    estimate_press,
+    run_buckling,
+    run_epsilon,
+)
 from finforce_eval.stress.mechanics_meshes import CHANGES, parts_of, run_kind, try_mesh
-from finforce_eval.stress.stress import Plan
-from finforce_eval.stress.summary import summarise
+from finforce_eval.stress.stress import Plan, summarise
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import ContactError, MeshError
 from finforce_ifea.fem.factorisation import SparseFactor, factorise_banded

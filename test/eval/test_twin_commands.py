@@ -11,10 +11,9 @@ from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 from finforce_eval.cli import twin as twin_commands
 from finforce_eval.cli.main import main
 from finforce_eval.evaluation.contact_source import GivenContact
-from finforce_eval.evaluation.detection import detect_keypoints
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
-from finforce_eval.evaluation.sight_table import format_sight, markdown_sight
-from finforce_eval.evaluation.tables import evaluation_json, format_table
+from finforce_eval.evaluation.keypoint_source import detect_keypoints
+from finforce_eval.evaluation.tables import evaluation_json, format_sight, format_table, markdown_sight
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
 from finforce_keypoints.images import ImageWatch

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
 from finforce_ifea.jaw.attachment import attach_points, attach_surface_points, find_closest_surface
-from finforce_ifea.jaw.drawing import Rib
+from finforce_ifea.jaw.drawing import Rib, mesh_drawing
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.mesh import build_volume_mesh, shape_gradients, shape_values
-from finforce_ifea.jaw.meshing import mesh_drawing
 
 TILTED = replace(load_jaw("bench").drawing, ribs=(Rib(inner_z=0.02, outer_z=0.03, thickness=0.001),), clamped_z=0.002)
 HEXES = mesh_drawing(TILTED, "coarse")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finforce_eval.stress.mechanics_programs import KINDS, draw_program, judge_program, run_programs
+from finforce_eval.stress.mechanics import KINDS, draw_program, judge_program, run_programs
 from finforce_eval.stress.stress import Plan
 from finforce_ifea import quadratic_program as program_module
 from finforce_ifea.errors import UnobservableError

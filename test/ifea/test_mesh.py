@@ -10,10 +10,9 @@ from jaw_fakes import shoelace_area
 
 from finforce_ifea.errors import JawFileError, MeshError
 from finforce_ifea.fem.tetrahedra import split_hexes, to_tet4, to_tet10
-from finforce_ifea.jaw.drawing import Rib
+from finforce_ifea.jaw.drawing import PRESETS, MeshDensity, Rib, mesh_drawing
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.jaw.mesh import FACES_HEX, FACES_TET, build_volume_mesh, compute_volume
-from finforce_ifea.jaw.meshing import PRESETS, MeshDensity, mesh_drawing
 
 BENCH = load_jaw("bench").drawing
 CUBE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], dtype=float)

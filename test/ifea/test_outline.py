@@ -9,10 +9,9 @@ from mechanics_fakes import BENCH, bench_mechanics
 from outline_fakes import SHAPES, STDDEV, WEDGE, Pressed, box, circle, contact_with, observe, outline, press_shape
 from test_tracking import settle
 
-from finforce_ifea.contact_mechanics.distance_field import CELL, build_distance_field, read_depth
 from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder, press_jaw
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
-from finforce_ifea.contact_mechanics.penalty import press_field
+from finforce_ifea.contact_mechanics.penalty import CELL, build_distance_field, press_field, read_depth
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import ObjectOutline
 

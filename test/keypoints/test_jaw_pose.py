@@ -4,8 +4,8 @@ from keypoint_scene_fakes import CAMERA, FakeScene
 
 from finforce.camera import project
 from finforce.gripper_frames import jaw_in_camera
+from finforce_keypoints.geometry.depth import rays_through
 from finforce_keypoints.geometry.jaw_pose import Origin, OriginFinder, OriginTrack
-from finforce_keypoints.geometry.side_fit import rays_through
 from finforce_keypoints.settings import DetectorSettings
 
 SETTINGS = DetectorSettings()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from keypoint_scene_fakes import CAMERA, FakeScene
 
-from finforce_keypoints.geometry.side_fit import (
+from finforce_keypoints.geometry.depth import (
     DepthScale,
     SideModel,
     compute_stddev,

@@ -4,7 +4,7 @@ import pytest
 from keypoint_fakes import small_jaws
 
 from finforce_keypoints.errors import NamingError
-from finforce_keypoints.networks.naming import build_name_map, parse_mapping
+from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
 
 JAWS = small_jaws()  # inner_7, tip, reference
 NAMES = ["right_tip", "left_reference", "left_inner_7", "right_inner_7", "left_tip", "right_reference"]

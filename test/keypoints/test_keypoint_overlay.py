@@ -7,8 +7,14 @@ from keypoint_node_fakes import COUNT, JAW, FakeKeypoints
 
 from finforce.health import Level
 from finforce_keypoints.build import FinderCard
-from finforce_keypoints.diagnostics import build_skeleton, describe_names, outcome_of_keypoints
-from finforce_keypoints.overlay import COLORS, LINE, draw_keypoints
+from finforce_keypoints.diagnostics import (
+    COLORS,
+    LINE,
+    build_skeleton,
+    describe_names,
+    draw_keypoints,
+    outcome_of_keypoints,
+)
 
 GREY = np.full((60, 80, 3), 128, dtype=np.uint8)
 

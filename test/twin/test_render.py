@@ -5,8 +5,16 @@ import pytest
 
 from finforce.camera import CameraIntrinsics, project
 from finforce_twin.rendering.bodies import _BOX, _BOX_TRIANGLES
-from finforce_twin.rendering.lighting import Exposure, Light, Lighting, draw_background, draw_look
-from finforce_twin.rendering.paint import PATTERNS, Paint, draw_jaw_paint
+from finforce_twin.rendering.lighting import (
+    PATTERNS,
+    Exposure,
+    Light,
+    Lighting,
+    Paint,
+    draw_background,
+    draw_jaw_paint,
+    draw_look,
+)
 from finforce_twin.rendering.render import FAR, Body, Decal, RenderedScene, Window
 from finforce_twin.rendering.sensor import expose, measure_depth
 

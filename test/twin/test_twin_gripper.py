@@ -12,10 +12,9 @@ from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
 from finforce_twin.errors import BalanceError, ScenarioError
 from finforce_twin.gripper.gripper import TwinGripper
-from finforce_twin.mechanics.material import RelaxedWrench, draw_material, find_elastic_weight
+from finforce_twin.mechanics.assembly import RelaxedWrench, draw_material, find_elastic_weight
 from finforce_twin.scenes.objects import place_object
-from finforce_twin.scenes.scenarios import SCENARIOS, Scenario, build_scenario
-from finforce_twin.scenes.script import GRAVITY, RATE, write_script
+from finforce_twin.scenes.scenarios import GRAVITY, RATE, SCENARIOS, Scenario, build_scenario, write_script
 
 QUICK = {"settle": 0.1, "record": 0.2}
 

@@ -9,10 +9,18 @@ from twin_fakes import CAMERA_POSE, FakeLens
 from finforce.transforms import invert_pose
 from finforce_driver.errors import LinkError
 from finforce_twin.errors import ScenarioError
-from finforce_twin.gripper.coupled import CoupledGripper
-from finforce_twin.gripper.live import LiveScene
+from finforce_twin.gripper.live import (
+    BEFORE_TOUCH,
+    COUNTS,
+    OPEN_STRIDE,
+    TAKES,
+    CoupledGripper,
+    LiveScene,
+    Reel,
+    choose_openings,
+    film_grasp,
+)
 from finforce_twin.gripper.pressing import PressedGrasp, RelaxedGrasp
-from finforce_twin.gripper.reel import BEFORE_TOUCH, COUNTS, OPEN_STRIDE, TAKES, Reel, choose_openings, film_grasp
 from finforce_twin.scenes.scenarios import build_scenario
 
 STROKE = 0.048
@@ -88,7 +96,7 @@ def test_the_same_seed_gives_the_same_images_whatever_the_threads(grasp, monkeyp
     openings = np.linspace(0.0, 0.03, 12)
     reels = []
     for workers in (1, 4):
-        monkeypatch.setattr("finforce_twin.gripper.reel.MOST_WORKERS", workers)
+        monkeypatch.setattr("finforce_twin.gripper.live.MOST_WORKERS", workers)
         reels.append(film_grasp(grasp, FakeLens(), openings, lambda frame: frame.color))
     np.testing.assert_array_equal(reels[0].takes, reels[1].takes)
 

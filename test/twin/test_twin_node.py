@@ -21,8 +21,7 @@ from finforce.ros import node as ros
 from finforce.settings import ParameterError
 from finforce_twin import node as twin_node
 from finforce_twin.errors import ScenarioError
-from finforce_twin.gripper.encoding import encode_depth
-from finforce_twin.gripper.footage import parse_size
+from finforce_twin.gripper.footage import encode_depth, parse_size
 from finforce_twin.gripper.live import LiveScene
 from finforce_twin.gripper.pressing import PressedGrasp
 from finforce_twin.node import TwinCameraNode

@@ -11,8 +11,7 @@ from finforce_ifea.relaxation import apply_relaxation
 from finforce_twin.errors import BalanceError
 from finforce_twin.gripper.gripper import TwinGripper
 from finforce_twin.gripper.pressing import JAMMED, PressedGrasp, RelaxedGrasp
-from finforce_twin.scenes.scenarios import build_scenario
-from finforce_twin.scenes.script import Posture
+from finforce_twin.scenes.scenarios import Posture, build_scenario
 
 SEED = 3
 FACE = load_jaw("bench").inner_face_x
