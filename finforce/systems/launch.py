@@ -1,11 +1,11 @@
-"""Launch descriptions of systems: an argument per option, an action per process or included file."""
+"""What the launch files share: the arguments of every system, and an action per process or included file."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, fields
+from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,66 +15,95 @@ from finforce.systems.processes import SINGLE_THREAD, Include, Process
 OptionsT = TypeVar("OptionsT")
 
 
+NONE = "none"  # on a command line, where an empty text cannot be given
+SWITCH = ("true", "false", "True", "False")
+
+
+def solver_arguments(*, images: str = "false", parameter_file: str = NONE, use_sim_time: str = "false") -> list[Any]:
+    """Return the launch arguments of every system with solvers; the defaults are those of its launch file."""
+    from launch.actions import DeclareLaunchArgument as Argument
+
+    own = "none: the node's own"
+    return [
+        Argument("jaw_file", default_value=NONE, description=f"jaw file, or the name of a shipped jaw; {own}, bench"),
+        Argument("calibration_file", default_value=NONE, description="calibration file, or a shipped name"),
+        Argument(
+            "contact_height",
+            default_value="nan",
+            description="height of first touch above the clamped base [m]; nan: contacts come by topic",
+        ),
+        Argument("object_mesh", default_value=NONE, description="mesh file of the object; contacts are then estimated"),
+        Argument("object_mesh_unit", default_value=NONE, description="unit of the mesh file: m, cm, mm or inch"),
+        Argument("contact", default_value=NONE, description="contact by: estimate, paper (Algorithm 1) or closest"),
+        Argument("pose_source", default_value=NONE, description="object poses: topic, detections or tracker"),
+        Argument(
+            "images",
+            default_value=images,
+            choices=SWITCH,
+            description="find the key points in images of a camera; else they come by topic",
+        ),
+        Argument("finder", default_value=NONE, description="key points by network, frame (DeepLabCut) or dots"),
+        Argument("model", default_value=NONE, description="folder of a network and its pytorch_config.yaml"),
+        Argument(
+            "T_gripper_camera", default_value=NONE, description="camera in the gripper's frame: x y z [m] qx qy qz qw"
+        ),
+        Argument("solver", default_value=NONE, description="mechanics: reduced, solid, frame, linear or paper (Eq. 1)"),
+        Argument("mesh", default_value=NONE, description="mesh density: default, coarse or fine"),
+        Argument("parameter_file", default_value=parameter_file, description="YAML file with parameters of the nodes"),
+        Argument("use_sim_time", default_value=use_sim_time, choices=SWITCH, description="take the time from /clock"),
+        Argument("rviz", default_value="false", choices=SWITCH, description="show the markers in RViz"),
+    ]
+
+
+def gripper_arguments() -> list[Any]:
+    """Return the launch arguments of every system with a gripper."""
+    from launch.actions import DeclareLaunchArgument as Argument
+
+    return [
+        Argument(
+            "gripper_port",
+            default_value=NONE,
+            description="port of the gripper's CAN adapter, or the CAN channel; none: that of the parameter file, "
+            "or, with sim:=true, one in the temporary folder",
+        ),
+        Argument(
+            "gripper_interface",
+            default_value=NONE,
+            description="slcan: a serial CAN adapter; else python-can's name of one, as socketcan",
+        ),
+        Argument(
+            "sim",
+            default_value="false",
+            choices=SWITCH,
+            description="no hardware: an emulated gripper bends the twin's jaws, and the twin films them",
+        ),
+    ]
+
+
 def options_from_texts(record: type[OptionsT], texts: Mapping[str, str]) -> OptionsT:
     """Return an options record from launch arguments, each turned into the type of its default.
 
     Raises:
         ValueError: a text is no such value.
     """
-    values = {entry.name: _value(entry.name, texts[entry.name], entry.default) for entry in fields(record)}
-    return record(**values)
+    return record(**{entry.name: _value(entry.name, texts[entry.name], entry.default) for entry in fields(record)})
 
 
 def _value(name: str, text: str, default: Any) -> Any:
-    """Turn one text into the type of a default."""
+    """Turn one text into the type of a default; "none" is an empty text, and no number."""
     if isinstance(default, bool):
-        if text.lower() not in ("true", "false"):
+        if text not in SWITCH:
             raise ValueError(f"{name}:={text}: expected true or false")
         return text.lower() == "true"
+    if text == NONE and isinstance(default, str | float):
+        return type(default)("" if isinstance(default, str) else "nan")
     try:
         return type(default)(text)
     except ValueError:
         raise ValueError(f"{name}:={text}: expected a {type(default).__name__}") from None
 
 
-def describe_launch(
-    record: type[OptionsT], build: Callable[[OptionsT, Path], Sequence[Process | Include]], share: Path, **defaults: str
-) -> Any:
-    """Return a launch description: one argument per field of the record, one action per process or included file.
-
-    Args:
-        record: the options dataclass.
-        build: options and share folder to processes.
-        share: folder that holds `config`, `urdf` and `rviz`.
-        defaults: of arguments, in place of the record's.
-    """
-    from launch import LaunchDescription
-    from launch.actions import DeclareLaunchArgument, OpaqueFunction
-
-    arguments = [
-        DeclareLaunchArgument(
-            entry.name,
-            default_value=defaults.get(entry.name, _text(entry.default)),
-            description=entry.metadata["description"],
-            choices=entry.metadata.get("choices"),
-        )
-        for entry in fields(record)
-        if entry.default is not MISSING
-    ]
-
-    def start(context: Any) -> list[Any]:
-        options = options_from_texts(record, context.launch_configurations)
-        return [_launch_action(part) for part in build(options, share)]
-
-    return LaunchDescription([*arguments, OpaqueFunction(function=start)])
-
-
-def _text(default: Any) -> str:
-    """Return a default as it is written on a command line."""
-    return str(default).lower() if isinstance(default, bool) else str(default)
-
-
-def _launch_action(part: Process | Include) -> Any:
+def launch_action(part: Process | Include) -> Any:
     """Return the action that starts a process or includes a file, a line where an optional one cannot be started.
 
     Raises:

@@ -168,7 +168,7 @@ def camera_includes(options: RobotOptions, share: Path) -> list[Include]:
     if options.sim or not options.camera:
         return []
     if not options.camera_name:
-        raise ValueError("camera_name:= is empty: camera:=true needs a name, as wrist_camera")
+        raise ValueError("camera_name:=none: camera:=true needs a name, as wrist_camera")
     serial = {"serial_no": f"'{options.camera_serial}'"} if options.camera_serial else {}  # quoted: digits are no text
     arguments = {
         "camera_namespace": "camera",

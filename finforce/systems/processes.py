@@ -1,7 +1,4 @@
-"""The processes of a system, their parameters and remappings, described once.
-
-What can be asked of a system when it is launched, one record per system.
-"""
+"""The processes of a system, their parameters and remappings, described once, and what can be asked of a system."""
 
 from __future__ import annotations
 
@@ -12,8 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-from finforce.settings import setting
 
 # small matrices: more threads per process cost time and make it vary
 SINGLE_THREAD = {
@@ -216,76 +211,67 @@ def viewer(options: SolverOptions, share: Path, config: str = "finforce.rviz") -
 
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions:
-    """What every graph with solvers is asked for; NaN and empty texts leave the node's own default."""
+    """What every system with solvers is asked for; NaN and empty texts leave the node's own default.
 
-    jaw_file: str = setting("", "jaw file, or the name of a shipped jaw")
-    calibration_file: str = setting("", "calibration file, or a shipped name")
-    contact_height: float = setting(
-        math.nan,
-        "height of first touch above the clamped base [m]; nan: contacts come by topic, as with an object mesh",
-    )
-    object_mesh: str = setting("", "mesh file of the object, whose contacts are then estimated; empty: none is known")
-    object_mesh_unit: str = setting("", "unit of the mesh file: m, cm, mm or inch")
-    contact: str = setting("", "how the contact is estimated: estimate, paper or closest")
-    pose_source: str = setting("", "object poses: topic, detections or tracker")
-    images: bool = setting(False, "find the key points in images of a camera; else they come by topic")
-    finder: str = setting("", "what finds key points in images: network, frame (any DeepLabCut network) or dots")
-    model: str = setting("", "folder of a network and its pytorch_config.yaml; empty: the shipped network")
-    T_gripper_camera: str = setting("", "camera in the gripper's frame: x y z [m] qx qy qz qw")
-    solver: str = setting("", "mechanics: default (reduced), reduced, solid, frame, linear or paper")
-    mesh: str = setting("", "mesh density: default, coarse or fine")
-    parameter_file: str = setting("", "YAML file with ROS parameters of the nodes")
-    use_sim_time: bool = setting(False, "take the time from /clock")
-    rviz: bool = setting(False, "show the markers in RViz")
+    The launch files and `finforce.systems.launch` say what each option means.
+    """
+
+    jaw_file: str = ""
+    calibration_file: str = ""
+    contact_height: float = math.nan
+    object_mesh: str = ""
+    object_mesh_unit: str = ""
+    contact: str = ""
+    pose_source: str = ""
+    images: bool = False
+    finder: str = ""
+    model: str = ""
+    T_gripper_camera: str = ""
+    solver: str = ""
+    mesh: str = ""
+    parameter_file: str = ""
+    use_sim_time: bool = False
+    rviz: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayOptions(SolverOptions):
     """The jaws of a recording."""
 
-    jaws: str = setting("left", "the jaws of the recording", choices=("left", "right", "both"))
-    bag: str = setting("", "recording to be played; empty: somebody else plays it, with /clock")
-    rate: float = setting(1.0, "speed of playing")
-    use_sim_time: bool = setting(True, "take the time from /clock")
+    jaws: str = "left"
+    bag: str = ""
+    rate: float = 1.0
+    use_sim_time: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
 class GripperOptions(SolverOptions):
-    """What a setup with the gripper is asked for beside the forces."""
+    """What a system with the gripper is asked for beside the forces."""
 
-    gripper_port: str = setting(
-        "",
-        "serial port of the gripper's CAN adapter, or the CAN channel; with sim: where the emulated gripper's port is "
-        "made; empty: that of the parameter file, with sim one in the temporary folder",
-    )
-    gripper_interface: str = setting("", "slcan: a serial CAN adapter; else python-can's name of one, as socketcan")
-    sim: bool = setting(False, "no hardware: an emulated gripper bends the twin's jaws, and the twin films them")
+    gripper_port: str = ""
+    gripper_interface: str = ""
+    sim: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions(GripperOptions):
     """One jaw, live; the gripper, if there is one, brings the object to it."""
 
-    jaw: str = setting("left", "the jaw that is on the bench", choices=("left", "right"))
+    jaw: str = "left"
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotOptions(GripperOptions):
     """Both jaws on a robot's wrist, with the camera beside them."""
 
-    images: bool = setting(True, "find the key points in images of a camera; else they come by topic")
-    gripper: bool = setting(True, "drive the gripper")
-    camera: bool = setting(True, "start the wrist camera, a RealSense D405, by realsense2_camera; not with sim")
-    camera_name: str = setting(
-        "wrist_camera",
-        "name of the camera: topics /camera/NAME/..., frames NAME_...; empty: topics and frame of the parameter file",
-    )
-    camera_config: str = setting("", "YAML file with parameters of realsense2_camera; empty: the shipped d405.yaml")
-    camera_serial: str = setting("", "serial number of the camera; empty: the only one")
-    arm: bool = setting(False, "start the arm, a Kinova Gen3, by kortex_bringup; with sim one that is not there")
-    arm_description: str = setting(
-        "", "xacro file of arm and gripper; empty: the shipped one, with the gripper on the flange of a Gen3"
-    )
-    robot_ip: str = setting("192.168.1.10", "address of the arm")
-    dof: int = setting(7, "joints of the arm", choices=("6", "7"))
-    use_fake_hardware: bool = setting(False, "an arm that is not there: it mirrors its commands")
+    images: bool = True
+    gripper: bool = True
+    camera: bool = True
+    camera_name: str = "wrist_camera"
+    camera_config: str = ""
+    camera_serial: str = ""
+    arm: bool = False
+    arm_description: str = ""
+    robot_ip: str = "192.168.1.10"
+    dof: int = 7
+    use_fake_hardware: bool = False

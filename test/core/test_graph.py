@@ -188,11 +188,6 @@ def test_a_launch_argument_that_means_nothing_is_named(name, text):
         options_from_texts(ReplayOptions, texts)
 
 
-def test_every_launch_argument_has_a_description():
-    for record in (BenchOptions, ReplayOptions, RobotOptions):
-        assert all(entry.metadata["description"] for entry in fields(record))
-
-
 def defaults_of(record, prefix=""):
     return {prefix + entry.name: entry.default for entry in fields(record)}
 

@@ -2,6 +2,7 @@
 
 import runpy
 import sys
+from dataclasses import fields
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -9,6 +10,7 @@ import pytest
 
 from finforce.errors import MissingDependencyError
 from finforce.systems import launch as launch_module
+from finforce.systems.processes import BenchOptions, ReplayOptions, RobotOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted((ROOT / "launch").glob("*.launch.py"))
@@ -100,6 +102,30 @@ def test_the_end_of_the_player_ends_the_launch(recorded_launch):
     assert set(nodes) == {"left_ifea_solver", "right_ifea_solver", "recording_player"}
     assert nodes["recording_player"]["on_exit"] is not None
     assert nodes["left_ifea_solver"]["on_exit"] is None
+
+
+RECORDS = {"bench": BenchOptions, "replay": ReplayOptions, "robot": RobotOptions}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_the_declared_arguments_are_the_options_with_their_defaults(recorded_launch, path):
+    *arguments, _ = runpy.run_path(str(path))["generate_launch_description"]()
+    record = RECORDS[path.name.split(".")[0]]
+    texts = {action.args[0]: action.kwargs["default_value"] for action in arguments}
+    assert set(texts) == {entry.name for entry in fields(record)} and len(texts) == len(arguments)
+    options = launch_module.options_from_texts(record, texts)
+    expected = record(parameter_file=options.parameter_file)
+    assert repr(options) == repr(expected)  # nan is not nan
+    assert "" not in texts.values()  # nobody can type it
+
+
+def test_none_is_an_empty_value(recorded_launch):
+    detector = start(ROBOT, camera="false", camera_name="none", finder="none")["keypoint_detector"]
+    assert not {"camera_frame", "finder"} & set(detector["parameters"][1])
+    with pytest.raises(ValueError, match="camera_name:=none: camera:=true needs a name"):
+        act(ROBOT, camera_name="none")
+    with pytest.raises(ValueError, match="dof:=none: expected a int"):
+        act(ROBOT, dof="none")
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
