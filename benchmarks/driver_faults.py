@@ -7,10 +7,6 @@ firmware variants and with adapters of different latencies, while a user moves, 
 random and objects come and go. Every state that the driver reports is compared with the truth (`Oracle`),
 every order that leaves with what was asked for. At the end of a run the faults cease, and the gripper has to get back
 to work.
-
-Compares what a driver says of an emulated gripper with the truth, state by state.
-
-What came out of runs with faults, added up, printed, and as JSON.
 """
 
 from __future__ import annotations

@@ -7,10 +7,6 @@ Overshoot is the largest true force less the set force, over the whole grasp wit
 difference over its last 5 s, and sensor that of the measured force to the true one; time to hold is from the first true
 0.02 N. Forces come at 30 Hz, 2 % of them never, with
 noise of 0.05 N and a jitter of 8 ms; with --estimator also from the solver on the twin's key points.
-
-The twin's fingers as a plant, and the real estimator on their key points as a sensor, for the grasp benchmark.
-
-Force over time of grasps by force, with the bound that the controller showed; reads the benchmark's figures.
 """
 
 from __future__ import annotations

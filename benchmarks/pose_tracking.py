@@ -4,8 +4,6 @@
 
 Depths are those of a D405 in noise, edges, holes and rounding; the tracker gets no mask after the first image, the two
 libraries that it is compared with get the true one. Times are those of one thread's processor.
-
-Ways to follow an object that the tracker is compared with, and what a pose is off.
 """
 
 import argparse

@@ -1,7 +1,4 @@
-"""Errors of objects, poses, images and reconstructions; no contact is a result and none of these.
-
-Numbers that are none, refused before anything is computed with them.
-"""
+"""Errors of objects, poses, images and reconstructions, and the check that numbers are finite."""
 
 from math import isfinite
 

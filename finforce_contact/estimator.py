@@ -1,7 +1,4 @@
-"""What a contact estimator says about one image.
-
-Object poses and the deformed jaw in, contact rows out, image after image.
-"""
+"""Where an object touches a jaw, image after image: poses and the deformed jaw in, a contact patch out."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -23,7 +20,7 @@ from finforce_contact.localization.outline_localizer import (
     Place,
 )
 from finforce_contact.localization.section import Section, SectionKeeper, count_inside
-from finforce_contact.localization.touch import SURELY_BENT, RestWatch, TouchBelief, describe_conflict
+from finforce_contact.localization.touch import SURELY_BENT, StillnessWatch, TouchBelief, describe_conflict
 from finforce_contact.mesh.object_mesh import surrounds
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.paper_contact import IntersectionLocalizer
@@ -109,7 +106,7 @@ _REASONS = ("solved", "apart", "still", "no_object", "no_pose", "surrounded", "b
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _RowPoints:
-    """Rows as points (n, 3) [m] with candidates (n,) and weights (n,)."""
+    """The contact patch as points (n, 3) [m] with candidates (n,) and weights (n,)."""
 
     points: NDArray
     candidates: NDArray
@@ -138,7 +135,7 @@ class ContactEstimator:
         self._rest_line = self.face.deform(self.face.mesh.nodes)
         self._samples = np.unique(np.linspace(0, len(self.face.mesh.nodes) - 1, _JAW_SAMPLES).astype(int))
         self._poses, self._belief = PoseFilter(self.settings), TouchBelief(self.settings)
-        self._rest, self.skips = RestWatch(self.settings), Skips(CONTACT)
+        self._rest, self.skips = StillnessWatch(self.settings), Skips(CONTACT)
         self._counts: Counter[str] = Counter(dict.fromkeys(_REASONS, 0))
         self.set_object(mesh)
 
@@ -148,9 +145,9 @@ class ContactEstimator:
         return self._counts
 
     @property
-    def resting(self) -> bool:
+    def still(self) -> bool:
         """Whether the grasp holds still, so that no new pose is needed."""
-        return self._rest.resting
+        return self._rest.still
 
     def set_object(self, mesh: ObjectMesh | None) -> None:
         """Takes another object, or none; its pose is not known yet.
@@ -209,9 +206,9 @@ class ContactEstimator:
         watched = camera is not None and self._mesh is not None
         if watched and surrounds(self._mesh, (invert_pose(T) @ np.append(camera, 1.0))[:3]):
             raise PoseError("this pose puts the object around the camera: check its pose, mesh and unit")
-        verdict = self._poses.update(stamp, T, covariance)
-        self._counts["late pose"] += verdict == "late"
-        self._counts["odd pose"] += verdict == "aside"
+        outcome = self._poses.update(stamp, T, covariance)
+        self._counts["late pose"] += outcome == "late"
+        self._counts["odd pose"] += outcome == "aside"
 
     def update(
         self, stamp: float, surface: NDArray | None = None, wrench: tuple[NDArray, NDArray] | None = None
@@ -236,13 +233,13 @@ class ContactEstimator:
         if self._poses.stamp is None:
             return self._give_up(stamp, "no_pose", f"no pose of {self._mesh.name} has come yet")
         age = min(stamp - self._poses.believed, stamp - self._rest.ended)
-        if not self._rest.resting and age > self.settings.pose_timeout:
+        if not self._rest.still and age > self.settings.pose_timeout:
             message = f"the last pose of {self._mesh.name} is {age:.1f} s old, expected one every second"
             return self._give_up(stamp, "no_pose", message)
         if age < -self.settings.pose_timeout:
             message = f"the last pose of {self._mesh.name} lies {-age:.1f} s ahead; reset after time has jumped back"
             return self._give_up(stamp, "no_pose", message)
-        pose = self._poses.at(self._poses.stamp if self._rest.resting else stamp)
+        pose = self._poses.at(self._poses.stamp if self._rest.still else stamp)
         section = self._sections.at(pose.T)
         scene = ContactScene(T=pose.T, section=section, surface=surface, line=self.face.deform(surface), wrench=wrench)
         return self._follow(stamp, pose, scene)
@@ -357,8 +354,8 @@ class ContactEstimator:
 
 def _points_of(place: Place, jaw: Jaw) -> "_RowPoints":
     """Returns the rows of a place as points on the undeformed inner surface."""
-    heights = place.rows.heights
+    heights = place.patch.heights
     points = np.zeros((len(heights), 3))
     points[:, 0], points[:, 2] = jaw.inner_face_x, heights
     candidates = np.abs(jaw.candidates[:, 2] - heights[:, None]).argmin(axis=1)
-    return _RowPoints(points=points, candidates=candidates, weights=place.rows.weights)
+    return _RowPoints(points=points, candidates=candidates, weights=place.patch.weights)

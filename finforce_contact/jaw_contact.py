@@ -1,7 +1,4 @@
-"""The contact of one jaw in the loop with its solver: the same offline, in nodes and from a Python prompt.
-
-Poses of jaw and object that belong to one image, whichever comes first.
-"""
+"""The contact of one jaw in the loop with its solver: the same offline, in nodes and from a Python prompt."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.observation import Observation, Solution
-from finforce_ifea.tracking.rest_response import is_away
+from finforce_ifea.tracking.influence import is_out_of_reach
 
 AWAY_FOR = 10  # images in a row, after which the object is taken to stay away: a second, of the ten that are looked at
 ValueT = TypeVar("ValueT")
@@ -70,14 +67,14 @@ class ContactLoop:
         self._start()
 
     @property
-    def is_away(self) -> bool:
+    def is_out_of_reach(self) -> bool:
         """Whether the object stood out of the jaw's reach in the last image."""
         return self._away > 0
 
     @property
     def is_idle(self) -> bool:
         """Whether nothing happens: the object is out of reach, or held still."""
-        return self.is_away or self.estimator.resting
+        return self.is_out_of_reach or self.estimator.still
 
     def take_pose(
         self, stamp: int, T_jaw_object: NDArray, covariance: NDArray | None = None, camera: NDArray | None = None
@@ -116,7 +113,7 @@ class ContactLoop:
         surface, wrench = self._fresh(self._surface, stamp), self._fresh(self._wrench, stamp)
         self.last = TimedEstimate(stamp, self.estimator.update(SECOND * stamp, surface, wrench))
         contact = self.last.estimate.contact
-        away = contact is not None and is_away(contact, self.estimator.jaw.inner_face_x)
+        away = contact is not None and is_out_of_reach(contact, self.estimator.jaw.inner_face_x)
         self._away = self._away + 1 if away else 0
         return self.last
 

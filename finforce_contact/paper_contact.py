@@ -1,4 +1,4 @@
-"""The contact place by the paper's Algorithm 1: the intersection of deformed jaw and object."""
+"""The contact place by the paper's Algorithm 1 and Eq. 2: the intersection of deformed jaw and object."""
 
 from itertools import product
 from typing import TYPE_CHECKING
@@ -10,7 +10,7 @@ from finforce.optional import import_manifold3d
 from finforce.transforms import invert_pose
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.localization.inner_face import InnerFace
-from finforce_contact.localization.outline_localizer import ContactScene, Place, Rows
+from finforce_contact.localization.outline_localizer import ContactPatch, ContactScene, Place
 from finforce_contact.mesh.triangles import ObjectMesh, solid_from_triangles, to_manifold, triangles_of_solid
 from finforce_contact.settings import ContactSettings
 from finforce_ifea.jaw.jaw import Jaw
@@ -45,7 +45,7 @@ class IntersectionLocalizer:
     def reset(self) -> None:
         """Starts anew, apart."""
         self._status = False
-        self._last: Rows | None = None
+        self._last: ContactPatch | None = None
 
     def locate(self, scene: ContactScene) -> Place | None:
         """Returns the place, None before any was found."""
@@ -60,7 +60,7 @@ class IntersectionLocalizer:
             return None
         height = float(self._last.heights[0])
         bend = float(np.interp(height, self._face.heights, self._face.x - scene.line[:, 0]))
-        return Place(rows=self._last, gap=float("nan"), bend=bend, touching=bool(self._status and shift >= 0.0))
+        return Place(patch=self._last, gap=float("nan"), bend=bend, touching=bool(self._status and shift >= 0.0))
 
     def _slight_contact(self, T: NDArray) -> float:
         """Returns t_x = l_0 + l_bd / 2 [m] (Eq. 2), corrected for objects whose origin is not in their middle."""
@@ -68,12 +68,12 @@ class IntersectionLocalizer:
         low, high = turned.min(), turned.max()
         return float(self._face.x - self._offset + 0.5 * (high - low) - 0.5 * (high + low))
 
-    def _candidate_of(self, centre: NDArray, surface: NDArray) -> Rows:
+    def _candidate_of(self, centre: NDArray, surface: NDArray) -> ContactPatch:
         """Returns the candidate of an intersection's centre (3,) [m]."""
         nearest = int(((surface - centre) ** 2).sum(axis=1).argmin())
         projected = self._mesh.nodes[nearest, 1:]
         chosen = int(((self._candidates - projected) ** 2).sum(axis=1).argmin())
-        return Rows(heights=self._candidates[chosen, 1:], weights=np.ones(1))
+        return ContactPatch(heights=self._candidates[chosen, 1:], weights=np.ones(1))
 
 
 class NearSolid:

@@ -201,7 +201,7 @@ class ContactSession:
 
     def take_depth(self, image: Any) -> StampedPose | None:
         """Return the object's pose in a depth image, None while every grasp rests; see `DepthFeed`."""
-        rests = self._skips.allows(RESTING) and all(jaw.estimator.resting for jaw in self.jaws.values())
+        rests = self._skips.allows(RESTING) and all(jaw.estimator.still for jaw in self.jaws.values())
         if rests:
             self._skips.count(RESTING)
         with self._camera_lock:

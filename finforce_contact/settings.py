@@ -1,7 +1,4 @@
-"""What can be set on a contact estimator: defaults, units, bounds and meanings.
-
-What can be set on the tracker of object poses: defaults, units, bounds and meanings.
-"""
+"""What can be set on a contact estimator and on the tracker of object poses: defaults, units, bounds and meanings."""
 
 from dataclasses import dataclass
 

@@ -1,7 +1,4 @@
-"""The time that a driver lives by: the machine's own, or one that a test steps.
-
-Stamps of messages on the gripper's clock, and its times as stamps.
-"""
+"""The time that a driver lives by, the machine's own or one that a test steps, and stamps of messages on it."""
 
 from __future__ import annotations
 

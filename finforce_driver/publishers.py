@@ -1,7 +1,4 @@
-"""The topics that a gripper driver writes: what stands in each of them, and when it is sent.
-
-How a gripper and its grasp are doing, in words for the diagnostics.
-"""
+"""The topics that a gripper driver writes, and how gripper and grasp are doing, in words for the diagnostics."""
 
 from __future__ import annotations
 

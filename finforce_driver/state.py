@@ -1,7 +1,4 @@
-"""What is known of a gripper at one instant, in SI units.
-
-One sentence on how the gripper is, with what would help.
-"""
+"""What is known of a gripper at one instant, in SI units, and in one sentence."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Key points and a contact in, force out, one image after the other: the entry for nodes and for evaluation.
-
-Images of an unloaded jaw that an estimator takes before the first true one, so that all is compiled by then.
-
-Which key points of a frame may be used.
-"""
+"""Key points and a contact in, force out, one image after the other: the entry for nodes and for evaluation."""
 
 from __future__ import annotations
 
@@ -32,9 +27,9 @@ from finforce_ifea.observation import (
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import TareKeeper, TareReport
+from finforce_ifea.tracking.influence import ReachWatch
 from finforce_ifea.tracking.place_tracker import PlaceTracker
 from finforce_ifea.tracking.point_tracker import PointTracker
-from finforce_ifea.tracking.rest_response import AwayWatch
 from finforce_ifea.tracking.track import Track, find_doubt, find_numbers
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
@@ -83,7 +78,7 @@ class JawEstimator:
         self._taring = TareKeeper(
             self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
         )
-        self._away = AwayWatch(self.jaw.keypoints, self.jaw.inner_face_x, self._rolling.rest_modes)
+        self._away = ReachWatch(self.jaw.keypoints, self.jaw.inner_face_x, self._rolling.rest_modes)
         self.spares, self.spared = True, False
         self.reset()
 
@@ -102,7 +97,7 @@ class JawEstimator:
 
     def warm_up(self) -> None:
         """Compiles what is compiled on first use, and leaves no trace."""
-        rehearse(self.jaw, self.settings.tare_frames, self.update, self.reset)
+        warm_up(self.jaw, self.settings.tare_frames, self.update, self.reset)
 
     @property
     def tared(self) -> bool:
@@ -295,7 +290,7 @@ _EACH = 3
 Update = Callable[[Observation, Contact], object]
 
 
-def rehearse(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None]) -> None:
+def warm_up(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None]) -> None:
     """Gives an estimator images with each kind of contact, with stated standard deviations and without.
 
     Args:
@@ -308,8 +303,8 @@ def rehearse(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], Non
     for stddev in (None, np.full(jaw.keypoints.shape, _STDDEV)):
         reset()
         contacts = list(_imagine_contacts(jaw))
-        course = [contacts[0]] * tare_frames + [contact for contact in contacts for _ in range(_EACH)]
-        for count, contact in enumerate(course):
+        sequence = [contacts[0]] * tare_frames + [contact for contact in contacts for _ in range(_EACH)]
+        for count, contact in enumerate(sequence):
             update(_imagine_image(jaw, count / 30.0, stddev, random), contact)
     reset()
 

@@ -1,4 +1,4 @@
-"""Two jaws as one gripper: grasp and manipulation force from the forces on the jaws."""
+"""Two jaws as one gripper: grasp and manipulation force from the forces on the jaws (Zuo, Yang and Chua, Eq. 3)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Messages into observations, contacts and forces.
-
-An object's outline to and from the columns of a point cloud, one row per corner.
-"""
+"""Messages into observations, contacts and forces; outlines to and from the columns of a point cloud."""
 
 from __future__ import annotations
 

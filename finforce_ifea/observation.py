@@ -1,7 +1,4 @@
-"""What goes into an estimator and what comes out.
-
-The outline of a rigid object in the plane of the finger, and where it is now.
-"""
+"""What goes into an estimator and what comes out: key points, the contact or the object's outline, the solution."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The inverse problem with a given contact: which forces at given places bring the key points to their targets.
+"""The inverse problem (Eq. 1): which forces at given places bring the key points to their targets.
 
 Each Newton iteration linearises the geometrically nonlinear equilibrium f_int(q) = G lambda about the current state and
 solves the quadratic program of Zuo, Yang and Chua (RA-L 2026), Eq. 1, for the forces lambda >= 0:

@@ -1,7 +1,4 @@
-"""The parameters of a solver node, and the estimator that they ask for.
-
-The contact that belongs to an image: a fixed one, or the newest that came by message.
-"""
+"""The parameters of a solver node, the estimator that they ask for, and the contact that belongs to an image."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""The topics that a solver writes: what stands in each of them, and when it is sent.
-
-The jaw as it is seen in RViz and Foxglove: surface, key points, contact and force.
-
-What a solution says about itself, in words for the diagnostics.
-"""
+"""The topics that a solver writes: wrenches, the jaw as RViz and Foxglove show it, words for the diagnostics."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""How noisy each key point of an image is: the tare's scatter, scaled by what the detector states.
-
-What the unloaded finger tells of its key points: constant offsets and noise.
-
-When offsets of key points are learnt, and from which frames.
-"""
+"""What the unloaded finger tells of its key points, constant offsets and noise, and when it is learnt."""
 
 from collections import deque
 from collections.abc import Callable, Sequence

@@ -1,7 +1,4 @@
-"""What a key point detector says about itself, in words for the diagnostics.
-
-Key points drawn into a picture, with NumPy alone.
-"""
+"""What a key point detector says about itself: words for the diagnostics, key points drawn into a picture."""
 
 from __future__ import annotations
 

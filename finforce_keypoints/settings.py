@@ -1,7 +1,4 @@
-"""What can be set on a key point detector: defaults, units, bounds and meanings.
-
-The work that a key point detector leaves out, by the names of its rules.
-"""
+"""What can be set on a key point detector, and the work that it leaves out by the names of its rules."""
 
 from dataclasses import dataclass
 

@@ -22,10 +22,10 @@ from finforce_twin.gripper.footage import (
     Footage,
     TwinFrame,
     build_footage,
+    detection_truth_columns,
     encode_depth,
     info_fields,
     parse_size,
-    sight_columns,
 )
 from finforce_twin.gripper.live import CoupledGripper, LiveScene, build_live_scene
 from finforce_twin.parameters import TwinParameters
@@ -71,24 +71,24 @@ class TwinCameraNode(Node):
         )
         if parameters.gripper_link:
             self.gripper = CoupledGripper(self.scene.grasp, parameters.gripper_link, parameters.gripper_firmware)
-        self.reel: list[list[Output]] = []
+        self.images: list[list[Output]] = []
         self.is_over = False
         self._next, self._phase, self._told = 0, "", monotonic()
         self._outputs: dict[str, Any] = {}
         self._flicker = Flicker(parameters.seed)
 
-    def film(self) -> None:
+    def render(self) -> None:
         """Render all images into messages, and begin to play them."""
         name = self.parameters.scene
         if self.gripper is not None:
-            self.scene.film(lambda frame: list(self._seen(frame)), self._tell)
+            self.scene.render(lambda frame: list(self._seen(frame)), self._tell)
             self.gripper.open()
             self.get_logger().info(f"{name}: playing as the gripper at {self.gripper.path} moves")
         else:
             for frame in self.scene:
-                self._tell(len(self.reel) + 1, len(self.scene))
-                self.reel.append([*self._scripted(frame), *self._seen(frame)])
-            self.get_logger().info(f"{name}: {len(self.reel)} images, {len(self.reel) / RATE:.1f} s, playing")
+                self._tell(len(self.images) + 1, len(self.scene))
+                self.images.append([*self._scripted(frame), *self._seen(frame)])
+            self.get_logger().info(f"{name}: {len(self.images)} images, {len(self.images) / RATE:.1f} s, playing")
         self.create_timer(1.0 / RATE, self.publish_next)
 
     def publish_next(self) -> None:
@@ -108,12 +108,12 @@ class TwinCameraNode(Node):
 
     def _follow_script(self) -> Iterable[Output]:
         """Return the next image of the script, nothing after the last one."""
-        if self._next == len(self.reel):
+        if self._next == len(self.images):
             self._next, self.is_over = 0, not self.parameters.loop
             if self.is_over:
                 return ()
         self._next += 1
-        return self.reel[self._next - 1]
+        return self.images[self._next - 1]
 
     def _follow_gripper(self) -> Iterable[Output]:
         """Return the image of the gripper as it is now."""
@@ -150,7 +150,7 @@ class TwinCameraNode(Node):
     def _seen(self, frame: TwinFrame) -> Iterable[Output]:
         """Yield publishers and messages of an image, after the key points in it."""
         for side, jaw in frame.jaws.items():
-            cloud = ros.cloud_message(Header(frame_id=f"{side}_jaw"), sight_columns(jaw))
+            cloud = ros.cloud_message(Header(frame_id=f"{side}_jaw"), detection_truth_columns(jaw))
             yield self._output(PointCloud2, f"{side}/ground_truth_keypoints"), cloud
         header, depth = Header(frame_id=self.parameters.camera_frame), encode_depth(frame.depth, self.scene.depth_step)
         yield self._output(CameraInfo, INFO_TOPIC), camera_info(header, self.scene.camera)
@@ -174,7 +174,7 @@ def camera_info(header: Header, camera: CameraIntrinsics) -> CameraInfo:
 
 def play_scene(node: TwinCameraNode, executor: Executor) -> None:
     """Render the scene and play it."""
-    node.film()
+    node.render()
     executor.add_node(node)
     while not node.is_over:
         executor.spin_once()

@@ -1,4 +1,7 @@
-"""An executor of rclpy that keeps its wait set while nothing comes or goes."""
+"""An executor of rclpy that keeps its wait set while nothing comes or goes.
+
+It saves the nodes of a robot 5 % of a core in a grasp and 2 % while idle, of some 20 % (docs/skipping.md).
+"""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def gripper_arguments() -> list[Any]:
             "sim",
             default_value="false",
             choices=SWITCH,
-            description="no hardware: an emulated gripper bends the twin's jaws, and the twin films them",
+            description="no hardware: an emulated gripper bends the twin's jaws, and the twin is their camera",
         ),
     ]
 

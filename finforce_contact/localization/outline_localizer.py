@@ -1,9 +1,4 @@
-"""The contact place of this package: where the object's outline overlaps the deformed inner face.
-
-Overlap of jaw and object along the finger into a few weighted contact rows.
-
-The contact place as the nearest point of the undeformed jaw, the way before the paper.
-"""
+"""The contact patch: where the object's outline overlaps the deformed inner face, as a few weighted rows."""
 
 from __future__ import annotations
 
@@ -26,8 +21,8 @@ _STEEPEST = 40.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Rows:
-    """Contact rows.
+class ContactPatch:
+    """A contact patch as rows across the finger.
 
     Attributes:
         heights: (n,) [m] on the undeformed inner surface, rising.
@@ -51,7 +46,7 @@ def overlap_of(gaps: NDArray, depth: float) -> NDArray:
     return np.maximum(0.0, depth + gaps.min() - gaps)
 
 
-def rows_from_overlap(heights: NDArray, overlap: NDArray, spacing: float, narrow: float) -> Rows:
+def patch_from_overlap(heights: NDArray, overlap: NDArray, spacing: float, narrow: float) -> ContactPatch:
     """Returns rows no farther apart than `spacing` [m], weighted by the overlap that each stands for.
 
     A contact whose overlap has the spread of an even one no higher than `narrow` [m], 12^0.5 standard deviations,
@@ -64,14 +59,14 @@ def rows_from_overlap(heights: NDArray, overlap: NDArray, spacing: float, narrow
         narrow: [m].
     """
     places, weights = _gather(heights, overlap, spacing, narrow)
-    return Rows(heights=places, weights=weights / weights.sum())
+    return ContactPatch(heights=places, weights=weights / weights.sum())
 
 
-def tilt_rows(rows: Rows, mean: float) -> Rows:
+def tilt_patch(patch: ContactPatch, mean: float) -> ContactPatch:
     """Returns the rows with weights w_i exp(s z_i) whose mean is `mean` [m], or one row there when none has it."""
-    if not rows.heights[0] < mean < rows.heights[-1]:
-        return Rows(heights=np.array([mean]), weights=np.ones(1))
-    return Rows(heights=rows.heights, weights=_tilt(rows.heights, rows.weights, mean))
+    if not patch.heights[0] < mean < patch.heights[-1]:
+        return ContactPatch(heights=np.array([mean]), weights=np.ones(1))
+    return ContactPatch(heights=patch.heights, weights=_tilt(patch.heights, patch.weights, mean))
 
 
 def cross_line_of_action(line: NDArray, heights: NDArray, force: NDArray, torque: NDArray, near: float) -> float:
@@ -162,9 +157,9 @@ class ClosestLocalizer:
         nearest = gaps if gaps.min() < 0.0 else distances_to(self._line, scene.section.edges)
         height = self._face.heights[nearest.argmin()]
         height = self._candidates[np.abs(self._candidates - height).argmin()]
-        rows = Rows(heights=np.array([height]), weights=np.ones(1))
+        patch = ContactPatch(heights=np.array([height]), weights=np.ones(1))
         bend = float(np.interp(height, self._face.heights, self._face.x - scene.line[:, 0]))
-        return Place(rows=rows, gap=float(gaps.min()) + bend, bend=bend)
+        return Place(patch=patch, gap=float(gaps.min()) + bend, bend=bend)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -191,13 +186,13 @@ class Place:
     """Where the object touches, or would touch first.
 
     Attributes:
-        rows: heights and weights on the undeformed inner surface.
+        patch: heights and weights on the undeformed inner surface.
         gap: from the surface to the object along x [m], negative when they overlap.
         bend: how far the surface has given way where the object is nearest [m].
         touching: what the localizer says itself; None when gap and bend are to decide.
     """
 
-    rows: Rows
+    patch: ContactPatch
     gap: float
     bend: float
     touching: bool | None = None
@@ -235,13 +230,13 @@ class OutlineLocalizer:
             return None
         heights, settings = self._face.heights, self._settings
         overlap = overlap_of(gaps, settings.overlap)
-        rows = rows_from_overlap(heights, overlap, settings.row_spacing, settings.narrow)
+        patch = patch_from_overlap(heights, overlap, settings.row_spacing, settings.narrow)
         if scene.wrench is not None:
-            rows = self._follow_wrench(rows, gaps - gaps[nearest] - settings.overlap, scene)
-        bend = float(np.interp(rows.mean, heights, self._face.x - scene.line[:, 0]))
-        return Place(rows=rows, gap=float(gaps[nearest]), bend=bend)
+            patch = self._follow_wrench(patch, gaps - gaps[nearest] - settings.overlap, scene)
+        bend = float(np.interp(patch.mean, heights, self._face.x - scene.line[:, 0]))
+        return Place(patch=patch, gap=float(gaps[nearest]), bend=bend)
 
-    def _follow_wrench(self, rows: Rows, gaps: NDArray, scene: ContactScene) -> Rows:
+    def _follow_wrench(self, patch: ContactPatch, gaps: NDArray, scene: ContactScene) -> ContactPatch:
         """Returns the rows with their mean moved towards the pressure centre, if that agrees with the gaps left (h,).
 
         A pose that is a little off along z closes the gap at one end of a wrapped surface and opens it at the other.
@@ -249,11 +244,11 @@ class OutlineLocalizer:
         force, torque = scene.wrench
         settings, heights = self._settings, self._face.heights
         if np.hypot(force[0], force[2]) < settings.wrench_force:
-            return rows
-        centre = cross_line_of_action(scene.line, heights, force, torque, rows.mean)
+            return patch
+        centre = cross_line_of_action(scene.line, heights, force, torque, patch.mean)
         touched = heights[gaps < 0.0]
         near = touched[0] - settings.wrench_reach <= centre <= touched[-1] + settings.wrench_reach
         if not (near or np.interp(centre, heights, gaps) < settings.wrench_slack):
-            return rows
-        mean = rows.mean + settings.wrench_gain * (centre - rows.mean)
-        return tilt_rows(rows, mean)
+            return patch
+        mean = patch.mean + settings.wrench_gain * (centre - patch.mean)
+        return tilt_patch(patch, mean)

@@ -1,9 +1,4 @@
-"""Outlines of an object in a jaw's plane, between the jaw's sides.
-
-The outline of an object in the finger's plane, cut when its pose needs it.
-
-Distances between a line along a jaw and the outline of an object, both in the x-z plane.
-"""
+"""The outline of an object in the jaw's plane, and its distances from a line along the jaw."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,4 @@
-"""Whether the object touches, from its pose and from how far the jaw is bent.
-
-Whether a grasp holds still, so that the object's pose in the jaw need not be looked for.
-"""
+"""Whether the object touches, and whether the grasp holds still."""
 
 from math import erf, exp, pi, sqrt
 
@@ -131,7 +128,7 @@ def _below(value: float) -> float:
     return 0.5 * (1.0 + erf(value / sqrt(2.0)))
 
 
-class RestWatch:
+class StillnessWatch:
     """Watches the deformed inner face while the object touches."""
 
     def __init__(self, settings: ContactSettings) -> None:
@@ -141,7 +138,7 @@ class RestWatch:
 
     def reset(self) -> None:
         """Starts anew, moving."""
-        self.resting = False
+        self.still = False
         self.ended = -np.inf
         self._since = np.inf
         self._line: NDArray | None = None
@@ -150,7 +147,7 @@ class RestWatch:
         """Takes the inner face (h, 2) [m] of an image [s] in contact; None without contact or surface."""
         held = self._line is not None and line is not None
         if not held or np.abs(line - self._line).max() > self._settings.rest_motion:
-            if self.resting:
+            if self.still:
                 self.ended = stamp
             self._line, self._since = line, stamp
-        self.resting = line is not None and stamp - self._since >= self._settings.rest_time
+        self.still = line is not None and stamp - self._since >= self._settings.rest_time

@@ -1,9 +1,4 @@
-"""Object meshes from files and arrays, checked and made fit for contact.
-
-Whether a mesh surrounds a point or a jaw, which no real object does.
-
-Fewer triangles for the same object, with the deviation that it costs.
-"""
+"""Object meshes from files and arrays: checked, repaired, and with few enough triangles for contact."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -309,8 +304,8 @@ def _describe(mesh: ObjectMesh, thinned: tuple[NDArray, NDArray]) -> str:
             f"{mesh.name}: got {len(mesh.triangles)} triangles, of which {len(thinned[1])} are left that deviate by "
             f"{deviation * 1e3:.1f} mm, expected one object of connected parts; remove fragments in a mesh editor"
         )
-    verdict = "" if deviation <= DEVIATION_LIMIT else ", more than contact should have: is this one object?"
+    warning = "" if deviation <= DEVIATION_LIMIT else ", more than contact should have: is this one object?"
     return (
         f"Decimated from {len(mesh.triangles)} to {len(thinned[1])} triangles; "
-        f"the surface deviates by {deviation * 1e3:.3f} mm at most{verdict}."
+        f"the surface deviates by {deviation * 1e3:.3f} mm at most{warning}."
     )

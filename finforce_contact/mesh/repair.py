@@ -1,11 +1,7 @@
-"""Closed loops made of directed edges.
-
-Whether a surface of triangles crosses itself.
+"""Repair of object meshes: merged, closed, of one sense, turned outward; and whether a surface crosses itself.
 
 Two triangles without a common corner cross where an edge of one goes through the other (Moeller and Trumbore 1997).
 Candidates are found by sweeping their boxes along the axis along which the surface is longest.
-
-Repair of object meshes: merged, closed, of one sense, turned outward.
 """
 
 from dataclasses import replace

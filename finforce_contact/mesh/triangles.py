@@ -1,7 +1,4 @@
-"""The triangles of an object and their edges as records.
-
-Solids of manifold3d made from object meshes, for booleans and cuts; the only module that makes them.
-"""
+"""The triangles of an object and their edges as records, and the solids that manifold3d makes of them."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -16,7 +16,7 @@ MARGIN = 2  # pixels around the projected box, for what distortion and rounding 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MeshSight:
+class RenderedMesh:
     """The visible part of a mesh, on the grid of every `step`-th pixel.
 
     Attributes:
@@ -57,7 +57,7 @@ class MeshView:
         bounds = np.array([vertices.min(axis=0), vertices.max(axis=0)], dtype=float)
         self._corners = np.array(list(product(*bounds.T)))
 
-    def render(self, T_camera_object: NDArray, camera: CameraIntrinsics, step: int = 1) -> MeshSight:
+    def render(self, T_camera_object: NDArray, camera: CameraIntrinsics, step: int = 1) -> RenderedMesh:
         """Return what the camera sees of the mesh.
 
         Args:
@@ -71,7 +71,7 @@ class MeshView:
         depth = np.full((-(-camera.height // step), -(-camera.width // step)), np.nan)
         if rays.size == 0:
             nothing = np.empty((0, 3))
-            return MeshSight(depth=depth, points=nothing, normals=nothing, pixels=np.empty((0, 2), dtype=int))
+            return RenderedMesh(depth=depth, points=nothing, normals=nothing, pixels=np.empty((0, 2), dtype=int))
         distance, normals = self._cast(T, rays.reshape(-1, 3))
         window = depth[rows.start // step :, columns.start // step :][: rays.shape[0], : rays.shape[1]]
         window[...] = distance.reshape(rays.shape[:2])
@@ -81,7 +81,7 @@ class MeshView:
         points = rays.reshape(-1, 3)[hit] * distance[hit, None]
         # normals of a stretched mesh go with the inverse
         facing = _towards_camera(normals[hit] @ np.linalg.inv(T[:3, :3]), points)
-        return MeshSight(depth=depth, points=points, normals=facing, pixels=pixels)
+        return RenderedMesh(depth=depth, points=points, normals=facing, pixels=pixels)
 
     def render_back(self, T_camera_object: NDArray, camera: CameraIntrinsics, step: int = 1) -> NDArray:
         """Return the depths (ceil(h / step), ceil(w / step)) [m] at which the rays leave the mesh, NaN beside it."""

@@ -1,4 +1,4 @@
-"""Noisy, late and rare poses of an object in a jaw's frame into one smooth course."""
+"""Noisy, late and rare poses of an object in a jaw's frame into one smooth trajectory."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -41,8 +41,8 @@ class PoseFilter:
     """Kalman filter of a pose: x moves at constant speed, all else hardly moves in the frame of a closing jaw.
 
     Each of the six numbers has a variance of its own. How noisy they are is learnt from the innovations: r = v^2 - p. A
-    pose far off the course is set aside until some in a row agree with each other; a trend in the innovations widens
-    the search at once.
+    pose far off the trajectory is set aside until some in a row agree with each other; a trend in the innovations
+    widens the search at once.
     """
 
     def __init__(self, settings: ContactSettings) -> None:
@@ -124,14 +124,14 @@ class PoseFilter:
         return np.diag(stated) * np.maximum(self._scale, 1.0)
 
     def _begin(self, stamp: float, T: NDArray, noise: NDArray, speed: float = 0.0) -> None:
-        """Starts the course at a pose."""
+        """Starts the trajectory at a pose."""
         self.stamp, self.believed, self._T, self._speed = stamp, stamp, T.copy(), speed
         self._P, self._cross, self._speed_variance = noise.copy(), 0.0, _SPEED_SURPRISE**2
         self._trend = np.zeros(6)
         self._aside.clear()
 
     def _predict(self, stamp: float) -> None:
-        """Moves the course on to a time [s]: constant speed of x under white acceleration, a random walk else."""
+        """Moves the trajectory on to a time [s]: constant speed of x under white acceleration, a random walk else."""
         dt, power = stamp - self.stamp, self._settings.acceleration**2
         self._T[_X, 3] += dt * self._speed
         self._P = self._P + self._drift * dt
@@ -141,7 +141,7 @@ class PoseFilter:
         self.stamp = stamp
 
     def _correct(self, innovation: NDArray, noise: NDArray) -> None:
-        """Moves the course towards a pose by the Kalman gain p / (p + r)."""
+        """Moves the trajectory towards a pose by the Kalman gain p / (p + r)."""
         gain = self._P / (self._P + noise)
         speed_gain = self._cross / (self._P[_X] + noise[_X])
         self._T = move_pose(self._T, gain * innovation)
@@ -169,7 +169,7 @@ class PoseFilter:
             self._speed_variance += _SPEED_SURPRISE**2
 
     def _set_aside(self, stamp: float, T: NDArray, noise: NDArray) -> str:
-        """Keeps a pose off the course; once enough in a row agree, the course starts anew from them."""
+        """Keeps a pose off the trajectory; once enough in a row agree, the trajectory starts anew from them."""
         self._aside.append((stamp, T))
         if len(self._aside) < self._settings.jump_samples or not self._agree(noise):
             return "aside"
@@ -178,7 +178,7 @@ class PoseFilter:
         return "jump"
 
     def _agree(self, noise: NDArray) -> bool:
-        """Whether the poses set aside lie on one straight course."""
+        """Whether the poses set aside lie on one straight trajectory."""
         stamps = np.array([stamp for stamp, _ in self._aside])
         steps = np.array([step_between(self._aside[0][1], T) for _, T in self._aside])
         line = np.outer((stamps - stamps[0]) / (stamps[-1] - stamps[0]), steps[-1])

@@ -1,7 +1,4 @@
-"""First poses of an object from a masked depth image: turns over the whole sphere, coarse to fine.
-
-Follows an object through depth images on one core.
-"""
+"""Follows an object through depth images on one core, and finds its first pose: turns over the whole sphere."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,9 +1,7 @@
-"""Scale and pose of a generated mesh as the paper finds them (section "Mesh Reconstruction"); one start, one scale.
+"""Scale and pose of a generated mesh as the paper finds them ("Mesh Reconstruction"), from the generator's axes.
 
-Axes and poses of SAM-3D Objects in those of the camera.
-
-The generator's canonical frame has z upwards, its GLB files have y upwards, its camera is PyTorch3D's (x left, y up, z
-forward) with row vectors, and its quaternions are w, x, y, z.
+The canonical frame of SAM-3D Objects has z upwards, its GLB files have y upwards, its camera is PyTorch3D's (x left,
+y up, z forward) with row vectors, and its quaternions are w, x, y, z.
 """
 
 from __future__ import annotations
@@ -86,24 +84,6 @@ CANONICAL_FROM_GLB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0
 CAMERA_FROM_PYTORCH3D = np.diag([-1.0, -1.0, 1.0])
 MESH_AXES = ("glb", "canonical")
 NORM_TOLERANCE = 1e-2  # of a quaternion that a network gave
-
-
-def canonical_from_glb(points: NDArray) -> NDArray:
-    """Return points (n, 3) of a GLB file in canonical axes: (x, -z, y)."""
-    return np.asarray(points) @ CANONICAL_FROM_GLB.T
-
-
-def glb_from_canonical(points: NDArray) -> NDArray:
-    """Return canonical points (n, 3) in the axes of a GLB file: (x, z, -y)."""
-    return np.asarray(points) @ CANONICAL_FROM_GLB
-
-
-def camera_from_pytorch3d(points: NDArray) -> NDArray:
-    """Return points (n, 3) or images of points (h, w, 3) of PyTorch3D's camera in the optical frame, and the reverse.
-
-    The map is its own inverse: (-x, -y, z).
-    """
-    return np.asarray(points) @ CAMERA_FROM_PYTORCH3D
 
 
 def affine_from_generator(

@@ -1,7 +1,4 @@
-"""What a reconstruction gives, and from what.
-
-How well a placed mesh explains a masked depth image, pixel by pixel.
-"""
+"""What a reconstruction gives, from what, and how well it explains a masked depth image, pixel by pixel."""
 
 from __future__ import annotations
 

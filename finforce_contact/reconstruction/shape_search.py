@@ -1,8 +1,4 @@
-"""The best placement of a mesh from many starts.
-
-Where a mesh is and how large, axis by axis: rotation, translation and scale as one record.
-
-Rotation, translation and scale of a mesh that explain a masked depth image.
+"""Rotation, translation and scale, axis by axis, of a mesh that explain a masked depth image; from many starts.
 
 Depth gives the surface, in metres, and the mask gives the outline: the two together leave only what neither shows.
 """
@@ -18,7 +14,7 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.mesh.views import MeshSight, MeshView
+from finforce_contact.mesh.views import MeshView, RenderedMesh
 from finforce_contact.reconstruction.evidence import ImageEvidence
 from finforce_contact.reconstruction.result import Report, ShapeScore, score_shape
 
@@ -225,7 +221,7 @@ class _StageFit:
         return Pull(points=points, directions=directions, residuals=residuals, weights=weights)
 
 
-def _find_rim(view: MeshSight) -> NDArray:
+def _find_rim(view: RenderedMesh) -> NDArray:
     """Return which points of a view lie at its outline, holes included."""
     hit = np.isfinite(view.depth)
     rim = hit & ~binary_erosion(hit, border_value=0)

@@ -1,7 +1,4 @@
-"""The gripper's controller: CAN messages in, messages out, in steps of a millisecond.
-
-Faults that the firmware latches, and its watchdog.
-"""
+"""The gripper's controller: CAN messages in, messages out, in steps of a millisecond; faults that it latches."""
 
 from __future__ import annotations
 

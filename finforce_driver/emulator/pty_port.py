@@ -1,7 +1,4 @@
-"""A pseudo-terminal with an emulated adapter behind it, in real time.
-
-The emulated gripper as a program of its own.
-"""
+"""A pseudo-terminal with an emulated adapter behind it, in real time, and the program that opens one."""
 
 from __future__ import annotations
 

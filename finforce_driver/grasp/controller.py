@@ -1,7 +1,4 @@
-"""Closing until a camera's force reaches a set one, and holding it: forces and openings in, moves out.
-
-What must hold for a grasp to go on, and the sentence where it does not.
-"""
+"""Closing until a camera's force reaches a set one, and holding it: forces and openings in, moves out."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Whether the jaws are loaded, and which measured forces may be believed.
-
-Forces and touches as a camera sends them: which may be believed, how late and how often.
-
-The grasp force as a line over the opening, learnt while closing.
+"""Which forces of a camera may be believed, whether the jaws are loaded, and how the force goes with the opening.
 
 Between two images the opening changes by d (closing: d > 0) and the force by k d, where neither stays what it was:
 fingers relax, contact spreads. A Kalman filter follows both,

@@ -1,4 +1,4 @@
-"""How far the jaws of a force-controlled grasp may go, and how fast.
+"""How far the jaws of a force-controlled grasp may go, how fast, and where they were at the time of an image.
 
 The gripper is only ever told to go where the force cannot be above the set one: from the newest image, with the force F
 at the opening o, to
@@ -7,8 +7,6 @@ at the opening o, to
 
 with the stiffness k learnt on the way (before contact: the greatest expected, and a share of F_set). Whatever comes
 late, or not at all, the jaws stop there by themselves.
-
-Where the jaws were told to go, and where they were at the time of an image.
 """
 
 from __future__ import annotations

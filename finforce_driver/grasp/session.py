@@ -1,7 +1,4 @@
-"""The force-controlled grasps of one gripper, begun, changed and ended by calls from outside.
-
-The grasp by force as one blocking call, in real or in stepped time.
-"""
+"""The force-controlled grasps of one gripper: begun, changed and ended from outside, or as one blocking call."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What a force-controlled grasp is asked for and what can be set on it.
-
-What a force-controlled grasp says and asks for.
-"""
+"""What a force-controlled grasp is asked for, what can be set on it, and what it says."""
 
 from __future__ import annotations
 

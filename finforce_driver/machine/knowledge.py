@@ -1,13 +1,7 @@
-"""Where the jaws were in the last seconds: their speed now, their place then.
+"""What the replies say of the gripper: which of them are believed, place, speed, faults and telemetry.
 
-What the replies say of the gripper: the believed reply, place, speed, faults.
-
-Decides which replies are believed: what goes on from the last one at once, anything else when it repeats itself.
-
-A digit that fell over on the serial line makes a valid reply that is wrong; it must never become a state. Knows neither
-what the gripper was told nor what follows from its state.
-
-What is asked for now and then: temperature, supply, errors; a value is believed when it goes on or is repeated.
+A digit that fell over on the serial line makes a valid reply that is wrong; it must never become a state. What goes on
+from the last reply is believed at once, anything else when it repeats itself.
 """
 
 from __future__ import annotations

@@ -1,9 +1,4 @@
-"""What became of a move, by the replies since it was sent.
-
-Motion slower than the gripper's speed byte allows: its target goes on by one count at a time.
-
-One move: where to, how, and what became of it.
-"""
+"""One move: where to, how, and what became of it by the replies since; slower than the speed byte allows, too."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""An emergency stop until the gripper says that it stands, and until it is cleared.
-
-Clears what is latched, in the gripper's order: stop flag off, clear, look.
-"""
+"""An emergency stop until the gripper says that it stands, and until what is latched is cleared."""
 
 from __future__ import annotations
 

@@ -1,11 +1,8 @@
-"""Presses of the bench finger as a camera would see them, made from shapes of an independent program.
+"""Presses of the bench finger as its camera would see them, made from shapes of an independent program.
 
 data/pressed_bench.npz holds key points [mm] and forces [N] of CalculiX 2.20 (20-node hexahedra, large displacements,
-frictionless contact, St. Venant-Kirchhoff, 30 MPa, 0.45) for nine cylinders at depths of 1 to 10 mm.
-
-What the camera of the bench makes of key points: noise, gross errors, holes, points behind the object.
-
-Knows no mechanics. The numbers are those of the bench recordings' measurement model.
+frictionless contact, St. Venant-Kirchhoff, 30 MPa, 0.45) for nine cylinders at depths of 1 to 10 mm. Noise, gross
+errors, holes and points behind the object are those of the bench recordings' measurement model.
 """
 
 from __future__ import annotations
@@ -122,8 +119,8 @@ def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, s
     """
     from scipy.interpolate import PchipInterpolator  # megabytes that a process measuring its memory need not have
 
-    course = _build_course()
-    depth = course.depth
+    motion = _build_motion()
+    depth = motion.depth
     grid = np.r_[0.0, case.depth]
     shapes = np.concatenate([np.zeros((1, *jaw.keypoints.shape)), case.moved])
     points = jaw.keypoints + PchipInterpolator(grid, shapes)(depth)
@@ -140,8 +137,8 @@ def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, s
         heights=[contact] * len(depth),
         outlines=_outlines(contact, axes, case.radius, 0.0 if camera is None else random.standard_normal(3)),
         force=force,
-        held=course.held,
-        ends=course.ends,
+        held=motion.held,
+        ends=motion.ends,
     )
 
 
@@ -154,7 +151,7 @@ class _PressMotion:
     ends: NDArray
 
 
-def _build_course() -> _PressMotion:
+def _build_motion() -> _PressMotion:
     """Returns rest, then ramps and holds."""
     parts, ends = [np.zeros(REST_FRAMES)], []
     for level in LEVELS:

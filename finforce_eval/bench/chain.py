@@ -26,7 +26,7 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import QUIET, NodeRun, describe_load, run_nodes
-from finforce_eval.replay.synthetic_stream import Film, film_images, film_keypoints
+from finforce_eval.replay.synthetic_stream import SyntheticStream, stream_images, stream_keypoints
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 RATES = (30, 60, 90)  # [Hz]
@@ -104,15 +104,15 @@ def measure(quick: bool) -> ChainFigures:
     recording = read_recording(source)
     rows = []
     for rate in RATES[:1] if quick else RATES:
-        rows.append(_run(KEYPOINTS, rate, film_keypoints(source, rate), recording))
-        rows.append(_run(IMAGES, rate, film_images(source, rate), recording))
+        rows.append(_run(KEYPOINTS, rate, stream_keypoints(source, rate), recording))
+        rows.append(_run(IMAGES, rate, stream_images(source, rate), recording))
     return ChainFigures(rows=sorted(rows, key=lambda row: row.source))
 
 
-def _run(source: str, rate: int, film: Film, recording: Recording) -> ChainRow:
-    """Play a film to the nodes and return what came of it."""
+def _run(source: str, rate: int, stream: SyntheticStream, recording: Recording) -> ChainRow:
+    """Play a stream to the nodes and return what came of it."""
     processes = chain_processes(recording, images=source == IMAGES)
-    run = run_nodes(processes, film, SIDES, awaited_topics(source == IMAGES), detector=source == IMAGES)
+    run = run_nodes(processes, stream, SIDES, awaited_topics(source == IMAGES), detector=source == IMAGES)
     return make_row(source, rate, run, true_grasp(recording))
 
 

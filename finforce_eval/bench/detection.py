@@ -1,8 +1,6 @@
 """Time against pixel error of the ways to find key points, on rendered images with truth.
 
 All ways look at a second of images each, one way after the other, so that a busy machine slows all of them alike.
-
-Printed dots painted into rendered images, on the key points that the camera sees.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from finforce.skipping import ALL, Skips
 from finforce.transforms import pose_from_quaternion
 from finforce_eval.bench.scenes import DIM, GRASP, BenchScene, find_scene
 from finforce_eval.evaluation.keypoint_source import Detector, KeypointSource, SideLog, build_records, with_detections
-from finforce_eval.evaluation.results import SightSeries, SightStats, compare_sight, sight_stats
+from finforce_eval.evaluation.results import DetectionErrors, DetectionStats, compare_detection, detection_stats
 from finforce_eval.figures.time_error import ErrorPoint, ErrorSeries, TimeStats, draw_time_error, time_stats
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import JawTrack, Recording
@@ -82,7 +80,7 @@ class DetectionRow:
     time: TimeStats
     cpu: TimeStats
     cpu_mean_ms: float
-    sight: SightStats
+    sight: DetectionStats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +139,7 @@ def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int |
     """
     seconds: dict[str, list[float]] = {way.name: [] for way in ways}
     cpu: dict[str, list[float]] = {way.name: [] for way in ways}
-    series: dict[str, list[SightSeries]] = {way.name: [] for way in ways}
+    series: dict[str, list[DetectionErrors]] = {way.name: [] for way in ways}
     yardstick: list[float] = []
     for scene in scenes:
         recording = read_recording(find_scene(scene))
@@ -151,14 +149,16 @@ def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int |
             seconds[run.way.name] += run.seconds[1:]
             cpu[run.way.name] += run.cpu[1:]
             detected = with_detections(recording, run.logs)
-            series[run.way.name] += [compare_sight(track.detection, track.sight) for track in detected.jaws.values()]
+            series[run.way.name] += [
+                compare_detection(track.detection, track.sight) for track in detected.jaws.values()
+            ]
     rows = [
         DetectionRow(
             name=name,
             time=time_stats(spent),
             cpu=time_stats(cpu[name]),
             cpu_mean_ms=1e3 * float(np.mean(cpu[name])),
-            sight=sight_stats(series[name]),
+            sight=detection_stats(series[name]),
         )
         for name, spent in seconds.items()
     ]

@@ -1,10 +1,6 @@
 """How the cost of solving and of finding the contact grows with its size: curves, slopes, and their pictures.
 
 Costs are processor times, to which other processes on the machine add nothing.
-
-How a solver's step grows with vertices, key points and contact candidates.
-
-How preparing an object's mesh and finding its contact in an image grow with its triangles.
 """
 
 from __future__ import annotations
@@ -303,13 +299,13 @@ def grow_keypoints(quick: bool) -> Growth:
 
 
 def _measure_keypoints(solver: str, count: int) -> float:
-    """Returns the median time [s] of a step with so many key points, whose course is that of the solid."""
+    """Returns the median time [s] of a step with so many key points, whose history is that of the solid."""
     jaw = spread_keypoints(bench_finger(), count)
     settings = EstimatorSettings(solver=solver, tare_frames=_TARE_FRAMES)
-    course = _press_keypoints(jaw)
+    history = _press_keypoints(jaw)
     observations = [
         Observation(stamp=PERIOD * index, points=points, likelihood=np.ones(count))
-        for index, points in enumerate(course)
+        for index, points in enumerate(history)
     ]
     return time_steps(JawEstimator(jaw, settings=settings), observations, Contact.fixed(jaw, _HEIGHT))
 
@@ -340,8 +336,8 @@ def grow_candidates(quick: bool) -> Growth:
     """Measures a jaw linearised with a force at each candidate, their program, and a step with rows of one contact."""
     sizes = CANDIDATES[:4] if quick else CANDIDATES
     jaw = bench_finger()
-    course = _press_keypoints(jaw)
-    rows = [{**_measure_program(jaw, count), **_measure_rows(jaw, course, count)} for count in sizes]
+    history = _press_keypoints(jaw)
+    rows = [{**_measure_program(jaw, count), **_measure_rows(jaw, history, count)} for count in sizes]
     curves = [Curve(name=name, sizes=sizes, seconds=[row[name] for row in rows]) for name in rows[0]]
     return Growth(name="contact candidates", unit="candidates", curves=curves)
 
@@ -380,7 +376,7 @@ def _linearise(model: JawModel, effectors: Any, contacts: Any, q: NDArray) -> ND
     return model.project(effectors, q, model.factorise(model.linearize(q).tangent).solve(loads))
 
 
-def _measure_rows(jaw: Jaw, course: NDArray, count: int) -> dict[str, float]:
+def _measure_rows(jaw: Jaw, history: NDArray, count: int) -> dict[str, float]:
     """Returns the median time [s] of an estimator's step with rows of one contact, given with weights."""
     points = _candidate_points(jaw, count)
     near = 0.005 / max(1, count - 1) * np.arange(count) - 0.0025 * (count > 1)
@@ -388,7 +384,7 @@ def _measure_rows(jaw: Jaw, course: NDArray, count: int) -> dict[str, float]:
     contact = Contact(points=points, weights=np.full(count, 1.0 / count))
     observations = [
         Observation(stamp=PERIOD * index, points=shape, likelihood=np.ones(len(shape)))
-        for index, shape in enumerate(course)
+        for index, shape in enumerate(history)
     ]
     estimator = JawEstimator(jaw, settings=EstimatorSettings(solver="solid", tare_frames=_TARE_FRAMES))
     return {"rows of one contact, one step": time_steps(estimator, observations, contact)}

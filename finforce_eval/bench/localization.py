@@ -2,8 +2,6 @@
 
 The error is the distance, on the undeformed surface, from the place found to where the line of action of the true force
 cuts the deformed surface. Times and errors are of the same calls.
-
-The ways to find a contact place that a benchmark compares.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Memory and start of a solver in a process of its own, with empty and with filled caches.
 
 python -m finforce_eval.bench.process SOLVER MESH
-
-Resident memory of processes, from /proc; Linux only.
 """
 
 from __future__ import annotations

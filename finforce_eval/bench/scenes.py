@@ -1,8 +1,7 @@
 """Rendered scenes with truth for benchmarks, none of whose seeds a network was trained on; kept once they are made.
 
-A scene is rendered as a camera of 180 Hz would see it, without what no camera of 30, 60 or 90 Hz sees. Knows no node.
-
-A recording cut into parts that are played one after the other, as often as asked.
+A scene is rendered as a camera of 180 Hz would see it, without what no camera of 30, 60 or 90 Hz sees, and cut into
+sections that are played on end.
 """
 
 from __future__ import annotations
@@ -253,7 +252,7 @@ class Span:
     end: float
 
 
-class SceneReel:
+class SceneStream:
     """The messages of the sections of a recording, in the order and as long as the parts have them.
 
     It is played as a `Playback` is; every iteration gives the same.

@@ -2,8 +2,6 @@
 
 One rendered grasp is cut into three scenes: idle (the object 15 mm from each jaw), approach (5 mm/s) and steady grasp.
 They are played as images to all nodes, once with every rule and once with none.
-
-What the benchmark of skipped work found: its records, tables and picture.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
 from finforce.skipping import ALL, AWAY, CONTACT, EVERYWHERE, IDLE, SOLVER, STILL, UNCHANGED, UNHEARD, UNNEEDED
 from finforce_eval.bench.chain import SIDES, awaited_topics, chain_processes
-from finforce_eval.bench.scenes import OBJECT_TOPIC, BenchScene, SceneReel, Span, StreamPart, cut_sections, find_scene
+from finforce_eval.bench.scenes import OBJECT_TOPIC, BenchScene, SceneStream, Span, StreamPart, cut_sections, find_scene
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import await_listeners, find_processes
@@ -79,8 +77,8 @@ def measure(
     """
     source = find_scene(SCENE)
     sections = cut_sections(read_playback(source), SECTIONS)
-    reel = SceneReel(sections, _plan(sections, seconds or (QUICK_SECONDS if quick else USUAL_SECONDS)))
-    runs = {name: _run(_build_nodes(source, off, solver), reel, name) for name, off in settings.items()}
+    stream = SceneStream(sections, _plan(sections, seconds or (QUICK_SECONDS if quick else USUAL_SECONDS)))
+    runs = {name: _run(_build_nodes(source, off, solver), stream, name) for name, off in settings.items()}
     return SkippingFigures(
         costs=[cost for run in runs.values() for cost in run.costs],
         memory={name: run.memory for name, run in runs.items()},
@@ -124,16 +122,16 @@ class _Run:
 class _SkipWatch:
     """Reads the CPU meter where a part begins or ends."""
 
-    def __init__(self, meter: CpuMeter, reel: SceneReel, answers: Callable[[], int], setting: str) -> None:
-        self._meter, self._reel, self._answers, self._setting = meter, reel, answers, setting
+    def __init__(self, meter: CpuMeter, stream: SceneStream, answers: Callable[[], int], setting: str) -> None:
+        self._meter, self._stream, self._answers, self._setting = meter, stream, answers, setting
         self._span: Span | None = None
         self._before, self._busy = 0, 0.0
         self.costs: list[SceneCost] = []
 
     def look(self, message: RawMessage) -> None:
         """Note that a message leaves."""
-        time = 1e-9 * (message.time - self._reel.begin) + 1e-6
-        span = next((span for span in self._reel.spans if span.begin <= time < span.end), None)
+        time = 1e-9 * (message.time - self._stream.begin) + 1e-6
+        span = next((span for span in self._stream.spans if span.begin <= time < span.end), None)
         if span is not self._span:
             self.close()
             self._span = span
@@ -156,8 +154,8 @@ class _SkipWatch:
         ]
 
 
-def _run(nodes: Sequence[Process], reel: SceneReel, setting: str) -> _Run:
-    """Play the reel to nodes and read what they take.
+def _run(nodes: Sequence[Process], stream: SceneStream, setting: str) -> _Run:
+    """Play the stream to nodes and read what they take.
 
     Raises:
         ProcessError: a process cannot be started, ended early, or does not listen.
@@ -172,15 +170,15 @@ def _run(nodes: Sequence[Process], reel: SceneReel, setting: str) -> _Run:
     with ExitStack() as stack:
         player = stack.enter_context(open_player(domain))
         group = stack.enter_context(ProcessGroup(nodes, {"ROS_DOMAIN_ID": str(domain)}))
-        player.offer(reel)
+        player.offer(stream)
         player.listen((), log)  # the grasp force and diagnostics: more listeners would ask for more work
 
         await_listeners(player, group, awaited)
         player.spin_until(monotonic() + 0.5)
         pids = find_processes([node.name for node in nodes])
-        watch = _SkipWatch(CpuMeter(pids), reel, lambda: len(log.grasp), setting)
-        log.offset = time_ns() - reel.begin
-        player.play(reel, offset=log.offset, sent=watch.look)
+        watch = _SkipWatch(CpuMeter(pids), stream, lambda: len(log.grasp), setting)
+        log.offset = time_ns() - stream.begin
+        player.play(stream, offset=log.offset, sent=watch.look)
         watch.close()
         run.memory = {name: resident_bytes(pid) / 1e6 for name, pid in pids.items()}
         log.ended = True

@@ -1,9 +1,4 @@
-"""Run time against force error of every solver tier: nine presses of an independent program, one thread, one run.
-
-The solver tiers' figures as tables in Markdown, aligned for a terminal.
-
-The picture of run time against force error; figures in, a matplotlib figure out.
-"""
+"""Run time against force error of every solver tier: nine presses of an independent program, one thread, one run."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The solver tiers that are compared, and what each makes of a press: forces, and seconds per step.
-
-Forces of a tier against the truth of presses, as numbers.
-"""
+"""The solver tiers that are compared, what each makes of a press, and how far that is from the truth."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Where the contact of an image comes from: given once, or estimated from mesh, pose and deformed jaw.
-
-The contact source that a choice names for one jaw of a recording.
-
-Which contact an offline run is given: `--contact`, `--object` and `case.json` into a choice.
-"""
+"""Where the contact of an image comes from: given once, or estimated from mesh, pose and deformed jaw."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""An estimator over recordings, offline, one frame after the other.
-
-One case step by step: contact to estimator, estimate to contact, and what both said.
-"""
+"""A recording through an estimator, image after image, and its scores."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from finforce.errors import FinforceError, ObservationError
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactSource
 from finforce_eval.evaluation.places import InnerSurface, true_lines
-from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_sight
+from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_detection
 from finforce_eval.evaluation.scoring import CaseScore, force_range, match_truth, score_case
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.estimator import JawEstimator
@@ -253,7 +250,7 @@ class StepLog:
         if detection is None:
             return {}
         return {
-            "sight": None if sight is None else compare_sight(detection, sight),
+            "sight": None if sight is None else compare_detection(detection, sight),
             "detector_ms": detection.step_ms,
             "latency_ms": self.step_ms + detection.step_ms,
         }

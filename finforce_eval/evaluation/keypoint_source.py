@@ -1,9 +1,4 @@
-"""Where the key points of a run come from, `--from images|keypoints|truth`.
-
-The key point detector over the images of a recording, offline.
-
-The detector is the one that its node runs: what it says of an image here, it says there.
-"""
+"""Where the key points of a recording come from: recorded, true, or found in its images by the detector of the node."""
 
 from __future__ import annotations
 

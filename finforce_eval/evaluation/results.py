@@ -1,11 +1,4 @@
-"""What an estimator said about a recording, frame by frame.
-
-`NAME=VALUE` texts of a command line as values of the types of a record's defaults.
-
-How long a force takes from its true onset to a published estimate.
-
-How well key points were seen: pixels, places, what was accepted and lost, and time.
-"""
+"""The time series of one jaw of one recording, how late its force was and how well its key points were seen."""
 
 from __future__ import annotations
 
@@ -17,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_eval.errors import OptionError
-from finforce_eval.recordings.tracks import DetectionTrack, SightTrack
+from finforce_eval.recordings.tracks import DetectionTrack, DetectionTruth
 
 TRUTH_VALUES = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
@@ -140,7 +133,7 @@ def delay_stats(delays: Sequence[Delay]) -> DelayStats:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SightSeries:
+class DetectionErrors:
     """A detection against the truth, image by image; n images that have both, K key points.
 
     Attributes:
@@ -157,7 +150,7 @@ class SightSeries:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SightStats:
+class DetectionStats:
     """How well the key points of a case, or of all cases together, were seen; None where nothing can be said.
 
     Attributes:
@@ -181,13 +174,13 @@ class SightStats:
     visible_lost_pct: float | None
 
 
-def compare_sight(detection: DetectionTrack, sight: SightTrack) -> SightSeries:
+def compare_detection(detection: DetectionTrack, sight: DetectionTruth) -> DetectionErrors:
     """Return a detection against the truth, at the images that both know."""
     _, ours, theirs = np.intersect1d(detection.stamps, sight.stamps, return_indices=True)
     visible, accepted = sight.visible[theirs], detection.accepted[ours]
     pixel_error = np.linalg.norm(detection.pixels[ours] - sight.pixels[theirs], axis=2)
     point_error = np.linalg.norm(detection.points[ours] - sight.points[theirs], axis=2)
-    return SightSeries(
+    return DetectionErrors(
         pixel_error=np.where(visible, pixel_error, np.nan),
         point_error=np.where(accepted, point_error, np.nan),
         visible=visible,
@@ -195,7 +188,7 @@ def compare_sight(detection: DetectionTrack, sight: SightTrack) -> SightSeries:
     )
 
 
-def sight_stats(series: Sequence[SightSeries]) -> SightStats:
+def detection_stats(series: Sequence[DetectionErrors]) -> DetectionStats:
     """Return the statistics of several series together."""
     visible, accepted = (
         np.concatenate([np.zeros(0, dtype=bool), *(getattr(entry, name).ravel() for entry in series)])
@@ -203,7 +196,7 @@ def sight_stats(series: Sequence[SightSeries]) -> SightStats:
     )
     pixels = _percentiles([entry.pixel_error for entry in series], 1.0)
     points = _percentiles([entry.point_error for entry in series], 1e3)
-    return SightStats(
+    return DetectionStats(
         n_visible=int(visible.sum()),
         n_hidden=int((~visible).sum()),
         pixel_median_px=pixels[0],
@@ -325,7 +318,7 @@ class CaseResult:
     snapshot: Snapshot | None = None
     message: str = ""
     contact: ContactSeries | None = None
-    sight: SightSeries | None = None
+    sight: DetectionErrors | None = None
     detector_ms: NDArray[np.float64] | None = None
     latency_ms: NDArray[np.float64] | None = None
 

@@ -1,9 +1,4 @@
-"""Errors of an estimate against the truth, as numbers.
-
-How far /grasp_wrench is from the truth, and how late.
-
-How well the contact was known: place against pressure centre, touch against onset.
-"""
+"""Errors of force, grasp force and contact against the truth, as numbers."""
 
 from __future__ import annotations
 
@@ -13,7 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.evaluation.results import CaseResult, DelayStats, SightStats, delay_stats, force_delays, sight_stats
+from finforce_eval.evaluation.results import (
+    CaseResult,
+    DelayStats,
+    DetectionStats,
+    delay_stats,
+    detection_stats,
+    force_delays,
+)
 from finforce_eval.recordings.tracks import Recording, WrenchTrack
 
 # Below it the pressure centre hardly matters; from it on the object is in contact [N].
@@ -222,7 +224,7 @@ class CaseScore:
     solved_place: PlaceStats
     onset: OnsetStats
     delay: DelayStats
-    sight: SightStats
+    sight: DetectionStats
     detector_ms: StepTimes
 
 
@@ -366,7 +368,7 @@ def score_case(results: CaseResult | Sequence[CaseResult], span: float) -> CaseS
         solved_place=place_stats(np.concatenate([solved_distance(case) for case in cases])),
         onset=onset_stats(cases),
         delay=delay_stats([delay for case in cases for delay in case.delays]),
-        sight=sight_stats([case.sight for case in cases if case.sight is not None]),
+        sight=detection_stats([case.sight for case in cases if case.sight is not None]),
         detector_ms=_step_times(np.concatenate([np.zeros(0), *_detector_times(cases)])),
         **stats,
     )

@@ -1,9 +1,4 @@
-"""Scores as text: the paper's table for the terminal and for Markdown, and the JSON of `evaluate`.
-
-How the key points were seen and when the force showed, as text.
-
-Tables in Markdown.
-"""
+"""Scores as tables, for a terminal and in Markdown."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.evaluation.results import CaseResult, compare_sight
+from finforce_eval.evaluation.results import CaseResult, compare_detection
 from finforce_eval.figures.figures import BLUE, GREEN, GREY, ORANGE, new_figure, style_axes
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, Recording
 from finforce_keypoints.diagnostics import COLORS, draw_keypoints
@@ -241,7 +241,7 @@ def _draw_pixel_error(axes: Any, track: JawTrack, begin: int) -> None:
     if track.sight is None:
         return
     times = np.intersect1d(track.detection.stamps, track.sight.stamps)
-    error = compare_sight(track.detection, track.sight).pixel_error
+    error = compare_detection(track.detection, track.sight).pixel_error
     for percent, color, label in ((95, ORANGE, "95th percentile"), (50, BLUE, "median of the visible")):
         axes.plot((times - begin) * 1e-9, _percentile(error, percent), color=color, linewidth=1.0, label=label)
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from finforce_contact.mesh.views import MeshSight, MeshView
+from finforce_contact.mesh.views import MeshView, RenderedMesh
 from finforce_contact.reconstruction.evidence import ImageEvidence
 from finforce_contact.reconstruction.result import Reconstruction
 from finforce_eval.figures.figures import BLUE, ORANGE, new_figure
@@ -77,7 +77,7 @@ def _as_picture(evidence: ImageEvidence, color: NDArray | None) -> NDArray:
     return np.repeat(grey[..., None], 3, axis=2)
 
 
-def _shade(view: MeshSight) -> NDArray:
+def _shade(view: RenderedMesh) -> NDArray:
     """Return a picture (h, w, 4) of the mesh, brighter where it faces the camera, clear beside it."""
     picture = np.zeros((*view.depth.shape, 4))
     facing = -np.einsum("ij,ij->i", view.normals, view.points) / np.linalg.norm(view.points, axis=1)

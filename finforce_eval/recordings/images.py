@@ -1,10 +1,4 @@
-"""The RGB-D images of a bag: found, paired by their stamps, and read one by one; never all of them are in memory.
-
-Colour, depth and camera messages to pixels and back, plain or compressed.
-
-Compressed images are those of image_transport: jpeg or png on `.../compressed`, and a 16-bit png behind twelve bytes of
-header on `.../compressedDepth`. It knows no bags and no topics.
-"""
+"""Colour and depth images of a recording, plain or compressed, read one by one."""
 
 from __future__ import annotations
 

@@ -17,11 +17,11 @@ from finforce_eval.recordings.bags import BagMessage, bag_source, check_types, o
 from finforce_eval.recordings.images import PAIRED, ImageTrack, find_images
 from finforce_eval.recordings.tracks import (
     JAWS,
+    DetectionTruth,
     JawTrack,
     KeypointTrack,
     PoseTrack,
     Recording,
-    SightTrack,
     WrenchTrack,
     parse_phases,
 )
@@ -30,7 +30,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 STRING = "std_msgs/msg/String"
-SIGHT_COLUMNS = ("x", "y", "z", "u", "v", "visible")
+TRUTH_COLUMNS = ("x", "y", "z", "u", "v", "visible")
 TRUE_KEYPOINTS, TRUE_POSE = "ground_truth_keypoints", "ground_truth_jaw_pose"
 TOPICS = {"/object_pose": POSE, "/bench/phase": STRING}
 for _side in JAWS:
@@ -153,7 +153,7 @@ def _jaw_track(samples: Mapping[str, list[BagMessage]], side: str, name: str) ->
         keypoints=_keypoint_track(keypoints, side, name) if keypoints else KeypointTrack.empty(),
         truth=_wrench_track(truth, side, name) if truth else None,
         pose=_pose_track(pose, f"/{side}/jaw_pose", name) if pose else None,
-        sight=_sight_track(sight, side, name) if sight else None,
+        sight=_detection_truth(sight, side, name) if sight else None,
         true_pose=_pose_track(true_pose, f"/{side}/{TRUE_POSE}", name) if true_pose else None,
     )
 
@@ -190,19 +190,19 @@ def _keypoint_track(samples: Sequence[BagMessage], side: str, name: str) -> Keyp
     return KeypointTrack(stamps=stamps, points=points, likelihood=likelihood, stddev=stddev)
 
 
-def _sight_track(samples: Sequence[BagMessage], side: str, name: str) -> SightTrack:
+def _detection_truth(samples: Sequence[BagMessage], side: str, name: str) -> DetectionTruth:
     """Stack the true key points of one jaw."""
     topic = f"/{side}/{TRUE_KEYPOINTS}"
     _check_frame(samples, topic, side, name)
     stamps = _stamps(samples, topic, name, strict=True)
     try:
-        clouds = [decode_columns(sample.message, SIGHT_COLUMNS) for sample in samples]
-        columns = ([cloud[name] for cloud in clouds] for name in SIGHT_COLUMNS)
+        clouds = [decode_columns(sample.message, TRUTH_COLUMNS) for sample in samples]
+        columns = ([cloud[name] for cloud in clouds] for name in TRUTH_COLUMNS)
         x, y, z, u, v, visible = (np.array(column, dtype=np.float64) for column in columns)
     except (ObservationError, ValueError) as error:
         raise RecordingError(f"{name}: {topic}: {error}") from error
     points, pixels = np.stack([x, y, z], axis=-1), np.stack([u, v], axis=-1)
-    return SightTrack(stamps=stamps, points=points, pixels=pixels, visible=visible > 0)
+    return DetectionTruth(stamps=stamps, points=points, pixels=pixels, visible=visible > 0)
 
 
 def _cloud(sample: BagMessage, index: int, topic: str, name: str) -> Keypoints:

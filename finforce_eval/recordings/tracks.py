@@ -1,7 +1,4 @@
-"""Recordings as frozen records of NumPy arrays.
-
-What a camera truly saw of a jaw, and what a detector said of it, over time.
-"""
+"""Recordings as frozen records of NumPy arrays, with what a camera truly saw and what a detector said of it."""
 
 from __future__ import annotations
 
@@ -23,7 +20,9 @@ JAWS = ("left", "right")
 DIRECTIONS = ("load", "unload")
 STAGES = ("ramp", "settle", "record")
 
-TrackT = TypeVar("TrackT", "KeypointTrack", "WrenchTrack", "PoseTrack", "PhaseTrack", "SightTrack", "DetectionTrack")
+TrackT = TypeVar(
+    "TrackT", "KeypointTrack", "WrenchTrack", "PoseTrack", "PhaseTrack", "DetectionTruth", "DetectionTrack"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +155,7 @@ class JawTrack:
     keypoints: KeypointTrack
     truth: WrenchTrack | None = None
     pose: PoseTrack | None = None
-    sight: SightTrack | None = None
+    sight: DetectionTruth | None = None
     true_pose: PoseTrack | None = None
     detection: DetectionTrack | None = None
 
@@ -301,7 +300,7 @@ def _parse_phase(text: str, name: str) -> tuple[int, str, float, str]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SightTrack:
+class DetectionTruth:
     """Where the key points of one jaw truly were, and which of them the camera could see.
 
     Attributes:

@@ -1,7 +1,4 @@
-"""Synthetic footage into RGB-D recordings, image by image.
-
-A picture of a recording at a glance: a few of its images with the true key points.
-"""
+"""Synthetic scenes as recordings: images, poses, the truth, and a preview."""
 
 from __future__ import annotations
 
@@ -37,9 +34,9 @@ from finforce_twin.gripper.footage import (
     TrueJaw,
     TwinFrame,
     build_footage,
+    detection_truth_columns,
     encode_depth,
     info_fields,
-    sight_columns,
 )
 from finforce_twin.scenes.scenarios import Scenario
 
@@ -185,7 +182,7 @@ def _truth_entries(stamp: int, side: str, jaw: TrueJaw, factory: MessageFactory)
     """Yield the truth about one jaw in one image."""
     wrench = factory.wrench(stamp, f"{side}_jaw", jaw.force, jaw.torque)
     yield Entry(stamp, f"/{side}/ground_truth_wrench", WRENCH, wrench)
-    columns = sight_columns(jaw)
+    columns = detection_truth_columns(jaw)
     yield Entry(stamp, f"/{side}/{TRUE_KEYPOINTS}", CLOUD, factory.cloud(stamp, f"{side}_jaw", columns))
     yield Entry(stamp, f"/{side}/{TRUE_POSE}", POSE, _pose(stamp, jaw.T_camera_jaw, factory))
 

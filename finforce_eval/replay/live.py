@@ -1,7 +1,4 @@
-"""What the nodes answered during a replay, as the time series of an offline run.
-
-What the key point detector node answered during a replay.
-"""
+"""What the nodes answered during a replay, as the time series of an offline run."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from finforce.pointcloud import decode_columns, decode_keypoints
 from finforce.stamps import NANOSECONDS
 from finforce_eval.evaluation.keypoint_source import SideLog
 from finforce_eval.evaluation.places import InnerSurface, true_lines
-from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_sight
+from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_detection
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
@@ -192,7 +189,7 @@ def live_result(
         scored=phases.scored,
         snapshot=_snapshot(recording, side, log, seen, estimator),
         contact=_contact_series(recording, side, log, estimator) if log.touching else None,
-        sight=compare_sight(detection, jaw_track.sight) if detection and jaw_track.sight else None,
+        sight=compare_detection(detection, jaw_track.sight) if detection and jaw_track.sight else None,
         detector_ms=None if detection is None else detection.step_ms,
     )
 

@@ -1,7 +1,4 @@
-"""The player of recordings: messages out at the pace of their receipt, results in.
-
-The parameters of the player node.
-"""
+"""The node that plays a recording in real time, and its parameters."""
 
 from __future__ import annotations
 

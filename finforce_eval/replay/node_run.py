@@ -1,4 +1,4 @@
-"""The real nodes while a film is played: their answers, CPU time and memory."""
+"""The real nodes while a stream is played: their answers, CPU time and memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from finforce_eval.replay.processes import (
     child_processes,
     resident_bytes,
 )
-from finforce_eval.replay.synthetic_stream import Film
+from finforce_eval.replay.synthetic_stream import SyntheticStream
 
 if TYPE_CHECKING:
     from finforce_eval.replay.node import PlayerNode
@@ -59,8 +59,8 @@ class NodeRun:
 
     Attributes:
         log: the answers, by recorded stamp.
-        cpu: of each process while the film was played, all its threads [% of a core].
-        memory: resident at the film's end [bytes].
+        cpu: of each process while the stream was played, all its threads [% of a core].
+        memory: resident at the stream's end [bytes].
         player: CPU use of this process, which plays [% of a core].
         others: CPU use of everything else on the machine meanwhile [% of a core]; it should be small.
         seconds: for which it was played.
@@ -90,15 +90,20 @@ def await_listeners(player: PlayerNode, nodes: ProcessGroup, topics: Collection[
 
 
 def run_nodes(
-    processes: Sequence[Runnable], film: Film, sides: Sequence[str], awaited: Collection[str], *, detector: bool = False
+    processes: Sequence[Runnable],
+    stream: SyntheticStream,
+    sides: Sequence[str],
+    awaited: Collection[str],
+    *,
+    detector: bool = False,
 ) -> NodeRun:
-    """Play a film to processes in real time, stamps shifted to now; nothing outlives the call.
+    """Play a stream to processes in real time, stamps shifted to now; nothing outlives the call.
 
     Args:
         processes: to be started, and ended.
-        film: what is played.
+        stream: what is played.
         sides: jaws whose results are heard.
-        awaited: topics that somebody has to listen to before the film begins.
+        awaited: topics that somebody has to listen to before the stream begins.
         detector: whether the results of a key point detector are heard, too.
 
     Raises:
@@ -113,17 +118,17 @@ def run_nodes(
     with ExitStack() as stack:
         player = stack.enter_context(open_player(domain))
         nodes = stack.enter_context(ProcessGroup(processes, {"ROS_DOMAIN_ID": str(domain)}))
-        player.offer(film)
+        player.offer(stream)
         player.listen(sides, log, detector=detector)
 
         await_listeners(player, nodes, awaited)
         player.spin_until(monotonic() + LINGER)
         pids = find_processes([process.name for process in processes])
         meter = CpuMeter({**pids, PLAYER: getpid()})
-        log.offset = time_ns() - film.begin
+        log.offset = time_ns() - stream.begin
         busy = busy_seconds()
         meter.sample()
-        player.play(film, offset=log.offset, sent=lambda message: _note(log, message))
+        player.play(stream, offset=log.offset, sent=lambda message: _note(log, message))
         meter.sample()
         busy = busy_seconds() - busy
         memory = {name: resident_bytes(pid) for name, pid in pids.items()}

@@ -1,7 +1,4 @@
-"""Recorded messages as they lie in a bag, ready to be published again, read one by one.
-
-What a slow generator gives, made in another thread before it is asked for.
-"""
+"""The messages of a recording in the order of their times, read ahead of the player."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The processes of a graph as children of this one: started, watched, and all of them ended.
-
-CPU time of processes, from /proc; Linux only.
-"""
+"""Processes that nothing outlives, and the share of a core that each takes."""
 
 from __future__ import annotations
 

@@ -5,33 +5,24 @@ They are decoded before they are played, so that the player takes no time from t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-
 from finforce.stamps import NANOSECONDS
-from finforce.transforms import pose_from_quaternion
-from finforce_contact.mesh.object_mesh import load_object_mesh
-from finforce_contact.mesh.views import MeshView
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import TRUTH, KeypointSource
-from finforce_eval.recordings.images import IMAGE
-from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.twin_writer import FRAME
-from finforce_eval.recordings.writer import MessageFactory, write_recording
+from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.playback import Playback, RawMessage, read_playback
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
-OBJECT_TOPIC, MASK_TOPIC = "/object_pose", "/object_mask"
-MASK_DEPTH = 5e-3  # [m] between measured and true depth of the object's pixels; what is farther off hides it
+OBJECT_TOPIC = "/object_pose"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Film:
+class SyntheticStream:
     """Messages that are played as a `Playback` is; every iteration gives the same.
 
     Attributes:
@@ -65,13 +56,8 @@ class Film:
                 data = message.restamped(message.stamp + shift)
                 yield message._replace(time=message.time + shift, data=data)
 
-    def joined(self, other: Iterable[RawMessage]) -> Film:
-        """Return the film with further messages, each at its time."""
-        messages = sorted([*self.messages, *other], key=lambda message: message.time)
-        return replace(self, messages=messages)
 
-
-def film_images(source: Path, rate: int, *, poses: bool = True) -> Film:
+def stream_images(source: Path, rate: int, *, poses: bool = True) -> SyntheticStream:
     """Return what a camera sees at a rate [Hz], with the object's poses at 10 Hz unless they are left out.
 
     Raises:
@@ -81,7 +67,7 @@ def film_images(source: Path, rate: int, *, poses: bool = True) -> Film:
     return thin_messages(read_playback(source), topics, rate)
 
 
-def film_keypoints(source: Path, rate: int) -> Film:
+def stream_keypoints(source: Path, rate: int) -> SyntheticStream:
     """Return the true key points and jaw poses of a scene at a rate [Hz], with the object's poses at 10 Hz.
 
     Raises:
@@ -94,7 +80,7 @@ def film_keypoints(source: Path, rate: int) -> Film:
         return thin_messages(read_playback(plain), topics | {OBJECT_TOPIC}, rate)
 
 
-def thin_messages(messages: Playback, topics: set[str], rate: int) -> Film:
+def thin_messages(messages: Playback, topics: set[str], rate: int) -> SyntheticStream:
     """Return the messages of some topics at a rate [Hz]."""
     if FINE_RATE % rate:
         raise RecordingError(f"rate {rate} Hz: expected a divisor of {FINE_RATE} Hz")
@@ -110,40 +96,11 @@ def thin_messages(messages: Playback, topics: set[str], rate: int) -> Film:
         raise RecordingError(
             f"the scene has {len(images)} images at {rate} Hz, some are missing; expected one for {rate} Hz"
         )
-    return Film(messages=kept, period=len(images) * step * NANOSECONDS // FINE_RATE)
-
-
-def film_mask(source: Path) -> RawMessage:
-    """Return the mask of the object in the first image, as a segmentation would give it, at the image's time.
-
-    Raises:
-        FinforceError: there is no object, or its mesh cannot be used.
-    """
-    recording = read_recording(source)
-    stamp, image = next(iter(recording.images))
-    pose = pose_from_quaternion(recording.object_pose.position[0], recording.object_pose.quaternion[0])
-    seen = MeshView(load_object_mesh(require_mesh(recording, None))).render(pose, image.camera).depth
-    mask = np.abs(np.nan_to_num(image.depth) - np.nan_to_num(seen, nan=np.inf)) < MASK_DEPTH
-    factory = MessageFactory()
-    message = factory.typestore.types[IMAGE](
-        header=factory.header(stamp, FRAME),
-        height=mask.shape[0],
-        width=mask.shape[1],
-        encoding="mono8",
-        is_bigendian=0,
-        step=mask.shape[1],
-        data=np.where(mask, 255, 0).astype(np.uint8).ravel(),
-    )
-    data = bytes(factory.typestore.serialize_cdr(message, IMAGE))
-    return RawMessage(stamp, MASK_TOPIC, IMAGE, data, True)
+    return SyntheticStream(messages=kept, period=len(images) * step * NANOSECONDS // FINE_RATE)
 
 
 FINE_RATE = 180  # [Hz] of the slots in which images can lie; 30, 60 and 90 divide it
-
-
 POSE_SLOTS = 18  # the object is tracked at 10 Hz
-
-
 START = 1_000_000_000_000  # [ns] stamp of slot 0, as the twin has it
 
 

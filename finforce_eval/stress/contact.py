@@ -1,7 +1,4 @@
-"""Stress of contact place and solver together: hard objects at given poses, approached, pressed in and held.
-
-Objects that are hard to hold: grazing, flat, sharp, tiny, huge, thin, open.
-"""
+"""Stress of contact place and solver together: hard objects at given poses, approached, pressed in and held."""
 
 from __future__ import annotations
 

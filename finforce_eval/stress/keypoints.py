@@ -1,9 +1,4 @@
-"""Stress by key points: few of them, noisy ones, gross errors alone and in clusters.
-
-Stress by loads: forces from 1e-4 to 1e3 N, a jaw that is not as modelled, targets that jump between images.
-
-Stress by time: stamps that stall, jitter, repeat or leap, and very many steps.
-"""
+"""Stress by key points, by loads and by time: few points, noisy or wrong ones, forces of any size, odd stamps."""
 
 from __future__ import annotations
 
@@ -111,16 +106,16 @@ def run_forces(plan: Plan) -> Iterator[Trial]:
         random = plan.random("forces", seed)
         force = FORCES[seed % len(FORCES)]
         height = random.uniform(0.02, 0.06)
-        course = usual.course(height=height, radius=RADIUS, depth=DEPTH)
-        full = float(np.linalg.norm(course.forces(DEPTH)))
+        history = usual.history(height=height, radius=RADIUS, depth=DEPTH)
+        full = float(np.linalg.norm(history.forces(DEPTH)))
         if seed // len(FORCES) % 2 and force < full:
             bench, level = usual, f"{force:g} N, the usual jaw"
             depth = DEPTH * force / full
-            course = replace(bench.course(height=height, radius=RADIUS, depth=max(depth, LEAST_DEPTH)), depth=depth)
+            history = replace(bench.history(height=height, radius=RADIUS, depth=max(depth, LEAST_DEPTH)), depth=depth)
         else:
             bench, level = Bench(plan, modulus=force / full), f"{force:g} N, a jaw to match"
-            course = bench.course(height=height, radius=RADIUS, depth=DEPTH)
-        session = open_session(bench, random, course=course, level=level)
+            history = bench.history(height=height, radius=RADIUS, depth=DEPTH)
+        session = open_session(bench, random, history=history, level=level)
         yield from session.play(seed, session.press())
 
 
@@ -154,7 +149,7 @@ def run_jumps(plan: Plan) -> Iterator[Trial]:
 
 def _jump(session: Session, kind: str, random: np.random.Generator, count: int = 60) -> list[SessionStep]:
     """Returns `count` steps whose depth changes as `kind` says."""
-    deepest = session.course.depth
+    deepest = session.history.depth
     if kind == "teleport":
         return session.steps(np.repeat(random.uniform(0.0, deepest, count // 4), 4))
     if kind == "walk":
@@ -163,7 +158,7 @@ def _jump(session: Session, kind: str, random: np.random.Generator, count: int =
     if kind == "alternate":
         return session.steps(np.where(np.arange(count) % 2, deepest, 0.0))
     other = take_another(session, random)
-    first, second = session.steps(np.full(count, deepest)), other.steps(np.full(count, other.course.depth))
+    first, second = session.steps(np.full(count, deepest)), other.steps(np.full(count, other.history.depth))
     return [pair[i // 10 % 2] for i, pair in enumerate(zip(first, second, strict=True))]
 
 
@@ -230,7 +225,7 @@ def _press_on(presses: list[Session], random: np.random.Generator, count: int) -
     done = 0
     while done < count:
         session = presses[int(random.integers(len(presses)))]
-        depth = random.uniform(0.2, 1.0) * session.course.depth
+        depth = random.uniform(0.2, 1.0) * session.history.depth
         up = np.linspace(0.0, depth, int(random.integers(5, 40)))
         depths = np.concatenate([np.zeros(20), up, np.full(int(random.integers(10, 90)), depth), up[::-1]])
         for step in session.steps(depths)[: count - done]:

@@ -1,9 +1,4 @@
-"""Stress of the mechanics: the energy weight, stiffness from 1e3 to 1e12 Pa, nu near 0.5, loads into buckling.
-
-Jaws under known loads, and how good such an equilibrium is.
-
-Stress of the quadratic program: badly scaled, nearly singular and bounded ones, beside a second solver.
-"""
+"""Stress of the mechanics and of the quadratic program: energy weight, stiffness, nu near 0.5, buckling."""
 
 from __future__ import annotations
 
@@ -146,8 +141,8 @@ def _scale_estimates(plan: Plan, seed: int) -> Iterator[Trial]:
 def estimate_press(plan: Plan, seed: int, modulus: float) -> Solution:
     """Returns what an estimator of a jaw of some modulus [Pa] says at the end of a press with noise."""
     bench = Bench(plan, jaw=build_jaw(modulus))
-    course = bench.course(height=0.04, radius=0.0125, depth=3e-3)
-    session = open_session(bench, plan.random("modulus", seed), course=course)
+    history = bench.history(height=0.04, radius=0.0125, depth=3e-3)
+    session = open_session(bench, plan.random("modulus", seed), history=history)
     return [update(bench, step) for step in session.press()][-1]
 
 

@@ -98,7 +98,7 @@ def _build_three(plan: Plan) -> Bench | None:
 
 def _contact_of(kind: str, session: Session, random: np.random.Generator) -> Contact | None:
     """Returns the contact of a session in the form, or with the error, that `kind` names."""
-    height, radius = session.course.height, session.course.radius
+    height, radius = session.history.height, session.history.radius
     heights = session.bench.jaw.candidates[:, 2]
     away = float(np.clip(height + random.choice((-1, 1)) * random.uniform(5e-3, FARTHEST), heights[0], heights[-1]))
     match kind:

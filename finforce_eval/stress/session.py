@@ -1,7 +1,4 @@
-"""Key points of a press in time, what an estimator says of them, and whether that is right.
-
-Presses of a known force on a jaw, and an estimator of that jaw.
-"""
+"""Key points of a press in time, what an estimator says of them, and whether that is right."""
 
 from __future__ import annotations
 
@@ -70,7 +67,7 @@ class Session:
     Attributes:
         bench: whose estimator it is.
         random: of the noise.
-        course: the press.
+        history: the press.
         contact: what the estimator is told of the place.
         offsets: of the key points, constant (K, 3) [m].
         start: stamp of the last unloaded image [s].
@@ -79,7 +76,7 @@ class Session:
 
     bench: Bench
     random: np.random.Generator
-    course: PressHistory
+    history: PressHistory
     contact: Contact
     offsets: NDArray
     start: float
@@ -87,9 +84,9 @@ class Session:
 
     def steps(self, depths: NDArray, *, scale: float = 1.0) -> list[SessionStep]:
         """Returns one step for each depth (n,) [m], a period apart, with `scale` times a bench camera's noise."""
-        clean = self.course.keypoints(depths) + self.offsets
+        clean = self.history.keypoints(depths) + self.offsets
         points = clean + noise_of(self.random, clean.shape[:2], scale)
-        forces, torques = self.course.forces(depths), self.course.torques(depths)
+        forces, torques = self.history.forces(depths), self.history.torques(depths)
         return [
             SessionStep(
                 stamp=self.start + (i + 1) * PERIOD,
@@ -105,7 +102,7 @@ class Session:
 
     def press(self, *, scale: float = 1.0) -> list[SessionStep]:
         """Returns the steps of a press: three images of rest, 0.4 s of ramp, 0.7 s of hold."""
-        depth = self.course.depth
+        depth = self.history.depth
         rising = np.linspace(0.0, depth, 13)[1:]
         return self.steps(np.concatenate([np.zeros(3), rising, np.full(20, depth)]), scale=scale)
 
@@ -115,22 +112,27 @@ class Session:
             yield attempt(
                 seed,
                 lambda s=step: update(self.bench, s),
-                lambda got, s=step: judge(got, s, self.course.balance),
+                lambda got, s=step: judge(got, s, self.history.balance),
                 level=step.level,
             )
 
 
 def open_session(
-    bench: Bench, random: np.random.Generator, *, course: PressHistory | None = None, tare: float = 1.0, level: str = ""
+    bench: Bench,
+    random: np.random.Generator,
+    *,
+    history: PressHistory | None = None,
+    tare: float = 1.0,
+    level: str = "",
 ) -> Session:
     """Draws a press unless one is given, and lets the estimator tare on images with `tare` times the usual noise.
 
     The estimator is told the height of first touch, off by what its settings call that height's deviation.
     """
-    course = course or bench.press(random)
+    history = history or bench.press(random)
     offsets = OFFSET * random.normal(size=bench.jaw.keypoints.shape)
     error = bench.estimator.settings.height_stddev * random.normal()
-    contact = Contact.fixed(bench.jaw, course.height + error)
+    contact = Contact.fixed(bench.jaw, history.height + error)
     rest = bench.jaw.keypoints + offsets
     bench.estimator.reset()
     stamp, likelihood = 10.0, np.full(len(rest), LIKELIHOOD)
@@ -139,15 +141,15 @@ def open_session(
         seen = Observation(stamp=stamp, points=rest + noise, likelihood=likelihood)
         bench.estimator.update(seen, contact)
     return Session(
-        bench=bench, random=random, course=course, contact=contact, offsets=offsets, start=stamp, level=level
+        bench=bench, random=random, history=history, contact=contact, offsets=offsets, start=stamp, level=level
     )
 
 
 def take_another(session: Session, random: np.random.Generator) -> Session:
     """Returns the session with another press and what is told of it, the estimator going on as it is."""
-    course = session.bench.press(random)
+    history = session.bench.press(random)
     error = session.bench.estimator.settings.height_stddev * random.normal()
-    return replace(session, course=course, contact=Contact.fixed(session.bench.jaw, course.height + error))
+    return replace(session, history=history, contact=Contact.fixed(session.bench.jaw, history.height + error))
 
 
 def update(bench: Bench, step: SessionStep) -> Solution:
@@ -253,11 +255,11 @@ class Bench:
             height, radius = random.uniform(0.018, 0.062), np.exp(random.uniform(np.log(5e-3), np.log(25e-3)))
             deepest = np.exp(random.uniform(np.log(0.3e-3), np.log(8e-3))) if depth is None else depth
             try:
-                return self.course(height=height, radius=radius, depth=deepest)
+                return self.history(height=height, radius=radius, depth=deepest)
             except ContactError:
                 continue
 
-    def course(self, *, height: float, radius: float, depth: float) -> PressHistory:
+    def history(self, *, height: float, radius: float, depth: float) -> PressHistory:
         """Returns the press of a cylinder; raises ContactError where there is no equilibrium."""
         model, surface = self.mechanics.model, self.mechanics.contact.surface
         depths = np.linspace(0.0, depth, COURSE_STEPS + 1)[1:]

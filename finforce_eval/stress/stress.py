@@ -1,7 +1,4 @@
-"""What a stress family is and how one of its trials is run.
-
-What the trials of a stress family come to, and which rules they break.
-"""
+"""What a stress family is, how one of its trials is run, what they come to, and which rules they break."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """Frictionless contact of surface points with a rigid object by a smoothed penalty.
 
-Penetration into a rigid outline as a smooth field, twice differentiable.
-
-Signed distances to the polygons are the coefficients of a uniform cubic B-spline. A B-spline with samples for
-coefficients smooths over half a cell, so that corners and the facets of a mesh do not make the contact rattle.
+The penetration into an outline is a smooth field, twice differentiable: signed distances to the polygons are the
+coefficients of a uniform cubic B-spline, which smooths over half a cell, so that corners and the facets of a mesh do
+not make the contact rattle.
 """
 
 from dataclasses import dataclass

@@ -1,11 +1,7 @@
-"""How stiff an undeformed jaw is against what presses on its inner surface.
-
-A jaw in equilibrium with a rigid object pressed into its inner surface.
+"""A jaw in equilibrium with a rigid object pressed into its inner surface, and how stiff it is against that.
 
 An unknown object is taken for a cylinder: its depth, radius and height are enough to place the pressure. That moves
 and spreads along the finger by itself as the finger bends.
-
-The inner surface of a jaw as a dense set of points where an object can touch.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""The jaw as a planar frame of co-rotational beams, clamped at the base.
-
-Compiled loops over planar co-rotational beams and the points that they carry.
+"""The jaw as a planar frame of co-rotational beams, clamped at the base, with its compiled loops.
 
 A rotation about y is positive from z to x: R(a) (x, z) = (x cos a + z sin a, z cos a - x sin a). A right
 angle turns (x, z) into (z, -x): the normal of a direction, and the derivative of a vector by its rotation.

@@ -1,7 +1,5 @@
 """The jaw as a geometrically nonlinear solid: co-rotational hexahedra or tetrahedra, clamped at the base.
 
-Compiled element loops of the co-rotational solid.
-
 With F = sum (X_i + u_i) g_i^T = R U, x' = R^T x and d = x' - X (about the element's centroid) an element's energy is
 d.K0.d / 2. Its gradient is f_i = R (f'_i - G_i^T m) with f' = K0 d, m = sum x'_i x f'_i and
 G_i = (tr(U) I - U)^-1 [g_i]; the spin of the element is sum G_i R^T du_i. The tangent is
@@ -9,8 +7,6 @@ R (P^T K0 P - [p] G - G^T [f']^T P) R^T, symmetrised, with P = I - S G and S w =
 of the undeformed shape, K0 S is formed from d alone.
 
 Source: Felippa, Haugen, A unified formulation of small-strain corotational finite elements, CMAME 194 (2005).
-
-Compiled loops over material points given as weighted sums of unknowns.
 """
 
 from dataclasses import dataclass

@@ -1,12 +1,9 @@
 """Identification of a finger from recordings with true forces: stiffness, effective thicknesses, clamp, relaxation.
 
-Shape tells the geometry, force the modulus, and the forces' course at steady shape the relaxation. All are found
+Shape tells the geometry, force the modulus, and the force history at steady shape the relaxation. All are found
 together by least squares over the steady loads; the depth of each load and of each recording the object's radius, or
-the tilt of its known outline, are found along the way.
-
-Recordings with true forces cut into steady loads and their mean key points.
-
-Modulus and relaxation from the whole course of force in recordings, ramps included.
+the tilt of its known outline, are found along the way. Modulus and relaxation are then refined by the whole force
+history of the recordings, ramps included.
 """
 
 from __future__ import annotations
@@ -114,17 +111,17 @@ def fit_calibration(
     )
     covariance = np.linalg.inv(result.jac.T @ result.jac)
     rough = fit.report(result.x, np.sqrt(np.diag(covariance)))
-    course = fit_course(jaw, cases, settings, rough.calibration, progress)
+    history = fit_force_history(jaw, cases, settings, rough.calibration, progress)
     return replace(
         rough,
         calibration=replace(
             rough.calibration,
-            young_modulus=rough.calibration.young_modulus * course.scale,
-            relaxation=course.terms,
-            force_error=float(np.clip(course.relative, 0.005, 0.5)),
+            young_modulus=rough.calibration.young_modulus * history.scale,
+            relaxation=history.terms,
+            force_error=float(np.clip(history.relative, 0.005, 0.5)),
         ),
-        uncertainty={**rough.uncertainty, **dict(zip(_NAMES[5:], course.stddev.tolist(), strict=True))},
-        force_rms=course.force_rms,
+        uncertainty={**rough.uncertainty, **dict(zip(_NAMES[5:], history.stddev.tolist(), strict=True))},
+        force_rms=history.force_rms,
     )
 
 
@@ -429,7 +426,7 @@ _CORRELATED_FRAMES = 30
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CourseFit:
+class HistoryFit:
     """The outcome.
 
     Attributes:
@@ -462,34 +459,34 @@ def branches_from_parameters(x: NDArray) -> tuple[RelaxationTerm, ...]:
     return tuple(sorted(terms, key=lambda term: term.time_constant))
 
 
-def fit_course(
+def fit_force_history(
     jaw: Jaw,
     cases: Sequence[CalibrationCase],
     settings: EstimatorSettings,
     calibration: Calibration,
     progress: Callable[[float], None],
-) -> CourseFit:
+) -> HistoryFit:
     """Fits modulus and relaxation at a given geometry.
 
     Raises:
         CalibrationError: The estimator trusts hardly a loaded frame of the recordings.
     """
-    courses = []
+    histories = []
     for case in cases:
-        courses.append(_track_course(jaw, case, settings, calibration))
+        histories.append(_track_force(jaw, case, settings, calibration))
         progress(float("nan"))
     fit = least_squares(
         _residuals,
         np.r_[0.0, BRANCH_PRIOR],
         bounds=(np.r_[-_LARGEST_SCALE, BRANCH_LOW], np.r_[_LARGEST_SCALE, BRANCH_HIGH]),
         x_scale=np.r_[1.0, BRANCH_STDDEV],
-        args=(courses,),
+        args=(histories,),
     )
-    errors = np.concatenate([_model(fit.x, course) - course.true for course in courses])
-    true = np.concatenate([course.true for course in courses])
+    errors = np.concatenate([_model(fit.x, history) - history.true for history in histories])
+    true = np.concatenate([history.true for history in histories])
     loaded = true > _LOADED_FORCE
     stddev = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac + 1e-12 * np.eye(5))))[1:]
-    return CourseFit(
+    return HistoryFit(
         scale=float(np.exp(fit.x[0])),
         terms=branches_from_parameters(fit.x[1:]),
         stddev=stddev * [1.0, np.exp(fit.x[2]), 1.0, np.exp(fit.x[4])],
@@ -498,7 +495,7 @@ def fit_course(
     )
 
 
-def _track_course(
+def _track_force(
     jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration
 ) -> _ForceHistory:
     """Estimates the elastic force of every frame."""
@@ -512,11 +509,11 @@ def _track_course(
     return _ForceHistory(stamps=stamps, elastic=np.array([np.linalg.norm(s.force) for s in trusted]), true=true)
 
 
-def _model(x: NDArray, course: _ForceHistory) -> NDArray:
-    return np.exp(x[0]) * apply_relaxation(course.elastic, course.stamps, branches_from_parameters(x[1:]))
+def _model(x: NDArray, history: _ForceHistory) -> NDArray:
+    return np.exp(x[0]) * apply_relaxation(history.elastic, history.stamps, branches_from_parameters(x[1:]))
 
 
-def _residuals(x: NDArray, courses: Sequence[_ForceHistory]) -> NDArray:
+def _residuals(x: NDArray, histories: Sequence[_ForceHistory]) -> NDArray:
     """Returns the force residuals of all frames over their standard deviations, and those of the prior."""
-    rows = [(_model(x, c) - c.true) / (_RELATIVE_ERROR * c.true + _ABSOLUTE_ERROR) for c in courses]
+    rows = [(_model(x, c) - c.true) / (_RELATIVE_ERROR * c.true + _ABSOLUTE_ERROR) for c in histories]
     return np.concatenate([np.concatenate(rows) / np.sqrt(_CORRELATED_FRAMES), (x[1:] - BRANCH_PRIOR) / BRANCH_STDDEV])

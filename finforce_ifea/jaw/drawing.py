@@ -1,7 +1,4 @@
-"""The parametric fin-ray finger as drawn in its x-z plane.
-
-Structured hexahedral meshes of a fin-ray drawing.
-"""
+"""The parametric fin-ray finger as drawn in its x-z plane, and its structured hexahedral meshes."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Literal

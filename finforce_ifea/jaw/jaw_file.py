@@ -1,7 +1,4 @@
-"""Typed reading of a jaw file's YAML, with errors that say what would do.
-
-The parts of a jaw from the tables of a jaw file: drawing, mesh file, key points, candidates.
-"""
+"""Typed reading of a jaw file's YAML into the parts of a jaw, with errors that say what would do."""
 
 import contextlib
 import difflib

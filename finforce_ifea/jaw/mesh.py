@@ -1,9 +1,4 @@
-"""A volume mesh with its checks and its surface.
-
-Whether a volume mesh is one piece that its clamp holds.
-
-Shape functions of the 4- and 10-node tetrahedron and the 8-node hexahedron, nodes in the VTK order.
-"""
+"""A volume mesh, its checks, its surface, and the shape functions of its elements, nodes in the VTK order."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
-"""What loads on the rows of a jaw's inner face do to it at an equilibrium.
+"""Builds the manifold of a jaw's equilibria: a rod is pressed in at every height.
 
-Builds the manifold of a jaw's equilibria: a rod is pressed in at every height.
+Each equilibrium comes with what loads on the rows of the jaw's inner face do to it.
 """
 
 from collections.abc import Callable
@@ -127,14 +127,14 @@ DEPTHS, HEIGHTS, SHAPES, ROWS = 16, 33, 40, 56
 _ROD, _DEEPEST, _LOWEST, _TOP = 0.2, 0.19, 0.11, 0.03
 # By so much the rods stand denser at base and tip than on the average: forces change fastest with height there.
 _DENSER = 0.5
-# So much of a course is divided by the square of the step's number: a jaw may stiffen early.
+# So much of a path is divided by the square of the step's number: a jaw may stiffen early.
 _EARLY = 0.8
 # The rod stops where it needs this many times the force that it needs half way up at full depth.
 _HARDEST = 12.0
 _LONGEST, _SHORTEST = 0.5e-3, 0.02e-3
 # What is not stored need not be as exact.
 _ITERATIONS, _TOLERANCE, _PASSING = 30, 1e-9, 1e-6
-# Quarters of a course that are tried next where it cannot be divided.
+# Quarters of a path that are tried next where it cannot be divided.
 _KEPT = 3
 _ON_FACE = 1e-4
 _FEWEST_ROWS, _MOST_ROWS = 12, 84
@@ -200,12 +200,12 @@ def _press_everywhere(contact: RollingContact, progress: Callable[[float], None]
     hardest = _HARDEST * float(np.linalg.norm(rods[HEIGHTS // 2].press(np.inf)[-1].state.force))
     depths, states = [], []
     for number, rod in enumerate(rods):
-        course, divided = rod.press(hardest), None
+        path, divided = rod.press(hardest), None
         while divided is None:
-            depth = _find_depth(course, hardest)
-            divided = rod.divide(course, depth, DEPTHS)
-            course = course[: _KEPT * len(course) // 4]
-            if divided is None and not course:
+            depth = _find_depth(path, hardest)
+            divided = rod.divide(path, depth, DEPTHS)
+            path = path[: _KEPT * len(path) // 4]
+            if divided is None and not path:
                 raise ContactError(f"the jaw cannot be pressed evenly at a height of {1e3 * heights[number]:.1f} mm")
         depths.append(depth)
         states.append(divided)
@@ -213,15 +213,15 @@ def _press_everywhere(contact: RollingContact, progress: Callable[[float], None]
     return _Grid(rods=heights, depths=np.array(depths), q=np.array(states).transpose(1, 0, 2))
 
 
-def _find_depth(course: list[_Equilibrium], hardest: float) -> float:
-    """Returns the depth [m] at which a course ends or, found between its steps, needs the largest force [N].
+def _find_depth(path: list[_Equilibrium], hardest: float) -> float:
+    """Returns the depth [m] at which a path ends or, found between its steps, needs the largest force [N].
 
     Depths that change smoothly with height make equilibria that do.
     """
-    forces = [0.0, *(float(np.linalg.norm(item.state.force)) for item in course[-2:])]
-    if len(course) < 2 or not forces[-2] < hardest < forces[-1]:
-        return course[-1].depth
-    return float(np.interp(hardest, forces[-2:], [item.depth for item in course[-2:]]))
+    forces = [0.0, *(float(np.linalg.norm(item.state.force)) for item in path[-2:])]
+    if len(path) < 2 or not forces[-2] < hardest < forces[-1]:
+        return path[-1].depth
+    return float(np.interp(hardest, forces[-2:], [item.depth for item in path[-2:]]))
 
 
 def _choose_rows(mechanics: Mechanics) -> NDArray:
@@ -258,9 +258,9 @@ class _Rod:
 
     def press(self, hardest: float) -> list[_Equilibrium]:
         """Returns equilibria at rising depths up to the largest, or to where the jaw gives way or resists."""
-        course, step = [], _LONGEST
-        while not course or course[-1].depth < self._deepest - 1e-9:
-            before = course[-1] if course else None
+        path, step = [], _LONGEST
+        while not path or path[-1].depth < self._deepest - 1e-9:
+            before = path[-1] if path else None
             depth = min((before.depth if before else 0.0) + step, self._deepest)
             found = self._settle(before, depth, _PASSING)
             if found is None:
@@ -268,24 +268,24 @@ class _Rod:
                 if step < _SHORTEST:
                     break
                 continue
-            course.append(found)
+            path.append(found)
             if np.linalg.norm(found.state.force) > hardest:
                 break
-        if not course:
+        if not path:
             raise ContactError(f"the jaw cannot be pressed at a height of {1e3 * self._height:.1f} mm")
-        return course
+        return path
 
-    def divide(self, course: list[_Equilibrium], largest: float, count: int) -> list[NDArray] | None:
-        """Returns the unknowns of equilibria that divide a course up to a depth [m], denser at its beginning.
+    def divide(self, path: list[_Equilibrium], largest: float, count: int) -> list[NDArray] | None:
+        """Returns the unknowns of equilibria that divide a path up to a depth [m], denser at its beginning.
 
         The unloaded one comes first. None where one is not found: the jaw goes over to another shape there.
         """
-        depths = np.array([item.depth for item in course])
+        depths = np.array([item.depth for item in path])
         states = [np.zeros(self._contact.model.size)]
         share = np.arange(1, count + 1) / count
         for depth in largest * ((1.0 - _EARLY) * share + _EARLY * share**2):
             below = int(np.searchsorted(depths, depth + 1e-12)) - 1
-            found = self._settle(course[below] if below >= 0 else None, depth, _TOLERANCE)
+            found = self._settle(path[below] if below >= 0 else None, depth, _TOLERANCE)
             if found is None:
                 return None
             states.append(found.q)

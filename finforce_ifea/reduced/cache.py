@@ -1,8 +1,6 @@
-"""Manifolds that were built before: found again by a hash of everything that they depend on.
+"""From a jaw's full mechanics to its stored equilibria, built once and found again by a hash of what they depend on.
 
 The folder is `$FINFORCE_CACHE`, else `finforce` in the user's cache folder. What cannot be read is built anew.
-
-From a jaw's full mechanics to its stored equilibria, built once and found again.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """The jaw by its stored equilibria: full geometric nonlinearity without an element.
 
 The unknowns q (2 n + 2,) are the loads on the n rows of the inner face (x and z interleaved) [N], whatever presses, and
-the grid coordinates of the stored equilibrium that is nearest in shape. See `finforce_ifea.reduced.equilibria`.
-
-A jaw of stored equilibria under a rigid object: the same as `RollingContact`, at the price of a look-up.
-
-Compiled loops over the rows and points of a jaw of stored equilibria.
+the grid coordinates of the stored equilibrium that is nearest in shape. See `finforce_ifea.reduced.equilibria`. Under a
+rigid object it is the same as `RollingContact`, at the price of a look-up.
 """
 
 from dataclasses import dataclass, replace

@@ -14,6 +14,7 @@ from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
+from finforce_ifea.tracking.influence import measure_influence
 from finforce_ifea.tracking.place_update import (
     Average,
     Forecast,
@@ -24,7 +25,6 @@ from finforce_ifea.tracking.place_update import (
     update_place,
     weigh_residuals,
 )
-from finforce_ifea.tracking.rest_response import measure_rest
 from finforce_ifea.tracking.track import Track, explain_offsets
 
 # The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
@@ -59,7 +59,7 @@ class PlaceTracker:
         self.probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
         self._stiffness: float | None = None
         self._rest = contact.model.positions(self.probe, np.zeros(contact.model.size))
-        self.response = measure_rest(contact, self.probe, len(keypoints))
+        self.response = measure_influence(contact, self.probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
         self._face = contact.surface.heights[[0, -1]]
         self.reset()

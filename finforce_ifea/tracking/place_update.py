@@ -1,11 +1,7 @@
-"""How sure a place is: its covariance's condition, another contact, points that err together.
+"""Compiled update of an object's place by the key points of one image, and how sure it is.
 
-Compiled update of an object's place by the key points of one frame.
-
-The depth is corrected by a Kalman filter on this frame's residuals. Log radius and height are the maximum a posteriori
-for the residuals averaged over the last frames, whose bias (errors of mechanics and of offsets) does not average out.
-
-Compiled in-plane residuals of key points about a place, and how far each can be believed.
+The depth is corrected by a Kalman filter on this image's residuals. Log radius and height are the maximum a posteriori
+for the residuals averaged over the last images, whose bias (errors of mechanics and of offsets) does not average out.
 """
 
 from __future__ import annotations
@@ -106,12 +102,12 @@ def doubt_height(
 
 
 @njit(**_OPTIONS)
-def find_rift(data: Residuals, deeper: float, information: float) -> float:
+def find_leverage(data: Residuals, deeper: float, information: float) -> float:
     """Returns how far the depth would move if points that are half believed were not believed at all [m].
 
     With w the weights, h the motions by depth, r what is left of the residuals and I the information,
 
-        rift = sum_k w_k (1 - w_k) h_k^T N_k^-1 r_k / I.
+        leverage = sum_k w_k (1 - w_k) h_k^T N_k^-1 r_k / I.
 
     Chance cancels in it; points that are wrong together do not.
 
@@ -120,14 +116,14 @@ def find_rift(data: Residuals, deeper: float, information: float) -> float:
         deeper: change of the depth since the residuals [m].
         information: on the depth [1/m^2].
     """
-    rift = 0.0
+    leverage = 0.0
     for k in range(len(data.weights)):
         n00, n11, n01 = data.noise[k, 0, 0], data.noise[k, 1, 1], data.noise[k, 0, 1]
         h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
         r0, r1 = data.r[k, 0] - h0 * deeper, data.r[k, 1] - h1 * deeper
         score = (h0 * (n11 * r0 - n01 * r1) + h1 * (n00 * r1 - n01 * r0)) / (n00 * n11 - n01 * n01)
-        rift += data.weights[k] * (1.0 - data.weights[k]) * score
-    return rift / information
+        leverage += data.weights[k] * (1.0 - data.weights[k]) * score
+    return leverage / information
 
 
 # Depth has no prior; this share of one frame's information keeps the posterior regular while nothing was averaged.
@@ -405,7 +401,7 @@ def update_place(
     # what chance leaves of the innovation may be a motion that was not expected; the gain has followed a part of it
     beyond = max(0.0, innovation**2 - 1.0 / information - max(forecast.spread[0, 0], 0.0))
     known = gain[0] / information + (1.0 - gain[0]) ** 2 * beyond
-    known += find_rift(data, depth - reference[0], information) ** 2
+    known += find_leverage(data, depth - reference[0], information) ** 2
     spread = spread - np.outer(gain, spread[0])
     return PlaceUpdate(
         place, speed, spread, jumped, new, covariance, known, kkt, residual, misfit, away, mistaken, condition

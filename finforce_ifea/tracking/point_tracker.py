@@ -1,7 +1,4 @@
-"""Force at a given contact from key points, frame after frame: the load sits where it is told to.
-
-Whether key points have a load that is held at a given height somewhere else.
-"""
+"""Force at a given contact from key points, image after image, and whether they have the load somewhere else."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,8 +15,8 @@ from finforce_ifea.observation import Contact
 from finforce_ifea.paper_inverse import InverseResult, Problem, solve_inverse
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
+from finforce_ifea.tracking.influence import InfluenceCoefficients
 from finforce_ifea.tracking.place_update import doubt_place
-from finforce_ifea.tracking.rest_response import RestResponse
 from finforce_ifea.tracking.track import Track, compute_magnitude_stddev, explain_offsets
 
 _NEIGHBOUR = 1e-3
@@ -42,7 +39,9 @@ class PointTracker:
     points are weighted by their agreement, and the state is brought to equilibrium.
     """
 
-    def __init__(self, jaw: Jaw, mechanics: Mechanics, settings: EstimatorSettings, response: RestResponse) -> None:
+    def __init__(
+        self, jaw: Jaw, mechanics: Mechanics, settings: EstimatorSettings, response: InfluenceCoefficients
+    ) -> None:
         """Attaches the key points, `response` being that of the unloaded jaw; raises MeshError when one is off it."""
         self._watch = PlaceWatch(response, settings)
         self.jaw, self.mechanics, self.settings = jaw, mechanics, settings
@@ -270,7 +269,7 @@ class PlaceWatch:
     is the way to the place that they ask for. A place that is off by dz changes the force by (U . U') / (U . U) dz F.
     """
 
-    def __init__(self, response: RestResponse, settings: EstimatorSettings) -> None:
+    def __init__(self, response: InfluenceCoefficients, settings: EstimatorSettings) -> None:
         """Keeps the answers of the unloaded jaw and how well heights are known."""
         self._response = response
         self._prior_variance = settings.height_stddev**2

@@ -1,9 +1,4 @@
-"""What a tracker says of one frame, and whether offsets look like a load.
-
-When a force must not be reported.
-
-Compiled numbers of a solution: standard deviations and moments of a force that was tracked.
-"""
+"""What a tracker says of one image with its standard deviations, and when a force must not be reported."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

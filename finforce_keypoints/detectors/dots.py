@@ -1,7 +1,4 @@
-"""Printed or painted dots in an image: their places, sizes and shapes.
-
-Key points by printed or painted dots, with OpenCV and without any training.
-"""
+"""Key points by printed or painted dots, with OpenCV and without any training."""
 
 from __future__ import annotations
 

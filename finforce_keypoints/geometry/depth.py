@@ -1,9 +1,8 @@
-"""Depth of the finger's side at its key points, from many pixels inside its outline.
+"""Pixels and depths of one jaw's key points to points in its frame.
 
-Pixels and depths of one jaw's key points to points in its frame.
-
-The key points lie on the jaw's side face. What their depths share (the place and the slopes of that face, the scale of
-the depth image) is found from all of them and the reference point, which is rigid; what is left over is each one's own.
+The key points lie on the jaw's side face. Depth is read from many pixels inside its outline. What the depths share (the
+place and the slopes of that face, the scale of the depth image) is found from all of them and the reference point,
+which is rigid; what is left over is each one's own.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""One jaw in one image after another: its place, and its key points in its frame.
-
-Whether the key points of a jaw at rest lie where its file says.
+"""One jaw in one image after another: its place, its key points, and a camera that is elsewhere.
 
 A camera that is not where it is said to be shifts, turns and stretches the picture of a jaw's side, all of it an affine
 map of the side's places; a load bends the finger, which is none. A load moves the key points along the closing axis, a

@@ -1,4 +1,4 @@
-"""How the grey values around a jaw's key points answer to its motion and to the light.
+"""Whether the jaws stand as they did in the last images, so that their key points hold.
 
 Around every key point, what a picture differs by from a mean picture m is explained by what light does (gain and
 brightness) and by what a jaw does: a shift along its x, one that grows with the height h and one with its square, and a
@@ -7,8 +7,6 @@ shift along its z; all of them small.
     d = g m + b - (c_0 + c_1 h + c_2 h^2) dm/dx - c_3 dm/dz + noise
 
 The least squares c say how far each key point has gone; that is a length, and so is what may be missed.
-
-Whether the jaws stand as they did in the last images, so that their key points hold.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The `pytorch_config.yaml` beside a DeepLabCut network: names, pre-processing and decoding.
-
-Which heatmap is which key point of which jaw.
-"""
+"""The `pytorch_config.yaml` beside a DeepLabCut network, and which heatmap is which key point of which jaw."""
 
 from __future__ import annotations
 

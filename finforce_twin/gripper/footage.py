@@ -1,7 +1,4 @@
-"""A scenario as its wrist camera and an object tracker would record it, image by image.
-
-Images, intrinsics and true key points as the contents of messages.
-"""
+"""A scenario as its wrist camera and an object tracker would record it, image by image, ready for messages."""
 
 from __future__ import annotations
 
@@ -77,8 +74,8 @@ class TwinFrame:
     T_camera_object: NDArray | None
 
 
-class FilmedGripper(Protocol):
-    """What is filmed; `TwinGripper` is one."""
+class RenderedGripper(Protocol):
+    """What is rendered; `TwinGripper` is one."""
 
     def __len__(self) -> int:
         """Return the number of states."""
@@ -88,7 +85,7 @@ class FilmedGripper(Protocol):
 
 
 class MountedCamera(Protocol):
-    """What films; `Photographer` is one."""
+    """What renders; `Photographer` is one."""
 
     def shoot(self, state: TwinState) -> Shot:
         """Return the image of a state."""
@@ -104,13 +101,13 @@ class Footage:
         depth_step: of the depth images [m].
 
     Args:
-        gripper: what is filmed.
-        photographer: who films it.
+        gripper: what is rendered.
+        photographer: that renders it.
         setting: what stands before the camera, and where the camera is.
         seed: of the object tracker's noise.
     """
 
-    def __init__(self, gripper: FilmedGripper, photographer: MountedCamera, setting: SceneSetting, seed: int) -> None:
+    def __init__(self, gripper: RenderedGripper, photographer: MountedCamera, setting: SceneSetting, seed: int) -> None:
         self._gripper, self._photographer, self._seed = gripper, photographer, seed
         self.camera, self.T_gripper_camera, self.mesh = setting.camera, setting.T_gripper_camera, setting.mesh
         self.depth_step = setting.depth_step
@@ -246,7 +243,7 @@ def info_fields(camera: CameraIntrinsics) -> dict[str, Any]:
     }
 
 
-def sight_columns(jaw: TrueJaw) -> dict[str, NDArray]:
+def detection_truth_columns(jaw: TrueJaw) -> dict[str, NDArray]:
     """Return the columns of a cloud of true key points: x y z [m] jaw frame, u v [px], visible."""
     columns = {axis: jaw.points[:, i].astype(np.float32) for i, axis in enumerate("xyz")}
     columns |= {name: jaw.pixels[:, i].astype(np.float32) for i, name in enumerate("uv")}

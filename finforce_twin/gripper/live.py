@@ -1,9 +1,4 @@
-"""A grasp before the camera while a gripper moves, with the truth at that moment.
-
-Images of a grasp at many openings, taken beforehand and looked up by the opening.
-
-An emulated gripper at a serial port whose jaws are those of the twin.
-"""
+"""A grasp before the camera while a gripper moves, by images that were rendered at many openings beforehand."""
 
 from __future__ import annotations
 
@@ -54,14 +49,14 @@ class LiveScene(Generic[T]):
     """A grasp that follows a gripper's opening.
 
     Attributes:
-        grasp: what is filmed.
+        grasp: what is rendered.
         camera: intrinsics.
         depth_step: of the depth images [m].
-        reel: the images that were filmed; None before.
+        table: the images that were rendered; None before.
 
     Args:
-        grasp: what is filmed.
-        photographer: who films it.
+        grasp: what is rendered.
+        photographer: that renders it.
         seed: of the object tracker's noise.
 
     Raises:
@@ -78,24 +73,24 @@ class LiveScene(Generic[T]):
             )
         self.grasp = grasp
         self.camera, self.depth_step = photographer.setting.camera, photographer.setting.depth_step
-        self.reel: Reel[T] | None = None
+        self.table: ImageTable[T] | None = None
         self._photographer = photographer
         self._relaxed = RelaxedGrasp(grasp)
         self._T_camera_gripper = invert_pose(photographer.setting.T_gripper_camera)
         self._rng = np.random.default_rng((seed, 3))
         self._count, self._last = 0, None
 
-    def film(self, keep: Callable[[TwinFrame], T], tell: Callable[[int, int], None]) -> None:
-        """Takes the images at all openings of the gripper; see `film_grasp`."""
+    def render(self, keep: Callable[[TwinFrame], T], tell: Callable[[int, int], None]) -> None:
+        """Takes the images at all openings of the gripper; see `render_openings`."""
         openings = choose_openings(self.grasp, self._low, self._high)
-        self.reel = film_grasp(self.grasp, self._photographer, openings, keep, tell)
+        self.table = render_openings(self.grasp, self._photographer, openings, keep, tell)
 
     def take(self, opening: float, now: float) -> Moment[T]:
-        """Returns the moment at an opening [m], at a time [s] that never goes back; `film` comes first."""
-        place = self.reel.find(opening)
-        takes = self.reel.takes[place]
+        """Returns the moment at an opening [m], at a time [s] that never goes back; `render` comes first."""
+        place = self.table.find(opening)
+        takes = self.table.takes[place]
         wrenches = self._relaxed.update(opening, 0.0 if self._last is None else now - self._last)
-        T_gripper_object = self.grasp.object_pose(float(self.reel.openings[place]))
+        T_gripper_object = self.grasp.object_pose(float(self.table.openings[place]))
         tracked = T_gripper_object is not None and self._count % TRACKED_EVERY == 0
         picture = takes[self._count % len(takes)]
         self._count, self._last = self._count + 1, now
@@ -133,7 +128,7 @@ _APART = 10.0  # [s] between the stamps that seed the noise, too far for motion 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Reel(Generic[T]):
+class ImageTable(Generic[T]):
     """Images by opening, in whatever form they were kept.
 
     Attributes:
@@ -164,34 +159,34 @@ def choose_openings(grasp: PressedGrasp, low: float, high: float) -> NDArray:
     return steps[kept & (steps >= grasp.least_opening)]
 
 
-def film_grasp(
+def render_openings(
     grasp: PressedGrasp,
     photographer: Photographer,
     openings: NDArray,
     keep: Callable[[TwinFrame], T],
     tell: Callable[[int, int], None] = lambda done, count: None,
-) -> Reel[T]:
+) -> ImageTable[T]:
     """Returns the images of a grasp.
 
     Args:
-        grasp: what is filmed.
-        photographer: who films it.
+        grasp: what is rendered.
+        photographer: that renders it.
         openings: (n,) [m], growing.
         keep: makes of an image what is kept of it; its wrenches are elastic, and it has no stamp and no object's pose.
-        tell: hears how many openings of how many are done; what it raises ends the filming.
+        tell: hears how many openings of how many are done; what it raises ends the rendering.
     """
-    film = partial(_film_opening, grasp, photographer)
+    render = partial(_render_opening, grasp, photographer)
     takes, pool = [], ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_WORKERS))
     try:
-        for frames in pool.map(film, openings.tolist(), range(len(openings))):
+        for frames in pool.map(render, openings.tolist(), range(len(openings))):
             tell(len(takes) + 1, len(openings))
             takes.append([keep(frame) for frame in frames])
     finally:
         pool.shutdown(cancel_futures=True)
-    return Reel(openings=openings, takes=takes)
+    return ImageTable(openings=openings, takes=takes)
 
 
-def _film_opening(grasp: PressedGrasp, photographer: Photographer, opening: float, index: int) -> list[TwinFrame]:
+def _render_opening(grasp: PressedGrasp, photographer: Photographer, opening: float, index: int) -> list[TwinFrame]:
     """Returns all takes at one opening [m]."""
     state = grasp.state(opening)
     view, frames = photographer.look(state), []

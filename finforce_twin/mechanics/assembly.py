@@ -1,7 +1,4 @@
-"""The jaws of a synthetic gripper and the object that they shut on, as they are put together.
-
-The material of a synthetic gripper, drawn anew for every seed as printed parts differ.
-"""
+"""The jaws of a synthetic gripper, of drawn material, and the object that they shut on, as they are put together."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

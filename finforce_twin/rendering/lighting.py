@@ -1,7 +1,4 @@
-"""Lights, background and exposure of one scene, drawn by chance between given bounds.
-
-Surfaces as a camera sees them: colours, patterns and gloss, drawn by chance.
-"""
+"""Lights, background, exposure and surfaces of one scene, drawn by chance between given bounds."""
 
 from __future__ import annotations
 

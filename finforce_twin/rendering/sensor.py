@@ -1,7 +1,4 @@
-"""A colour sensor and its stereo depth: light and true depths into the images that a camera gives.
-
-The least noise of a camera, laid over a picture that is shown again: a bit here and there.
-"""
+"""A colour sensor and its stereo depth: light and true depths into the images that a camera gives, and its noise."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Objects made from a few numbers, watertight, in metres: of the size of a hand, and small enough for two fin-ray jaws.
-
-Those of a hand's size stand with z upwards, the origin half way up; the small ones lie along y, their origin inside.
-
-An object and how it lies between the jaws.
-"""
+"""Objects made from a few numbers, watertight, in metres, and how they lie between the jaws."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Depth images of an object on a table before a moving hand, with two plates that come in between.
-
-An object on a table before the wrist camera, partly hidden or not.
-"""
+"""An object on a table before the wrist camera, still or with the hand moving and plates that come in between."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What happens in a synthetic recording, as numbers with names.
-
-The course of a scenario over time: how far closed, where the object is drawn, how the wrist is turned.
-"""
+"""What happens in a synthetic recording, as numbers with names, and how it goes on over time."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

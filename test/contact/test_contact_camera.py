@@ -169,7 +169,7 @@ def test_the_tracker_rests_while_the_grasp_does(probe, camera, scene):
     probe.wait_for(lambda: bench.node.skips.describe()["skipped: grasp rests"] == "1")
     probe.spin(0.3)
     assert len(bench.poses) == 1
-    jaw.estimator.resting = False
+    jaw.estimator.still = False
     bench.see(scene, masked=False)
     probe.wait_for(lambda: len(bench.poses) == 2)
 
@@ -177,7 +177,7 @@ def test_the_tracker_rests_while_the_grasp_does(probe, camera, scene):
 class Resting:
     """An estimator whose grasp holds still."""
 
-    resting = True
+    still = True
 
     def __init__(self, estimator):
         self._estimator = estimator

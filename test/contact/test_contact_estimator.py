@@ -257,11 +257,11 @@ class TestRest:
     def test_still_grasp_rests_until_it_moves(self):
         estimator = estimator_of()
         press(estimator, 2 * MM, frames=20)
-        assert not estimator.resting
+        assert not estimator.still
         press(estimator, 2 * MM, start=20 * FRAME, frames=20)
-        assert estimator.resting
+        assert estimator.still
         press(estimator, 2.5 * MM, start=40 * FRAME)
-        assert not estimator.resting
+        assert not estimator.still
 
     def test_resting_grasp_needs_no_pose(self):
         estimator = estimator_of()
@@ -269,7 +269,7 @@ class TestRest:
         surface = pressed(2 * MM)[1]
         for frame in range(40, 140):
             estimate = estimator.update(frame * FRAME, surface)
-        assert (estimate.status, estimator.resting) == ("touching", True)
+        assert (estimate.status, estimator.still) == ("touching", True)
         # and when it moves, a new pose is waited for
         surface = pressed(3 * MM)[1]
         assert estimator.update(140 * FRAME, surface).status == "touching"
@@ -279,7 +279,7 @@ class TestRest:
     def test_object_apart_does_not_rest(self):
         estimator = estimator_of()
         press(estimator, -2 * MM, frames=60)
-        assert not estimator.resting
+        assert not estimator.still
 
 
 class TestTouch:

@@ -9,13 +9,13 @@ from finforce_contact.errors import ObjectMeshError
 from finforce_contact.localization.inner_face import build_inner_face
 from finforce_contact.localization.outline_localizer import (
     ClosestLocalizer,
+    ContactPatch,
     ContactScene,
     OutlineLocalizer,
-    Rows,
     cross_line_of_action,
     overlap_of,
-    rows_from_overlap,
-    tilt_rows,
+    patch_from_overlap,
+    tilt_patch,
 )
 from finforce_contact.localization.section import (
     SectionKeeper,
@@ -117,7 +117,7 @@ class TestRows:
     def test_mean_of_the_rows_is_that_of_the_overlap(self):
         heights = np.arange(0.0, 0.08, 0.5e-3)
         overlap = np.maximum(0.0, 1.0 - ((heights - 0.03) / 0.02) ** 2)
-        rows = rows_from_overlap(heights, overlap, 2.5 * MM, 5 * MM)
+        rows = patch_from_overlap(heights, overlap, 2.5 * MM, 5 * MM)
         assert rows.mean == pytest.approx(heights @ overlap / overlap.sum(), abs=1e-12)
         assert rows.weights.sum() == pytest.approx(1.0)
         assert np.diff(rows.heights).max() < 3 * MM
@@ -126,23 +126,23 @@ class TestRows:
         heights = np.arange(0.0, 0.08, 0.5e-3)
         overlap = np.zeros(len(heights))
         overlap[20:26] = 1.0
-        assert len(rows_from_overlap(heights, overlap, 2.5 * MM, 5 * MM).heights) == 1
+        assert len(patch_from_overlap(heights, overlap, 2.5 * MM, 5 * MM).heights) == 1
         overlap[100:103] = 2.0
-        rows = rows_from_overlap(heights, overlap, 2.5 * MM, 5 * MM)
+        rows = patch_from_overlap(heights, overlap, 2.5 * MM, 5 * MM)
         np.testing.assert_allclose(rows.heights, [heights[20:26].mean(), heights[101]], atol=1e-12)
         np.testing.assert_allclose(rows.weights, [0.5, 0.5], atol=1e-12)
 
     @pytest.mark.parametrize("mean", [0.021, 0.03, 0.0389])
     def test_tilted_rows_have_the_mean_asked_for_and_stay_where_they_are(self, mean):
-        rows = Rows(heights=np.linspace(0.02, 0.04, 9), weights=np.full(9, 1 / 9))
-        tilted = tilt_rows(rows, mean)
+        rows = ContactPatch(heights=np.linspace(0.02, 0.04, 9), weights=np.full(9, 1 / 9))
+        tilted = tilt_patch(rows, mean)
         assert tilted.mean == pytest.approx(mean, abs=1e-7)
         assert tilted.weights.min() >= 0.0
         np.testing.assert_array_equal(tilted.heights, rows.heights)
 
     def test_mean_beyond_the_rows_is_one_row_there(self):
-        rows = Rows(heights=np.array([0.02, 0.03]), weights=np.array([0.5, 0.5]))
-        assert tilt_rows(rows, 0.031).heights.tolist() == [0.031]
+        rows = ContactPatch(heights=np.array([0.02, 0.03]), weights=np.array([0.5, 0.5]))
+        assert tilt_patch(rows, 0.031).heights.tolist() == [0.031]
 
     @pytest.mark.parametrize("lean", [-0.5, 0.0, 0.4])
     def test_line_of_action_meets_the_surface_in_the_pressure_centre(self, lean):
@@ -191,15 +191,15 @@ class TestOutline:
     @pytest.mark.parametrize("x", [FACE + 0.0125 - 3 * MM, FACE + 0.0125, FACE + 0.05])
     def test_place_of_a_cylinder_is_its_height_wherever_it_is_along_x(self, x):
         place = locate(cylinder(), pose(x, 0.0412))
-        assert place.rows.heights == pytest.approx([0.0412], abs=0.1 * MM)
+        assert place.patch.heights == pytest.approx([0.0412], abs=0.1 * MM)
         assert place.gap == pytest.approx(x - 0.0125 - FACE, abs=0.02 * MM)
 
     def test_box_touches_along_its_face_in_rows_with_even_weights(self):
         place = locate(box(), pose(FACE + 0.015, 0.045))
-        assert place.rows.heights[0] < 0.0325 and place.rows.heights[-1] > 0.0575
-        assert np.diff(place.rows.heights).max() <= 2.5 * MM + 1e-9
-        assert place.rows.mean == pytest.approx(0.045, abs=0.3 * MM)
-        assert np.ptp(place.rows.weights) < 0.3 * place.rows.weights.mean()
+        assert place.patch.heights[0] < 0.0325 and place.patch.heights[-1] > 0.0575
+        assert np.diff(place.patch.heights).max() <= 2.5 * MM + 1e-9
+        assert place.patch.mean == pytest.approx(0.045, abs=0.3 * MM)
+        assert np.ptp(place.patch.weights) < 0.3 * place.patch.weights.mean()
 
     def test_tilted_box_touches_with_its_edge(self):
         # tilted from x to z the face leans, its lower edge goes first
@@ -207,13 +207,13 @@ class TestOutline:
         corner = pose(0.0, 0.045, tilt=np.radians(20)) @ [-0.015, 0.0, -0.015, 1.0]
         other = pose(0.0, 0.045, tilt=np.radians(20)) @ [-0.015, 0.0, 0.015, 1.0]
         leading = corner if corner[0] < other[0] else other
-        assert place.rows.mean == pytest.approx(leading[2], abs=0.5 * MM)
+        assert place.patch.mean == pytest.approx(leading[2], abs=0.5 * MM)
 
     def test_two_bumps_are_two_contacts(self):
         mesh = joined(box((0.01, 0.03, 0.004), (0, 0, -0.015)), box((0.01, 0.03, 0.004), (0, 0, 0.015)))
         place = locate(mesh, pose(FACE + 0.005, 0.04))
-        np.testing.assert_allclose(place.rows.heights, [0.025, 0.055], atol=0.3 * MM)
-        np.testing.assert_allclose(place.rows.weights, [0.5, 0.5], atol=0.1)
+        np.testing.assert_allclose(place.patch.heights, [0.025, 0.055], atol=0.3 * MM)
+        np.testing.assert_allclose(place.patch.weights, [0.5, 0.5], atol=0.1)
 
     def test_object_above_the_jaw_has_no_place(self):
         assert locate(box(), pose(0.03, 0.13)) is None
@@ -221,7 +221,7 @@ class TestOutline:
     def test_place_is_on_the_material_that_the_bent_jaw_brings_there(self):
         surface = bent(NODES, 3 * MM, 0.04)
         surface[:, 2] += 4 * MM
-        assert locate(cylinder(), pose(0.03, 0.064), surface).rows.mean == pytest.approx(0.06, abs=0.3 * MM)
+        assert locate(cylinder(), pose(0.03, 0.064), surface).patch.mean == pytest.approx(0.06, abs=0.3 * MM)
 
     @pytest.mark.parametrize("noise", [-0.3 * MM, 0.3 * MM])
     def test_noise_along_x_moves_no_place_and_noise_along_z_no_more_than_itself(self, noise):
@@ -229,40 +229,40 @@ class TestOutline:
         surface = wrapped(NODES, radius, x, 0.04)
         still = locate(cylinder(radius), pose(x, 0.04), surface)
         pushed = locate(cylinder(radius), pose(x + noise, 0.04), surface)
-        assert pushed.rows.mean == pytest.approx(still.rows.mean, abs=1e-9)
+        assert pushed.patch.mean == pytest.approx(still.patch.mean, abs=1e-9)
         assert pushed.gap - still.gap == pytest.approx(noise, abs=1e-9)
         lifted = locate(cylinder(radius), pose(x, 0.04 + 0.2 * noise), surface)
         # where the face is wrapped by 7 mm to either side, the shape alone tells the place only roughly
-        assert abs(lifted.rows.mean - still.rows.mean) < 2.5 * MM
+        assert abs(lifted.patch.mean - still.patch.mean) < 2.5 * MM
 
     def test_rows_follow_the_line_of_action_within_the_overlap(self):
         mesh, T = box(), pose(FACE + 0.015, 0.045)
         gain = SETTINGS.wrench_gain
         place = locate(mesh, T, wrench=push_at(INNER.deform(NODES), 0.039))
-        shape = locate(mesh, T).rows.mean
-        assert place.rows.mean == pytest.approx(shape + gain * (0.039 - shape), abs=1e-6)
-        assert len(place.rows.heights) == len(locate(mesh, T).rows.heights)
+        shape = locate(mesh, T).patch.mean
+        assert place.patch.mean == pytest.approx(shape + gain * (0.039 - shape), abs=1e-6)
+        assert len(place.patch.heights) == len(locate(mesh, T).patch.heights)
 
     def test_line_of_action_far_from_the_object_is_not_believed(self):
         T = pose(FACE + 0.0125, 0.045)
         place = locate(cylinder(), T, wrench=push_at(INNER.deform(NODES), 0.02))
-        assert place.rows.mean == pytest.approx(0.045, abs=0.1 * MM)
+        assert place.patch.mean == pytest.approx(0.045, abs=0.1 * MM)
 
     def test_force_too_weak_has_no_line_of_action(self):
         T = pose(FACE + 0.015, 0.045)
         weak = push_at(INNER.deform(NODES), 0.035, size=0.9 * SETTINGS.wrench_force)
-        assert locate(box(), T, wrench=weak).rows.mean == pytest.approx(locate(box(), T).rows.mean)
+        assert locate(box(), T, wrench=weak).patch.mean == pytest.approx(locate(box(), T).patch.mean)
 
     def test_open_mesh_has_the_same_place(self):
         T = pose(FACE + 0.0125, 0.0412)
-        assert locate(opened(cylinder()), T).rows.mean == pytest.approx(0.0412, abs=0.2 * MM)
+        assert locate(opened(cylinder()), T).patch.mean == pytest.approx(0.0412, abs=0.2 * MM)
 
     def test_right_jaw_has_the_same_place(self):
         face = build_inner_face(JAW.mirrored(), "default")
         T = pose(FACE + 0.0125, 0.0412)
         section = SectionKeeper(cylinder(), face.half_width, SETTINGS).at(T)
         scene = ContactScene(T=T, section=section, surface=face.mesh.nodes, line=face.deform(face.mesh.nodes))
-        assert OutlineLocalizer(face, SETTINGS).locate(scene).rows.mean == pytest.approx(0.0412, abs=0.1 * MM)
+        assert OutlineLocalizer(face, SETTINGS).locate(scene).patch.mean == pytest.approx(0.0412, abs=0.1 * MM)
 
 
 class TestClosest:
@@ -270,13 +270,13 @@ class TestClosest:
         localizer = ClosestLocalizer(JAW, INNER)
         for x in (FACE + 0.0125 - 2 * MM, FACE + 0.03):
             place = localizer.locate(scene_of(cylinder(), pose(x, 0.0412), bent(NODES, 2 * MM, 0.04)))
-            assert place.rows.heights.tolist() == [pytest.approx(0.043)]
+            assert place.patch.heights.tolist() == [pytest.approx(0.043)]
 
     def test_distance_counts_not_the_way_along_x(self):
         # beyond the tip the nearest point is the tip's end, whatever is before the surface along x
         mesh = joined(box((0.01, 0.03, 0.01), (0.03, 0.0, 0.03)), box((0.01, 0.03, 0.01), (0.0, 0.0, 0.087)))
         place = ClosestLocalizer(JAW, INNER).locate(scene_of(mesh, pose(FACE, 0.0)))
-        assert place.rows.mean == pytest.approx(JAW.candidates[-1, 2])
+        assert place.patch.mean == pytest.approx(JAW.candidates[-1, 2])
 
 
 class TestIntersection:
@@ -298,7 +298,7 @@ class TestIntersection:
 
     def test_before_contact_the_object_is_brought_into_the_surface_and_does_not_touch(self, localizer):
         place = localizer.locate(scene_of(cylinder(), pose(0.06, 0.0412)))
-        assert place.rows.heights.tolist() == [pytest.approx(0.043)]
+        assert place.patch.heights.tolist() == [pytest.approx(0.043)]
         assert place.touching is False
 
     def test_shift_before_contact_is_equation_two(self, localizer):
@@ -314,7 +314,7 @@ class TestIntersection:
         far = scene_of(cylinder(), pose(0.06, 0.0412))
         first, second = localizer.locate(far), localizer.locate(far)
         assert localizer._status is False
-        assert second.rows.heights.tolist() == first.rows.heights.tolist()
+        assert second.patch.heights.tolist() == first.patch.heights.tolist()
 
     def test_touching_is_an_intersection_where_the_object_is(self, localizer):
         scene = scene_of(cylinder(), pose(FACE + 0.0125 - 0.5 * MM, 0.0412))

@@ -15,9 +15,6 @@ from finforce_contact.mesh.views import MeshView
 from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_contact.reconstruction.paper_alignment import (
     affine_from_generator,
-    camera_from_pytorch3d,
-    canonical_from_glb,
-    glb_from_canonical,
     scale_coarsely,
 )
 from finforce_contact.reconstruction.reconstruction import reconstruct
@@ -215,27 +212,17 @@ def test_chamfer_of_nested_cubes_is_known():
     assert compute_chamfer(larger, cube).mean == pytest.approx(chamfer.mean, rel=0.01)
 
 
-def test_glb_has_y_where_the_canonical_frame_has_z():
-    np.testing.assert_array_equal(canonical_from_glb(np.array([[1.0, 2.0, 3.0]])), [[1.0, -3.0, 2.0]])
-    np.testing.assert_array_equal(glb_from_canonical(np.array([[1.0, -3.0, 2.0]])), [[1.0, 2.0, 3.0]])
-
-
-def test_pytorch3d_camera_looks_the_same_way_with_x_left_and_y_up():
-    points = np.array([[0.1, 0.2, 0.3]])
-    np.testing.assert_array_equal(camera_from_pytorch3d(points), [[-0.1, -0.2, 0.3]])
-    np.testing.assert_array_equal(camera_from_pytorch3d(camera_from_pytorch3d(points)), points)
-
-
 def test_generator_pose_is_that_of_row_vectors_times_the_rotation():
     rotation = Rotation.from_euler("xyz", [0.3, -0.8, 1.9])
     wxyz = rotation.as_quat()[[3, 0, 1, 2]]
     translation, canonical = np.array([0.05, -0.02, 0.4]), np.random.default_rng(0).standard_normal((4, 3))
     # the generator's own formula: rows, PyTorch3D axes
-    seen = camera_from_pytorch3d(0.12 * canonical @ rotation.as_matrix() + translation)
+    seen = (0.12 * canonical @ rotation.as_matrix() + translation) * [-1.0, -1.0, 1.0]  # x left, y up
     A = affine_from_generator(wxyz[None], translation[None], [[0.12, 0.12, 0.12]], "canonical")
     np.testing.assert_allclose(canonical @ A[:3, :3].T + A[:3, 3], seen, atol=1e-12)
     B = affine_from_generator(wxyz, translation, 0.12)
-    np.testing.assert_allclose(glb_from_canonical(canonical) @ B[:3, :3].T + B[:3, 3], seen, atol=1e-12)
+    glb = canonical[:, [0, 2, 1]] * [1.0, 1.0, -1.0]  # (x, z, -y)
+    np.testing.assert_allclose(glb @ B[:3, :3].T + B[:3, 3], seen, atol=1e-12)
     assert np.linalg.det(B[:3, :3]) == pytest.approx(0.12**3)
 
 

@@ -14,7 +14,7 @@ from finforce.skipping import ALL, EVERYWHERE, SkippingError, Skips
 from finforce.stamps import Idling
 from finforce_contact.estimator import ContactEstimator
 from finforce_ifea.observation import Contact, ObjectOutline
-from finforce_ifea.tracking.rest_response import AWAY, is_away
+from finforce_ifea.tracking.influence import AWAY, is_out_of_reach
 from finforce_keypoints.settings import RULES as DETECTOR
 
 RADIUS, HEIGHT = 0.0125, 0.040
@@ -132,13 +132,13 @@ class TestAnObjectOutOfReach:
         contact = circle(FAR)
         for name, value in change.items():
             object.__setattr__(contact, name, value)
-        assert is_away(contact, BENCH.inner_face_x) is away
+        assert is_out_of_reach(contact, BENCH.inner_face_x) is away
 
     @pytest.mark.parametrize(("gap", "away"), [(AWAY + 1.6e-3, True), (AWAY + 1.4e-3, False), (-FAR, False)])
     def test_what_the_place_may_err_counts_as_near(self, gap, away):
         contact = circle(gap)
         object.__setattr__(contact, "touching", False)
-        assert is_away(contact, BENCH.inner_face_x) is away
+        assert is_out_of_reach(contact, BENCH.inner_face_x) is away
 
     def test_the_jaw_at_rest_is_left_alone_and_says_so(self):
         solutions, spared = watched(spares=True)

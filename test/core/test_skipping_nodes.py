@@ -155,7 +155,7 @@ class TestContactEstimator:
             self.image(bench, NEAR_GAP, now + TENTH * k // 3)
         bench.probe.spin(0.05)
         assert len(bench.contacts) - known >= 3
-        assert not bench.node.session.jaws["left"].is_away
+        assert not bench.node.session.jaws["left"].is_out_of_reach
 
     def find_place(self, off):
         """The height [m] at which an object touches that came from afar."""

@@ -152,7 +152,7 @@ class FakeContactEstimator:
     """Puts the contact at the height of the object it knows, from its first update on; notes every call in order."""
 
     jaw = SimpleNamespace(inner_face_x=0.014)
-    resting = False
+    still = False
 
     def __init__(self, touching=lambda update: True):
         self.calls = []

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from finforce.skipping import EVERYWHERE
-from finforce_eval.bench.scenes import SceneReel, StreamPart, cut_sections, read_word
+from finforce_eval.bench.scenes import SceneStream, StreamPart, cut_sections, read_word
 from finforce_eval.bench.skipping import (
     EACH,
     OF_NODE,
@@ -57,17 +57,17 @@ def test_sections_hold_the_images_of_their_phases_and_nothing_but_what_is_played
 def test_a_reel_repeats_a_section_with_rising_stamps_at_its_rate():
     sections = cut_sections(recording(), {"a:": "first", "c:": "last"})
     parts = [StreamPart(section="first", seconds=0.5, name="shown"), StreamPart(section="last", seconds=0.1)]
-    reel = SceneReel(sections, parts, rate=10.0)
-    played = list(reel)
-    assert len(played) == len(reel) == 6
-    assert [entry.time - reel.begin for entry in played] == [round(0.1 * k * SECOND) for k in range(6)]
+    stream = SceneStream(sections, parts, rate=10.0)
+    played = list(stream)
+    assert len(played) == len(stream) == 6
+    assert [entry.time - stream.begin for entry in played] == [round(0.1 * k * SECOND) for k in range(6)]
     assert [entry.stamp for entry in played] == [entry.time for entry in played]
-    assert [(span.begin, span.end) for span in reel.spans] == [(0.0, 0.5), (0.5, pytest.approx(0.6))]
+    assert [(span.begin, span.end) for span in stream.spans] == [(0.0, 0.5), (0.5, pytest.approx(0.6))]
 
 
 def test_a_section_without_images_is_refused():
     with pytest.raises(RecordingError, match="no images of the section 'press'"):
-        SceneReel({}, [StreamPart(section="press", seconds=1.0)])
+        SceneStream({}, [StreamPart(section="press", seconds=1.0)])
 
 
 def figures():

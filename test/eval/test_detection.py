@@ -10,7 +10,7 @@ from rgbd_fakes import FakeDetector, FakeGripper, FakePhotographer, make_footage
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.keypoint_source import KeypointSource, awaiting_keypoints, detect_keypoints, parse_source
-from finforce_eval.evaluation.results import compare_sight, sight_stats
+from finforce_eval.evaluation.results import compare_detection, detection_stats
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.recording import read_recording
@@ -109,7 +109,7 @@ def test_object_poses_meet_the_jaw_poses_that_were_found(recording):
 def test_scores_count_what_they_say(recording):
     found, _ = detect(recording, accepted=(True, True, False, True))
     track = found.jaws["left"]
-    stats = sight_stats([compare_sight(track.detection, track.sight)])
+    stats = detection_stats([compare_detection(track.detection, track.sight)])
     assert (stats.n_visible, stats.n_hidden) == (36, 12)
     assert stats.pixel_median_px == pytest.approx(1.0, abs=1e-4)  # of 0.6 and 0.8, in single precision
     assert stats.point_median_mm == pytest.approx(0.3, abs=1e-4)
@@ -120,12 +120,12 @@ def test_scores_count_what_they_say(recording):
 def test_a_jaw_that_is_not_found_has_lost_all_its_points(recording):
     found, _ = detect(recording, lost=(0, 1, 2), accepted=(True,) * 3 + (False,))
     track = found.jaws["left"]
-    stats = sight_stats([compare_sight(track.detection, track.sight)])
+    stats = detection_stats([compare_detection(track.detection, track.sight)])
     assert stats.visible_lost_pct == pytest.approx(25.0) and stats.hidden_accepted_pct == 0.0
 
 
 def test_no_detection_has_no_numbers():
-    stats = sight_stats([])
+    stats = detection_stats([])
     assert stats.n_visible == 0 and stats.pixel_median_px is None and stats.visible_lost_pct is None
 
 

@@ -1,4 +1,4 @@
-"""Processes under a film: found by their names, measured while it is played, ended with it."""
+"""Processes under a stream: found by their names, measured while it is played, ended with it."""
 
 import os
 import subprocess
@@ -11,7 +11,7 @@ from finforce_eval.recordings.writer import MessageFactory
 from finforce_eval.replay.node_run import Listener, describe_load, find_processes, run_nodes
 from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.processes import ProcessError
-from finforce_eval.replay.synthetic_stream import Film
+from finforce_eval.replay.synthetic_stream import SyntheticStream
 
 TOPIC = "/left/jaw_pose"
 
@@ -41,7 +41,7 @@ def make_film(count):
         stamp = 10**12 + round(index * 1e9 / 30)
         pose = factory.pose(stamp, "camera", [0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0])
         messages.append(RawMessage(stamp, TOPIC, POSE, bytes(factory.typestore.serialize_cdr(pose, POSE)), True))
-    return Film(messages=messages)
+    return SyntheticStream(messages=messages)
 
 
 def test_a_busy_machine_is_said_and_a_quiet_one_too():

@@ -8,7 +8,7 @@ from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import quaternion_from_pose
 from finforce_eval.bench.detection import paint_dots
-from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, PoseTrack, SightTrack
+from finforce_eval.recordings.tracks import DetectionTruth, JawTrack, KeypointTrack, PoseTrack
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detectors.dots import DotSettings, find_dots
 from finforce_keypoints.images import RgbdImage
@@ -26,7 +26,7 @@ def scene():
     pixels = project(points @ POSE[:3, :3].T + POSE[:3, 3], LENS)
     visible = np.arange(len(points)) != HIDDEN
     stamps = np.array([7], dtype=np.int64)
-    sight = SightTrack(stamps=stamps, points=points[None], pixels=pixels[None], visible=visible[None])
+    sight = DetectionTruth(stamps=stamps, points=points[None], pixels=pixels[None], visible=visible[None])
     poses = PoseTrack(
         stamps=stamps, position=POSE[None, :3, 3], quaternion=quaternion_from_pose(POSE)[None], frame_id="camera"
     )

@@ -25,8 +25,8 @@ def bench():
 
 
 def session(height=40e-3, radius=12e-3, depth=3e-3, seed=0, **options):
-    course = bench().course(height=height, radius=radius, depth=depth)
-    return open_session(bench(), np.random.default_rng(seed), course=course, **options)
+    history = bench().history(height=height, radius=radius, depth=depth)
+    return open_session(bench(), np.random.default_rng(seed), history=history, **options)
 
 
 def play(steps):
@@ -53,8 +53,8 @@ def test_forces_of_a_long_run_do_not_drift():
 
 
 def test_work_of_the_object_is_the_energy_stored():
-    # 16 steps of a smooth course: the integral is good to a thousandth
-    assert abs(bench().course(height=30e-3, radius=10e-3, depth=6e-3).balance) < 1e-3
+    # 16 steps of a smooth history: the integral is good to a thousandth
+    assert abs(bench().history(height=30e-3, radius=10e-3, depth=6e-3).balance) < 1e-3
 
 
 # --- what is stated
@@ -65,7 +65,7 @@ def test_radius_is_not_taken_for_known_before_the_finger_was_pressed():
     # a press in which the first images suggest twice the radius
     start = open_session(bench(), Plan(seed=7).random("an", 16))
     sure = [t for s, t in play(start.press()) if s.trusted]
-    assert start.course.height < 0.02 and len(sure) > 30
+    assert start.history.height < 0.02 and len(sure) > 30
     assert max(t.sigmas for t in sure) < 3.0
 
 

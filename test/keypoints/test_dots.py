@@ -181,6 +181,6 @@ def test_settings_out_of_bounds_and_a_missing_library_are_named(monkeypatch):
     def refuse(name):
         raise ImportError(f"no {name}")
 
-    monkeypatch.setattr("finforce.errors.import_module", refuse)
+    monkeypatch.setattr("finforce.optional.import_module", refuse)
     with pytest.raises(MissingDependencyError, match="opencv-contrib-python-headless"):
         DotFinder(JAWS)

@@ -239,7 +239,7 @@ def test_without_onnxruntime_the_message_says_what_to_install(tmp_path, monkeypa
     def refuse(name):
         raise ImportError(f"no {name}")
 
-    monkeypatch.setattr("finforce.errors.import_module", refuse)
+    monkeypatch.setattr("finforce.optional.import_module", refuse)
     with pytest.raises(MissingDependencyError, match="pip install onnxruntime"):
         KeypointModel(tmp_path)
 

@@ -15,10 +15,10 @@ from finforce_twin.gripper.live import (
     OPEN_STRIDE,
     TAKES,
     CoupledGripper,
+    ImageTable,
     LiveScene,
-    Reel,
     choose_openings,
-    film_grasp,
+    render_openings,
 )
 from finforce_twin.gripper.pressing import PressedGrasp, RelaxedGrasp
 from finforce_twin.scenes.scenarios import build_scenario
@@ -36,7 +36,7 @@ def grasp():
 @pytest.fixture
 def scene(grasp):
     scene = LiveScene(grasp, FakeLens(), 5)
-    scene.film(lambda frame: frame, lambda done, count: None)
+    scene.render(lambda frame: frame, lambda done, count: None)
     return scene
 
 
@@ -74,18 +74,18 @@ def test_no_image_is_taken_of_jaws_that_jam(grasp, monkeypatch):
     [(-0.1, 0), (0.0, 0), (0.0014, 0), (0.0016, 1), (0.003, 1), (0.0074, 1), (0.0076, 2), (1.0, 2)],
 )
 def test_the_nearest_image_is_shown(opening, place):
-    reel = Reel(openings=np.array([0.0, 0.003, 0.012]), takes=[[0], [1], [2]])
-    assert reel.find(opening) == place
+    table = ImageTable(openings=np.array([0.0, 0.003, 0.012]), takes=[[0], [1], [2]])
+    assert table.find(opening) == place
 
 
 def test_images_are_of_their_openings_and_no_two_takes_are_alike(grasp):
     openings = np.array([0.0, 0.010, 0.030])
     teller = Teller()
-    reel = film_grasp(grasp, FakeLens(), openings, lambda frame: frame, teller)
+    table = render_openings(grasp, FakeLens(), openings, lambda frame: frame, teller)
     assert teller.heard == [(1, 3), (2, 3), (3, 3)]
-    pictures = [frame.color.tobytes() for takes in reel.takes for frame in takes]
+    pictures = [frame.color.tobytes() for takes in table.takes for frame in takes]
     assert len(pictures) == len(set(pictures)) == TAKES * 3
-    for opening, takes in zip(openings, reel.takes, strict=True):
+    for opening, takes in zip(openings, table.takes, strict=True):
         state = grasp.state(opening)
         for frame in takes:
             np.testing.assert_array_equal(frame.jaws["left"].points, state.jaws["left"].keypoints)
@@ -97,14 +97,14 @@ def test_the_same_seed_gives_the_same_images_whatever_the_threads(grasp, monkeyp
     reels = []
     for workers in (1, 4):
         monkeypatch.setattr("finforce_twin.gripper.live.MOST_WORKERS", workers)
-        reels.append(film_grasp(grasp, FakeLens(), openings, lambda frame: frame.color))
+        reels.append(render_openings(grasp, FakeLens(), openings, lambda frame: frame.color))
     np.testing.assert_array_equal(reels[0].takes, reels[1].takes)
 
 
 def test_filming_that_is_ended_does_not_go_on(grasp):
     lens = FakeLens()
     with pytest.raises(KeyboardInterrupt):
-        film_grasp(grasp, lens, np.linspace(0.0, 0.048, 200), lambda frame: frame, Teller(ends_at=2))
+        render_openings(grasp, lens, np.linspace(0.0, 0.048, 200), lambda frame: frame, Teller(ends_at=2))
     # what the threads had begun, and what they took while the end was on its way
     assert lens.looks < 100
 
@@ -112,7 +112,7 @@ def test_filming_that_is_ended_does_not_go_on(grasp):
 def test_a_gripper_that_stands_still_is_never_shown_twice_by_the_same_image(scene):
     pictures = [scene.take(HELD, 0.033 * k).picture for k in range(6)]
     assert all(a is not b for a, b in zip(pictures[:-1], pictures[1:], strict=True))
-    shown = scene.grasp.state(scene.reel.openings[scene.reel.find(HELD)])
+    shown = scene.grasp.state(scene.table.openings[scene.table.find(HELD)])
     for picture in pictures:
         np.testing.assert_array_equal(picture.jaws["left"].points, shown.jaws["left"].keypoints)
 
@@ -132,10 +132,10 @@ def test_true_forces_follow_the_true_opening_and_relax_in_time(scene):
 def test_the_object_is_tracked_at_a_third_of_the_images_where_it_is_seen():
     # on the bench the object moves
     scene = LiveScene(PressedGrasp(build_scenario("bench_cylinder"), 3, "coarse", step=1e-3), FakeLens(), 5)
-    scene.film(lambda frame: frame, lambda done, count: None)
+    scene.render(lambda frame: frame, lambda done, count: None)
     poses = [scene.take(HELD, 0.033 * k).T_camera_object for k in range(9)]
     assert [pose is not None for pose in poses] == [True, False, False] * 3
-    seen = scene.reel.openings[scene.reel.find(HELD)]
+    seen = scene.table.openings[scene.table.find(HELD)]
     true = invert_pose(CAMERA_POSE) @ scene.grasp.object_pose(seen)
     tracked = [pose for pose in poses if pose is not None]
     for pose in tracked:

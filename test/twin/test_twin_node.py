@@ -59,8 +59,8 @@ def start(probe, footage=None, **parameters):
 
 
 def play(probe, node):
-    """Film, and wait for the listeners before the first image leaves."""
-    node.film()
+    """Start the stream, and wait for the listeners before the first image leaves."""
+    node.render()
     outputs = node._outputs.values()
     probe.wait_for(lambda: all(output.get_subscription_count() for output in outputs))
 
@@ -130,7 +130,7 @@ def start_live(probe, grasp, link, lens=None, **parameters):
 
 def test_images_and_forces_are_those_of_the_gripper_at_the_link(probe, grasp, tmp_path):
     node = start_live(probe, grasp, tmp_path / "gripper")
-    node.film()
+    node.render()
     assert (tmp_path / "gripper").is_char_device()
     probe.wait_for(lambda: len(probe.got[COLOR]) > 3)
     assert {message.wrench.force.x for message in probe.got["/left/ground_truth_wrench"]} == {0.0}
@@ -143,14 +143,14 @@ def test_images_and_forces_are_those_of_the_gripper_at_the_link(probe, grasp, tm
     forces = [-message.wrench.force.x for message in probe.got["/left/ground_truth_wrench"][held:]]
     assert forces[-1] < forces[0] and forces[-1] > grasp.elastic_force(0.013)  # it relaxes, and takes seconds
     shown = decode_columns(probe.got["/left/ground_truth_keypoints"][-1], ("x", "z"))
-    state = grasp.state(node.scene.reel.openings[node.scene.reel.find(jaws.opening)])
+    state = grasp.state(node.scene.table.openings[node.scene.table.find(jaws.opening)])
     np.testing.assert_allclose(shown["x"], state.jaws["left"].keypoints[:, 0], atol=1e-6)
     assert probe.got["/bench/phase"] == []
 
 
 def test_images_of_a_gripper_are_stamped_as_those_of_a_script_and_never_alike(probe, grasp, tmp_path):
     node = start_live(probe, grasp, tmp_path / "gripper")
-    node.film()
+    node.render()
     probe.wait_for(lambda: min(len(probe.got[topic]) for topic in (COLOR, DEPTH, INFO)) >= 8)
     stamps = [[stamp_of(message) for message in probe.got[topic][:8]] for topic in (COLOR, DEPTH)]
     assert stamps[0] == stamps[1] and (np.diff(stamps[0]) > 0).all()
@@ -168,7 +168,7 @@ def test_rendering_ends_with_the_node(probe, grasp, tmp_path):
     lens = EndingLens()
     node = lens.node = start_live(probe, grasp, tmp_path / "gripper", lens)
     with pytest.raises(ExternalShutdownException):
-        node.film()
+        node.render()
     assert lens.looks < 80  # of 169
     assert not (tmp_path / "gripper").exists()
 

@@ -15,13 +15,11 @@ from finforce_eval.recordings.twin_writer import write_footage
 from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.synthetic_stream import (
     FINE_RATE,
-    MASK_TOPIC,
     OBJECT_TOPIC,
     START,
-    film_images,
-    film_keypoints,
-    film_mask,
     slot_of,
+    stream_images,
+    stream_keypoints,
     thin_messages,
 )
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
@@ -49,15 +47,15 @@ def bag(tmp_path_factory):
 
 @pytest.mark.parametrize("rate", [30, 60, 90])
 def test_film_holds_every_image_of_its_rate_and_no_other(rate):
-    film = thin_messages([message(slot) for slot in SLOTS], {"/left/keypoints"}, rate)
+    stream = thin_messages([message(slot) for slot in SLOTS], {"/left/keypoints"}, rate)
     step = FINE_RATE // rate
-    assert [slot_of(kept.stamp) for kept in film] == list(range(0, 60, step))
+    assert [slot_of(kept.stamp) for kept in stream] == list(range(0, 60, step))
 
 
 def test_object_is_tracked_at_ten_hertz_whatever_the_camera_does():
     messages = [message(slot, topic) for slot in SLOTS for topic in ("/left/keypoints", OBJECT_TOPIC)]
-    film = thin_messages(messages, {"/left/keypoints", OBJECT_TOPIC}, 90)
-    assert [slot_of(kept.stamp) for kept in film if kept.topic == OBJECT_TOPIC] == [0, 18, 36, 54]
+    stream = thin_messages(messages, {"/left/keypoints", OBJECT_TOPIC}, 90)
+    assert [slot_of(kept.stamp) for kept in stream if kept.topic == OBJECT_TOPIC] == [0, 18, 36, 54]
 
 
 def test_topics_that_nobody_asked_for_are_left_out():
@@ -72,8 +70,8 @@ def test_a_scene_without_all_images_of_the_rate_is_refused(slots, rate):
 
 
 def test_a_film_that_is_played_twice_goes_on_where_it_ended():
-    film = thin_messages([message(slot) for slot in SLOTS], {"/left/keypoints"}, 60)
-    twice = type(film)(messages=film.messages, repeats=2, period=film.period)
+    stream = thin_messages([message(slot) for slot in SLOTS], {"/left/keypoints"}, 60)
+    twice = type(stream)(messages=stream.messages, repeats=2, period=stream.period)
     stamps = np.array([kept.stamp for kept in twice])
     assert len(twice) == len(stamps) == 40
     # rounding to whole nanoseconds
@@ -82,22 +80,14 @@ def test_a_film_that_is_played_twice_goes_on_where_it_ended():
 
 
 def test_images_of_a_recording_come_decoded_with_their_camera(bag):
-    film = film_images(bag, 60)
-    topics = [kept.topic for kept in film]
+    stream = stream_images(bag, 60)
+    topics = [kept.topic for kept in stream]
     assert topics.count(COLOR_TOPIC) == topics.count(DEPTH_TOPIC) == topics.count(INFO_TOPIC) == 13
-    assert {kept.msgtype for kept in film if kept.topic in (COLOR_TOPIC, DEPTH_TOPIC)} == {IMAGE}
-    assert OBJECT_TOPIC in film.types and OBJECT_TOPIC not in film_images(bag, 60, poses=False).types
+    assert {kept.msgtype for kept in stream if kept.topic in (COLOR_TOPIC, DEPTH_TOPIC)} == {IMAGE}
+    assert OBJECT_TOPIC in stream.types and OBJECT_TOPIC not in stream_images(bag, 60, poses=False).types
 
 
 def test_true_key_points_of_a_recording_come_at_every_image(bag):
-    topics = [kept.topic for kept in film_keypoints(bag, 90)]
+    topics = [kept.topic for kept in stream_keypoints(bag, 90)]
     assert topics.count("/left/keypoints") == topics.count("/left/jaw_pose") == 19
     assert COLOR_TOPIC not in topics
-
-
-def test_mask_has_the_stamp_of_the_first_image_and_is_played_with_it(bag):
-    mask = film_mask(bag)
-    film = film_images(bag, 30, poses=False)
-    assert mask.stamp == film.begin and mask.msgtype == IMAGE
-    joined = film.joined([mask])
-    assert [kept.topic for kept in joined].index(MASK_TOPIC) < 4 and len(joined) == len(film) + 1

@@ -1,6 +1,4 @@
-"""How an unloaded jaw answers a force at any height, and what key points at rest leave room for.
-
-Whether the known object is out of the jaw's reach and the jaw where it is without load.
+"""Influence coefficients of an unloaded jaw, and whether the known object is out of its reach.
 
 Key points say of an unloaded jaw how deep d [m] something would press it. With the modes m_k [m/m] by which a depth
 moves the points, their deviations e_k [m] from the tared jaw and the covariance N of one of them,
@@ -26,7 +24,7 @@ _TOUCH = 3e-5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RestResponse:
+class InfluenceCoefficients:
     """Answers of the unloaded jaw to objects at several heights.
 
     Attributes:
@@ -95,7 +93,7 @@ class _PointFit:
     stddevs: NDArray
 
 
-def measure_rest(contact: RollingContact, probe: Any, keypoints: int) -> RestResponse:
+def measure_influence(contact: RollingContact, probe: Any, keypoints: int) -> InfluenceCoefficients:
     """Returns the answers of a contact's model, whose `probe` is that of the key points.
 
     Args:
@@ -114,7 +112,7 @@ def measure_rest(contact: RollingContact, probe: Any, keypoints: int) -> RestRes
         stiffness[row] = np.linalg.norm(state.force_modes[:, DEPTH])
         modes = contact.model.project(probe, q, state.modes)
         motions[row] = modes[:, ::2, DEPTH] / stiffness[row]
-    return RestResponse(heights=heights, motions=motions, stiffness=stiffness)
+    return InfluenceCoefficients(heights=heights, motions=motions, stiffness=stiffness)
 
 
 # An object is away that stands in front of the undeformed surface by more than this and what its place may err [m].
@@ -130,7 +128,7 @@ _FARTHEST, _FEWEST, _VAGUE = 3e-3, 4, 0.3e-3
 _NEARER, _REST_REACH = 0.75, 1e-3
 
 
-class AwayWatch:
+class ReachWatch:
     """Watches an unloaded jaw while its object is away.
 
     Args:
@@ -153,7 +151,7 @@ class AwayWatch:
     def is_idle(self, contact: Contact, points: NDArray, tare: Tare) -> bool:
         """Whether the contact's object is away and the key points (K, 3) [m] show the unloaded jaw."""
         if contact is not self._contact:
-            self._contact, self._is_away = contact, is_away(contact, self._face_x)
+            self._contact, self._is_away = contact, is_out_of_reach(contact, self._face_x)
         if not self._is_away:
             self._modes, self._count = None, 0
             return False
@@ -183,7 +181,7 @@ class AwayWatch:
         )
 
 
-def is_away(contact: Contact, face_x: float) -> bool:
+def is_out_of_reach(contact: Contact, face_x: float) -> bool:
     """Whether a contact's outline is in front of a surface x = face_x [m] by more than `AWAY` and its uncertainty."""
     outline = contact.outline
     if outline is None or contact.touching is not False:
