@@ -326,7 +326,7 @@ def _by_localizer(setup: MethodSetup, localizer: Localizer, *, with_wrench: bool
             wrench=wrench if with_wrench else None,
         )
         place = localizer.locate(scene)
-        return None if place is None else place.rows.mean
+        return None if place is None else place.patch.mean
 
     return locate
 
