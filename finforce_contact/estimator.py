@@ -120,12 +120,19 @@ class ContactEstimator:
         jaw: with the calibration applied that the solver has.
         settings: of this estimator.
         face: the inner surface of the jaw's mesh.
-        skips: rules of what need not be done; all are applied unless others are put here.
+        skips: rules of what need not be done.
         counts: images and poses by what was done with them, or why nothing was.
     """
 
-    def __init__(self, jaw: Jaw, *, mesh: ObjectMesh | None = None, settings: ContactSettings | None = None) -> None:
-        """Prepares the jaw's inner face.
+    def __init__(
+        self,
+        jaw: Jaw,
+        *,
+        mesh: ObjectMesh | None = None,
+        settings: ContactSettings | None = None,
+        skips: Skips | None = None,
+    ) -> None:
+        """Prepares the jaw's inner face; without `skips` every rule of what need not be done is applied.
 
         Raises:
             FinforceError: The jaw has no mesh of that density, or the object does not do for the mode.
@@ -135,7 +142,7 @@ class ContactEstimator:
         self._rest_line = self.face.deform(self.face.mesh.nodes)
         self._samples = np.unique(np.linspace(0, len(self.face.mesh.nodes) - 1, _JAW_SAMPLES).astype(int))
         self._poses, self._belief = PoseFilter(self.settings), TouchBelief(self.settings)
-        self._rest, self.skips = StillnessWatch(self.settings), Skips(CONTACT)
+        self._rest, self.skips = StillnessWatch(self.settings), skips or Skips(CONTACT)
         self._counts: Counter[str] = Counter(dict.fromkeys(_REASONS, 0))
         self.set_object(mesh)
 

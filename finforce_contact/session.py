@@ -53,11 +53,11 @@ class ContactSession:
         self._skips = skips or Skips(CONTACT)
         tolerance, max_age = round(parameters.pose_tolerance / SECOND), round(parameters.max_age / SECOND)
         self.jaws = {
-            side: JawContact(ContactEstimator(jaw, settings=contact), tolerance=tolerance, max_age=max_age)
+            side: JawContact(
+                ContactEstimator(jaw, settings=contact, skips=self._skips), tolerance=tolerance, max_age=max_age
+            )
             for side, jaw in load_jaws(parameters).items()
         }
-        for jaw_contact in self.jaws.values():
-            jaw_contact.estimator.skips = self._skips
         self.mesh: ObjectMesh | None = None
         self.trouble = ""
         self._frame = parameters.camera_frame

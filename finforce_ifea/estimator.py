@@ -51,14 +51,24 @@ class JawEstimator:
     """Estimates the force on one jaw; deterministic, one thread.
 
     Attributes:
-        spares: whether a jaw at rest is left alone while its object is out of reach.
-        spared: whether the last image was such a one.
+        spared: whether the jaw was left alone in the last image.
     """
 
     def __init__(
-        self, jaw: Jaw, *, settings: EstimatorSettings | None = None, calibration: Calibration | None = None
+        self,
+        jaw: Jaw,
+        *,
+        settings: EstimatorSettings | None = None,
+        calibration: Calibration | None = None,
+        spares: bool = True,
     ) -> None:
         """Builds the mechanics of the jaw as the calibration describes it.
+
+        Args:
+            jaw: as its file has it.
+            settings: of this estimator.
+            calibration: of the finger, None for the jaw as it is.
+            spares: whether a jaw at rest is left alone while its object is out of reach.
 
         Raises:
             FinforceError: Jaw, settings and calibration do not fit each other.
@@ -79,7 +89,7 @@ class JawEstimator:
             self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
         )
         self._away = ReachWatch(self.jaw.keypoints, self.jaw.inner_face_x, self._rolling.rest_modes)
-        self.spares, self.spared = True, False
+        self._spares, self.spared = spares, False
         self.reset()
 
     def reset(self) -> None:
@@ -146,7 +156,7 @@ class JawEstimator:
             return self._fail("waiting", waiting, used)
         if contact is None or not len(contact.points):
             return self._without_contact(points, used)
-        if self.spares and self.tared and self._away.is_idle(contact, points, self._taring.tare):
+        if self._spares and self.tared and self._away.is_idle(contact, points, self._taring.tare):
             self.spared = True
             return self._rest("the object is out of reach, the jaw is at rest", points)
         try:
@@ -183,8 +193,8 @@ class JawEstimator:
         free = (contact.free or contact.outline is not None) and self.settings.solver != "paper"
         chosen = self._rolling if free else self._pointed
         if chosen is not self._tracker:
-            chosen.reset()
-            chosen.q, self._tracker = self._tracker.q.copy(), chosen
+            chosen.resume(self._tracker.q)
+            self._tracker = chosen
         chosen.follow(contact)
 
     def _check_on_surface(self, contact: Contact) -> None:

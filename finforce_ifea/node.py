@@ -50,8 +50,7 @@ class IfeaSolverNode(Node):
         jaw = load_parameter_jaw(parameters)
         self.contacts = build_contact_feed(jaw, parameters)
         with self._patience(jaw.name):
-            self.estimator = build(jaw, parameters, settings)
-        self.estimator.spares = self.skips.allows(AWAY)
+            self.estimator = build(jaw, parameters, settings, self.skips.allows(AWAY))
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
         self.health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
         self.pairing, self.idling = ForcePairing(parameters.jaw_name), Idling()

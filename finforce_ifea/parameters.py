@@ -80,8 +80,10 @@ def build_contact_feed(jaw: Jaw, parameters: NodeParameters) -> ContactFeed:
     )
 
 
-def build_estimator(jaw: Jaw, parameters: NodeParameters, settings: EstimatorSettings) -> JawEstimator:
-    """Build the estimator of a node, compiled and ready for the first image.
+def build_estimator(
+    jaw: Jaw, parameters: NodeParameters, settings: EstimatorSettings, spares: bool = True
+) -> JawEstimator:
+    """Build the estimator of a node, compiled and ready for the first image; see `JawEstimator`.
 
     Raises:
         FinforceError: the calibration or the settings do not fit the jaw.
@@ -91,7 +93,7 @@ def build_estimator(jaw: Jaw, parameters: NodeParameters, settings: EstimatorSet
 
     file = parameters.calibration_file
     calibration = load_calibration(file) if file else None
-    estimator = JawEstimator(jaw, settings=settings, calibration=calibration)
+    estimator = JawEstimator(jaw, settings=settings, calibration=calibration, spares=spares)
     estimator.warm_up()
     return estimator
 

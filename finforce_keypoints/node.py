@@ -42,11 +42,19 @@ STAMPED = 12  # bytes of a serialised message up to the end of its stamp
 class DoorGroup(MutuallyExclusiveCallbackGroup):
     """Callbacks that are called while it is open; messages that come meanwhile wait, unread."""
 
-    is_open = True
+    _is_open = True
+
+    def open(self) -> None:
+        """Have what waits read."""
+        self._is_open = True
+
+    def close(self) -> None:
+        """Leave what comes unread."""
+        self._is_open = False
 
     def can_execute(self, entity: Any) -> bool:
         """Say whether one may be called now."""
-        return self.is_open and super().can_execute(entity)
+        return self._is_open and super().can_execute(entity)
 
 
 class KeypointDetectorNode(Node):
@@ -128,7 +136,7 @@ class KeypointDetectorNode(Node):
         with self._refusals():
             message = read_image(data)
             if not (self._rest() or self._confirm(message, began)):
-                self.depth_group.is_open = True  # what came meanwhile is read now
+                self.depth_group.open()  # what came meanwhile is read now
                 self._answer(self.feed.take_color(topic, message), began)
 
     def _on_depth(self, data: bytes) -> None:
@@ -140,7 +148,7 @@ class KeypointDetectorNode(Node):
         """Say whether nobody listens, so that there is nothing to do."""
         if not self.skips.allows(UNHEARD) or self.out.are_heard:
             return False
-        self.depth_group.is_open = False
+        self.depth_group.close()
         self.rested = monotonic()
         self.skips.count(UNHEARD)
         return True
@@ -153,7 +161,7 @@ class KeypointDetectorNode(Node):
         found = self.detector.confirm(SECOND * stamp, color, self.feed.camera)
         if found is None:
             return False
-        self.depth_group.is_open = False
+        self.depth_group.close()
         self.feed.pass_over()
         self.gate.enter(stamp, self._now())
         if self.skips.allows(IDLE) and self.idling.passes(stamp):

@@ -185,17 +185,19 @@ class LargeSubscription:
     """
 
     def __init__(self, qos: QosWatch, kind: type, topic: str, callback: Callable, **options: Any) -> None:
-        self._relax = partial(qos.subscription, kind, topic, callback, SENSOR, **options)
-        self._node, self._topic = qos.node, topic
+        self._qos, self._node, self._steady = qos, qos.node, True
+        self._asked: Any = (kind, topic, callback)
+        self._options = options
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch)
         self.current = qos.node.create_subscription(kind, topic, callback, STEADY, event_callbacks=events, **options)
 
     def _on_mismatch(self, _: Any) -> None:
         """Take the messages as they come from a publisher that offers no more."""
-        if self._relax is not None:
-            self._node.get_logger().warning(f"{self._topic} comes with best effort: large messages may be lost")
+        if self._steady:
+            self._steady = False
+            self._node.get_logger().warning(f"{self._asked[1]} comes with best effort: large messages may be lost")
             self._node.destroy_subscription(self.current)
-            self.current, self._relax = self._relax(), None
+            self.current = self._qos.subscription(*self._asked, SENSOR, **self._options)
 
 
 def publish_diagnostics(

@@ -177,11 +177,12 @@ def _run(nodes: Sequence[Process], stream: SceneStream, setting: str) -> _Run:
         player.spin_until(monotonic() + 0.5)
         pids = find_processes([node.name for node in nodes])
         watch = _SkipWatch(CpuMeter(pids), stream, lambda: len(log.grasp), setting)
-        log.offset = time_ns() - stream.begin
-        player.play(stream, offset=log.offset, sent=watch.look)
+        offset = time_ns() - stream.begin
+        log.begin(offset)
+        player.play(stream, offset=offset, sent=watch.look)
         watch.close()
         run.memory = {name: resident_bytes(pid) / 1e6 for name, pid in pids.items()}
-        log.ended = True
+        log.end()
         player.spin_until(monotonic() + 0.5)
         group.check()
     run.costs = watch.costs

@@ -71,13 +71,21 @@ class ReplayLog:
         self.grasp_latency: dict[int, float] = {}
         self.detections = {side: DetectionLog() for side in sides}
         self.health: dict[str, Mapping[str, str]] = {}
-        self.offset = 0
-        self.ended = False
+        self._offset = 0
+        self._ended = False
+
+    def begin(self, offset: int) -> None:
+        """Take stamps as later by so much than they were recorded [ns]."""
+        self._offset = offset
+
+    def end(self) -> None:
+        """Take what comes now as the nodes' last words."""
+        self._ended = True
 
     def _stamp(self, message: Any) -> int:
         """Return a stamp as it was recorded [ns]."""
         stamp = message.header.stamp
-        return stamp.sec * NANOSECONDS + stamp.nanosec - self.offset
+        return stamp.sec * NANOSECONDS + stamp.nanosec - self._offset
 
     def take_sent(self, topic: str, stamp: int, time: float) -> None:
         """Note when a message left [s, monotonic]; those count that a run begins with: key points, or an image."""
@@ -143,7 +151,7 @@ class ReplayLog:
     def take_diagnostics(self, message: Any) -> None:
         """Keep the last state of every node; that nothing arrives any more after the end is no news."""
         for status in message.status:
-            if self.ended and status.name in self.health:
+            if self._ended and status.name in self.health:
                 continue
             values = {entry.key: entry.value for entry in status.values}
             self.health[status.name] = {"message": status.message, **values}

@@ -125,14 +125,15 @@ def run_nodes(
         player.spin_until(monotonic() + LINGER)
         pids = find_processes([process.name for process in processes])
         meter = CpuMeter({**pids, PLAYER: getpid()})
-        log.offset = time_ns() - stream.begin
+        offset = time_ns() - stream.begin
+        log.begin(offset)
         busy = busy_seconds()
         meter.sample()
-        player.play(stream, offset=log.offset, sent=lambda message: _note(log, message))
+        player.play(stream, offset=offset, sent=lambda message: _note(log, message))
         meter.sample()
         busy = busy_seconds() - busy
         memory = {name: resident_bytes(pid) for name, pid in pids.items()}
-        log.ended = True
+        log.end()
         player.spin_until(monotonic() + LINGER)
         nodes.check()
     shares = meter.shares()

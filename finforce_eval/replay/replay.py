@@ -228,16 +228,16 @@ def _run(processes: Sequence[Process], messages: Playback, log: ReplayLog, playi
         await_listeners(player, nodes, awaited)
         player.spin_until(monotonic() + LINGER)
         bar = stack.enter_context(tqdm(total=len(messages), unit="msg", desc="replay", disable=None))
-        log.offset = 0 if playing.has_clock else time_ns() - messages.begin
+        offset = None if playing.has_clock else time_ns() - messages.begin
+        log.begin(offset or 0)
 
         def sent(message: RawMessage) -> None:
             nodes.check()
             log.take_sent(message.topic, message.stamp, monotonic())
             bar.update()
 
-        offset = None if playing.has_clock else log.offset
         player.play(messages, rate=playing.rate, offset=offset, sent=sent)
-        log.ended = True
+        log.end()
         player.spin_until(monotonic() + LINGER)
         nodes.check()
 

@@ -90,6 +90,10 @@ class RollingContact:
         self.face_x = face_x
         self.indenter: Indenter = RoundIndenter()
 
+    def set_indenter(self, indenter: Indenter) -> None:
+        """Takes another object, which is pressed in from now on."""
+        self.indenter = indenter
+
     def begin(self, height: float) -> NDArray:
         """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
         return np.zeros(self.model.size)

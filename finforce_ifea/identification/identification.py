@@ -272,7 +272,7 @@ class _PlateauSolver:
         Raises:
             CalibrationError: No shape of the jaw comes close.
         """
-        self._contact.indenter = item.indenter
+        self._contact.set_indenter(item.indenter)
         place = np.array([0.0, shape, item.mean[1]])
         touch = item.indenter.find_touch(place, *self._contact.surface.heights[[0, -1]])
         q = np.zeros(self._model.size) if start is None else start.q

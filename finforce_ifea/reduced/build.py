@@ -254,7 +254,7 @@ class _Rod:
         low, high = contact.surface.heights[[0, -1]]
         self._contact, self._height = contact, height
         self._radius, self._deepest = _ROD * (high - low), _DEEPEST * (high - low)
-        contact.indenter = RoundIndenter()
+        contact.set_indenter(RoundIndenter())
 
     def press(self, hardest: float) -> list[_Equilibrium]:
         """Returns equilibria at rising depths up to the largest, or to where the jaw gives way or resists."""

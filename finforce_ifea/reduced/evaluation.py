@@ -216,6 +216,10 @@ class ReducedContact:
         self._farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
         self._tables = (model.manifold.moves, model.compliance, model.loads)
 
+    def set_indenter(self, indenter: Indenter) -> None:
+        """Takes another object, which is pressed in from now on."""
+        self.indenter = indenter
+
     def begin(self, height: float) -> NDArray:
         """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
         q, rods = np.zeros(self.model.size), self.model.manifold.rods

@@ -69,7 +69,7 @@ class PlaceTracker:
         settings = self.settings
         self._given = height
         height = float(np.median(self.contact.surface.heights)) if height is None else height
-        self.contact.indenter = RoundIndenter()
+        self.contact.set_indenter(RoundIndenter())
         self._prior = np.array([np.log(settings.radius), height])
         self._prior_variance = np.array([settings.radius_log_stddev, settings.height_stddev]) ** 2
         self._begin()
@@ -161,6 +161,11 @@ class PlaceTracker:
         state = self.contact.linearize(q, self._reachable(np.r_[-1.0, self._prior]))
         return self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
 
+    def resume(self, q: NDArray) -> None:
+        """Starts anew from the shape (size,) that another tracker has found."""
+        self.reset()
+        self.q = q.copy()
+
     def follow(self, contact: Contact) -> None:
         """Takes over where a contact's object is: its outline, or its height as that of first touch."""
         if contact.outline is not None:
@@ -180,7 +185,8 @@ class PlaceTracker:
         before = self.contact.indenter
         expected = expect_object(contact, self.settings, self._outline)
         self._prior, self._prior_variance = expected.mean, expected.variance
-        self.contact.indenter = self._outline = after = expected.indenter
+        self._outline = after = expected.indenter
+        self.contact.set_indenter(after)
         self._given, self._stiffness = None, self.response.stiffness_at(float(expected.mean[1]))
         away = abs(self._slow[1] - expected.mean[1]) > _FARTHEST_HEIGHT * self.settings.height_stddev
         if away or not isinstance(before, OutlineIndenter) or not after.resembles(before):

@@ -62,6 +62,11 @@ class PointTracker:
         self._heights = (float(self.jaw.candidates[self._candidate, 2]),)
         self._weights: NDArray | None = np.ones(1)
 
+    def resume(self, q: NDArray) -> None:
+        """Starts anew from the shape (size,) that another tracker has found."""
+        self.reset()
+        self.q = q.copy()
+
     def follow(self, contact: Contact) -> None:
         """Takes a contact over: its heights and weights."""
         heights = contact.points[:, 2]

@@ -6,14 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from estimator_fakes import BENCH, PERIOD, magnitudes, make_estimator, ramp, record
+from estimator_fakes import BENCH, CALIBRATION, PERIOD, magnitudes, ramp, record
 from localization_fakes import JAW, cylinder
 
 from finforce import skipping as rules
 from finforce.skipping import ALL, EVERYWHERE, SkippingError, Skips
 from finforce.stamps import Idling
 from finforce_contact.estimator import ContactEstimator
+from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.observation import Contact, ObjectOutline
+from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.influence import AWAY, is_out_of_reach
 from finforce_keypoints.settings import RULES as DETECTOR
 
@@ -108,8 +110,9 @@ def circle(gap):
 @cache
 def watched(*, spares, near=NEAR):
     """Solutions of a press whose object stands far away at first, and which images were spared."""
-    recording, estimator = record(DEPTHS), make_estimator(solver="frame")
-    estimator.spares = spares
+    settings = EstimatorSettings(solver="frame")
+    recording = record(DEPTHS)
+    estimator = JawEstimator(BENCH, settings=settings, calibration=CALIBRATION, spares=spares)
     far, solutions, spared = circle(FAR), [], []
     for frame, (observation, depth) in enumerate(zip(recording.observations, DEPTHS, strict=True)):
         contact = far if frame < near else circle(-depth if depth > 0.0 else 1e-3)
@@ -181,8 +184,7 @@ class TestAnObjectOutOfReach:
 class TestContactThatNeedNotBeLookedFor:
     def follow(self, off, gap, noise):
         """Mean heights (n,) [m] and touch (n,) of a cylinder whose pose trembles before the undeformed jaw."""
-        estimator = ContactEstimator(JAW, mesh=cylinder())
-        estimator.skips = Skips(rules.CONTACT, off)
+        estimator = ContactEstimator(JAW, mesh=cylinder(), skips=Skips(rules.CONTACT, off))
         random, heights, touching = np.random.default_rng(3), [], []
         for frame in range(40):
             T = np.eye(4)

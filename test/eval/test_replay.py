@@ -216,7 +216,7 @@ def test_silence_after_the_end_of_a_recording_is_no_state_of_a_node():
     log = ReplayLog(("left",))
     log.take_diagnostics(report("jaw", "loaded"))
     log.take_diagnostics(report("jaw", "touching"))
-    log.ended = True
+    log.end()
     log.take_diagnostics(report("jaw", "nothing has arrived"))
     log.take_diagnostics(report("late", "never heard before"))
     assert {name: state["message"] for name, state in log.health.items()} == {
