@@ -30,7 +30,7 @@ from finforce_ifea.tare import TareKeeper, TareReport
 from finforce_ifea.tracking.influence import ReachWatch
 from finforce_ifea.tracking.place_tracker import PlaceTracker
 from finforce_ifea.tracking.point_tracker import PointTracker
-from finforce_ifea.tracking.track import Track, find_doubt, find_numbers
+from finforce_ifea.tracking.track import ForceEvidence, Track, find_doubt, find_numbers
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 
@@ -262,17 +262,16 @@ class JawEstimator:
     def _solution(self, track: Track, force: NDArray, used: NDArray) -> Solution:
         extrapolated = _EXTRAPOLATED * track.extrapolation
         share = float(np.sqrt(self._force_error**2 + track.place_error**2 + extrapolated**2))
-        numbers = find_numbers(
-            force,
-            track.force,
-            track.force_modes,
-            track.covariance,
-            track.pressure_point,
-            track.pressure_place,
-            track.place_stddev,
-            share,
-            _LEAN,
+        evidence = ForceEvidence(
+            force=force,
+            elastic=track.force,
+            modes=track.force_modes,
+            covariance=track.covariance,
+            pressure=track.pressure_point,
+            place=track.pressure_place,
+            place_stddev=track.place_stddev,
         )
+        numbers = find_numbers(evidence, share, _LEAN)
         return Solution(
             stamp=self._stamp,
             status="ok" if numbers.magnitude > 0.0 else "unloaded",

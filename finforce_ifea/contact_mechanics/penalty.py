@@ -211,15 +211,15 @@ class PenaltyContact:
 
 
 @njit(cache=True, error_model="numpy")
-def _resist(depth, stiffness, smooth):
+def _resist(depth, stiffness):
     """Returns force [N] and its derivative [N/m] at a depth above zero [m]."""
-    if depth < smooth:
-        return 0.5 * stiffness * depth * depth / smooth, stiffness * depth / smooth
-    return stiffness * (depth - 0.5 * smooth), stiffness
+    if depth < _SMOOTH_DEPTH:
+        return 0.5 * stiffness * depth * depth / _SMOOTH_DEPTH, stiffness * depth / _SMOOTH_DEPTH
+    return stiffness * (depth - 0.5 * _SMOOTH_DEPTH), stiffness
 
 
 @njit(cache=True, error_model="numpy")
-def _press_cylinder(points, stiffness, centre_x, centre_z, radius, smooth):
+def _press_cylinder(points, stiffness, centre_x, centre_z, radius):
     count = len(points)
     forces, springs, by_shape = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3))
     for p in range(count):
@@ -229,7 +229,7 @@ def _press_cylinder(points, stiffness, centre_x, centre_z, radius, smooth):
         if depth <= 0.0 or r < 1e-12:
             continue
         nx, nz = dx / r, dz / r
-        push, slope = _resist(depth, stiffness[p], smooth)
+        push, slope = _resist(depth, stiffness[p])
         forces[p, 0], forces[p, 2] = push * nx, push * nz
         by_shape[p, 0], by_shape[p, 2] = slope * nx, slope * nz
         side = push / r
@@ -266,12 +266,12 @@ def press_cylinder(
         centre_z: of the axis [m].
         radius: of the cylinder [m].
     """
-    forces, springs, by_shape = _press_cylinder(points, stiffness, centre_x, centre_z, radius, _SMOOTH_DEPTH)
+    forces, springs, by_shape = _press_cylinder(points, stiffness, centre_x, centre_z, radius)
     return PenaltyContact(forces=forces, springs=springs, by_shape=by_shape)
 
 
 @njit(cache=True, error_model="numpy")
-def _press_box(points, stiffness, centre_x, centre_z, half_x, half_z, edge, smooth):
+def _press_box(points, stiffness, centre_x, centre_z, half_x, half_z, edge):
     count = len(points)
     forces, springs = np.zeros((count, 3)), np.zeros((count, 3, 3))
     for p in range(count):
@@ -288,7 +288,7 @@ def _press_box(points, stiffness, centre_x, centre_z, half_x, half_z, edge, smoo
             r, nx, nz, depth = 1.0, 0.0, sz, edge - oz
         if depth <= 0.0:
             continue
-        push, slope = _resist(depth, stiffness[p], smooth)
+        push, slope = _resist(depth, stiffness[p])
         side = push / r if curved else 0.0
         forces[p, 0], forces[p, 2] = push * nx, push * nz
         springs[p, 0, 0] = slope * nx * nx - side * nz * nz
@@ -309,12 +309,12 @@ def press_box(
         half: half sizes along x and z [m].
         edge: radius of the edges [m], above zero.
     """
-    forces, springs = _press_box(points, stiffness, *centre, *half, edge, _SMOOTH_DEPTH)
+    forces, springs = _press_box(points, stiffness, *centre, *half, edge)
     return PenaltyContact(forces=forces, springs=springs, by_shape=np.zeros_like(forces))
 
 
 @njit(cache=True, error_model="numpy")
-def _press_field(points, stiffness, coefficients, low, cell, origin, c, s, smooth):
+def _press_field(points, stiffness, coefficients, low, cell, origin, c, s):
     count = len(points)
     forces, springs, by_tilt = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3))
     local = np.empty((count, 2))
@@ -325,7 +325,7 @@ def _press_field(points, stiffness, coefficients, low, cell, origin, c, s, smoot
     for p in range(count):
         if field[p, 0] <= 0.0:
             continue
-        push, slope = _resist(field[p, 0], stiffness[p], smooth)
+        push, slope = _resist(field[p, 0], stiffness[p])
         gx, gz = c * field[p, 1] - s * field[p, 2], s * field[p, 1] + c * field[p, 2]
         a, b, d = field[p, 3], field[p, 4], field[p, 5]
         hxx = c * c * a - 2.0 * c * s * b + s * s * d
@@ -359,6 +359,6 @@ def press_field(
     """
     c, s = np.cos(tilt), np.sin(tilt)
     forces, springs, by_tilt = _press_field(
-        points, stiffness, field.coefficients, field.low, CELL, np.asarray(origin), c, s, _SMOOTH_DEPTH
+        points, stiffness, field.coefficients, field.low, CELL, np.asarray(origin), c, s
     )
     return PenaltyContact(forces=forces, springs=springs, by_shape=by_tilt)

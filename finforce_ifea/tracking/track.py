@@ -193,21 +193,10 @@ def measure_along(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
     return np.sqrt(total)
 
 
-@njit(**_OPTIONS)
-def find_numbers(
-    force: NDArray,
-    elastic: NDArray,
-    modes: NDArray,
-    covariance: NDArray,
-    pressure: NDArray,
-    place: NDArray,
-    place_stddev: float,
-    share: float,
-    lean: float,
-) -> SolutionNumbers:
-    """Returns what belongs to a force; see `SolutionNumbers`.
+class ForceEvidence(NamedTuple):
+    """A force that was tracked, and what is known of it.
 
-    Args:
+    Attributes:
         force: that the material gives now (3,) [N].
         elastic: that the shape asks for (3,) [N].
         modes: derivative of the elastic force by what was estimated (3, m).
@@ -215,9 +204,27 @@ def find_numbers(
         pressure: pressure centre on the deformed surface (3,) [m].
         place: the same on the undeformed surface (3,) [m].
         place_stddev: of its height [m].
+    """
+
+    force: NDArray
+    elastic: NDArray
+    modes: NDArray
+    covariance: NDArray
+    pressure: NDArray
+    place: NDArray
+    place_stddev: float
+
+
+@njit(**_OPTIONS)
+def find_numbers(evidence: ForceEvidence, share: float, lean: float) -> SolutionNumbers:
+    """Returns what belongs to a force; see `SolutionNumbers`.
+
+    Args:
+        evidence: the force that was tracked.
         share: relative standard deviation of the mechanics; it errs in the direction as in the magnitude.
         lean: share of a force that nobody has seen along z.
     """
+    force, elastic, modes, covariance, pressure, place, place_stddev = evidence
     fit, magnitude = measure_along(elastic, modes, covariance), np.sqrt((force * force).sum())
     stddev = np.zeros(3)
     for a in range(3):
