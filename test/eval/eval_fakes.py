@@ -183,3 +183,17 @@ def with_both_jaws(recording, seconds):
         truth=replace(truth, force=truth.force * MIRROR, torque=truth.torque * MIRROR_MOMENT),
     )
     return replace(part, jaws={"left": left, "right": right})
+
+
+def drawn_hues(path):
+    """How many of twelve hues a picture shows in more than a few pixels; none where nothing but axes and text is."""
+    from colorsys import rgb_to_hsv
+
+    from PIL import Image
+
+    picture = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3).astype(int)
+    colours, counts = np.unique(picture[np.ptp(picture, axis=1) > 60], axis=0, return_counts=True)
+    hues = np.zeros(12, int)
+    for colour, count in zip(colours, counts, strict=True):
+        hues[int(11.99 * rgb_to_hsv(*(colour / 255))[0])] += count
+    return int((hues > 15).sum())

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from eval_fakes import drawn_hues
 
 from finforce_eval.bench import growth as bench_growth
 from finforce_eval.bench.cases import bench_finger
@@ -58,7 +59,6 @@ def test_meshes_reach_from_hundreds_to_twenty_thousand_vertices(solid):
 def test_step_and_its_shares_are_measured_on_the_same_mesh():
     row = _measure_density(_density(1, 1, 1, 2))
     assert row["vertices"] == len(mesh_jaw(JAW, _density(1, 1, 1, 2)).build_mesh().nodes)
-    assert all(value > 0 for value in row.values())
     assert {"a step of the full solver", "SuperLU on its matrix", "assembly", "factorisation"} <= row.keys()
 
 
@@ -72,13 +72,20 @@ def test_key_points_spread_over_the_side_face_and_stay_on_the_jaw(count):
     build_mechanics(jaw, EstimatorSettings()).model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
 
 
-def test_steps_with_many_key_points_give_forces():
-    assert _measure_keypoints("frame", 40) > 0
+def test_steps_with_many_key_points_give_forces(monkeypatch):
+    def run(estimator, observations, contact):
+        return [estimator.update(observation, contact) for observation in observations]
+
+    monkeypatch.setattr(bench_growth, "time_steps", run)
+    *_, last = _measure_keypoints("frame", 40)
+    assert last.status == "ok" and last.force[0] < -0.3
 
 
-def test_program_with_many_candidates_is_solved():
-    times = _measure_program(JAW, 20)
-    assert all(value > 0 for value in times.values())
+def test_program_with_many_candidates_is_solved(monkeypatch):
+    monkeypatch.setattr(bench_growth, "time_median", lambda call, count: call())
+    moved, solved = _measure_program(JAW, 20).values()
+    assert moved.shape == (len(JAW.keypoints), 3, 20) and np.ptp(moved[:, 0], axis=1).max() > 0
+    assert solved.kkt < 1e-8
 
 
 def test_sphere_has_the_triangles_that_it_is_asked_for():
@@ -91,7 +98,6 @@ def test_images_of_spheres_are_measured_at_every_size(monkeypatch):
     monkeypatch.setattr("finforce_eval.bench.growth.SUBDIVISIONS", (1, 2))
     growth = grow_triangles(quick=True)
     assert [list(curve.sizes) for curve in growth.curves] == [[80, 320]] * 4
-    assert all(min(curve.seconds) > 0 for curve in growth.curves)
 
 
 def test_table_json_and_picture_hold_slopes(tmp_path):
@@ -101,4 +107,4 @@ def test_table_json_and_picture_hold_slopes(tmp_path):
     assert "  2.00" in format_table(figures)
     assert json.loads(json.dumps(as_json(figures)))["growths"][0]["curves"][0]["slope"] == pytest.approx(2.0)
     bench_growth.draw(figures, tmp_path / "growth.png")
-    assert (tmp_path / "growth.png").stat().st_size > 5000
+    assert drawn_hues(tmp_path / "growth.png") >= 2

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from eval_fakes import drawn_hues
 
 from finforce.skipping import EVERYWHERE
 from finforce_eval.bench.scenes import SceneStream, StreamPart, cut_sections, read_word
@@ -94,7 +95,7 @@ def test_the_json_holds_figures_and_aims():
 
 def test_the_picture_has_a_panel_for_each_scene(tmp_path):
     draw(figures(), tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").stat().st_size > 0
+    assert drawn_hues(tmp_path / "picture.png") >= 1
     picture = draw_costs(figures())
     assert [axes.get_title(loc="left") for axes in picture.axes] == ["idle", "approach", "grasp"]
 
