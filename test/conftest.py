@@ -1,9 +1,12 @@
-"""Settings of all tests."""
+"""What tests of several packages are given."""
 
-import os
-from pathlib import Path
+import pytest
 
-# Before numpy is imported: on small matrices a second thread of the linear algebra only gets in the way.
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-os.environ.setdefault("FINFORCE_CACHE", str(Path(__file__).parent.parent / ".pytest_cache" / "finforce"))
+
+@pytest.fixture
+def probe():
+    """A node on a DDS domain of its own that talks to the nodes of a test."""
+    from node_fakes import ros_domain
+
+    with ros_domain() as probe:
+        yield probe

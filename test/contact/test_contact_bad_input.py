@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from localization_fakes import FACE, JAW, bent, box, cylinder, opened, pose
+from contact_fakes import FACE, JAW, bent, box, cylinder, opened, pose
 
 from finforce.errors import ObservationError, PoseError
 from finforce_contact.errors import ObjectMeshError

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from contact_node_fakes import CAMERA, MESH, ContactBench, call, cylinder_before_jaw, header, pose
 from geometry_msgs.msg import PoseStamped
-from node_fakes import ros_domain
 from rclpy.qos import ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
@@ -96,12 +95,6 @@ class TrackingBench(ContactBench):
     @property
     def poses(self):
         return self.probe.got["object_pose"]
-
-
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
 
 
 def test_the_object_is_found_with_a_mask_and_followed_without(probe, camera, scene):

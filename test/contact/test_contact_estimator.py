@@ -2,7 +2,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from localization_fakes import FACE, JAW, bent, box, cylinder, joined, opened, pose
+from contact_fakes import FACE, JAW, bent, box, cylinder, joined, opened, pose
 from scipy.spatial.transform import Rotation
 
 from finforce.errors import PoseError

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from contact_node_fakes import SECOND, T_CAMERA_JAW, ContactBench, cylinder_before_jaw, header, pose
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from node_fakes import ros_domain
 from sensor_msgs.msg import PointCloud2, PointField
 
 from finforce.health import Level
@@ -15,12 +14,6 @@ from finforce_ifea.jaw.jaw import load_jaw
 
 NAN, INF, HOUR = float("nan"), float("inf"), 3600 * SECOND
 VERTICES = load_jaw("bench").build_mesh("default").nodes
-
-
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
 
 
 def surface(vertices, stamp=None, frame="left_jaw"):

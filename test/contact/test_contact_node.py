@@ -18,7 +18,6 @@ from contact_node_fakes import (
     pose,
 )
 from geometry_msgs.msg import PoseStamped
-from node_fakes import ros_domain
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -29,12 +28,6 @@ from finforce.pointcloud import decode_cloud
 from finforce.ros import node as ros
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
-
-
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
 
 
 def columns(cloud, *names):

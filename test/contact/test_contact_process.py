@@ -6,7 +6,7 @@ import sys
 
 import pytest
 from contact_node_fakes import MESH
-from node_process_fakes import PATIENCE, command_of, run_node, stop_when_ready
+from node_fakes import START_PATIENCE, command_of, run_node, stop_when_ready
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -39,5 +39,7 @@ def test_heavy_libraries_wait_until_they_are_needed(name):
     heavy = "{'open3d', 'trimesh', 'manifold3d', 'small_gicp', 'coal'}"
     load = f"from finforce.ros import start; __import__(start.NODES['{name}'])"
     check = f"import sys; {load}; print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, timeout=PATIENCE, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", check], capture_output=True, text=True, timeout=START_PATIENCE, check=True
+    )
     assert done.stdout.strip() == "set()"

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from localization_fakes import FACE, JAW, bent, box, cylinder, joined, opened, pose, wrapped
+from contact_fakes import FACE, JAW, bent, box, cylinder, joined, opened, pose, wrapped
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.errors import ObjectMeshError

@@ -2,7 +2,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from scene_fakes import distance_mm, make_case
+from contact_fakes import distance_mm, make_case
 
 from finforce.optional import import_manifold3d
 from finforce_contact.mesh.triangles import ObjectMesh

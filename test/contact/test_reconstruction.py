@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene_fakes import bare_mesh, distance_mm, make_case
+from contact_fakes import bare_mesh, distance_mm, make_case
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import ImageError, deproject

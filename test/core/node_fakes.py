@@ -1,6 +1,9 @@
-"""A DDS domain of its own with a probe that talks to nodes, and an estimator that answers by rule."""
+"""Nodes under test: a DDS domain of their own with a probe, an estimator that answers by rule, processes."""
 
 import os
+import subprocess
+import sys
+import threading
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import monotonic, time_ns
@@ -158,3 +161,36 @@ def keypoint_cloud(stamp=None, *, frame="left_jaw", points=KEYPOINTS, **columns)
     header = Header(stamp=ros.stamp_message(time_ns() if stamp is None else stamp), frame_id=frame)
     likelihood = np.full(len(points), 0.9, dtype=np.float32)
     return ros.cloud_message(header, {**ros.xyz_columns(points), "likelihood": likelihood, **columns})
+
+
+START_PATIENCE = 240.0  # s; a first start compiles
+
+
+def command_of(name, *parameters):
+    """The command line of a node with parameters `name:=value`."""
+    given = [word for parameter in parameters for word in ("-p", parameter)]
+    return [sys.executable, "-m", "finforce.ros.start", name, "--ros-args", *given]
+
+
+def environment():
+    own = {"ROS_DOMAIN_ID": str(free_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return {**os.environ, **own}
+
+
+def run_node(command):
+    """What came of a node that ends by itself."""
+    return subprocess.run(command, capture_output=True, text=True, timeout=START_PATIENCE, env=environment())
+
+
+def stop_when_ready(command, number):
+    """The exit status of a node that is sent a signal once it is ready, and all that it said."""
+    node = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment())
+    guard = threading.Timer(START_PATIENCE, node.kill)
+    guard.start()
+    said = []
+    for line in node.stderr:
+        said.append(line)
+        if " ready" in line:
+            node.send_signal(number)
+    guard.cancel()
+    return node.wait(10), "".join(said)

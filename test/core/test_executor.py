@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from node_fakes import ros_domain
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -39,12 +38,6 @@ class Worker(Node):
     def spare_time(self):
         self.slept += self.spare > 0.0
         return self.spare
-
-
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
 
 
 @pytest.fixture(params=[(), (ALL,)], ids=["kept", "not kept"])

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from contact_fakes import JAW, cylinder
 from estimator_fakes import BENCH, CALIBRATION, PERIOD, magnitudes, ramp, record
-from localization_fakes import JAW, cylinder
 
 from finforce import skipping as rules
 from finforce.skipping import ALL, EVERYWHERE, SkippingError, Skips

@@ -28,12 +28,6 @@ class Resting(FakeEstimator):
         return super().surface()
 
 
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
-
-
 def counted(node, rule):
     return node.skips.describe()[f"skipped: {rule}"]
 

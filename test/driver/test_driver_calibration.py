@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from driver_rig_fakes import VARIANTS, Rig
+from emulator_fakes import VARIANTS, Rig
 
 from finforce_driver.can.protocol import Command
 from finforce_driver.emulator.faults import FaultKind

@@ -1,19 +1,12 @@
 """Claims about python-can as a bus: messages pass, others are counted, and every way to fail says what would help."""
 
 import pytest
-from link_fakes import LONG, POLL, REPLY, FakeAdapter
+from emulator_fakes import LONG, POLL, REPLY
 
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.python_can import PythonCanBus
 from finforce_driver.can.slcan import encode_message
 from finforce_driver.errors import LinkError
-
-
-@pytest.fixture
-def adapter(tmp_path):
-    fake = FakeAdapter(tmp_path)
-    yield fake
-    fake.unplug()
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """Claims about the driver under random faults, against the emulator's truth."""
 
-import driver_rig_fakes  # noqa: F401  (finds the benchmarks)
+import emulator_fakes  # noqa: F401  (finds the benchmarks)
 import pytest
 from driver_faults import FaultRun, choose_kinds
 

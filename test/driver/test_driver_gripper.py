@@ -5,7 +5,7 @@ import threading
 import time
 
 import pytest
-from driver_rig_fakes import COUNT, VARIANTS, Rig
+from emulator_fakes import COUNT, VARIANTS, Rig
 
 from finforce_driver.can.protocol import Flag
 from finforce_driver.can.serial_bus import SerialBus

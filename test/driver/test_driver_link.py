@@ -5,7 +5,7 @@ import threading
 from time import sleep
 
 import pytest
-from link_fakes import LONG, POLL, REPLY, REPLY_LINE, FakeAdapter, receive_until
+from emulator_fakes import LONG, POLL, REPLY, REPLY_LINE, receive_until
 
 from finforce.errors import MissingDependencyError
 from finforce_driver.can import serial_bus
@@ -15,13 +15,6 @@ from finforce_driver.can.serial_bus import SerialBus
 from finforce_driver.errors import LinkError
 
 GREETING = b"\rC\rS8\rO\r"
-
-
-@pytest.fixture
-def adapter(tmp_path):
-    fake = FakeAdapter(tmp_path)
-    yield fake
-    fake.unplug()
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from driver_rig_fakes import VARIANTS, Rig
+from emulator_fakes import VARIANTS, Rig
 
 from finforce_driver.can.protocol import Command
 from finforce_driver.emulator.faults import FaultKind
@@ -11,11 +11,6 @@ from finforce_driver.errors import GripperStateError, LinkError
 from finforce_driver.state import MoveOutcome, Phase
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
-
-
-@pytest.fixture
-def rig(variant):
-    return Rig(variant)
 
 
 @both_variants

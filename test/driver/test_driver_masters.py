@@ -1,7 +1,7 @@
 """Claims about other programs on the bus."""
 
 import pytest
-from driver_rig_fakes import VARIANTS, Rig
+from emulator_fakes import VARIANTS, Rig
 
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.state import MoveOutcome, Phase

@@ -17,7 +17,6 @@ from driver_node_fakes import (
     gripper_state,
     send,
 )
-from node_fakes import ros_domain
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
@@ -26,12 +25,6 @@ from finforce.messages import stamp_of
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 
 SECOND = 1_000_000_000
-
-
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
 
 
 def test_joint_states_have_half_the_opening_and_the_time_of_the_reply(probe):

@@ -5,8 +5,8 @@ from contextlib import ExitStack
 from time import time_ns
 
 import pytest
-from driver_bench_fakes import Bench, Fingers
 from driver_node_fakes import ask
+from emulator_fakes import Bench, Fingers
 from node_fakes import ros_domain
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger

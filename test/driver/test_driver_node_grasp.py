@@ -17,7 +17,6 @@ from driver_node_fakes import (
     wrench,
 )
 from geometry_msgs.msg import WrenchStamped
-from node_fakes import ros_domain
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -26,12 +25,6 @@ from finforce.health import Level
 from finforce.ros import node as ros
 
 SECOND = 1_000_000_000
-
-
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
 
 
 BAD_FORCES = {

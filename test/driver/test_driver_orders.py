@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from driver_rig_fakes import COUNT, VARIANTS, Rig
+from emulator_fakes import COUNT, VARIANTS, Rig
 
 from finforce_driver.can.protocol import Command, Flag
 from finforce_driver.emulator.faults import FaultKind
@@ -12,11 +12,6 @@ from finforce_driver.state import MoveOutcome, Phase
 
 GO = Flag.ACTIVATE | Flag.GO
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
-
-
-@pytest.fixture
-def rig(variant):
-    return Rig(variant)
 
 
 @both_variants

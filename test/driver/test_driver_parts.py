@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from driver_rig_fakes import reply
+from emulator_fakes import reply
 
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import Command, Flag, Move, encode_poll

@@ -6,7 +6,7 @@ import sys
 from time import monotonic, sleep
 
 import pytest
-from node_process_fakes import PATIENCE, command_of, run_node, stop_when_ready
+from node_fakes import START_PATIENCE, command_of, run_node, stop_when_ready
 
 from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.firmware import EmulatedGripper
@@ -58,5 +58,7 @@ def test_what_cannot_be_set_up_ends_with_two_and_one_line(given, reason):
 def test_heavy_libraries_wait_until_they_are_needed():
     heavy = "{'serial', 'can', 'cv2', 'onnxruntime', 'torch', 'open3d', 'trimesh', 'numba'}"
     check = f"import finforce.ros.start, sys, finforce_driver.node; print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, timeout=PATIENCE, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", check], capture_output=True, text=True, timeout=START_PATIENCE, check=True
+    )
     assert done.stdout.strip() == "set()"

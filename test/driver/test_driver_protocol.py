@@ -1,7 +1,7 @@
 """Claims about the messages, to the byte."""
 
 import pytest
-from driver_rig_fakes import message_of
+from emulator_fakes import message_of
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from driver_rig_fakes import reply
+from emulator_fakes import reply
 from hypothesis import given
 from hypothesis import strategies as st
 

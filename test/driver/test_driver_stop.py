@@ -1,7 +1,7 @@
 """Claims about the emergency stop and its end."""
 
 import pytest
-from driver_rig_fakes import VARIANTS, Rig
+from emulator_fakes import VARIANTS
 
 from finforce_driver.can.protocol import Command, Flag
 from finforce_driver.emulator.faults import FaultKind
@@ -11,11 +11,6 @@ from finforce_driver.state import MoveOutcome, Phase
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
 LATCHED = {Fault.ESTOP_COMMAND, Fault.ESTOP_FLAG}
-
-
-@pytest.fixture
-def rig(variant):
-    return Rig(variant)
 
 
 def prepare(rig, what):

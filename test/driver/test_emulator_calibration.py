@@ -1,13 +1,8 @@
 import pytest
-from emulator_fakes import CALIBRATE, CLEAR, IDLE, RESET, VARIANTS, Host, calibrated_host
+from emulator_fakes import CALIBRATE, CLEAR, IDLE, RESET, Host, calibrated_host
 
 from finforce_driver.emulator.control import Mode
 from finforce_driver.emulator.settings import EmulatorSettings
-
-
-@pytest.fixture(params=VARIANTS)
-def variant(request):
-    return request.param
 
 
 def test_calibration_finds_the_stops_closes_and_goes_limp(variant):

@@ -9,11 +9,6 @@ AT_POSITION = 0x30
 TICK = 0.048 / 10558  # [m]
 
 
-@pytest.fixture(params=VARIANTS)
-def variant(request):
-    return request.param
-
-
 @pytest.mark.parametrize("position", [0, 1, 50, 100, 128, 254, 255])
 def test_target_is_reached_and_reported_one_count_less(variant, position):
     host = calibrated_host(variant)

@@ -1,4 +1,4 @@
-"""A small recording and an estimator that answers by rule, for the tests of the evaluation."""
+"""Recordings, estimators that answer by rule, and pictures for tests of evaluation."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, PoseTrack, Recording, WrenchTrack, parse_phases
+from finforce_eval.stress.stress import Family, Trial, attempt
+from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact
 
 PERIOD = 33_333_333
@@ -197,3 +199,26 @@ def drawn_hues(path):
     for colour, count in zip(colours, counts, strict=True):
         hues[int(11.99 * rgb_to_hsv(*(colour / 255))[0])] += count
     return int((hues > 15).sum())
+
+
+def answers(count, *, error=0.01, stddev=0.01, **fields):
+    """Sure, converged answers with the same error and the same stated standard deviation [N]."""
+    usual = {"converged": True, "sure": True, "force_error": error, "stddev": stddev, "step_time": 1e-3}
+    return [Trial(seed=i, **{**usual, **fields}) for i in range(count)]
+
+
+def family_of(trials, **fields):
+    return Family(name="made", what="made up", run=lambda plan: iter(trials), **fields)
+
+
+def refuse():
+    raise ContactError("not on the jaw")
+
+
+def divide():
+    return 1 / 0
+
+
+def fail_with(work, **options):
+    """The trial of a step that does not return."""
+    return attempt(7, work, lambda got: Trial(converged=True), level="made", **options)

@@ -2,8 +2,8 @@ import json
 
 import numpy as np
 import pytest
+from contact_fakes import bare_mesh, distance_mm, make_case
 from PIL import Image
-from scene_fakes import bare_mesh, distance_mm, make_case
 
 from finforce.optional import import_trimesh
 from finforce_contact.mesh.object_mesh import load_object_mesh, read_triangles

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from stress_fakes import answers, divide, fail_with, family_of, refuse
+from eval_fakes import answers, divide, fail_with, family_of, refuse
 
 from finforce_eval.cli.main import main
 from finforce_eval.cli.stress import choose_families, worst_trials, write_page

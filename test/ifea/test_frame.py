@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from frame_fakes import Press, line_stiffness
+from mechanics_fakes import Press, line_stiffness
 
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem import frame as frame_module

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from jaw_fakes import BENCH, changed, content_of, write_jaw, write_mesh_jaw
+from mechanics_fakes import SHIPPED_BENCH, changed, content_of, write_jaw, write_mesh_jaw
 
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.tetrahedra import to_tet10
@@ -29,16 +29,16 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "your_finger.md"
 
 
 def test_bench_keypoints_are_those_of_the_independent_program():
-    np.testing.assert_allclose(1e3 * BENCH.keypoints, BENCH_KEYPOINTS, atol=1e-9)
+    np.testing.assert_allclose(1e3 * SHIPPED_BENCH.keypoints, BENCH_KEYPOINTS, atol=1e-9)
     names = [f"inner_{i}" for i in range(1, 8)] + [f"outer_{i}" for i in range(1, 8)] + ["tip"]
-    assert list(BENCH.keypoint_names) == names
+    assert list(SHIPPED_BENCH.keypoint_names) == names
 
 
 def test_bench_candidates_stand_every_five_millimetres_on_the_inner_face():
     expected = [(14.0, 0.0, 8.0 + 5.0 * i) for i in range(14)]
-    np.testing.assert_allclose(1e3 * BENCH.candidates, expected, atol=1e-9)
-    assert BENCH.inner_face_x == 0.014
-    assert BENCH.model == "solid"
+    np.testing.assert_allclose(1e3 * SHIPPED_BENCH.candidates, expected, atol=1e-9)
+    assert SHIPPED_BENCH.inner_face_x == 0.014
+    assert SHIPPED_BENCH.model == "solid"
 
 
 def test_steel_hinges_are_where_they_were_measured():
@@ -68,24 +68,24 @@ def test_shipped_jaws_load_by_name_and_by_path():
 def test_the_right_jaw_is_the_mirror_image_of_the_left():
     right = load_jaw("bench", side="right")
     mirror = np.array([1.0, -1.0, 1.0])
-    np.testing.assert_array_equal(right.keypoints, BENCH.keypoints * mirror)
-    np.testing.assert_array_equal(right.candidates, BENCH.candidates * mirror)
-    np.testing.assert_array_equal(right.build_mesh("coarse").nodes, BENCH.build_mesh("coarse").nodes * mirror)
+    np.testing.assert_array_equal(right.keypoints, SHIPPED_BENCH.keypoints * mirror)
+    np.testing.assert_array_equal(right.candidates, SHIPPED_BENCH.candidates * mirror)
+    np.testing.assert_array_equal(right.build_mesh("coarse").nodes, SHIPPED_BENCH.build_mesh("coarse").nodes * mirror)
     assert right.side == "right"
     assert right.mirrored().side == "left"
-    np.testing.assert_array_equal(right.mirrored().keypoints, BENCH.keypoints)
+    np.testing.assert_array_equal(right.mirrored().keypoints, SHIPPED_BENCH.keypoints)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
 @pytest.mark.parametrize("convert", [lambda mesh: mesh, to_tet10])
 def test_a_mesh_file_makes_the_same_jaw_as_its_drawing(tmp_path, side, convert):
-    source = convert(BENCH.build_mesh("coarse"))
+    source = convert(SHIPPED_BENCH.build_mesh("coarse"))
     jaw = load_jaw(write_mesh_jaw(tmp_path, source), side=side)
     mesh = jaw.build_mesh()
     mirror = [1.0, 1.0, 1.0] if side == "left" else [1.0, -1.0, 1.0]
     np.testing.assert_allclose(mesh.nodes, source.nodes * mirror, atol=1e-12)
     np.testing.assert_array_equal(mesh.clamped, source.clamped)
-    np.testing.assert_allclose(jaw.candidates, BENCH.candidates)
+    np.testing.assert_allclose(jaw.candidates, SHIPPED_BENCH.candidates)
     assert jaw.name == "finger"
     assert jaw.model == "solid"
 
@@ -98,13 +98,13 @@ def test_a_mesh_file_keeps_its_own_density(tmp_path):
 
 
 def test_numbers_that_yaml_reads_as_text_are_numbers(tmp_path):
-    text = BENCH.path.read_text().replace("26.0e+6", "26e6")
+    text = SHIPPED_BENCH.path.read_text().replace("26.0e+6", "26e6")
     assert isinstance(yaml.safe_load(text)["material"]["young_modulus"], str)
     assert load_jaw(write_jaw(tmp_path, text)).material.young_modulus == 26e6
 
 
 def test_points_and_candidates_can_be_listed(tmp_path):
-    content = changed(content_of(BENCH), "keypoints", {"root": [0.0132, 0.01, 0.009], 7: [0.012, 0.01, 0.08]})
+    content = changed(content_of(SHIPPED_BENCH), "keypoints", {"root": [0.0132, 0.01, 0.009], 7: [0.012, 0.01, 0.08]})
     content = changed(content, "candidates", [[0.014, 0.0, 0.020], [0.014, 0.002, 0.040]])
     content = changed(content, "reference_point", [0.0, 0.01, 0.0])
     jaw = load_jaw(write_jaw(tmp_path, content))
@@ -115,7 +115,7 @@ def test_points_and_candidates_can_be_listed(tmp_path):
 
 def test_ribs_can_tilt_and_differ_in_thickness(tmp_path):
     ribs = {"inner_z": [0.02, 0.04], "outer_z": [0.025, 0.05], "thickness": [0.001, 0.0015]}
-    jaw = load_jaw(write_jaw(tmp_path, changed(content_of(BENCH), "drawing.ribs", ribs)))
+    jaw = load_jaw(write_jaw(tmp_path, changed(content_of(SHIPPED_BENCH), "drawing.ribs", ribs)))
     assert [rib.outer_z for rib in jaw.drawing.ribs] == [0.025, 0.05]
     assert [rib.thickness for rib in jaw.drawing.ribs] == [0.001, 0.0015]
     jaw.build_mesh()

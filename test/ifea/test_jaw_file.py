@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaw_fakes import BENCH, changed, content_of, write_jaw, write_mesh_jaw
+from mechanics_fakes import SHIPPED_BENCH, changed, content_of, write_jaw, write_mesh_jaw
 
 from finforce.errors import FinforceError
 from finforce_ifea.errors import JawFileError, MeshError
@@ -89,7 +89,7 @@ BAD_VALUES = [
 
 @pytest.mark.parametrize(("place", "value", "words"), BAD_VALUES)
 def test_bad_value_is_refused_by_name(tmp_path, place, value, words):
-    path = write_jaw(tmp_path, changed(content_of(BENCH), place, value))
+    path = write_jaw(tmp_path, changed(content_of(SHIPPED_BENCH), place, value))
     with pytest.raises(JawFileError, match="^finger.yaml: .*" + words):
         load_jaw(path)
 
@@ -103,11 +103,11 @@ def test_everything_in_millimetres_is_refused(tmp_path):
         return 1e3 * value if isinstance(value, float) else value
 
     with pytest.raises(JawFileError, match="looks like millimetres"):
-        load_jaw(write_jaw(tmp_path, scaled(content_of(BENCH))))
+        load_jaw(write_jaw(tmp_path, scaled(content_of(SHIPPED_BENCH))))
 
 
 def test_a_misspelt_key_gets_a_suggestion_before_the_right_one_is_missed(tmp_path):
-    text = BENCH.path.read_text().replace("drawing:", "drawng:")
+    text = SHIPPED_BENCH.path.read_text().replace("drawing:", "drawng:")
     with pytest.raises(JawFileError, match="unknown key 'drawng'; did you mean 'drawing'"):
         load_jaw(write_jaw(tmp_path, text))
 
@@ -207,7 +207,7 @@ PLACES_IN_FILE = sorted({place for place, value, _ in BAD_VALUES if value is ...
 @settings(max_examples=150, deadline=None)
 @given(place=st.sampled_from(PLACES_IN_FILE), value=VALUES)
 def test_no_content_causes_anything_but_our_errors(tmp_path_factory, place, value):
-    path = write_jaw(tmp_path_factory.mktemp("jaw"), changed(content_of(BENCH), place, value))
+    path = write_jaw(tmp_path_factory.mktemp("jaw"), changed(content_of(SHIPPED_BENCH), place, value))
     try:
         jaw = load_jaw(path)
     except FinforceError as error:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaw_fakes import shoelace_area
+from mechanics_fakes import shoelace_area
 
 from finforce_ifea.errors import JawFileError, MeshError
 from finforce_ifea.fem.tetrahedra import split_hexes, to_tet4, to_tet10

@@ -6,7 +6,7 @@ from time import time_ns
 import numpy as np
 import pytest
 from geometry_msgs.msg import WrenchStamped
-from node_fakes import KEYPOINTS, FakeEstimator, keypoint_cloud, ros_domain, start_solver
+from node_fakes import KEYPOINTS, FakeEstimator, keypoint_cloud, start_solver
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
@@ -18,12 +18,6 @@ from finforce.messages import stamp_of
 from finforce.ros import node as ros
 
 SECOND = 1_000_000_000
-
-
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
 
 
 def one_jaw(probe, estimator=None, **parameters):

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from node_process_fakes import PATIENCE, command_of, run_node, stop_when_ready
+from node_fakes import START_PATIENCE, command_of, run_node, stop_when_ready
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -41,7 +41,7 @@ def test_a_signal_while_the_node_loads_ends_it_without_a_word():
         [sys.executable, "-c", f"{slow}; finforce.ros.start.start('ifea_solver')"],
         capture_output=True,
         text=True,
-        timeout=PATIENCE,
+        timeout=START_PATIENCE,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
@@ -52,7 +52,7 @@ def test_without_ros_a_node_says_how_to_get_it():
         [sys.executable, "-c", f"{missing}; sys.exit(finforce.ros.start.ifea_solver())"],
         capture_output=True,
         text=True,
-        timeout=PATIENCE,
+        timeout=START_PATIENCE,
     )
     assert done.returncode == 2
     assert "pip install 'finforce[ros]'" in done.stderr and len(done.stderr.splitlines()) == 1

@@ -4,9 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimator_fakes import make_estimator
+from estimator_fakes import (
+    SHAPES,
+    STDDEV,
+    WEDGE,
+    Pressed,
+    box,
+    circle,
+    contact_with,
+    make_estimator,
+    observe,
+    outline,
+    press_shape,
+)
 from mechanics_fakes import BENCH, bench_mechanics
-from outline_fakes import SHAPES, STDDEV, WEDGE, Pressed, box, circle, contact_with, observe, outline, press_shape
 from test_tracking import settle
 
 from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder, press_jaw

@@ -2,16 +2,10 @@
 
 import numpy as np
 import pytest
-from mechanics_fakes import BENCH, EDGE, TPU, bench_mechanics, bench_press, block, unknowns_from_displacements, wobble
+from mechanics_fakes import BENCH, EDGE, TPU, bench_mechanics, block, unknowns_from_displacements, wobble
 
 from finforce_ifea.fem.factorisation import SparseFactor
 from finforce_ifea.fem.solid import SolidModel
-
-
-@pytest.fixture(scope="module")
-def pressed():
-    """The coarse bench finger with a cylinder of 25 mm pressed 8 mm into its middle, and its unknowns."""
-    return bench_mechanics("coarse").model, bench_press("coarse", "solid", 25, 40, (2, 8))[-1].q
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from estimator_fakes import magnitudes, make_estimator, ramp, record, run
-from mechanics_fakes import BENCH, bench_mechanics
-from reduced_fakes import box, press, settle
+from mechanics_fakes import BENCH, bench_mechanics, press, rounded_box, settle
 
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
@@ -53,7 +52,7 @@ def test_forces_and_shapes_are_those_of_the_full_mechanics_between_the_stored_he
 
 @pytest.mark.parametrize("tilt", [0.0, 0.1, -0.3])
 def test_boxes_are_pressed_in_as_by_the_full_mechanics(tilt):
-    force, shape = compare(lambda: OutlineIndenter((box(0.02),)), tilt, 0.045)
+    force, shape = compare(lambda: OutlineIndenter((rounded_box(0.02),)), tilt, 0.045)
     assert np.abs(force).max() < 0.003
     assert shape.max() < 0.06e-3
 
@@ -115,7 +114,7 @@ def test_deformed_surface_is_that_of_the_full_mechanics():
 def test_shapes_that_are_far_from_the_stored_ones_are_known_as_such():
     contact = reduced().contact
     near = press(contact, RoundIndenter(), np.log(0.0125), 0.045, [0.008])[0][1].extrapolation
-    wide = press(contact, OutlineIndenter((box(0.04),)), 0.0, 0.045, [0.008])[0][1].extrapolation
+    wide = press(contact, OutlineIndenter((rounded_box(0.04),)), 0.0, 0.045, [0.008])[0][1].extrapolation
     assert near < 0.05
     assert wide > 0.9
 
@@ -150,7 +149,9 @@ def test_force_on_the_lowest_element_counts_what_the_clamp_holds(height):
 
 def test_wide_box_that_changes_its_edge_is_followed():
     """Without a limit to the energy, Newton's method swings between contacts at 7 mm for ever."""
-    force, _ = compare(lambda: OutlineIndenter((box(0.03306),)), 0.01538, 0.03059, np.array([6.0, 7.0, 8.0]) * 1e-3)
+    force, _ = compare(
+        lambda: OutlineIndenter((rounded_box(0.03306),)), 0.01538, 0.03059, np.array([6.0, 7.0, 8.0]) * 1e-3
+    )
     assert np.abs(force).max() < 0.01
 
 

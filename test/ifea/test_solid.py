@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jaw_fakes import write_mesh_jaw
 from mechanics_fakes import (
     BENCH,
     EDGE,
@@ -20,6 +19,7 @@ from mechanics_fakes import (
     tangent_matrix,
     unknowns_from_displacements,
     wobble,
+    write_mesh_jaw,
 )
 
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
@@ -42,12 +42,6 @@ def hinged(request):
     model = SolidModel(mesh, TPU, symmetric=symmetric)
     assert model.symmetric == symmetric
     return model
-
-
-@pytest.fixture(scope="module")
-def pressed():
-    """The coarse bench finger with a cylinder of 25 mm pressed 8 mm into its middle, and its unknowns."""
-    return bench_mechanics("coarse").model, bench_press("coarse", "solid", 25, 40, (2, 8))[-1].q
 
 
 def test_finite_rigid_rotation_gives_zero_force(hinged):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from keypoint_fakes import bend, draw_dots
+from keypoint_scene_fakes import bend, draw_dots
 
 from finforce.camera import CameraIntrinsics
 from finforce.errors import MissingDependencyError

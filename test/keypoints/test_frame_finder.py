@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from keypoint_fakes import COLOURS, Fake, paint, small_jaws, write_model
+from keypoint_scene_fakes import COLOURS, Fake, paint, small_jaws, write_model
 
 from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera

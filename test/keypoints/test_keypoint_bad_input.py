@@ -5,19 +5,12 @@ from time import time_ns
 import numpy as np
 import pytest
 from keypoint_node_fakes import HEIGHT, MILLISECOND, OLD_COLOR, TOPICS, WIDTH, CameraBench, camera_info
-from node_fakes import ros_domain
 from sensor_msgs.msg import Image
 
 import finforce_keypoints.camera_feed as camera_feed
 from finforce.health import Level
 
 PERIOD = 33 * MILLISECOND
-
-
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
 
 
 def recovers(bench):

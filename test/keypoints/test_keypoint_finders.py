@@ -4,7 +4,7 @@ from dataclasses import replace
 from hashlib import sha256
 
 import pytest
-from keypoint_fakes import Fake, small_jaws, write_model
+from keypoint_scene_fakes import Fake, small_jaws, write_model
 
 from finforce_keypoints.build import build_detector, build_finder, load_model
 from finforce_keypoints.detector import KeypointDetector

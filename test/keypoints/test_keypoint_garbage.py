@@ -6,8 +6,7 @@ import numpy as np
 import onnx
 import pytest
 import yaml
-from keypoint_fakes import Fake, sidecar, write_model
-from keypoint_scene_fakes import CAMERA, FakeFinder, FakeScene, bare_image
+from keypoint_scene_fakes import CAMERA, Fake, FakeFinder, FakeScene, bare_image, sidecar, write_model
 from onnx import TensorProto, helper, numpy_helper
 
 from finforce_keypoints.detector import KeypointDetector

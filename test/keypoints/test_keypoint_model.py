@@ -4,7 +4,7 @@ import numpy as np
 import onnx
 import pytest
 import yaml
-from keypoint_fakes import Fake, paint, sidecar, write_model
+from keypoint_scene_fakes import Fake, paint, sidecar, write_model
 
 from finforce.errors import MissingDependencyError
 from finforce_keypoints.errors import DetectionError, ModelError

@@ -1,7 +1,7 @@
 """Names of body parts and of key points."""
 
 import pytest
-from keypoint_fakes import small_jaws
+from keypoint_scene_fakes import small_jaws
 
 from finforce_keypoints.errors import NamingError
 from finforce_keypoints.networks.metadata import build_name_map, parse_mapping

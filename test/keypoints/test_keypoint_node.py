@@ -6,7 +6,6 @@ from time import time_ns
 import numpy as np
 import pytest
 from contact_node_fakes import call
-from keypoint_fakes import draw_dots
 from keypoint_node_fakes import (
     COUNT,
     FRAME,
@@ -21,8 +20,7 @@ from keypoint_node_fakes import (
     start_detector,
     start_real_detector,
 )
-from keypoint_scene_fakes import CAMERA, Bend, FakeScene
-from node_fakes import ros_domain
+from keypoint_scene_fakes import CAMERA, Bend, FakeScene, draw_dots
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
@@ -35,12 +33,6 @@ from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.node import KeypointDetectorNode
 
 COLUMNS = ("x", "y", "z", "likelihood", "u", "v", "valid", "reason", "stddev_x", "stddev_y", "stddev_z")
-
-
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
 
 
 def columns(cloud):

@@ -6,7 +6,6 @@ from time import time_ns
 import numpy as np
 import pytest
 from keypoint_node_fakes import HEIGHT, JAW, MILLISECOND, WIDTH, CameraBench, FakeKeypoints, image_of
-from node_fakes import ros_domain
 from sensor_msgs.msg import PointCloud2
 
 from finforce.health import Level
@@ -15,12 +14,6 @@ from finforce.skipping import IDLE, LATE, UNHEARD
 from finforce_keypoints.settings import ANNOTATED
 
 PERIOD = 100 * MILLISECOND  # of the answers while nothing moves
-
-
-@pytest.fixture
-def probe():
-    with ros_domain() as probe:
-        yield probe
 
 
 def counted(bench, rule):

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from keypoint_scene_fakes import CAMERA, FakeFinder, bare_image, scene_of
-from still_fakes import SIDES, bend, picture
+from keypoint_scene_fakes import CAMERA, SIDES, FakeFinder, bare_image, move_tip, picture, scene_of
 
 from finforce.skipping import ALL, STILL, Skips
 from finforce_keypoints.detector import KeypointDetector
@@ -87,7 +86,7 @@ def test_an_image_is_looked_at_when_a_jaw_has_moved_in_it():
     watched = Watched()
     watched.rest()
     looks = watched.looks
-    watched.show(picture(90, bend(4.0 * LARGEST_SHIFT)))
+    watched.show(picture(90, move_tip(4.0 * LARGEST_SHIFT)))
     assert watched.looks == looks + 1
 
 
@@ -106,7 +105,7 @@ def test_a_jaw_that_rested_long_is_not_lost():
     watched.rest()
     for number in range(40):
         watched.show(picture(100 + number % 8))
-    found = watched.show(picture(93, bend(1e-3)))
+    found = watched.show(picture(93, move_tip(1e-3)))
     assert set(found) == set(SIDES)
     assert all(pose is not None for pose in watched.finder.expected[-1].values())
 

@@ -5,8 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from keypoint_scene_fakes import CAMERA
-from still_fakes import SIDES, bend, found_at, move_all, picture
+from keypoint_scene_fakes import CAMERA, SIDES, found_at, move_all, move_tip, picture
 
 from finforce_keypoints.geometry.stillness import (
     JUDGED,
@@ -36,7 +35,13 @@ def watch_of(images=SETTLED, rng=None, **options):
 def seen():
     """A picture of a still jaw, of one that went as far as is let pass, and of jaws that moved more."""
     far = 3.0 * LARGEST_SHIFT
-    moves = {"none": move_all(0.0), "all": move_all(far), "back": move_all(-far), "tip": bend(far), "jump": bend(2e-3)}
+    moves = {
+        "none": move_all(0.0),
+        "all": move_all(far),
+        "back": move_all(-far),
+        "tip": move_tip(far),
+        "jump": move_tip(2e-3),
+    }
     return {(name, side): picture(100, move, side=side) for name, move in moves.items() for side in SIDES}
 
 
@@ -62,7 +67,7 @@ def test_a_motion_is_seen_on_the_very_picture_that_shows_it(seen, move, side):
 
 
 @pytest.mark.parametrize("side", SIDES)
-@pytest.mark.parametrize("shape", [move_all, bend])
+@pytest.mark.parametrize("shape", [move_all, move_tip])
 def test_no_shift_beyond_the_bound_is_let_pass(side, shape):
     watch = watch_of()
     error = max(jaw._model.errors.max() for jaw in watch._jaws.values())
@@ -121,7 +126,7 @@ def test_one_picture_that_looks_moved_forgets_nothing(seen, name):
 
 
 def test_after_two_pictures_that_look_moved_the_new_place_is_learnt():
-    watch, move = watch_of(), bend(3.0 * LARGEST_SHIFT)
+    watch, move = watch_of(), move_tip(3.0 * LARGEST_SHIFT)
     for number in range(SETTLED):
         color = picture(700 + number, move)
         assert watch.confirm(8.0, color, CAMERA) is None
@@ -159,7 +164,7 @@ def test_where_little_is_to_be_seen_more_is_looked_at(dim):
 
 
 @pytest.mark.parametrize("side", SIDES)
-@pytest.mark.parametrize("move", [move_all, bend])
+@pytest.mark.parametrize("move", [move_all, move_tip])
 def test_there_too_a_motion_is_seen_on_the_very_picture_that_shows_it(dim, side, move):
     bound = max((jaw.limits + 3.0 * jaw._model.errors).max() for jaw in dim._jaws.values())
     assert bound < 3.0 * LARGEST_SHIFT

@@ -1,17 +1,18 @@
-"""A gripper that moves by rule, pictures of it and a detector that knows the truth: no renderer, no network."""
+"""Cameras and grippers that are quick to render, for tests of images."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from threading import Lock
 
 import numpy as np
 
 from finforce.camera import CameraIntrinsics, project
-from finforce.gripper_frames import BENCH_CAMERA, jaw_in_camera
+from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA, jaw_in_camera
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_keypoints.errors import DetectionError
 from finforce_twin.gripper.footage import Footage
 from finforce_twin.gripper.gripper import JawState, TwinState
-from finforce_twin.rendering.photographer import SceneSetting, Shot, TrueKeypoints
+from finforce_twin.rendering.photographer import SceneSetting, Shot, TrueKeypoints, WristView
 
 CAMERA = CameraIntrinsics(width=64, height=48, fx=43.0, fy=43.0, cx=31.5, cy=23.5, distortion=np.full(5, 0.01))
 KEYPOINTS = 4
@@ -141,3 +142,33 @@ class FakeDetector:
             T_camera_jaw=jaw_in_camera(BENCH_CAMERA, side, -0.055 if side == "left" else 0.055),
             reasons=np.where(self.accepted, "", "likelihood"),
         )
+
+
+CAMERA_POSE = ROBOT_CAMERA
+
+
+class FakeLens:
+    """Takes what `Photographer` takes, of 64 x 48 pixels; every key point is visible."""
+
+    def __init__(self):
+        self.setting = SceneSetting(shapes={}, mesh=None, camera=CAMERA, T_gripper_camera=CAMERA_POSE)
+        self.looks = 0
+        self._lock = Lock()
+
+    def look(self, state):
+        with self._lock:
+            self.looks += 1
+        return WristView(picture=None, truth={side: self._find(state, side) for side in state.jaws})
+
+    def develop(self, view, stamp):
+        rng = np.random.default_rng(round(stamp * 1e6))
+        size = (CAMERA.height, CAMERA.width)
+        depth = rng.uniform(0.1, 0.2, size).astype(np.float32)
+        return Shot(color=rng.integers(0, 255, (*size, 3), dtype=np.uint8), depth=depth, truth=view.truth)
+
+    def _find(self, state, side):
+        jaw = state.jaws[side]
+        T = jaw_in_camera(CAMERA_POSE, side, jaw.origin_x)
+        points = np.vstack((jaw.keypoints, jaw.reference))
+        pixels = project(points @ T[:3, :3].T + T[:3, 3], CAMERA)
+        return TrueKeypoints(T_camera_jaw=T, points=points, pixels=pixels, visible=np.ones(len(points), bool))

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from twin_fakes import CAMERA_POSE, FakeLens
+from rgbd_fakes import CAMERA_POSE, FakeLens
 
 from finforce.transforms import invert_pose
 from finforce_driver.errors import LinkError

@@ -10,10 +10,9 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from node_fakes import ros_domain
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
-from rgbd_fakes import FakeGripper, make_footage
+from rgbd_fakes import FakeGripper, FakeLens, make_footage
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import String
-from twin_fakes import FakeLens
 
 from finforce.messages import stamp_of
 from finforce.pointcloud import decode_columns
