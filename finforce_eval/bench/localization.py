@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.errors import MissingDependencyError
-from finforce.optional import import_library
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.localization.inner_face import build_inner_face
 from finforce_contact.localization.outline_localizer import ClosestLocalizer, ContactScene, Localizer, OutlineLocalizer
@@ -93,7 +91,6 @@ class LocalizationFigures:
     """What was measured, and what could not be."""
 
     rows: Sequence[MethodRow]
-    notes: Sequence[str] = ()
 
 
 def measure(quick: bool) -> LocalizationFigures:
@@ -120,30 +117,23 @@ def measure_methods(
 
     calls: dict[tuple[str, int], list[tuple[float, float]]] = {}
     away: dict[tuple[str, int], list[float]] = {}
-    notes: list[str] = []
     for path in paths:
         recording = read_recording(path)
         own = load_object_mesh(Path(path).parent / recording.case["mesh"])
         frames = list(follow(recording, own, every))
         for mesh in tqdm(meshes or [own], desc="contact places", unit="mesh", disable=None, leave=False):
-            for name, method in build_methods(mesh, notes).items():
+            for name, method in build_methods(mesh).items():
                 key = name, len(mesh.triangles)
                 calls.setdefault(key, []).extend(_run(method, frames, _stay))
                 away.setdefault(key, []).extend(spent for spent, _ in _run(method, frames, _jittered_apart()))
     rows = [summarise(*key, np.array(found), away[key]) for key, found in calls.items()]
-    return LocalizationFigures(rows=rows, notes=list(dict.fromkeys(notes)))
+    return LocalizationFigures(rows=rows)
 
 
-def build_methods(mesh: ObjectMesh, notes: list[str]) -> dict[str, Method]:
-    """Return the ways to find a place on a mesh by name; of a missing library there is a note instead."""
+def build_methods(mesh: ObjectMesh) -> dict[str, Method]:
+    """Return the ways to find a place on a mesh by name."""
     jaw = load_calibration("bench").apply(load_jaw("bench"))
-    methods: dict[str, Method] = {}
-    for name, build in METHODS.items():
-        try:
-            methods[name] = build(MethodSetup(jaw=jaw, mesh=mesh))
-        except MissingDependencyError as error:
-            notes.append(f"{name}: not measured: {error}")
-    return methods
+    return {name: build(MethodSetup(jaw=jaw, mesh=mesh)) for name, build in METHODS.items()}
 
 
 def follow(recording: Recording, mesh: ObjectMesh, every: int) -> Iterator[LocatedImage]:
@@ -241,7 +231,7 @@ def build_cylinder(radius: float, length: float, around: int, along: int) -> Obj
 
 
 def format_table(figures: LocalizationFigures) -> str:
-    """Return the rows as a table in Markdown, with the notes below."""
+    """Return the rows as a table in Markdown."""
     lines = [
         "| contact place | triangles | n | found | error: median/mm | p95 | max | in contact: p50/ms | p99 "
         "| 50 mm apart: p50/ms | p99 |",
@@ -253,7 +243,7 @@ def format_table(figures: LocalizationFigures) -> str:
         f"| {row.apart.p99:.3f} |"
         for row in figures.rows
     ]
-    return "\n".join([*lines, *figures.notes])
+    return "\n".join(lines)
 
 
 def as_json(figures: LocalizationFigures) -> dict[str, Any]:
@@ -288,7 +278,6 @@ def _series(name: str, rows: Sequence[MethodRow]) -> ErrorSeries:
 
 Wrench = tuple[NDArray, NDArray] | None
 Method = Callable[[NDArray, NDArray, Wrench], float | None]
-MOST_PAIRS = 2000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -345,41 +334,6 @@ def by_intersection(setup: MethodSetup, *, cut_down: bool) -> Method:
     return locate
 
 
-def by_triangle_pairs(setup: MethodSetup) -> Method:
-    """Returns the mean of the points where triangles meet, found by coal.
-
-    Raises:
-        MissingDependencyError: coal is not installed.
-    """
-    coal = import_library("coal", "the test of triangle pairs")
-    jaw = setup.jaw.build_mesh(ContactSettings().mesh)
-    thing = _build_tree(coal, setup.mesh.vertices, setup.mesh.triangles)
-    request, still = coal.CollisionRequest(), coal.Transform3s()
-    request.num_max_contacts, request.enable_contact = MOST_PAIRS, True
-
-    def locate(T: NDArray, surface: NDArray, wrench: Wrench) -> float | None:
-        result = coal.CollisionResult()
-        finger = _build_tree(coal, surface, jaw.surface)
-        coal.collide(finger, still, thing, coal.Transform3s(T[:3, :3], T[:3, 3]), request, result)
-        count = result.numContacts()
-        if not count:
-            return None
-        centre = np.mean([result.getContact(index).pos for index in range(count)], axis=0)
-        return _height_of(centre, surface, jaw.nodes)
-
-    return locate
-
-
-def _build_tree(coal, vertices: NDArray, triangles: NDArray):
-    """Returns the tree of boxes around triangles (m, 3) on vertices (n, 3) [m]."""
-    tree = coal.BVHModelOBBRSS()
-    tree.beginModel(len(triangles), len(vertices))
-    tree.addVertices(np.ascontiguousarray(vertices, dtype=float))
-    tree.addTriangles(np.ascontiguousarray(triangles, dtype=np.int64))
-    tree.endModel()
-    return tree
-
-
 def _height_of(centre: NDArray, surface: NDArray, nodes: NDArray) -> float:
     """Returns the undeformed height [m] of the deformed vertex nearest to a centre (3,) [m], as the paper does."""
     return float(nodes[((surface - centre) ** 2).sum(axis=1).argmin(), 2])
@@ -403,7 +357,6 @@ METHODS: dict[str, Callable[[MethodSetup], Method]] = {
     "outline alone": lambda setup: by_outline(setup, with_wrench=False),
     "manifold3d, whole object": lambda setup: by_intersection(setup, cut_down=False),
     "manifold3d, cut to the jaw": lambda setup: by_intersection(setup, cut_down=True),
-    "triangle pairs (coal)": by_triangle_pairs,
     "closest point, undeformed": by_closest,
     "the whole estimator": by_whole_estimator,
 }

@@ -66,7 +66,7 @@ def _find_versions() -> Iterator[tuple[str, str]]:
             yield name, version(name)
 
 
-LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh", "small_gicp", "coal")
+LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh", "small_gicp")
 
 
 def write_json(path: str, content: Mapping[str, Any]) -> None:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from eval_fakes import drawn_hues
 
-from finforce.errors import MissingDependencyError
 from finforce.stamps import NANOSECONDS
 from finforce_eval.bench import localization as bench
 from finforce_eval.bench.localization import METHODS, LocatedImage, build_cylinder, measure_methods, summarise
@@ -25,16 +24,12 @@ def at_truth(setup):
     return locate
 
 
-def missing(setup):
-    raise MissingDependencyError("it needs lib: pip install lib")
-
-
 @pytest.fixture
 def frames(monkeypatch):
     """Four images in contact, whose pose holds the true height."""
     made = [LocatedImage(T=np.eye(4), surface=np.zeros((1, 3)), wrench=None, true=0.0) for _ in range(4)]
     monkeypatch.setattr(bench, "follow", lambda recording, mesh, every: iter(made))
-    monkeypatch.setattr(bench, "METHODS", {"near": at_truth, "absent": missing})
+    monkeypatch.setattr(bench, "METHODS", {"near": at_truth})
     return made
 
 
@@ -43,13 +38,6 @@ def test_error_is_the_distance_to_the_true_place_over_the_images_where_one_was_f
     assert (row.method, row.triangles, row.contact.n, row.apart.n) == ("near", len(MESH.triangles), 4, 4)
     assert row.found == 0.5
     assert row.median == row.largest == pytest.approx(2.0)  # mm
-
-
-def test_a_way_without_its_library_is_noted_and_not_measured(frames):
-    figures = measure_methods([RECORDING], [MESH, MESH])
-    assert figures.notes == ["absent: not measured: it needs lib: pip install lib"]
-    assert "absent" not in {row.method for row in figures.rows}
-    assert "absent: not measured" in bench.format_table(figures)
 
 
 def test_a_way_that_found_nothing_has_no_error():
