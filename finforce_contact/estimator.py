@@ -11,13 +11,13 @@ from finforce.errors import ObservationError, PoseError
 from finforce.skipping import AWAY, CONTACT, STILL, Skips
 from finforce.transforms import check_pose, invert_pose
 from finforce_contact.errors import check_stamp, check_wrench
-from finforce_contact.localization.inner_face import build_inner_face
 from finforce_contact.localization.outline_localizer import (
     ClosestLocalizer,
     ContactScene,
     Localizer,
     OutlineLocalizer,
     Place,
+    build_inner_face,
 )
 from finforce_contact.localization.section import Section, SectionKeeper, count_inside
 from finforce_contact.localization.touch import SURELY_BENT, StillnessWatch, TouchBelief, describe_conflict

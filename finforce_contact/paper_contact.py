@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from finforce.optional import import_manifold3d
 from finforce.transforms import invert_pose
 from finforce_contact.errors import ObjectMeshError
-from finforce_contact.localization.inner_face import InnerFace
-from finforce_contact.localization.outline_localizer import ContactPatch, ContactScene, Place
+from finforce_contact.localization.outline_localizer import ContactPatch, ContactScene, InnerFace, Place
 from finforce_contact.mesh.triangles import ObjectMesh, solid_from_triangles, to_manifold, triangles_of_solid
 from finforce_contact.settings import ContactSettings
 from finforce_ifea.jaw.jaw import Jaw

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from finforce.ros import node as ros
 from finforce.skipping import Skips
 from finforce.transforms import pose_numbers
-from finforce_contact.messages import contact_columns
 from finforce_ifea.messages import columns_from_outline
 
 if TYPE_CHECKING:
     from finforce_contact.camera_feed import StampedPose
+    from finforce_contact.estimator import ContactEstimate
     from finforce_contact.jaw_contact import TimedEstimate
     from finforce_contact.parameters import ContactParameters
 
@@ -46,3 +49,14 @@ class ContactOutputs:
         if self.pose is not None and ros.is_wanted(self.pose, self._skips):
             header = ros.Header(stamp=ros.stamp_message(found.stamp), frame_id=self._frame)
             self.pose.publish(ros.pose_message(header, pose_numbers(found.pose.T_camera_object)))
+
+
+def contact_columns(estimate: ContactEstimate) -> dict[str, NDArray]:
+    """Return the columns of a contact cloud, one row per contact, none without an object."""
+    points = np.asarray(estimate.points, dtype=np.float32).reshape(-1, 3)
+    return {
+        **dict(zip("xyz", points.T, strict=True)),
+        "candidate": np.asarray(estimate.candidates, dtype=np.uint16),
+        "touching": np.full(len(points), estimate.touching, dtype=np.uint8),
+        "weight": np.asarray(estimate.weights, dtype=np.float32),
+    }

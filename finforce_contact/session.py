@@ -6,11 +6,13 @@ from collections.abc import Callable
 from threading import RLock
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import ImageError
-from finforce.errors import FinforceError
-from finforce.messages import pose_from_message, stamp_of, wrench_from_message
+from finforce.errors import FinforceError, ObservationError
+from finforce.messages import check_cloud, pose_from_message, stamp_of, wrench_from_message
+from finforce.pointcloud import decode_keypoints
 from finforce.skipping import CONTACT, RESTING, Skips
 from finforce.stamps import SECOND
 from finforce_contact.camera_feed import DepthFeed, StampedPose
@@ -19,7 +21,6 @@ from finforce_contact.estimator import ContactEstimator
 from finforce_contact.jaw_contact import JawContact, TimedEstimate
 from finforce_contact.mesh.object_mesh import describe_mesh, load_object_mesh
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.messages import surface_from_cloud
 from finforce_contact.parameters import ContactParameters, load_generated, load_jaws
 from finforce_contact.pose.source import ExternalPoseSource, ObjectPose
 from finforce_contact.settings import ContactSettings, TrackerSettings
@@ -211,3 +212,16 @@ class ContactSession:
         """Return the object's pose in the image that a mask belongs to, if it is looked for; see `DepthFeed`."""
         with self._camera_lock:
             return self._camera.take_mask(image)
+
+
+def surface_from_cloud(cloud: Any, frame: str) -> NDArray:
+    """Return the deformed vertices (n, 3) [m] of a solver's surface.
+
+    Raises:
+        ObservationError: the frame or the fields are wrong, or a vertex is not finite.
+    """
+    check_cloud(cloud, frame, "the surface")
+    points = decode_keypoints(cloud).points
+    if not np.isfinite(points).all():
+        raise ObservationError("the surface has vertices that are not finite")
+    return points

@@ -21,7 +21,6 @@ from finforce.health import Health, Outcome, Report
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce.ros.raw_image import read_image
-from finforce.ros.transport import keep_heap
 from finforce.skipping import IDLE, LATE, UNHEARD, Skips
 from finforce.stamps import Idling, StampGate
 from finforce_keypoints.build import BuiltDetector, build_detector
@@ -232,7 +231,6 @@ class KeypointDetectorNode(Node):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until Ctrl-C."""
-    keep_heap()
     return ros.run_node("keypoint_detector", KeypointDetectorNode, args)
 
 

@@ -16,8 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_contact.estimator import ContactEstimator
-from finforce_contact.localization.inner_face import build_inner_face
-from finforce_contact.localization.outline_localizer import ClosestLocalizer, ContactScene, Localizer, OutlineLocalizer
+from finforce_contact.localization.outline_localizer import (
+    ClosestLocalizer,
+    ContactScene,
+    Localizer,
+    OutlineLocalizer,
+    build_inner_face,
+)
 from finforce_contact.localization.section import SectionKeeper
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.triangles import ObjectMesh

@@ -6,12 +6,12 @@ from contact_fakes import FACE, JAW, bent, box, cylinder, joined, opened, pose, 
 from scipy.spatial.transform import Rotation
 
 from finforce_contact.errors import ObjectMeshError
-from finforce_contact.localization.inner_face import build_inner_face
 from finforce_contact.localization.outline_localizer import (
     ClosestLocalizer,
     ContactPatch,
     ContactScene,
     OutlineLocalizer,
+    build_inner_face,
     cross_line_of_action,
     overlap_of,
     patch_from_overlap,
