@@ -29,3 +29,7 @@ class GripperTimeoutError(DriverError, TimeoutError):
 
 class GraspError(DriverError, RuntimeError):
     """A force-controlled grasp was ended for safety; the message says why."""
+
+
+class UnseenForceError(GraspError):
+    """The motor presses much harder than the camera says: the camera does not see the force."""

@@ -9,6 +9,8 @@ from typing import Any
 from finforce_driver.errors import TargetError
 from finforce_driver.grasp.settings import GraspGoal
 
+JOINTS_DIFFER = 1e-4  # [m] by which the joints of one command may differ
+
 
 @dataclass(frozen=True, kw_only=True)
 class MoveRequest:
@@ -25,17 +27,47 @@ class MoveRequest:
     force: float | None = None
 
 
-def move_from_joint_state(message: Any) -> MoveRequest:
+def move_from_joint_state(message: Any, joints: Sequence[str] = ()) -> MoveRequest:
     """Return the move of a sensor_msgs/JointState: position = opening, velocity = speed, effort = grip force.
 
+    With the names of joints, position and velocity are theirs: the value of each is half the opening, and they move
+    alike.
+
+    Args:
+        message: the command.
+        joints: names of the two jaws' joints.
+
     Raises:
-        TargetError: there is no opening, or a field has several values.
+        TargetError: there is no opening, a field has several values, or a joint is not one of the gripper.
     """
+    if message.name:
+        return _move_of_joints(message, joints)
     opening = _single(message.position, "position, the opening [m]")
     if opening is None:
         raise TargetError("a command without position; expected one value, the opening between the jaws [m]")
     speed = _single(message.velocity, "velocity, the speed of the opening [m/s]")
     return MoveRequest(opening=opening, speed=speed, force=_single(message.effort, "effort, the grip force [N]"))
+
+
+def _move_of_joints(message: Any, joints: Sequence[str]) -> MoveRequest:
+    """Return the move of a command that names its joints, one or both.
+
+    Raises:
+        TargetError: a joint is not one of the gripper, or both are told to differ.
+    """
+    if not set(message.name) <= set(joints) or len(set(message.name)) != len(message.name):
+        raise TargetError(f"joints {list(message.name)}; expected {' or '.join(joints)}, or both, or no name")
+    if len(message.position) != len(message.name):
+        raise TargetError(f"{len(message.position)} positions of {len(message.name)} joints; expected one for each")
+    speeds = [abs(speed) for speed in message.velocity]
+    if max(message.position) - min(message.position) > JOINTS_DIFFER or len(set(speeds)) > 1:
+        raise TargetError(f"positions {list(message.position)}; expected the same for both joints, which move alike")
+    efforts = {float(effort) for effort in message.effort}
+    return MoveRequest(
+        opening=2.0 * sum(message.position) / len(message.position),
+        speed=2.0 * speeds[0] if speeds else None,
+        force=_single(sorted(efforts), "effort, the grip force [N]"),
+    )
 
 
 def move_from_gripper_command(command: Any) -> MoveRequest:

@@ -33,6 +33,7 @@ from finforce_driver.publishers import (
     GripperHealth,
     describe_grasp,
     describe_state,
+    grasp_alarms,
     gripper_alarms,
     news_of_state,
     outcome_of_state,
@@ -129,7 +130,16 @@ class GripperDriverNode(Node):
                     self.out.send_joints(self.times.to_stamp(state.stamp, self._now()), state)
             if self.health.is_news("gripper", text := news_of_state(state)):
                 self._log(outcome_of_state(state).level, text)
-        self.out.send_grasp(self.session.status)
+        self._tell_grasp()
+
+    def _tell_grasp(self) -> None:
+        """Publish how the grasp is, and log that it failed."""
+        self.out.send_grasp(status := self.session.status)
+        for outcome in grasp_alarms(status):
+            if self.health.is_news("grasp", outcome.text):
+                self._log(outcome.level, f"the grasp failed: {outcome.text}")
+        if status is not None and not status.failed:
+            self.health.is_news("grasp", "")
 
     def _log(self, level: Level, text: str) -> None:
         """Log a sentence at the level of a diagnosis."""
@@ -143,7 +153,7 @@ class GripperDriverNode(Node):
     def _on_command(self, message: JointState) -> None:
         """Move as a message says."""
         with self._refusals("command", stream=False):
-            self.tasks.move(move_from_joint_state(message))
+            self.tasks.move(move_from_joint_state(message, self.parameters.joint_names))
 
     def _on_goal(self, message: JointState) -> None:
         """Set the goal of the grasp that runs, and of the next."""
@@ -155,7 +165,7 @@ class GripperDriverNode(Node):
         with self._refusals("force"):
             force, stamp = ros.grasp_force(message, self.parameters.gripper_frame), self._enter("force", message)
             self.session.take_force(ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force))
-            self.out.send_grasp(self.session.status)
+            self._tell_grasp()
 
     def _on_contact(self, side: str, cloud: PointCloud2) -> None:
         """Hand to the grasp whether a jaw touches the object."""
@@ -184,7 +194,7 @@ class GripperDriverNode(Node):
         """Return how gripper and grasp are doing."""
         state = self.gripper.state
         values = describe_state(state) | describe_grasp(self.session.status)
-        return self.health.report([*alarms, *gripper_alarms(state)], values)
+        return self.health.report([*alarms, *gripper_alarms(state), *grasp_alarms(self.session.status)], values)
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds

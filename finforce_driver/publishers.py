@@ -141,7 +141,13 @@ def describe_state(state: GripperState) -> dict[str, str]:
 def outcome_of_grasp(status: GraspStatus) -> Outcome:
     """Return the level of a grasp, its phase and its sentence; one that was ended wants to be looked at."""
     level = Level.WARN if status.phase is GraspPhase.STOPPED else Level.OK
+    level = Level.ERROR if status.unseen else level
     return Outcome(level=level, reason=status.phase.value, text=status.reason)
+
+
+def grasp_alarms(status: GraspStatus | None) -> list[Outcome]:
+    """Return the alarm of a grasp that failed, until something else is commanded."""
+    return [outcome_of_grasp(status)] if status is not None and status.failed else []
 
 
 def describe_grasp(status: GraspStatus | None) -> dict[str, str]:

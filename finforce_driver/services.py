@@ -58,11 +58,18 @@ class GripperTasks:
         return "the gripper holds in place"
 
     def estop(self) -> str:
-        """Stop at once, limp; before anything else is looked at."""
+        """Stop at once, limp; before anything else is looked at.
+
+        Raises:
+            GripperStateError: no gripper answers; the stop is pending.
+        """
         self._gripper.estop()
         self._command(lambda: None, "emergency stop")
         if self._gripper.state.phase in ABSENT:
-            return "emergency stop: no gripper answers; it is sent as soon as one does, until clear_errors ends it"
+            raise GripperStateError(
+                "emergency stop pending: no link to the gripper, whose jaws may go on moving; it is sent once one "
+                "answers, until clear_errors ends it"
+            )
         return "emergency stop: the jaws are limp; clear_errors ends it"
 
     def activate(self, on: bool) -> str:

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 
-from finforce_driver.errors import GraspError
+from finforce_driver.errors import GraspError, UnseenForceError
 from finforce_driver.grasp.load_watch import ForceFeed, ForceSample, LoadWatch, LocatedForce, TouchSample
 from finforce_driver.grasp.plan import GraspPlan, JawHistory, JawPlace
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus, GraspStep, GripperMove
@@ -17,6 +17,7 @@ OpeningAt = Callable[[float], float]
 _CONTENT = 3  # images at rest without a wish to move after which the force is held
 _SATURATED_AFTER = 1.0  # [s] at the least opening
 _SPARE_STEPS = 3  # that holding may close in any case
+_WITNESSED = 0.05  # [s] that the motor's force has to be too large; the current of a motor that starts is, too
 
 
 class ForceGrasp:
@@ -51,7 +52,9 @@ class ForceGrasp:
         self._phase, self._reason = GraspPhase.APPROACH, "waits for the first force"
         self._began = self._held_at = self._spare = self._saturated = math.nan
         self._content = 0
+        self._excess_since = self._start = math.nan
         self._asked_to_stop = ""
+        self._failed = self._unseen = False
 
     def take_force(self, sample: ForceSample) -> None:
         """Take the force of an image; it counts with the next `update`."""
@@ -93,16 +96,23 @@ class ForceGrasp:
             return self._step(None, state, now)
         if math.isnan(self._began):
             self._began = now
+        if math.isnan(self._start):
+            self._start = state.opening
         try:
             if self._asked_to_stop:
                 raise GraspError(self._asked_to_stop)
             check_gripper(state, now)
             self._jaws.check_power(state)
             fresh = self._drain(state, now, opening_at)
+            self._check_witness(state, now)
             self._check_limits(state, now)
             move = self._choose_move(state, now) if fresh else None
+        except UnseenForceError as error:
+            self._phase, self._reason, self._failed, self._unseen = GraspPhase.STOPPED, str(error), True, True
+            return GraspStep(move=self._back_off(state, now), stop=False, status=self._status(state, now))
         except GraspError as error:
             self._phase, self._reason = GraspPhase.STOPPED, str(error)
+            self._failed = not self._asked_to_stop
             return GraspStep(move=None, stop=is_working(state), status=self._status(state, now))
         return self._step(move, state, now)
 
@@ -120,8 +130,8 @@ class ForceGrasp:
                 counts = self._feed.admit_touch(sample, now) and not self._feed.heard and not sample.touching
                 force = 0.0
             else:
-                check_force_value(sample.force)
-                counts, force = self._feed.admit(sample), sample.force
+                force = check_force_value(sample.force, self.settings.noise)
+                counts = self._feed.admit(sample)
             if counts:
                 fresh |= self._locate(force, sample.stamp, state, opening_at)
         return fresh
@@ -149,6 +159,30 @@ class ForceGrasp:
             self._phase = GraspPhase.LOADING if self._load.loaded else GraspPhase.APPROACH
             self._reason = words
         return True
+
+    def _check_witness(self, state: GripperState, now: float) -> None:
+        """Refuse to press harder, by the motor's current, than the camera says by more than friction explains.
+
+        Raises:
+            UnseenForceError: that has been so for a while.
+        """
+        seen = 0.0 if math.isnan(self._load.force) else max(0.0, self._load.pressing)
+        moved = not math.isnan(self._jaws.target)  # else it was not this grasp that presses
+        if not (moved and state.force - seen > self.settings.motor_margin):
+            self._excess_since = math.nan
+            return
+        if math.isnan(self._excess_since):
+            self._excess_since = now
+        if now - self._excess_since >= _WITNESSED:
+            raise UnseenForceError(
+                f"the motor presses with {state.force:.1f} N by its current, the camera says {seen:.2f} N: "
+                "is the estimator blind, frozen or looking at something else? The jaws back off"
+            )
+
+    def _back_off(self, state: GripperState, now: float) -> GripperMove:
+        """Return the move to where the grasp began: how soft what the motor presses on is, nobody knows."""
+        target = self._jaws.nearest(min(max(self._start, state.opening), self._jaws.widest))
+        return self._move(target, self.goal.speed, state, now)
 
     def _check_limits(self, state: GripperState, now: float) -> None:
         """Refuse to go on beyond a limit.
@@ -212,7 +246,7 @@ class ForceGrasp:
     @property
     def _motor_force(self) -> float:
         """The motor's limit [N]: no hindrance to the set force, which both jaws give, and friction takes from."""
-        return max(self.settings.motor_force, 3.0 * self._set_force)
+        return max(self.settings.motor_force, 2.5 * self._set_force)
 
     def _step(self, move: GripperMove | None, state: GripperState, now: float) -> GraspStep:
         return GraspStep(move=move, stop=False, status=self._status(state, now))
@@ -235,6 +269,8 @@ class ForceGrasp:
             peak=load.peak,
             resolution=self._plan.resolution,
             target=self._jaws.target,
+            failed=self._failed,
+            unseen=self._unseen,
             refused=dict(feed.refused),
         )
 
@@ -243,14 +279,19 @@ _WORKING = (Phase.READY, Phase.MOVING)
 _SILENT = 0.3  # [s] after which a gripper without a reply is not the one that is known
 
 
-def check_force_value(force: float) -> None:
-    """Refuse what no grasp force is.
+def check_force_value(force: float, noise: float) -> float:
+    """Return a grasp force [N]; one that is negative by no more than noise is none.
+
+    Args:
+        force: that came [N].
+        noise: its standard deviation [N].
 
     Raises:
         GraspError: the force is no finite number, or negative.
     """
-    if not math.isfinite(force) or force < 0.0:
+    if not math.isfinite(force) or force < -3.0 * noise:
         raise GraspError(f"a grasp force of {force} N came, expected a number from 0: holds in place")
+    return max(0.0, force)
 
 
 def is_working(state: GripperState) -> bool:

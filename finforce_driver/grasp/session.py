@@ -9,7 +9,7 @@ from dataclasses import replace
 from threading import Condition, Lock
 from typing import TYPE_CHECKING, Protocol
 
-from finforce_driver.errors import DriverError, GraspError, GripperTimeoutError
+from finforce_driver.errors import DriverError, GraspError, GripperTimeoutError, UnseenForceError
 from finforce_driver.grasp.controller import ForceGrasp
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus, GraspStep
@@ -122,7 +122,7 @@ class GraspSession:
             try:
                 self._act(step)
             except DriverError as error:
-                self._end(str(error))
+                self._end(str(error), failed=True)
                 with suppress(DriverError):
                     self._gripper.hold()
 
@@ -135,6 +135,7 @@ class GraspSession:
         with self._changed:
             command()
             self._end(reason)
+            self._acknowledge()
 
     def stop(self, reason: str) -> None:
         """End the grasp that runs; the gripper holds in place.
@@ -144,7 +145,13 @@ class GraspSession:
         """
         with self._changed:
             self._end(reason)
+            self._acknowledge()
             self._gripper.hold()
+
+    def _acknowledge(self) -> None:
+        """Take a command for a sign that somebody knows of a grasp that failed."""
+        if self.status is not None and self.status.failed:
+            self.status = replace(self.status, failed=False, unseen=False)
 
     def _begin(self) -> None:
         """Make a grasp and let it look at the gripper."""
@@ -160,12 +167,12 @@ class GraspSession:
         elif step.move is not None:
             self._gripper.move(step.move.opening, step.move.speed, step.move.force)
 
-    def _end(self, reason: str) -> None:
+    def _end(self, reason: str, *, failed: bool = False) -> None:
         """Forget the grasp that runs and say why."""
         if self._grasp is not None:
             self._grasp = None
             last = self.status or GraspStatus(phase=GraspPhase.STOPPED, reason=reason, goal=self.goal.force)
-            self._tell(replace(last, phase=GraspPhase.STOPPED, reason=reason))
+            self._tell(replace(last, phase=GraspPhase.STOPPED, reason=reason, failed=failed))
             self._ended()
 
     def _tell(self, status: GraspStatus) -> None:
@@ -242,6 +249,8 @@ def hold_force(
     try:
         while not is_done(status := _turn(gripper, forces, grasp)):
             _await_reply(gripper)
+    except UnseenForceError:
+        raise  # the jaws back off
     except BaseException:
         with suppress(DriverError):
             gripper.hold()
@@ -262,10 +271,10 @@ def _turn(gripper: Gripper, forces: ForceSource, grasp: ForceGrasp) -> GraspStat
         else:
             grasp.take_force(sample)
     step = grasp.update(gripper.state, gripper.clock.now(), gripper.opening_at)
-    if step.status.phase is GraspPhase.STOPPED:
-        raise GraspError(step.status.reason)
     if step.move is not None:
         gripper.move(step.move.opening, step.move.speed, step.move.force)
+    if step.status.phase is GraspPhase.STOPPED:
+        raise (UnseenForceError if step.status.unseen else GraspError)(step.status.reason)
     return step.status
 
 

@@ -60,7 +60,10 @@ class GraspSettings:
     silence_timeout: float = setting(2.0, "wait for the first word of the camera", "s", 0.1, 60.0)
     relaxation: float = setting(0.4, "share of the force that holding may make up for by closing", "", 0.05, 1.0)
     motor_force: float = setting(
-        20.0, "grip force by the maker's curve that the motor is limited to; 3 set forces if more", "N", 7.0, 62.0
+        7.5, "grip force by the maker's curve that the motor is limited to; 2.5 set forces if more", "N", 7.0, 62.0
+    )
+    motor_margin: float = setting(
+        4.0, "of the motor's force above the camera's, friction included, at which a grasp backs off", "N", 1.0, 62.0
     )
 
     def __post_init__(self) -> None:
@@ -121,6 +124,8 @@ class GraspStatus:
         peak: largest force measured while loaded [N]; 0 before.
         resolution: change of the force with one step of the gripper [N].
         target: opening that the jaws were told to go to [m]; NaN before the first move.
+        failed: it was not ended by a command, and nothing has been commanded since.
+        unseen: it failed because the motor pressed much harder than the camera said.
         refused: forces and touches that were set aside, by reason.
     """
 
@@ -137,6 +142,8 @@ class GraspStatus:
     peak: float = 0.0
     resolution: float = math.nan
     target: float = math.nan
+    failed: bool = False
+    unseen: bool = False
     refused: Mapping[str, int] = field(default_factory=dict)
 
 

@@ -186,11 +186,16 @@ def test_force_above_the_limit_ends_at_once():
         watch([7.5] * 5 + [8.1], speed=0.0)
 
 
-@pytest.mark.parametrize("force", [math.nan, math.inf, -math.inf, -1e-9])
+@pytest.mark.parametrize("force", [math.nan, math.inf, -math.inf, -0.16])
 def test_number_that_is_no_force_is_named(force):
     with pytest.raises(GraspError, match="expected a number from 0"):
-        check_force_value(force)
-    check_force_value(0.0)
+        check_force_value(force, 0.05)
+
+
+def test_a_force_that_noise_makes_negative_is_none():
+    assert check_force_value(-0.14, 0.05) == 0.0
+    assert check_force_value(-0.008, 0.05) == 0.0
+    assert check_force_value(1.5, 0.05) == 1.5
 
 
 def test_course_snaps_towards_open():

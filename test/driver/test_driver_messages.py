@@ -20,9 +20,11 @@ from finforce_driver.publishers import describe_state, news_of_state, outcome_of
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import MoveOutcome, Phase
 
+JOINTS = ("left_jaw_joint", "right_jaw_joint")
 
-def joints(position=(), velocity=(), effort=()):
-    return SimpleNamespace(position=position, velocity=velocity, effort=effort)
+
+def joints(position=(), velocity=(), effort=(), name=()):
+    return SimpleNamespace(name=name, position=position, velocity=velocity, effort=effort)
 
 
 def test_a_command_leaves_to_the_driver_what_it_does_not_say():
@@ -30,6 +32,30 @@ def test_a_command_leaves_to_the_driver_what_it_does_not_say():
     assert (move.opening, move.speed, move.force) == (0.02, None, None)
     move = move_from_joint_state(joints([0.02], [0.005], [10.0]))
     assert (move.opening, move.speed, move.force) == (0.02, 0.005, 10.0)
+
+
+@pytest.mark.parametrize("names", [JOINTS[:1], JOINTS[1:], JOINTS, JOINTS[::-1]])
+def test_a_command_that_names_joints_means_their_values_each_half_the_opening(names):
+    count = len(names)
+    move = move_from_joint_state(joints([0.01] * count, [0.004] * count, [9.0] * count, names), JOINTS)
+    assert (move.opening, move.speed, move.force) == pytest.approx((0.02, 0.008, 9.0))
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (
+            joints([0.01], name=["finger_joint"]),
+            r"joints \['finger_joint'\]; expected left_jaw_joint or right_jaw_joint",
+        ),
+        (joints([0.01], name=JOINTS), "1 positions of 2 joints"),
+        (joints([0.01, 0.02], name=JOINTS), "expected the same for both joints"),
+        (joints([0.01] * 2, name=[JOINTS[0]] * 2), "or both, or no name"),
+    ],
+)
+def test_a_command_of_other_joints_is_refused(message, words):
+    with pytest.raises(TargetError, match=words):
+        move_from_joint_state(message, JOINTS)
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,14 @@ def test_an_emergency_stop_reaches_the_gripper_and_says_what_ends_it(probe):
     assert gripper.calls == [("estop",)]
 
 
+def test_an_emergency_stop_without_a_link_is_pending_and_no_success(probe):
+    gripper, _ = driver(probe)
+    gripper.reply(phase=Phase.DISCONNECTED)
+    answer = call(probe, Trigger, "estop")
+    assert not answer.success and "emergency stop pending: no link" in answer.message
+    assert gripper.calls == [("estop",)]
+
+
 def test_stop_holds_in_place(probe):
     gripper, _ = driver(probe)
     assert call(probe, Trigger, "stop").success

@@ -69,7 +69,7 @@ def test_a_force_that_cannot_be_is_named_and_not_used(probe, name):
 def test_a_grasp_closes_with_the_forces_and_says_how_it_is(probe):
     gripper, *_ = grasping(probe, grasp_speed=0.005)
     _, opening, speed, force = gripper.calls[-1]
-    assert opening < READY.opening and speed <= 0.005 and force == 20.0
+    assert opening < READY.opening and speed <= 0.005 and force == 7.5
     probe.wait_for(lambda: probe.got["/gripper_driver/grasp_state"])
     state = probe.got["/gripper_driver/grasp_state"][-1]
     assert "overshoot bound [N]" in {entry.key for entry in state.values}
@@ -103,6 +103,30 @@ def test_a_force_topic_that_goes_silent_stops_the_grasp(probe):
         gripper.reply()
     assert answer.done() and not answer.result().success
     assert gripper.calls[-1] == ("hold",)
+
+
+def test_a_grasp_that_failed_is_told_until_something_else_is_commanded(probe):
+    gripper, node, out, answer = grasping(probe)
+    out.publish(wrench(-1.0))
+    probe.wait_for(answer.done)
+    gripper.reply()
+    state = gripper_state(probe, Level.WARN, "a grasp force of -1.0 N came")
+    assert state.level[0] == Level.WARN and node.session.status.failed
+    assert call(probe, Trigger, "stop").success
+    assert not node.session.status.failed
+
+
+def test_a_motor_that_presses_while_the_camera_sees_nothing_is_an_error_and_the_jaws_back_off(probe):
+    gripper, node, out, answer = grasping(probe)
+    for _ in range(10):
+        out.publish(wrench(0.0))
+        probe.spin(0.02)
+        gripper.reply(force=6.0)
+    probe.wait_for(answer.done)
+    assert not answer.result().success and "the motor presses with 6.0 N" in answer.result().message
+    name, opening, *_ = gripper.calls[-1]
+    assert name == "move" and opening == pytest.approx(READY.opening, abs=2e-4)
+    gripper_state(probe, Level.ERROR, "the motor presses with 6.0 N")
 
 
 def test_the_goal_changes_while_a_grasp_runs(probe):

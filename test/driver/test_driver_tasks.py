@@ -156,7 +156,9 @@ def test_another_command_ends_a_grasp(name, words, last):
 def test_a_command_that_is_refused_leaves_a_grasp_as_it_was():
     with Grasping() as grasp:
         with pytest.raises(TargetError):
-            grasp.tasks.move(move_from_joint_state(SimpleNamespace(position=[math.nan], velocity=(), effort=())))
+            grasp.tasks.move(
+                move_from_joint_state(SimpleNamespace(name=(), position=[math.nan], velocity=(), effort=()))
+            )
         with pytest.raises(TargetError):
             grasp.session.set_goal(GraspGoal(force=20.0))
         assert grasp.session.runs and not grasp.caller.done
