@@ -1,7 +1,8 @@
 """The standard action GripperCommand as a move of the gripper.
 
-The position is the opening between the jaws [m], `max_effort` the grip force by the maker's curve [N], 0 for none. Both
-an opening that is reached and something that is grasped on the way are a success; the result says which.
+The position is the opening between the jaws [m], `max_effort` the grip force by the maker's curve [N], 0 for that of
+the driver's settings; a goal that cannot be is rejected. Both an opening that is reached and something that is grasped
+on the way are a success; the result says which.
 """
 
 from __future__ import annotations
@@ -33,6 +34,15 @@ class GripperCommandAction:
 
     def __init__(self, kind: Any, gripper: Gripper, tasks: GripperTasks) -> None:
         self._kind, self._gripper, self._tasks = kind, gripper, tasks
+
+    def refusal(self, goal: Any) -> str:
+        """Return why a goal cannot be carried out, with what was expected; empty when it can."""
+        try:
+            request = move_from_gripper_command(goal.command)
+            self._gripper.check_move(request.opening, request.speed, request.force)
+        except DriverError as error:
+            return str(error)
+        return ""
 
     def execute(self, handle: Any) -> Any:
         """Move as a goal says and return the result, when the move is over or the goal is cancelled.

@@ -124,6 +124,14 @@ class Gripper:
             force = self.scale.force_for(current, force)
         self._loop.command(lambda machine, now: machine.move(opening, speed, force, now))
 
+    def check_move(self, opening: float, speed: float | None = None, force: float | None = None) -> None:
+        """Refuse what `move` would refuse in whatever state.
+
+        Raises:
+            TargetError: a value is no number or out of bounds.
+        """
+        self._loop.command(lambda machine, _: machine.check_move(opening, speed, force))
+
     def hold(self) -> None:
         """Stop in place and hold there; during a calibration: stop, limp.
 

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, PointCloud2
@@ -103,7 +103,13 @@ class GripperDriverNode(Node):
         async def execute(handle: Any) -> Any:
             return await ros.run_aside(self, partial(action.execute, handle))
 
-        return ActionServer(self, kind, "~/gripper_cmd", execute, cancel_callback=lambda _: CancelResponse.ACCEPT)
+        def judge(goal: Any) -> GoalResponse:
+            if refusal := action.refusal(goal):
+                self.get_logger().warning(f"goal of ~/gripper_cmd rejected: {refusal}")
+            return GoalResponse.REJECT if refusal else GoalResponse.ACCEPT
+
+        accept = {"goal_callback": judge, "cancel_callback": lambda _: CancelResponse.ACCEPT}
+        return ActionServer(self, kind, "~/gripper_cmd", execute, **accept)
 
     def _subscribe(self) -> None:
         """Create the subscriptions; a node that has them is ready."""

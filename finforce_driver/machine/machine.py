@@ -17,7 +17,7 @@ from finforce_driver.machine.calibration import CalibrationRun, CalibrationStep
 from finforce_driver.machine.exchange import Exchange, Request
 from finforce_driver.machine.knowledge import Knowledge
 from finforce_driver.machine.move import GRACE, Goal, MoveJob
-from finforce_driver.machine.orders import Echo, EchoWatch, Orders
+from finforce_driver.machine.orders import Arrival, Echo, EchoWatch, Orders
 from finforce_driver.machine.requests import RequestSource
 from finforce_driver.machine.state_report import build_state
 from finforce_driver.machine.stop import EmergencyStop, Recovery, RecoveryStep, StopStage
@@ -40,6 +40,7 @@ OLD = 0.1  # [s] after which a reply does not tell where moving jaws are
 STANDING = 2.0  # [counts/s], below which an unknown order is taken to hold
 GO = Flag.ACTIVATE | Flag.GO
 FOREIGN = frozenset({Command.ESTOP, Command.CLEAR, Command.IDLE, Command.RESET, Command.CALIBRATE})
+INHERITED = "the jaws were moving by an order from before the link was there; they are held"
 LOST_ORDER = "the gripper fell silent before the order could be sent: command again"
 NO_FAULTS = (False, False, False, False)
 CONNECTED = (Phase.UNCALIBRATED, Phase.READY, Phase.MOVING)
@@ -96,6 +97,7 @@ class GripperMachine:
         self._ended = MoveOutcome.NONE  # of the last move that is no job any more
         self._enabled = True  # not switched off
         self._joined = self._silent = False
+        self._arrival: Arrival | None = None
         self._order_sent = -math.inf
         self._link_counts: Mapping[str, int] = {}
         self._requests = RequestSource(self)
@@ -117,6 +119,8 @@ class GripperMachine:
             return Phase.CALIBRATING
         if not self.known.calibrated:
             return Phase.UNCALIBRATED
+        if self._arrival is not None and not self.moving:
+            return Phase.MOVING if self._arrival.moving else Phase.PROBING
         return Phase.MOVING if self.moving else Phase.READY
 
     @property
@@ -287,7 +291,7 @@ class GripperMachine:
     def on_link_open(self) -> None:
         """Begin on a link that was opened."""
         self.exchange.reset()
-        self._joined = True
+        self._joined, self._arrival = True, Arrival()
         self._refresh()
 
     def on_link_lost(self, reason: str) -> None:
@@ -302,6 +306,7 @@ class GripperMachine:
         self.known.forget()
         self.exchange.reset()
         self._joined = self._silent = False
+        self._arrival = None
         self._refresh()
 
     def on_message(self, message: CanMessage, now: float, link_counts: Mapping[str, int] | None = None) -> bool:
@@ -383,6 +388,10 @@ class GripperMachine:
         """Refuse what cannot be done in the present phase, by raising GripperStateError."""
         if self.phase not in phases:
             raise GripperStateError(f"{what}: {REFUSALS[self.phase]}" + (f" ({self.note})" if self.note else ""))
+
+    def check_move(self, opening: float, speed: float | None, force: float | None) -> None:
+        """Refuse what no move can be, by raising TargetError."""
+        self._make_goal(opening, speed, force)
 
     def _make_goal(self, opening: float, speed: float | None, force: float | None) -> Goal:
         """Return a move in the gripper's units; raises TargetError."""
@@ -507,8 +516,26 @@ class GripperMachine:
             self.known.half_calibrated = False
         elif not reply.error:
             self._follow_orders(reply, now)
+        self._follow_arrival(reply, now)
         if self.hold_wanted and self.phase in USABLE:
             self._hold(now)
+
+    def _follow_arrival(self, reply: Reply, now: float) -> None:
+        """Hold jaws that move by an order from before the link was there."""
+        arrival = self._arrival
+        if arrival is None:
+            return
+        was_moving = arrival.moving
+        arrival.take(reply, now)
+        if arrival.over:
+            self._arrival = None
+        elif arrival.moving and not was_moving and self.orders.wanted is None:
+            self._hold_here(now)
+            self.note = INHERITED
+
+    def _hold_here(self, now: float) -> None:
+        """Want the jaws to stay where they are by now."""
+        self.orders.want(self.order(position=self.place_for_order(now), flags=GO), urgent=True)
 
     def _follow_recovery(self, reply: Reply, now: float) -> None:
         """Let the clearing of errors go on."""

@@ -129,3 +129,35 @@ class EchoWatch:
             return reply.at_target or not order.drives
         self._arrived = reply.at_target and near
         return near or not reply.at_target
+
+
+LOOK = 0.3  # [s] in which jaws that go at 1.5 mm/s show it
+STEPS = 2  # counts that are motion and no rounding
+
+
+class Arrival:
+    """Looks, once a link is there, whether the jaws move by an order from before: of a killed program, or a lost link.
+
+    Jaws that push without moving hold something, and are left alone.
+
+    Attributes:
+        moving: they do.
+        over: it is known that they do not, or no more.
+    """
+
+    def __init__(self) -> None:
+        self.moving = self.over = False
+        self._first: int | None = None
+        self._since = 0.0
+
+    def take(self, reply: Reply, now: float) -> None:
+        """Take a believed reply."""
+        drives = reply.activated and reply.action and not reply.error
+        if not drives or (reply.at_target and not self.moving):
+            self.over = True
+        elif self._first is None or (self.moving and reply.position != self._first):
+            self._first, self._since = reply.position, now
+        elif abs(reply.position - self._first) >= STEPS:
+            self.moving, self._first, self._since = True, reply.position, now
+        elif now - self._since >= LOOK:
+            self.over = True

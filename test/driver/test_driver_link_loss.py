@@ -7,7 +7,10 @@ from emulator_fakes import VARIANTS, Rig
 
 from finforce_driver.can.protocol import Command
 from finforce_driver.emulator.faults import FaultKind
+from finforce_driver.emulator.virtual import VirtualBus
 from finforce_driver.errors import GripperStateError, LinkError
+from finforce_driver.gripper import Gripper
+from finforce_driver.settings import GripperSettings
 from finforce_driver.state import MoveOutcome, Phase
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
@@ -187,3 +190,63 @@ def test_who_waits_for_a_gripper_that_was_closed_hears_of_it():
     rig.gripper.close()
     with pytest.raises(GripperStateError, match="has ended"):
         rig.gripper.wait(lambda state: state.phase is Phase.MOVING, 5.0)
+
+
+def states_since(rig, begin):
+    return [state for state in rig.states if state.stamp >= begin]
+
+
+@both_variants
+def test_jaws_that_went_on_moving_without_a_link_are_held_and_never_said_to_be_ready(rig):
+    rig.arrive(0.048)
+    rig.gripper.move(0.0, 0.016)
+    rig.live(0.3)
+    rig.adapter.inject(FaultKind.UNPLUGGED, duration=0.3)
+    begin = rig.clock.now()
+    moved, ready = [], []
+    last = rig.emulated.true_opening
+    for _ in range(400):
+        rig.live(0.01)
+        moved.append(abs(rig.emulated.true_opening - last) > 2e-5)
+        ready.append(rig.state.phase is Phase.READY)
+        last = rig.emulated.true_opening
+    assert any(moved) and not moved[-1]
+    assert not any(was and is_ready for was, is_ready in zip(moved, ready, strict=True))
+    assert rig.emulated.true_opening > 0.010  # it had 37 mm to go
+    assert rig.state.phase is Phase.READY and "they are held" in rig.state.message
+    assert rig.state.opening == pytest.approx(rig.emulated.true_opening, abs=2e-4)
+    assert len(states_since(rig, begin)) > 10
+
+
+@both_variants
+def test_a_driver_that_is_started_anew_holds_what_the_last_one_left_moving(rig):
+    rig.arrive(0.048)
+    rig.gripper.move(0.0, 0.016)
+    rig.live(0.5)
+    again = Gripper(VirtualBus(rig.adapter, rig.clock), GripperSettings(), rig.clock)
+    phases = set()
+    for _ in range(60):
+        again.turn()
+        if again.state.phase is Phase.MOVING:
+            phases.add("moving")
+        moving = rig.emulated.true_opening
+        again.turn()
+        assert again.state.phase is not Phase.READY or abs(rig.emulated.true_opening - moving) < 5e-4
+    again.wait(lambda state: state.phase is Phase.READY, 5.0)
+    assert phases == {"moving"} and rig.emulated.true_opening > 0.010
+
+
+@both_variants
+def test_what_is_held_is_not_let_go_when_the_link_comes_back(rig):
+    rig.arrive(0.048)
+    rig.emulated.jaws.object_opening = 0.020
+    rig.gripper.move(0.0, 0.03, 12.0)
+    rig.live(3.0)
+    before = rig.state.force
+    rig.adapter.inject(FaultKind.UNPLUGGED, duration=0.3)
+    begin = rig.clock.now()
+    rig.live(0.2)
+    rig.wait_for(Phase.READY)
+    rig.live(1.0)
+    assert rig.orders(begin) == []
+    assert rig.state.force == pytest.approx(before, rel=0.1) and before > 8.0

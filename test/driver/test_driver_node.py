@@ -193,8 +193,9 @@ def test_a_clock_that_does_not_go_yet_gives_no_joint_states(probe):
 class FakeServer:
     """What the node makes of the action server's class."""
 
-    def __init__(self, node, kind, name, execute, cancel_callback):
+    def __init__(self, node, kind, name, execute, goal_callback, cancel_callback):
         self.kind, self.name, self.execute, self.destroyed = kind, name, execute, False
+        self.judge = goal_callback
 
     def destroy(self):
         self.destroyed = True

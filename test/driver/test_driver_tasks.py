@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 from driver_node_fakes import READY, Caller, FakeGoal, FakeGripper
+from emulator_fakes import Rig
 
 from finforce_driver.actions import GripperCommandAction
 from finforce_driver.errors import DriverError, GraspError, GripperStateError, TargetError
@@ -298,3 +299,22 @@ def test_an_action_of_a_gripper_that_knows_no_opening_has_numbers_all_the_same()
 def test_a_first_goal_above_the_limit_is_refused():
     with pytest.raises(TargetError, match="force limit"):
         build(grasp_force=9.0)
+
+
+@pytest.mark.parametrize(
+    ("position", "effort", "words"),
+    [
+        (0.02, 5.0, "force: got 5 N, expected 7.16 to 62 N"),
+        (0.02, 100.0, "force: got 100 N, expected 7.16 to 62 N"),
+        (-0.0001, 10.0, "opening: got -0.0001 m, expected 0 to 0.048 m"),
+        (math.nan, 10.0, "opening: got nan"),
+        (0.02, 0.0, ""),
+        (0.02, 10.0, ""),
+    ],
+)
+def test_a_goal_of_the_action_that_cannot_be_is_rejected_with_the_reason(position, effort, words):
+    rig = Rig()
+    goal = SimpleNamespace(command=SimpleNamespace(position=position, max_effort=effort))
+    refusal = GripperCommandAction(KIND, rig.gripper, None).refusal(goal)
+    assert words in refusal and bool(words) == bool(refusal)
+    assert rig.state.outcome is MoveOutcome.NONE
