@@ -131,7 +131,9 @@ class GripperMachine:
     @property
     def outcome(self) -> MoveOutcome:
         """What became of the last move."""
-        return self._ended if self.job is None else self.job.outcome
+        outcome = self._ended if self.job is None else self.job.outcome
+        limp = self.known.reply is not None and not self.known.driving
+        return MoveOutcome.NONE if outcome is MoveOutcome.GRASPED and limp else outcome
 
     @property
     def silent(self) -> bool:

@@ -13,6 +13,7 @@ GRACE = 0.05  # [s] after a move in which its replies may still speak of the one
 CONTACT_TIME = 0.1  # [s] and
 CONTACT_REPLIES = 5  # replies that a contact must last
 REACHED_REPLIES = 2
+REST_TIME = 0.3  # [s] at one count, beside the target, that are rest
 TOLERANCE = 2  # [counts]: the reply truncates, the gripper stops within a fraction of a count
 CLOSED = 250  # [counts] from which contact while closing is with the other jaw
 OPENED = 3  # [counts] up to which contact while opening is with the stop
@@ -57,6 +58,7 @@ class MoveWatch:
         self._sent = now
         self._contact: _Contact | None = None
         self._arrivals = 0
+        self._beside, self._beside_since = -1, now
 
     def send(self, now: float) -> None:
         """Note that a message of the move was sent: what comes soon after is of the one before."""
@@ -83,9 +85,16 @@ class MoveWatch:
             return self._judge_contact(reply)
         there = reply.at_target and abs(reply.position - self._position) <= TOLERANCE
         self._arrivals = self._arrivals + 1 if there and final else 0
-        if self._arrivals >= REACHED_REPLIES:
+        if self._arrivals >= REACHED_REPLIES or self._rests_beside(reply, now, final):
             return MoveOutcome.REACHED
         return MoveOutcome.TIMED_OUT if now > self._deadline else MoveOutcome.NONE
+
+    def _rests_beside(self, reply: Reply, now: float, final: bool) -> bool:
+        """Whether the jaws have come to rest a count beside the target, which old firmware never calls reached."""
+        if not final or reply.contact or abs(reply.position - self._position) > 1 or reply.position != self._beside:
+            self._beside, self._beside_since = reply.position, now
+            return False
+        return now - self._beside_since >= REST_TIME
 
     def _follow_contact(self, reply: Reply, now: float) -> None:
         """Keep how long a contact lasts at one place."""

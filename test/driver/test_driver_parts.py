@@ -132,3 +132,16 @@ def test_speed_and_place_come_from_the_last_tenth_of_a_second():
     assert history.place_at(0.37, 0.0) == pytest.approx(13.5)
     assert math.isnan(history.place_at(-0.01, 0.0))
     assert history.place_at(0.40, 0.05) == 14.0
+
+
+@pytest.mark.parametrize(("position", "outcome"), [(99, "REACHED"), (101, "REACHED"), (97, "TIMED_OUT")])
+def test_jaws_that_rest_a_count_beside_the_target_have_reached_it(position, outcome):
+    watch = MoveWatch(position=100, closing=True, allowed=1.0, now=0.0)
+    found = {}
+    for step in range(1, 120):
+        now = 0.02 * step
+        result = watch.take(reply(position=min(position, 60 + 4 * step), code=0), now, True)
+        found.setdefault(result, now)
+    assert MoveOutcome[outcome] in found
+    if outcome == "REACHED":
+        assert found[MoveOutcome.REACHED] == pytest.approx(0.2 + 0.3, abs=0.05)

@@ -198,3 +198,13 @@ def test_clearing_survives_lost_messages(rig, kind):
     rig.wait_for(Phase.READY)
     rig.live(0.5)
     assert rig.emulated.faults == set()
+
+
+@both_variants
+def test_a_gripper_that_let_go_holds_nothing(rig):
+    rig.arrive(0.048)
+    rig.emulated.jaws.object_opening = 0.020
+    assert rig.arrive(0.0, 0.03, 12.0).outcome is MoveOutcome.GRASPED
+    rig.gripper.activate(False)
+    rig.live(0.3)
+    assert rig.state.outcome is MoveOutcome.NONE and "grasped" not in rig.state.message
