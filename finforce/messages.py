@@ -1,12 +1,15 @@
-"""Messages of ROS into stamps, poses, wrenches and images; any object with a message's attributes will do."""
+"""ROS messages into stamps, poses, wrenches, images, columns of clouds; any object with their attributes will do."""
 
 from __future__ import annotations
 
 import struct
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from finforce.camera import (
     CameraIntrinsics,
@@ -20,6 +23,254 @@ from finforce.camera import (
 from finforce.errors import ObservationError, PoseError
 from finforce.stamps import NANOSECONDS
 from finforce.transforms import pose_from_quaternion
+
+# sensor_msgs/msg/PointField: INT8 = 1 ... FLOAT64 = 8
+DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+STDDEV_COLUMNS = ("stddev_x", "stddev_y", "stddev_z")
+_CODES = {np.dtype(name): code for code, name in DATATYPES.items()}
+
+
+class FieldLike(Protocol):
+    """What is read of a field description; sensor_msgs/PointField satisfies it."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int
+
+
+@dataclass(frozen=True)
+class PointField:
+    """One field of a point cloud, with the attributes of sensor_msgs/PointField."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int = 1
+
+
+class EncodedCloud(NamedTuple):
+    """The parts of a PointCloud2 of height 1 that depend on its columns."""
+
+    fields: tuple[PointField, ...]
+    point_step: int
+    data: bytes
+
+
+class Keypoints(NamedTuple):
+    """Key points of one cloud: `points (K, 3)` [m], NaN = none; `likelihood (K,)` in [0, 1]; `stddev (K, 3)` [m]."""
+
+    points: NDArray[np.float64]
+    likelihood: NDArray[np.float64]
+    stddev: NDArray[np.float64] | None
+
+
+@lru_cache(maxsize=64)
+def _layout(entries: tuple[tuple[str, int, int, int], ...], point_step: int, big_endian: bool) -> np.dtype:
+    """Build the structured dtype of one point; `entries` are (name, offset, datatype, count)."""
+    order = ">" if big_endian else "<"
+    names, formats, offsets = [], [], []
+    for name, offset, datatype, count in entries:
+        if datatype not in DATATYPES:
+            raise ObservationError(f"field '{name}' has the unknown datatype {datatype}; expected 1 to 8")
+        scalar = np.dtype(order + DATATYPES[datatype])
+        if offset + scalar.itemsize * max(count, 1) > point_step:
+            raise ObservationError(f"field '{name}' at offset {offset} leaves a point of {point_step} bytes")
+        names.append(name)
+        formats.append(scalar if count <= 1 else (scalar, (count,)))
+        offsets.append(offset)
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": point_step})
+
+
+def _wanted(
+    fields: Iterable[FieldLike], names: Sequence[str], optional: Sequence[str]
+) -> tuple[tuple[str, int, int, int], ...]:
+    """Pick the wanted fields; the first of a repeated name wins, unknown ones are ignored."""
+    entries: dict[str, tuple[str, int, int, int]] = {}
+    for field in fields:
+        if field.name in names or field.name in optional:
+            entry = (field.name, int(field.offset), int(field.datatype), int(field.count))
+            entries.setdefault(field.name, entry)
+    missing = [name for name in names if name not in entries]
+    if missing:
+        raise ObservationError(f"the cloud has no field {', '.join(missing)}; expected {', '.join(names)}")
+    return tuple(entries.values())
+
+
+def decode_cloud(
+    fields: Iterable[FieldLike],
+    data: Any,
+    *,
+    width: int,
+    height: int,
+    point_step: int,
+    row_step: int,
+    is_bigendian: bool,
+    names: Sequence[str],
+    optional: Sequence[str] = (),
+) -> dict[str, NDArray]:
+    """Return the named columns of a PointCloud2, whatever their order, offset, type and byte order.
+
+    Args:
+        fields: field descriptions (`name`, `offset`, `datatype`, `count`).
+        data: the buffer: bytes, array('B') or a uint8 array.
+        width: points per row.
+        height: rows.
+        point_step: bytes per point.
+        row_step: bytes per row; ignored for a single row.
+        is_bigendian: byte order of the numbers.
+        names: columns that must be there.
+        optional: columns that are returned when they are there.
+
+    Returns:
+        For each name an array (width * height,), or (width * height, count) for a field of several
+        elements, with the field's own type in native byte order.
+
+    Raises:
+        ObservationError: a field is missing or leaves the point, or the buffer is too short.
+    """
+    points = int(width) * int(height)
+    if points == 0:
+        return {name: np.empty(0) for name in names}
+    layout = _layout(_wanted(fields, names, optional), int(point_step), bool(is_bigendian))
+    rows = _rows(data, int(width), int(height), int(point_step), int(row_step))
+    table = rows.view(layout).reshape(points)
+    return {
+        name: np.ascontiguousarray(table[name], dtype=table[name].dtype.newbyteorder("="))
+        for name in layout.names or ()
+    }
+
+
+def _rows(data: Any, width: int, height: int, point_step: int, row_step: int) -> NDArray[np.uint8]:
+    """Return the bytes of the points without the padding of the rows, (height, width * point_step)."""
+    used = width * point_step
+    step = used if height == 1 else row_step
+    if step < used:
+        raise ObservationError(f"row_step is {row_step} bytes; {width} points of {point_step} need {used}")
+    buffer = np.frombuffer(data, dtype=np.uint8)
+    needed = step * (height - 1) + used
+    if buffer.size < needed:
+        raise ObservationError(f"the cloud's buffer holds {buffer.size} bytes; {needed} were announced")
+    if height == 1:
+        return buffer[:used].reshape(1, used)
+    strided = np.lib.stride_tricks.as_strided(buffer, (height, used), (step, 1), writeable=False)
+    return np.ascontiguousarray(strided)
+
+
+def encode_cloud(columns: Mapping[str, ArrayLike]) -> EncodedCloud:
+    """Pack columns of equal length into the little-endian buffer of a PointCloud2 of height 1.
+
+    Args:
+        columns: name -> (n,) or (n, count) array; the field takes the array's type, in this order.
+
+    Returns:
+        The field descriptions, the bytes per point and the buffer; `decode_cloud` inverts it.
+
+    Raises:
+        ObservationError: the columns differ in length or have a type that PointField lacks.
+    """
+    arrays = {name: np.asarray(values) for name, values in columns.items()}
+    lengths = {array.shape[:1] for array in arrays.values()}
+    if len(lengths) > 1:
+        sizes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise ObservationError(f"the columns of a cloud differ in length: {sizes}")
+    fields, layout = _plan(tuple((name, array.dtype, array.shape[1:]) for name, array in arrays.items()))
+    table = np.zeros(lengths.pop() if lengths else (0,), dtype=layout)
+    for name, array in arrays.items():
+        table[name] = array.reshape(table[name].shape)
+    return EncodedCloud(fields, layout.itemsize, table.tobytes())
+
+
+@lru_cache(maxsize=64)
+def _plan(columns: tuple[tuple[str, np.dtype, tuple[int, ...]], ...]) -> tuple[tuple[PointField, ...], np.dtype]:
+    """Return fields and layout of a point with columns (name, type, shape without the first axis)."""
+    fields, point_step = [], 0
+    for name, kind, shape in columns:
+        code = _CODES.get(kind.newbyteorder("="))
+        if code is None or len(shape) > 1:
+            raise ObservationError(f"column '{name}' of type {kind}, shape (n, *{shape}) is no field")
+        count = shape[0] if shape else 1
+        fields.append(PointField(name, point_step, code, count))
+        point_step += kind.itemsize * count
+    entries = tuple((field.name, field.offset, field.datatype, field.count) for field in fields)
+    return tuple(fields), _layout(entries, point_step, False)
+
+
+def decode_columns(cloud: Any, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray]:
+    """Return the named columns of any object with the attributes of PointCloud2; see `decode_cloud`.
+
+    Raises:
+        ObservationError: a field is missing or leaves the point, or the buffer is too short.
+    """
+    return decode_cloud(
+        cloud.fields,
+        cloud.data,
+        width=cloud.width,
+        height=cloud.height,
+        point_step=cloud.point_step,
+        row_step=cloud.row_step,
+        is_bigendian=cloud.is_bigendian,
+        names=names,
+        optional=optional,
+    )
+
+
+def decode_keypoints(cloud: Any) -> Keypoints:
+    """Return points, likelihood and standard deviations of a key point cloud (any object like a PointCloud2).
+
+    A cloud without the field `likelihood` gets ones. Rows whose field `valid` is zero, if there is one, become NaN.
+
+    Raises:
+        ObservationError: the cloud has no x, y, z, its buffer is too short, it has some of the fields `stddev_x`,
+            `stddev_y`, `stddev_z` and not all, or a point states what is no standard deviation.
+    """
+    columns = decode_columns(cloud, ("x", "y", "z"), ("likelihood", "valid", *STDDEV_COLUMNS))
+    points = _stack(columns, ("x", "y", "z"))
+    valid, likelihood = columns.get("valid"), columns.get("likelihood")
+    if valid is not None:
+        points[valid == 0] = np.nan
+    ones = np.ones(len(points))
+    stddev = _stated(columns, points)
+    return Keypoints(points, ones if likelihood is None else likelihood.astype(np.float64), stddev)
+
+
+def _stated(columns: Mapping[str, NDArray], points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the standard deviations (K, 3) [m] of a cloud's points, None when it states none."""
+    have = [name for name in STDDEV_COLUMNS if name in columns]
+    if not have:
+        return None
+    if len(have) < len(STDDEV_COLUMNS):
+        raise ObservationError(f"the cloud has {', '.join(have)}; expected all of {', '.join(STDDEV_COLUMNS)}, or none")
+    stddev = _stack(columns, STDDEV_COLUMNS)
+    check_stddev(stddev, points)
+    return stddev
+
+
+def check_stddev(stddev: NDArray, points: NDArray) -> None:
+    """Refuse what cannot be the standard deviations (K, 3) [m] of key points (K, 3) [m], NaN where there is none.
+
+    Raises:
+        ObservationError: another shape, or a point with a standard deviation that is not a number above zero.
+    """
+    if stddev.shape != points.shape:
+        raise ObservationError(f"standard deviations of shape {stddev.shape}, expected {points.shape}")
+    there = np.isfinite(points).all(axis=1)[:, None]
+    odd = there & ~((stddev > 0.0) & np.isfinite(stddev))
+    if odd.any():
+        row, axis = np.argwhere(odd)[0]
+        raise ObservationError(
+            f"key point {row} states the standard deviation {stddev[row, axis]:g} m along {'xyz'[axis]}, expected a "
+            "number above zero; a point that must not be used has valid = 0 or NaN coordinates"
+        )
+
+
+def _stack(columns: Mapping[str, NDArray], names: Sequence[str]) -> NDArray[np.float64]:
+    """Return columns (K,) side by side (K, 3)."""
+    stacked = np.stack([columns.get(name, np.empty(0)) for name in names], axis=-1).astype(np.float64)
+    if stacked.ndim != 2:
+        raise ObservationError(f"{', '.join(names)} of a key point cloud must be single numbers (count 1)")
+    return stacked
+
 
 MASKS = ("mono8", "8UC1")
 

@@ -26,9 +26,8 @@ from finforce_contact.diagnostics import describe, object_alarms, outcome_of_est
 from finforce_contact.jaw_contact import TimedEstimate
 from finforce_contact.parameters import ContactParameters
 from finforce_contact.publishers import ContactOutputs
-from finforce_contact.session import ContactSession
+from finforce_contact.session import ContactSession, subscribe
 from finforce_contact.settings import ContactSettings, TrackerSettings
-from finforce_contact.subscriptions import subscribe
 
 
 class ContactEstimatorNode(Node):

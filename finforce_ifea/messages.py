@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
-from finforce.messages import check_cloud, check_frame
-from finforce.pointcloud import decode_columns, decode_keypoints
+from finforce.messages import check_cloud, check_frame, decode_columns, decode_keypoints
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, are_same_polygons
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
-from finforce.pointcloud import check_stddev
+from finforce.messages import check_stddev
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.jaw import Jaw
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from finforce_keypoints.networks.decoding import DecodingRule, decode
+from finforce_keypoints.networks.model import DecodingRule, decode
 from training.dataset import LabelledPictures
 from training.loading import stack_centres
 from training.network import LOCREF_STD, STRIDE, KeypointNetwork

@@ -21,8 +21,7 @@ from visualization_msgs.msg import Marker
 
 from finforce.errors import ObservationError
 from finforce.health import Report
-from finforce.messages import check_cloud, check_frame
-from finforce.pointcloud import decode_columns, encode_cloud
+from finforce.messages import check_cloud, check_frame, decode_columns, encode_cloud
 from finforce.stamps import NANOSECONDS
 
 MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}

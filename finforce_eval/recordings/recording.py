@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from finforce.errors import ObservationError
-from finforce.pointcloud import Keypoints, decode_columns, decode_keypoints
+from finforce.messages import Keypoints, decode_columns, decode_keypoints
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import BagMessage, bag_source, check_types, open_bag

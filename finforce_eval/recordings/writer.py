@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from finforce.errors import MissingDependencyError
-from finforce.pointcloud import STDDEV_COLUMNS, encode_cloud
+from finforce.messages import STDDEV_COLUMNS, encode_cloud
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, WRENCH

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.messages import pose_from_message
-from finforce.pointcloud import decode_columns, decode_keypoints
+from finforce.messages import decode_columns, decode_keypoints, pose_from_message
 from finforce.stamps import NANOSECONDS
 from finforce_eval.evaluation.keypoint_source import SideLog
 from finforce_eval.evaluation.places import InnerSurface, true_lines

@@ -18,8 +18,7 @@ from finforce_keypoints.pixel_finder import REFERENCE, PixelFinding
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_keypoints.images import RgbdImage
-    from finforce_keypoints.networks.decoding import Peaks
-    from finforce_keypoints.networks.model import KeypointModel
+    from finforce_keypoints.networks.model import KeypointModel, Peaks
 
 SAME_PLACE = 1e-3  # [m] by which a jaw may move before its picture is mapped anew; places are exact all the same
 SEARCH_STEP = 20e-3  # [m] between the places where a lost jaw is looked for; a picture shows 79 mm

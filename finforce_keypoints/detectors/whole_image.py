@@ -17,9 +17,8 @@ from finforce_keypoints.pixel_finder import PixelFinding
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_keypoints.images import RgbdImage
-    from finforce_keypoints.networks.decoding import Peaks
     from finforce_keypoints.networks.metadata import NameMap
-    from finforce_keypoints.networks.model import KeypointModel
+    from finforce_keypoints.networks.model import KeypointModel, Peaks
 
 CROP_MARGIN = 48.0  # px around the undeformed key points: 15 mm at the nearest that a wrist camera is
 CROP_STEP = 64  # px, of a cut-out's height and width, so that a network rarely meets a new size

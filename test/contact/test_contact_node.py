@@ -23,8 +23,7 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
 from finforce.health import Level
-from finforce.messages import stamp_of
-from finforce.pointcloud import decode_cloud
+from finforce.messages import decode_cloud, stamp_of
 from finforce.ros import node as ros
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud

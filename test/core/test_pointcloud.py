@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from finforce.errors import ObservationError
-from finforce.pointcloud import PointField, decode_cloud, decode_keypoints, encode_cloud
+from finforce.messages import PointField, decode_cloud, decode_keypoints, encode_cloud
 
 NAMES = ("x", "y", "z", "likelihood", "candidate")
 TYPES = ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8")

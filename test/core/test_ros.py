@@ -19,8 +19,7 @@ from visualization_msgs.msg import Marker
 
 from finforce.errors import FinforceError, ObservationError
 from finforce.health import Level, Report
-from finforce.messages import stamp_of
-from finforce.pointcloud import decode_keypoints
+from finforce.messages import decode_keypoints, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import refresh_record
 from finforce_contact.parameters import ContactParameters

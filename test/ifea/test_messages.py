@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finforce.errors import ObservationError
-from finforce.pointcloud import encode_cloud
+from finforce.messages import encode_cloud
 from finforce_ifea.errors import ContactError
 from finforce_ifea.messages import contact_from_cloud, force_from_wrench, observation_from_cloud
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finforce.errors import ObservationError
-from finforce.pointcloud import encode_cloud
+from finforce.messages import encode_cloud
 from finforce_ifea.errors import ContactError
 from finforce_ifea.messages import columns_from_outline, outline_from_columns
 from finforce_ifea.observation import ObjectOutline

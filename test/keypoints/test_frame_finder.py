@@ -9,9 +9,8 @@ from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_keypoints.detectors.whole_image import FrameFinder, check_offsets
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.networks.decoding import Peaks
 from finforce_keypoints.networks.metadata import build_name_map
-from finforce_keypoints.networks.model import KeypointModel
+from finforce_keypoints.networks.model import KeypointModel, Peaks
 
 CAMERA = CameraIntrinsics(width=640, height=480, fx=431.2, fy=430.0, cx=319.6, cy=241.3)
 LEFT, RIGHT = ("left_inner_7", "left_tip", "left_reference"), ("right_inner_7", "right_tip", "right_reference")

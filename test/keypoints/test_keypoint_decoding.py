@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finforce_keypoints.networks.decoding import (
+from finforce_keypoints.networks.model import (
     DEFAULT_STDDEV,
     DecodingRule,
     decode,

@@ -12,9 +12,8 @@ from onnx import TensorProto, helper, numpy_helper
 from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.errors import DetectionError, FrozenImageError, ModelError
 from finforce_keypoints.images import ImageWatch
-from finforce_keypoints.networks.decoding import DecodingRule, decode
 from finforce_keypoints.networks.metadata import parse_metadata, read_metadata
-from finforce_keypoints.networks.model import KeypointModel, ModelOverrides
+from finforce_keypoints.networks.model import DecodingRule, KeypointModel, ModelOverrides, decode
 
 SIZE = (256, 256)
 PICTURE = np.full((1, *SIZE, 3), 128, np.uint8)

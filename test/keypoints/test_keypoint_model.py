@@ -9,9 +9,8 @@ from keypoint_scene_fakes import Fake, paint, sidecar, write_model
 from finforce.errors import MissingDependencyError
 from finforce_keypoints.errors import DetectionError, ModelError
 from finforce_keypoints.networks import network as network_module
-from finforce_keypoints.networks.decoding import decode
 from finforce_keypoints.networks.metadata import parse_metadata
-from finforce_keypoints.networks.model import KeypointModel, ModelOverrides
+from finforce_keypoints.networks.model import KeypointModel, ModelOverrides, decode
 
 # The squares of 12 px lie on the middles of cells: one cell is pure, its neighbours hold a quarter.
 SQUARES = {"red": (100, 68), "green": (340, 204), "blue": (628, 12), "yellow": (20, 460)}

@@ -26,8 +26,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 from finforce.health import Level
-from finforce.messages import pose_from_message, stamp_of
-from finforce.pointcloud import decode_cloud
+from finforce.messages import decode_cloud, pose_from_message, stamp_of
 from finforce.ros import node as ros
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.node import KeypointDetectorNode

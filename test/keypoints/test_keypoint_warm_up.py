@@ -7,7 +7,7 @@ from keypoint_scene_fakes import bare_image, build
 from finforce.gripper_frames import jaw_in_camera
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.geometry import jaw_localizer as jaw_localizer
-from finforce_keypoints.geometry.reference_patch import ReferencePatch
+from finforce_keypoints.geometry.jaw_localizer import ReferencePatch
 
 
 def test_a_detector_that_was_warmed_up_has_done_everything_once_and_knows_nothing():

@@ -10,7 +10,7 @@ from finforce_keypoints.detectors.side_plane import PlaneFinder, grid_from_metad
 from finforce_keypoints.errors import ModelError
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.networks.decoding import Peaks
+from finforce_keypoints.networks.model import Peaks
 from finforce_twin.rendering.depth_camera import build_d405_vga
 
 CAMERA = build_d405_vga()

@@ -15,8 +15,7 @@ pytest.importorskip("cv2", reason="pictures need OpenCV: pip install opencv-cont
 import torch
 from training_fakes import draw_blobs, write_blobs
 
-from finforce_keypoints.networks.decoding import decode
-from finforce_keypoints.networks.model import KeypointModel
+from finforce_keypoints.networks.model import KeypointModel, decode
 from training.augment import AugmentSettings, augment, crop_centre
 from training.checkpoint import load_checkpoint
 from training.dataset import MARGIN, LabelledPictures, iterate_batches, load_pictures

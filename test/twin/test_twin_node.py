@@ -14,8 +14,7 @@ from rgbd_fakes import FakeGripper, FakeLens, make_footage
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import String
 
-from finforce.messages import stamp_of
-from finforce.pointcloud import decode_columns
+from finforce.messages import decode_columns, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import ParameterError
 from finforce_twin import node as twin_node
