@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from finforce.messages import magnitude_stddev
 from finforce_contact.estimator import ContactEstimator
 from finforce_driver.grasp.settings import GraspPhase
 from finforce_eval.evaluation.machine import describe_machine, write_figures
@@ -279,6 +280,7 @@ class EstimatorSensor:
 
     Attributes:
         touching: whether a jaw was said to touch in the last image.
+        stddev: of the jaw whose force is less certain, as the driver takes it from `wrench_stddev` [N].
     """
 
     def __init__(self, pressed: PressedGrasp, seed: int) -> None:
@@ -286,6 +288,7 @@ class EstimatorSensor:
         self._jaws = {side: JawSensor(pressed, side) for side in pressed.assembly.jaws}
         self._next_pose = 0.0
         self.touching: bool | None = None
+        self.stddev = 0.0
 
     def measure(self, stamp: float, force: float, opening: float) -> float | None:
         """Return min(|F_left|, |F_right|), None unless both are trusted."""
@@ -299,6 +302,7 @@ class EstimatorSensor:
         self.touching = any(jaw.touching for jaw in self._jaws.values())
         if not all(solution.trusted for solution in solutions):
             return None
+        self.stddev = max(magnitude_stddev(solution.force_stddev) for solution in solutions)
         return min(float(np.linalg.norm(solution.force)) for solution in solutions)
 
     def _observe(self, stamp: float, keypoints: NDArray) -> Observation:

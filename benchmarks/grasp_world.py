@@ -20,7 +20,7 @@ from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
 from finforce_driver.grasp.session import hold_force
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspStatus
+from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
 from finforce_driver.gripper import Gripper
 from finforce_driver.state import Phase
 from finforce_ifea.relaxation import Relaxation, RelaxationTerm
@@ -49,9 +49,11 @@ class Sensor(Protocol):
 
     Attributes:
         touching: whether the jaws were said to touch in the last image; None where nobody says it.
+        stddev: that is stated of the last force [N].
     """
 
     touching: bool | None
+    stddev: float
 
     def measure(self, stamp: float, force: float, opening: float) -> float | None:
         """Return what an image at `stamp` [s] shows of a true force [N] at an opening [m]."""
@@ -61,6 +63,7 @@ class NoisySensor:
     """The true force with white noise [N], as a magnitude: never negative."""
 
     touching = None
+    stddev = 0.0
 
     def __init__(self, noise: float, seed: int) -> None:
         self._noise, self._random = noise, np.random.default_rng(seed)
@@ -109,8 +112,8 @@ class GraspTrace:
 class World:
     """One emulated gripper with fingers and camera; it is the force source of `hold_force`, too."""
 
-    def __init__(self, case: GraspCase, sensor: Sensor) -> None:
-        self._case, self._sensor = case, sensor
+    def __init__(self, case: GraspCase, sensor: Sensor, settings: GraspSettings | None = None) -> None:
+        self._case, self._sensor, self._settings = case, sensor, settings
         self.emulated = EmulatedGripper(case.variant, load=case.plant.force_at)
         self.clock = VirtualClock()
         self.bus = VirtualBus(EmulatedAdapter(self.emulated), self.clock)
@@ -148,7 +151,7 @@ class World:
         self._prepare()
         goal = GraspGoal(force=self._case.force, speed=self._case.speed)
         try:
-            hold_force(self.gripper, self, goal, until=self._is_over)
+            hold_force(self.gripper, self, goal, self._settings, until=self._is_over)
         except Exception as error:  # whatever ends a grasp is a result of the benchmark
             self.course.error = str(error)
         self.course.violations = dict(self.emulated.violations)
@@ -177,7 +180,9 @@ class World:
         if self._random.uniform() < LOST:
             return
         if measured is not None:
-            self._send(now + late, ForceSample(stamp=now, arrived=now + late, force=measured))
+            self._send(
+                now + late, ForceSample(stamp=now, arrived=now + late, force=measured, stddev=self._sensor.stddev)
+            )
         if self._sensor.touching is not None:
             self._send(now + late, TouchSample(stamp=now, touching=self._sensor.touching))
 

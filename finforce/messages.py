@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -307,6 +308,24 @@ def wrench_from_message(message: Any, frame: str) -> tuple[NDArray, NDArray]:
     if not np.isfinite([force, torque]).all():
         raise ObservationError(f"the wrench is not finite: {force}, {torque}")
     return force, torque
+
+
+_LEAN = math.sin(math.radians(15.0))
+
+
+def magnitude_stddev(axes: Sequence[float]) -> float:
+    """Return the standard deviation [N] of the magnitude of a jaw's force, which is along x up to 15 degrees.
+
+    Args:
+        axes: standard deviations of the force along x, y and z [N].
+
+    Raises:
+        ObservationError: one is no finite number from 0.
+    """
+    x, y, z = (float(value) for value in axes)
+    if not all(math.isfinite(value) and value >= 0.0 for value in (x, y, z)):
+        raise ObservationError(f"the force's standard deviation: got {(x, y, z)} N, expected finite numbers from 0")
+    return math.hypot(x, _LEAN * y, _LEAN * z)
 
 
 def camera_from_info(info: Any, frame: str) -> CameraIntrinsics:

@@ -31,5 +31,9 @@ class GraspError(DriverError, RuntimeError):
     """A force-controlled grasp was ended for safety; the message says why."""
 
 
-class UnseenForceError(GraspError):
+class BackOffError(GraspError):
+    """A grasp pressed harder than it may; the jaws go back to where it began."""
+
+
+class UnseenForceError(BackOffError):
     """The motor presses much harder than the camera says: the camera does not see the force."""

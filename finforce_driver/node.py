@@ -67,7 +67,7 @@ class GripperDriverNode(Node):
         self.session = GraspSession(self.gripper, parameters.goal, grasp, self.wake.trigger)
         self.tasks = GripperTasks(self.gripper, self.session, parameters)
         gate = {"max_age": parameters.max_age, "restart_gap": parameters.restart_gap}
-        self.times = MessageTimes(self.gripper.clock, ("force", *JAWS), **gate)
+        self.times = MessageTimes(self.gripper.clock, ("force", *JAWS, *(f"{side} stddev" for side in JAWS)), **gate)
         self.health = GripperHealth(source=parameters.port, stale_after=parameters.max_age)
         self.qos = ros.QosWatch(self)
         self.out = DriverOutputs(self.qos, parameters)
@@ -118,6 +118,8 @@ class GripperDriverNode(Node):
         self.qos.subscription(WrenchStamped, "grasp_wrench", self._on_wrench, ros.SENSOR)
         for side in JAWS:
             self.qos.subscription(PointCloud2, f"{side}/contact", partial(self._on_contact, side), ros.SENSOR)
+            stddev = f"{side}/wrench_stddev"
+            self.qos.subscription(WrenchStamped, stddev, partial(self._on_stddev, side), ros.RESULT)
 
     def _take_state(self, state: GripperState) -> None:
         """Keep a state, in the gripper's thread, until the node's own thread has time for it."""
@@ -173,6 +175,12 @@ class GripperDriverNode(Node):
             self.session.take_force(ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force))
             self._tell_grasp()
 
+    def _on_stddev(self, side: str, message: WrenchStamped) -> None:
+        """Keep how sure a jaw's force is."""
+        with self._refusals("standard deviation"):
+            stddev, stamp = ros.force_stddev(message, f"{side}_jaw"), self._enter(f"{side} stddev", message)
+            self.session.take_stddev(side, stddev, stamp)
+
     def _on_contact(self, side: str, cloud: PointCloud2) -> None:
         """Hand to the grasp whether a jaw touches the object."""
         with self._refusals("contact"):
@@ -190,6 +198,8 @@ class GripperDriverNode(Node):
         try:
             yield
         except FinforceError as error:
+            if what == "force":
+                self.session.refuse(str(error))
             self.health.refuse(outcome := Outcome.of_error(error))
             kind = outcome.reason
             if self.health.is_news(what, kind) or not stream:

@@ -160,6 +160,7 @@ def describe_grasp(status: GraspStatus | None) -> dict[str, str]:
         "grasp reason": status.reason,
         "set force [N]": _number(status.goal, 2),
         "force [N]": _number(status.force, 3),
+        "stated deviation of the force [N]": _number(status.stddev, 3),
         "predicted force [N]": _number(status.predicted, 3),
         "peak force [N]": _number(status.peak, 3),
         "overshoot bound [N]": _number(status.overshoot_bound, 3),

@@ -21,7 +21,7 @@ from visualization_msgs.msg import Marker
 
 from finforce.errors import ObservationError
 from finforce.health import Report
-from finforce.messages import check_cloud, check_frame, decode_columns, encode_cloud
+from finforce.messages import check_cloud, check_frame, decode_columns, encode_cloud, magnitude_stddev
 from finforce.stamps import NANOSECONDS
 
 MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
@@ -113,6 +113,17 @@ def grasp_force(message: WrenchStamped, frame: str) -> float:
     """
     check_frame(message, frame, "the grasp wrench")
     return message.wrench.force.x
+
+
+def force_stddev(message: WrenchStamped, frame: str) -> float:
+    """Return the standard deviation [N] of the magnitude of a jaw's force, which is along x up to 15 degrees.
+
+    Raises:
+        ObservationError: the frame is another one, or a deviation is no finite number from 0.
+    """
+    check_frame(message, frame, "the wrench's standard deviation")
+    vector = message.wrench.force
+    return magnitude_stddev((vector.x, vector.y, vector.z))
 
 
 def is_touching(cloud: PointCloud2, frame: str) -> bool:

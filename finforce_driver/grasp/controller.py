@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 
-from finforce_driver.errors import GraspError, UnseenForceError
+from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
 from finforce_driver.grasp.load_watch import ForceFeed, ForceSample, LoadWatch, LocatedForce, TouchSample
 from finforce_driver.grasp.plan import GraspPlan, JawHistory, JawPlace
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus, GraspStep, GripperMove
@@ -54,7 +54,7 @@ class ForceGrasp:
         self._content = 0
         self._excess_since = self._start = math.nan
         self._asked_to_stop = ""
-        self._failed = self._unseen = False
+        self._failed = self._unseen = self._backs_off = False
 
     def take_force(self, sample: ForceSample) -> None:
         """Take the force of an image; it counts with the next `update`."""
@@ -78,6 +78,10 @@ class ForceGrasp:
         self._content = 0
         if self._phase is GraspPhase.HOLDING:
             self._phase, self._reason = GraspPhase.LOADING, "goes to another force"
+
+    def refuse(self, words: str) -> None:
+        """Take note of a force that was refused before it came here, and why."""
+        self._feed.refuse("refused", words)
 
     def stop(self, reason: str) -> None:
         """End the grasp with the next `update`; the jaws hold where they are."""
@@ -107,8 +111,9 @@ class ForceGrasp:
             self._check_witness(state, now)
             self._check_limits(state, now)
             move = self._choose_move(state, now) if fresh else None
-        except UnseenForceError as error:
-            self._phase, self._reason, self._failed, self._unseen = GraspPhase.STOPPED, str(error), True, True
+        except BackOffError as error:
+            self._phase, self._reason, self._failed, self._backs_off = GraspPhase.STOPPED, str(error), True, True
+            self._unseen = isinstance(error, UnseenForceError)
             return GraspStep(move=self._back_off(state, now), stop=False, status=self._status(state, now))
         except GraspError as error:
             self._phase, self._reason = GraspPhase.STOPPED, str(error)
@@ -130,14 +135,15 @@ class ForceGrasp:
                 counts = self._feed.admit_touch(sample, now) and not self._feed.heard and not sample.touching
                 force = 0.0
             else:
-                force = check_force_value(sample.force, self.settings.noise)
+                force = check_force_value(sample.force, max(self.settings.noise, sample.stddev))
                 counts = self._feed.admit(sample)
             if counts:
-                fresh |= self._locate(force, sample.stamp, state, opening_at)
+                stddev = 0.0 if isinstance(sample, TouchSample) else sample.stddev
+                fresh |= self._locate(force, sample.stamp, stddev, state, opening_at)
         return fresh
 
-    def _locate(self, force: float, stamp: float, state: GripperState, opening_at: OpeningAt) -> bool:
-        """Take a force [N] with the opening at the time of its image; False where that is not known."""
+    def _locate(self, force: float, stamp: float, stddev: float, state: GripperState, opening_at: OpeningAt) -> bool:
+        """Take a force [N] with its deviation [N] and the opening at its image; False where that is not known."""
         place = self._jaws.locate(stamp, state, opening_at)
         if math.isnan(place.opening):
             return False
@@ -150,6 +156,7 @@ class ForceGrasp:
             way_stddev=way,
             resting=place.resting,
             passing=passing,
+            stddev=stddev,
         )
         self._load.take(located, self._feed.is_touching(stamp))
         if not (self._load.doubtful or passing):
@@ -270,6 +277,8 @@ class ForceGrasp:
             resolution=self._plan.resolution,
             target=self._jaws.target,
             failed=self._failed,
+            stddev=load.stddev,
+            backs_off=self._backs_off,
             unseen=self._unseen,
             refused=dict(feed.refused),
         )
@@ -331,14 +340,21 @@ def check_silence(feed: ForceFeed, now: float, started: float, settings: GraspSe
         if feed.age(now) > settings.stale_after:
             raise GraspError(
                 f"the newest force is {feed.age(now):.2f} s old, at most {settings.stale_after:g} s are allowed: "
-                "is the camera there, and the solver sure of itself?"
+                + (_refused(feed) or "is the camera there, and the solver sure of itself?")
             )
         return
     touched = feed.touched_since
     if now - touched > settings.touch_timeout:
-        raise GraspError(f"the jaws are said to touch, but no force came for {now - touched:.2f} s")
+        words = f"the jaws are said to touch, but no force came for {now - touched:.2f} s"
+        raise GraspError(f"{words}: {_refused(feed)}" if feed.last_refusal else words)
     heard = max(started, feed.touch.stamp if feed.touch else started)
     if now - heard > settings.silence_timeout:
         raise GraspError(
-            f"no force came for {now - heard:.2f} s: is the camera there, are the solvers tared (30 unloaded images)?"
+            f"no force came for {now - heard:.2f} s: "
+            + (_refused(feed) or "is the camera there, are the solvers tared (30 unloaded images)?")
         )
+
+
+def _refused(feed: ForceFeed) -> str:
+    """Return what was wrong with the forces that came last; empty where nothing was."""
+    return f"those that came were refused, the last one as {feed.last_refusal}" if feed.last_refusal else ""

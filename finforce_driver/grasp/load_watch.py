@@ -15,7 +15,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from statistics import median
 
-from finforce_driver.errors import GraspError
+from finforce_driver.errors import BackOffError, GraspError
 from finforce_driver.grasp.settings import GraspSettings
 
 _LARGEST_OFFSET = 0.2  # [N] that an unloaded estimate may show
@@ -34,6 +34,7 @@ class LocatedForce:
         way_stddev: standard deviation of the way since the last force that was no passing one [m].
         resting: the jaws rested at their target.
         passing: from a way between two rests, whose ends say more than it does.
+        stddev: of the force, as its source states it [N].
     """
 
     force: float
@@ -42,6 +43,7 @@ class LocatedForce:
     way_stddev: float = 0.0
     resting: bool = False
     passing: bool = False
+    stddev: float = 0.0
 
 
 class LoadWatch:
@@ -59,6 +61,7 @@ class LoadWatch:
         opening: that belongs to it [m].
         resting: whether the jaws rested then.
         peak: the largest while loaded [N].
+        stddev: of the force, as its source stated it for the newest that was believed [N].
     """
 
     def __init__(self, settings: GraspSettings, onset_force: float) -> None:
@@ -66,7 +69,7 @@ class LoadWatch:
         self.model = ForceModel(stiffness=settings.largest_stiffness, noise=settings.noise)
         self.loaded = self.doubtful = self.resting = False
         self.force = self.opening = math.nan
-        self.peak = 0.0
+        self.peak = self.stddev = 0.0
         self._idle: deque[float] = deque([0.0], maxlen=15)
         self._above = self._doubts = self._empty = 0
 
@@ -98,6 +101,7 @@ class LoadWatch:
                 f"the force is {sample.force:.2f} N, above the limit of {self._settings.force_limit:g} N: the jaws hold"
             )
         self.force, self.opening, self.resting = sample.force, sample.opening, sample.resting
+        self.stddev = sample.stddev
         if not self.loaded:
             self._watch_onset(sample, touching)
             return
@@ -123,7 +127,8 @@ class LoadWatch:
         """Whether neither motion nor noise explains a force.
 
         Raises:
-            GraspError: that is so in two images in a row.
+            BackOffError: that is so in two images in a row, and the jaws have just touched something.
+            GraspError: likewise, later.
         """
         if math.isnan(self.force):
             return False
@@ -132,6 +137,11 @@ class LoadWatch:
             self._doubts = 0
             return False
         self._doubts += 1
+        if self._doubts >= _CONFIRMED and not self.loaded and sample.opening < self.opening:
+            raise BackOffError(
+                f"the force rose to {sample.force:.2f} N at the first touch, more than {self._bound} explain: is "
+                "something stiffer than that between the jaws? They back off"
+            )
         if self._doubts >= _CONFIRMED:
             verb = "jumped to" if beyond > 0.0 else "fell to"
             raise GraspError(
@@ -147,6 +157,10 @@ class LoadWatch:
         # where contact began between the two images is not known: any force up to the greatest stiffness may be
         reach = self._settings.largest_stiffness * max(0.0, self.opening - sample.opening)
         return max(0.0, sample.force - self.force - reach)
+
+    @property
+    def _bound(self) -> str:
+        return f"{1e-3 * self._settings.largest_stiffness:g} N/mm (largest_stiffness)"
 
     def _check_presence(self, force: float) -> None:
         """Refuse to press on after the force has gone.
@@ -175,11 +189,13 @@ class ForceSample:
         stamp: time of the image [s], on the driver's clock.
         arrived: when the force was there [s], on the same clock.
         force: [N].
+        stddev: of the force, as its source states it [N]; 0 where it states none.
     """
 
     stamp: float
     arrived: float
     force: float
+    stddev: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,6 +217,7 @@ class ForceFeed:
         touch: the newest word on touching; None before the first.
         touched_since: time of the first image of those in a row that show touching [s]; NaN while none does.
         refused: samples that were not admitted, by reason.
+        last_refusal: why the newest force was not, with what would help; empty once one is.
     """
 
     def __init__(self, stale_after: float) -> None:
@@ -209,6 +226,7 @@ class ForceFeed:
         self.touch: TouchSample | None = None
         self.touched_since = math.nan
         self.refused: Counter[str] = Counter()
+        self.last_refusal = ""
         self._latencies: deque[float] = deque(maxlen=31)
         self._periods: deque[float] = deque(maxlen=31)
 
@@ -220,6 +238,10 @@ class ForceFeed:
     def is_touching(self, now: float) -> bool:
         """Whether the newest fresh word says that the jaws touch."""
         return self.touch is not None and self.touch.touching and now - self.touch.stamp <= self._stale_after
+
+    def is_apart(self, now: float) -> bool:
+        """Whether the newest fresh word says that the jaws do not touch."""
+        return self.touch is not None and not self.touch.touching and now - self.touch.stamp <= self._stale_after
 
     @property
     def latency(self) -> float:
@@ -239,13 +261,19 @@ class ForceFeed:
         """Take a force if its times can be; otherwise count why not."""
         reason = self._doubt(sample)
         if reason:
-            self.refused[reason] += 1
+            self.refuse(reason, f"{reason}, {sample.arrived - sample.stamp:.2f} s after its image")
             return False
+        self.last_refusal = ""
         if self.heard:
             self._periods.append(sample.stamp - self.stamp)
         self._latencies.append(sample.arrived - sample.stamp)
         self.stamp = sample.stamp
         return True
+
+    def refuse(self, reason: str, words: str) -> None:
+        """Count a force that cannot be used, and keep why."""
+        self.refused[reason] += 1
+        self.last_refusal = words
 
     def admit_touch(self, sample: TouchSample, now: float) -> bool:
         """Take a word on touching if it is newer than the last one and fresh."""

@@ -26,6 +26,9 @@ _LEAST_SPEED = 0.001  # [m/s] slower would only cost time: the target is bounded
 _FEW_STEPS = 3.5  # by which a target may lie ahead of the one that was sent
 _BACK_STEPS = 1.5  # by which it must lie behind while the jaws move, where a step is noise
 _SPEED_CHANGE = 1.25  # ratio at which a new speed is worth a command
+_CALM = 0.15  # [N] stated deviation of the force above which the jaws go slower
+_CONTRADICTED = 0.5  # share of the speed while the contact estimator says that nothing touches
+_SURE = 2.0  # stated deviations of the force within which it is reckoned with
 _HYSTERESIS = 0.3  # [steps] of force beyond the tolerance before jaws at rest open again
 
 
@@ -75,10 +78,25 @@ class GraspPlan:
         return min(max(wish, self._least), self._jaws.widest)
 
     def choose_speed(self, target: float) -> float:
-        """Return the speed [m/s] at which the next image comes before the jaws are at `target` [m]."""
+        """Return the speed [m/s] at which the next image comes before the jaws are at `target` [m].
+
+        It is less where the force is uncertain, and where contact and force contradict each other.
+        """
         way = abs(self._load.opening - target)
         due = self._feed.latency + 1.5 * self._feed.period + _REACTION
-        return min(self._goal.speed, max(_LEAST_SPEED, way / due))
+        return min(self._goal.speed * self._sureness, max(_LEAST_SPEED, way / due))
+
+    @property
+    def _sureness(self) -> float:
+        """Share of the speed that the force's stated deviation and the contact's state leave."""
+        load, feed = self._load, self._feed
+        sure = min(1.0, _CALM / max(load.stddev, 1e-9)) if load.loaded else 1.0
+        return _CONTRADICTED * sure if load.loaded and feed.is_apart(feed.stamp) else sure
+
+    @property
+    def _caution(self) -> float:
+        """What the force's stated deviation has beyond the tolerance [N]: so much nearer to the set force it may be."""
+        return max(0.0, self._load.stddev - self._settings.tolerance)
 
     def is_worth(self, target: float, speed: float, opening: float) -> bool:
         """Whether a target [m] with a speed [m/s] is worth a command to jaws that are at `opening` [m] now."""
@@ -101,7 +119,8 @@ class GraspPlan:
         """Return by how much the set force may be passed [N] on the way that no image has shown yet.
 
         That way is speed x (latency + period), or what is left to the target. Before contact the greatest expected
-        stiffness holds on it, later twice the learnt one, or the one that is reckoned with if that is more.
+        stiffness holds on it, later twice the learnt one, or the one that is reckoned with if that is more. The force
+        may be off by two of the deviations that its source states.
         """
         load, jaws = self._load, self._jaws
         unseen = min(load.opening - jaws.target, jaws.speed * (self._feed.latency + self._feed.period))
@@ -109,7 +128,8 @@ class GraspPlan:
         if not load.loaded:
             return max(0.0, self.stiffness * unseen - set_force)
         stiffness = max(2.0 * load.model.stiffness, self.stiffness)
-        return max(0.0, load.model.force + load.model.force_stddev + stiffness * unseen - set_force)
+        doubt = load.model.force_stddev + _SURE * load.stddev
+        return max(0.0, load.model.force + doubt + stiffness * unseen - set_force)
 
     def _allowed(self, set_force: float, slack: float = 0.0) -> float:
         """Return by how much the force may rise [N], with `slack` above the set one; negative: by how much to fall."""
@@ -118,14 +138,15 @@ class GraspPlan:
             return max(0.0, self._settings.approach_share * set_force - load.force)
         allowed = set_force + slack - load.model.force
         # a doubt about the force keeps the jaws where they are, and opens them no more than it closes them
-        return max(0.0, allowed - load.model.force_stddev) if allowed > 0.0 else allowed
+        return max(0.0, allowed - load.model.force_stddev - self._caution) if allowed > 0.0 else allowed
 
     def _may_step(self, allowed: float) -> bool:
         """Whether jaws at rest may close by one step for an allowed rise of the force [N]: its effect will be seen."""
         load = self._load
         if not load.loaded:
             return load.force < load.onset
-        return allowed > load.model.likely_stiffness * self._jaws.resolution
+        largest = max(self._settings.largest_stiffness, 1.05 * load.model.stiffness)
+        return allowed > min(load.model.likely_stiffness, largest) * self._jaws.resolution
 
     def _steps_back(self, excess: float) -> int:
         """Return by how many steps jaws at rest are to open for an excess of force [N]."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 from threading import Condition, Lock
 from typing import TYPE_CHECKING, Protocol
 
-from finforce_driver.errors import DriverError, GraspError, GripperTimeoutError, UnseenForceError
+from finforce_driver.errors import BackOffError, DriverError, GraspError, GripperTimeoutError, UnseenForceError
 from finforce_driver.grasp.controller import ForceGrasp
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus, GraspStep
@@ -52,6 +52,7 @@ class GraspSession:
         self._grasp: ForceGrasp | None = None
         self._touches: dict[str, TouchSample] = {}
         self._touch_told = -math.inf
+        self._stddevs: dict[str, tuple[float, float]] = {}
         self._changed = Condition()
 
     @property
@@ -93,10 +94,15 @@ class GraspSession:
             return self.status
 
     def take_force(self, sample: ForceSample) -> None:
-        """Hand the force of an image to the grasp that runs, and let it act on it."""
+        """Hand the force of an image to the grasp that runs, and let it act on it.
+
+        Where it states no deviation, the largest of what was told of the jaws in the last images is taken.
+        """
         with self._changed:
             if self._grasp is not None:
-                self._grasp.take_force(sample)
+                oldest = sample.stamp - self._settings.stale_after
+                told = [stddev for stamp, stddev in self._stddevs.values() if stamp > oldest]
+                self._grasp.take_force(replace(sample, stddev=sample.stddev or max(told, default=0.0)))
                 self.update(self._gripper.state)
 
     def take_touch(self, jaw: str, touching: bool, stamp: float) -> None:
@@ -108,6 +114,17 @@ class GraspSession:
             if self._grasp is not None and stamp > self._touch_told and (touching or complete):
                 self._touch_told = stamp
                 self._grasp.take_touch(any(touch.touching for touch in fresh), stamp)
+
+    def take_stddev(self, jaw: str, stddev: float, stamp: float) -> None:
+        """Keep the standard deviation of a jaw's force [N] in the image at `stamp` [s], for the forces to come."""
+        with self._changed:
+            self._stddevs[jaw] = (stamp, stddev)
+
+    def refuse(self, words: str) -> None:
+        """Keep why a force was refused before it came here, for what the grasp says when none come."""
+        with self._changed:
+            if self._grasp is not None:
+                self._grasp.refuse(words)
 
     def update(self, state: GripperState) -> None:
         """Let the grasp that runs do what is due; what the gripper refuses ends it."""
@@ -249,7 +266,7 @@ def hold_force(
     try:
         while not is_done(status := _turn(gripper, forces, grasp)):
             _await_reply(gripper)
-    except UnseenForceError:
+    except BackOffError:
         raise  # the jaws back off
     except BaseException:
         with suppress(DriverError):
@@ -274,7 +291,8 @@ def _turn(gripper: Gripper, forces: ForceSource, grasp: ForceGrasp) -> GraspStat
     if step.move is not None:
         gripper.move(step.move.opening, step.move.speed, step.move.force)
     if step.status.phase is GraspPhase.STOPPED:
-        raise (UnseenForceError if step.status.unseen else GraspError)(step.status.reason)
+        backing = UnseenForceError if step.status.unseen else BackOffError
+        raise (backing if step.status.backs_off else GraspError)(step.status.reason)
     return step.status
 
 

@@ -120,11 +120,13 @@ class GraspStatus:
         latency: from image to arrival of a force, median [s].
         period: between two images with a force, median [s].
         overshoot_bound: by which the set force is passed at most if the stiffness at most doubles on the way that no
-            image has shown yet [N].
+            image has shown yet, and the force is off by two of its stated deviations [N].
         peak: largest force measured while loaded [N]; 0 before.
         resolution: change of the force with one step of the gripper [N].
         target: opening that the jaws were told to go to [m]; NaN before the first move.
         failed: it was not ended by a command, and nothing has been commanded since.
+        stddev: of the newest force, as its source states it [N].
+        backs_off: it failed, and the jaws go back to where it began.
         unseen: it failed because the motor pressed much harder than the camera said.
         refused: forces and touches that were set aside, by reason.
     """
@@ -143,6 +145,8 @@ class GraspStatus:
     resolution: float = math.nan
     target: float = math.nan
     failed: bool = False
+    stddev: float = 0.0
+    backs_off: bool = False
     unseen: bool = False
     refused: Mapping[str, int] = field(default_factory=dict)
 

@@ -12,6 +12,7 @@ class FrozenSensor:
     """A camera that sees well up to a force [N], and from then on says the same again and again."""
 
     touching = None
+    stddev = 0.0
 
     def __init__(self, frozen_at):
         self.frozen_at, self.last = frozen_at, 0.0
