@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from finforce_driver.emulator.adapter import EmulatedAdapter
+from finforce_driver.emulator.faults import FaultyAdapter, PlannedFault
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
@@ -112,11 +113,18 @@ class GraspTrace:
 class World:
     """One emulated gripper with fingers and camera; it is the force source of `hold_force`, too."""
 
-    def __init__(self, case: GraspCase, sensor: Sensor, settings: GraspSettings | None = None) -> None:
+    def __init__(
+        self,
+        case: GraspCase,
+        sensor: Sensor,
+        settings: GraspSettings | None = None,
+        plan: Sequence[PlannedFault] = (),
+    ) -> None:
         self._case, self._sensor, self._settings = case, sensor, settings
         self.emulated = EmulatedGripper(case.variant, load=case.plant.force_at)
         self.clock = VirtualClock()
-        self.bus = VirtualBus(EmulatedAdapter(self.emulated), self.clock)
+        self.adapter = FaultyAdapter(EmulatedAdapter(self.emulated), plan, case.seed)
+        self.bus = VirtualBus(self.adapter, self.clock)
         self.gripper = Gripper(self.bus, clock=self.clock)
         self._relaxation = Relaxation(case.plant.terms)
         self._random = np.random.default_rng([case.seed, 1])

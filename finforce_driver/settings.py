@@ -18,6 +18,9 @@ class GripperSettings:
     missed_replies: int = setting(25, "requests in a row without a reply after which the port is reopened", "", 2, 1000)
     stroke: float = setting(0.048, "opening of the mechanism between its end stops", "m", 0.001, 0.5)
     closed_opening: float = setting(0.0, "between the jaws' inner faces when the mechanism is closed", "m", 0.0, 0.2)
+    stroke_tolerance: float = setting(
+        0.04, "share of the stroke by which a calibration may find another one; beyond, it is refused", "", 0.001, 1.0
+    )
     pinion_radius: float = setting(0.006, "of the pinion between the two racks", "m", 0.001, 0.1)
     force_per_current: float = setting(47.7, "slope of the maker's curve of grip force", "N/A", 1.0, 500.0)
     least_current: float = setting(0.15, "below it the gripper is unstable", "A", 0.05, 1.0)

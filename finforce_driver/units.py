@@ -40,6 +40,11 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
 
 
+def opening_per_tick(pinion_radius: float) -> float:
+    """Return the opening [m] of a tick of the encoder: both racks move by the pinion's circumference a turn."""
+    return 4.0 * math.pi * pinion_radius / TICKS_PER_TURN
+
+
 class GripperScale:
     """Converts openings, speeds and forces into bytes and back.
 
@@ -53,8 +58,7 @@ class GripperScale:
         self._stroke = settings.stroke
         self._force_per_current = settings.force_per_current
         self._least_current, self._largest_current = settings.least_current, settings.largest_current
-        # both racks move by the pinion's circumference per turn
-        self._opening_per_tick = 4.0 * math.pi * settings.pinion_radius / TICKS_PER_TURN
+        self._opening_per_tick = opening_per_tick(settings.pinion_radius)
 
     @property
     def resolution(self) -> float:

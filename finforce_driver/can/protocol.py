@@ -254,6 +254,15 @@ def decode_supply(message: CanMessage) -> float:
     return 1e-3 * int.from_bytes(_content(message, Command.SUPPLY, 2), "big")
 
 
+def decode_encoder(message: CanMessage) -> int:
+    """Return the count of the motor's encoder [ticks], of all its turns since the start; 16384 are a turn.
+
+    Raises:
+        CanMessageError: it is no answer to command 28.
+    """
+    return _signed(_content(message, Command.ENCODER, 8)[:4])
+
+
 def decode_errors(message: CanMessage) -> ErrorReport:
     """Return what is latched; no name beside a fault means the E-stop of a command 61.
 

@@ -1,10 +1,12 @@
-"""One calibration from the request to its end, which the gripper does not announce."""
+"""One calibration from the request to its end, which the gripper does not announce, and whether its stops can be."""
 
 from __future__ import annotations
 
 from enum import Enum, auto
 
-from finforce_driver.can.protocol import Reply
+from finforce_driver.can.protocol import CanMessage, Reply, decode_encoder
+from finforce_driver.settings import GripperSettings
+from finforce_driver.units import opening_per_tick
 
 TIME_LIMIT = 35.0  # [s]: the firmware gives up after 30 s
 BOOT_TIME = 3.0  # [s] after a reset
@@ -19,6 +21,88 @@ NO_GRIPPER = (
     "(#Gripper 1, #Save over UART)"
 )
 CALIBRATED_REPLIES = 2  # the first reply may carry a position of before
+
+
+UNCHECKED = "calibrated; whether all of the stroke was travelled is not known: the gripper does not tell its encoder"
+FASTEST = 16000.0  # [ticks/s] of a calibrating gripper, 14150 at most
+JITTER = 60  # [ticks] by which a count may differ from the last one beside that
+SILENCES = 3  # questions without any answer after which there is none to be had
+
+
+class Travel:
+    """The way that the motor goes during a calibration, by the counts of its encoder.
+
+    A count is believed when it goes on from the last one: a digit that fell over on the line is a count, too.
+
+    Attributes:
+        answers: counts that came.
+
+    Args:
+        settings: stroke, its tolerance, pinion, and how often is asked.
+    """
+
+    def __init__(self, settings: GripperSettings) -> None:
+        self._settings = settings
+        self._period = 1.0 / settings.poll_rate
+        self._per_tick = opening_per_tick(settings.pinion_radius)
+        self.answers = self._silences = 0
+        self._next_time = 0.0
+        self._last: tuple[float, int] | None = None
+        self._believed: float | None = None  # time of the newest believed count
+        self._low = self._high = 0
+        self._gap = 0.0
+
+    def is_due(self, now: float) -> bool:
+        """Whether the encoder is to be asked now."""
+        return now >= self.next_time
+
+    @property
+    def next_time(self) -> float:
+        """When the encoder is asked next [s]; infinite where it never answers."""
+        return self._next_time if self.answers or self._silences < SILENCES else float("inf")
+
+    def ask(self, now: float) -> None:
+        """Note that the encoder is asked."""
+        self._next_time = now + self._period
+
+    def miss(self) -> None:
+        """Note that no answer came."""
+        self._silences += 1
+
+    def take(self, message: CanMessage, now: float) -> None:
+        """Take an answer that came at a time [s]."""
+        self.answers += 1
+        ticks, last = decode_encoder(message), self._last
+        self._last = (now, ticks)
+        if last is None or abs(ticks - last[1]) > FASTEST * (now - last[0]) + JITTER:
+            return
+        if self._believed is None:
+            self._low = self._high = ticks
+        else:
+            self._gap = max(self._gap, now - max(self._believed, last[0]))
+        self._low, self._high = min(self._low, ticks), max(self._high, ticks)
+        self._believed = now
+
+    def has_seen(self, time: float) -> bool:
+        """Whether a count was believed after a time [s], or none is to be had."""
+        return self.next_time == float("inf") or (self._believed is not None and self._believed > time)
+
+    def find_doubt(self) -> str:
+        """Return what is wrong with the way that was gone; empty where nothing is."""
+        if not self.answers:
+            return ""
+        settings, way = self._settings, self._per_tick * (self._high - self._low)
+        # between two counts the jaws may have gone on to a stop and come back
+        unseen = 0.5 * self._per_tick * FASTEST * max(0.0, self._gap - 1.5 * self._period)
+        least, most = (settings.stroke * (1.0 + sign * settings.stroke_tolerance) for sign in (-1.0, 1.0))
+        words = f"the jaws travelled {1e3 * way:.1f} mm of the stroke of {1e3 * settings.stroke:.1f} mm"
+        if way > most:
+            return f"{words}: is gripper.stroke or gripper.pinion_radius wrong, or does the pinion slip?"
+        if way + unseen < least:
+            return f"{words}: is something between them? Take it out, then calibrate again"
+        if way < least:
+            return f"{words}, and too many replies were lost to tell whether that is all: calibrate again"
+        return ""
 
 
 class CalibrationStep(Enum):
@@ -37,14 +121,18 @@ class CalibrationRun:
 
     Attributes:
         step: what is to be done next.
-        reason: why it failed.
+        reason: why it failed, or what is to be said of its success.
+        travel: the way that the jaws have gone.
 
     Args:
+        settings: of the gripper.
         calibrated: the gripper is calibrated already, so that its flag says nothing about the end.
         reset: an earlier calibration was aborted.
     """
 
-    def __init__(self, *, calibrated: bool, reset: bool) -> None:
+    def __init__(self, settings: GripperSettings, *, calibrated: bool, reset: bool) -> None:
+        self._settings = settings
+        self.travel = Travel(settings)
         self.step = CalibrationStep.RESET if reset else CalibrationStep.START
         self.reason = ""
         self._was_calibrated = calibrated and not reset
@@ -73,6 +161,7 @@ class CalibrationRun:
         self._starts += 1
         self._begun, self.step = now, CalibrationStep.WATCH
         self._place, self._runs, self._moved = None, False, False
+        self.travel = Travel(self._settings)
 
     def fail(self, reason: str) -> None:
         """End it without success."""
@@ -116,7 +205,7 @@ class CalibrationRun:
         self._closed |= self._opened and reply.position >= CLOSED
         self._idle = self._idle + 1 if self._closed and abs(reply.current_mA) < IDLE_CURRENT else 0
         if self._idle >= IDLE_REPLIES and now > self._begun + LEAST_TIME:
-            self.step = CalibrationStep.DONE
+            self._end()
 
     def _check_end(self, reply: Reply, now: float) -> None:
         """Check what the flag tells: a controller that is no gripper moves, too, and keeps its position.
@@ -125,7 +214,17 @@ class CalibrationRun:
         """
         self._ended = now if self._ended is None else self._ended
         self._calibrated = self._calibrated + 1 if self._moved or reply.position >= CLOSED else 0
-        if self._calibrated >= CALIBRATED_REPLIES:
-            self.step = CalibrationStep.DONE
-        elif now > self._ended + END_TIME:
+        # what is soft between the jaws opens them: a count is waited for, for as long as the position is
+        seen = self.travel.has_seen(self._ended) or now > self._ended + END_TIME
+        if self._calibrated >= CALIBRATED_REPLIES and seen:
+            self._end()
+        elif self._calibrated < CALIBRATED_REPLIES and now > self._ended + END_TIME:
             self.fail(NO_GRIPPER)
+
+    def _end(self) -> None:
+        """End it, well if the jaws went from stop to stop."""
+        if doubt := self.travel.find_doubt():
+            self.fail(doubt)
+        else:
+            self.step = CalibrationStep.DONE
+            self.reason = "" if self.travel.answers else UNCHECKED

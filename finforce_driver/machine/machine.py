@@ -210,7 +210,9 @@ class GripperMachine:
         self.orders.drop()
         self._echo.forget()
         self.note, self._enabled = "", True
-        self.calibration = CalibrationRun(calibrated=self.known.calibrated, reset=self.known.half_calibrated)
+        self.calibration = CalibrationRun(
+            self.settings, calibrated=self.known.calibrated, reset=self.known.half_calibrated
+        )
         self._refresh()
 
     def clear_errors(self) -> None:
@@ -332,7 +334,7 @@ class GripperMachine:
             self.note = OTHER_NODE.format(node=self.settings.node_id, other=request.node)
             self._refresh()
         elif not request.counted:
-            self.known.telemetry.take(request.answer, message, now)
+            self._take_answer(request, message, now)
         return True
 
     def on_silence(self, now: float, suspicion: str = "") -> None:
@@ -344,7 +346,7 @@ class GripperMachine:
         if request.move is not None and self.orders.urgent and self.orders.wanted.drives:
             self._postpone_hold()
         if not request.counted:
-            self.known.telemetry.miss(now)
+            self._miss_answer(request, now)
             return
         if self.exchange.misses >= (PROBES if self.known.reply is None else SHORT_SILENCE) and not self._silent:
             self._silent = True
@@ -352,6 +354,20 @@ class GripperMachine:
                 self._abort(LOST_ORDER)
             self.note = self.note or suspicion or SILENT.format(node=self.settings.node_id)
             self._refresh()
+
+    def _take_answer(self, request: Request, message: CanMessage, now: float) -> None:
+        """Take the answer to a question."""
+        if request.answer is not Command.ENCODER:
+            self.known.telemetry.take(request.answer, message, now)
+        elif self.calibration is not None:
+            self.calibration.travel.take(message, now)
+
+    def _miss_answer(self, request: Request, now: float) -> None:
+        """Note that a question was not answered."""
+        if request.answer is not Command.ENCODER:
+            self.known.telemetry.miss(now)
+        elif self.calibration is not None:
+            self.calibration.travel.miss()
 
     # For the choice of requests
 

@@ -38,6 +38,7 @@ class RequestSource:
         self._machine = machine
         self._node = machine.settings.node_id
         self._next_poll = -math.inf
+        self._polled = False
         # an order leaves on the word of a reply, not on that of an old one
         self._freshness = 1.5 / machine.settings.poll_rate + machine.settings.reply_timeout
         self._searched = machine.settings.node_id
@@ -49,6 +50,7 @@ class RequestSource:
             self._order,
             self._doubt,
             self._sequence,
+            self._travel,
             self._poll,
             self._telemetry,
         )
@@ -66,6 +68,8 @@ class RequestSource:
             return machine.calibration.quiet_until(now)
         step = machine.job.next_time if machine.job is not None and machine.may_drive else math.inf
         question = machine.known.telemetry.next_time if self._may_ask() else math.inf
+        if self._may_watch():
+            question = machine.calibration.travel.next_time
         wanted = machine.known.filter.doubtful or machine.hold_wanted
         repetition = machine.exchange.sent + SPACING if wanted else math.inf
         poll = machine.exchange.sent + LATEST_REPLY if self._resting() else self._next_poll
@@ -108,8 +112,8 @@ class RequestSource:
         return self._request_of(machine.orders.wanted)
 
     def _marker(self, _: float) -> Request | None:
-        """The way back into step; during a calibration only polls are sent."""
-        return None if self._machine.calibration else self._machine.exchange.marker()
+        """The way back into step."""
+        return self._machine.exchange.marker()
 
     def _doubt(self, now: float) -> Request | None:
         """A reply that is not believed is asked for again, and one that tells where to hold."""
@@ -133,6 +137,16 @@ class RequestSource:
             return Request(message=encode_command(self._node, Command.CALIBRATE))
         return None
 
+    def _travel(self, now: float) -> Request | None:
+        """A question for the encoder's count while the gripper looks for its stops, in turn with the polls."""
+        run = self._machine.calibration
+        if not self._may_watch() or not run.travel.is_due(now):
+            return None
+        run.travel.ask(now)
+        self._polled = False
+        message = encode_request(self._node, Command.ENCODER)
+        return Request(message=message, answer=Command.ENCODER, node=self._node, counted=False)
+
     def _order(self, now: float) -> Request | None:
         """The wanted order, where it differs from the gripper's and may leave."""
         machine = self._machine
@@ -153,6 +167,7 @@ class RequestSource:
         period = 1.0 / self._machine.settings.poll_rate
         # a late poll does not delay the next ones, unless it is so late that one is left out
         self._next_poll = max(self._next_poll + period, now)
+        self._polled = True
         misses = self._machine.exchange.misses
         if misses < SEARCH_MISSES or misses % 2 or self._machine.calibration is not None:
             return self._poll_now()
@@ -169,8 +184,12 @@ class RequestSource:
 
     def _resting(self) -> bool:
         machine, exchange = self._machine, self._machine.exchange
-        unmarked = machine.calibration is not None or exchange.marker() is None
-        return unmarked and not exchange.in_step and machine.known.reply is not None and not machine.silent
+        return (
+            exchange.marker() is None
+            and not exchange.in_step
+            and machine.known.reply is not None
+            and not machine.silent
+        )
 
     def _search(self) -> Request:
         """A ping to another node, which changes nothing there."""
@@ -191,6 +210,11 @@ class RequestSource:
         machine = self._machine
         known = machine.known.reply is not None and machine.exchange.in_step
         return known and machine.calibration is None and machine.recovery is None
+
+    def _may_watch(self) -> bool:
+        run = self._machine.calibration
+        watches = run is not None and run.step is CalibrationStep.WATCH
+        return watches and self._polled and self._machine.exchange.in_step
 
     def _poll_now(self) -> Request:
         return Request(message=encode_poll(self._node), answer=Command.REPLY, node=self._node)

@@ -44,7 +44,7 @@ def test_a_calibration_finds_the_stops_and_ends_closed(rig):
 
 
 @both_variants
-def test_during_a_calibration_only_empty_polls_are_sent(rig):
+def test_during_a_calibration_only_empty_polls_and_questions_are_sent(rig):
     rig.gripper.calibrate()
     rig.live(0.1)
     begin = rig.clock.now()
@@ -52,7 +52,71 @@ def test_during_a_calibration_only_empty_polls_are_sent(rig):
     while rig.state.phase is Phase.CALIBRATING:
         assert math.isnan(rig.state.opening)
         rig.gripper.turn()
-    assert {(message.id, message.data, message.remote) for message in rig.sent(begin)} == {(0x07A, b"", False)}
+    assert {message.data for message in rig.sent(begin)} == {b""}
+    assert {message.id for message in rig.sent(begin) if not message.remote} == {0x07A}
+    assert 0x038 in {message.id for message in rig.sent(begin) if message.remote}
+
+
+@both_variants
+@pytest.mark.parametrize("width", [0.003, 0.010, 0.020, 0.040])
+def test_a_calibration_with_an_object_between_the_jaws_is_refused(rig, width):
+    rig.emulated.jaws.object_opening = width
+    rig.gripper.calibrate()
+    state = rig.wait_for(Phase.UNCALIBRATED, Phase.READY)
+    assert state.phase is Phase.UNCALIBRATED and math.isnan(state.opening)
+    assert f"travelled {1e3 * (0.048 - width):.0f}" in state.message and "something between them" in state.message
+    with pytest.raises(GripperStateError, match="something between them"):
+        rig.gripper.move(0.03)
+    rig.emulated.jaws.object_opening = None
+    rig.gripper.calibrate()
+    rig.wait_for(Phase.READY)
+    rig.arrive(0.03)
+    assert rig.emulated.true_opening == pytest.approx(0.03, abs=2e-4)
+
+
+@both_variants
+def test_a_recalibration_with_an_object_between_the_jaws_is_refused(rig):
+    rig.gripper.calibrate()
+    rig.wait_for(Phase.READY)
+    rig.arrive(0.04)
+    rig.emulated.jaws.object_opening = 0.012
+    rig.gripper.calibrate()
+    assert "something between them" in rig.wait_for(Phase.UNCALIBRATED, Phase.READY).message
+
+
+@both_variants
+@pytest.mark.parametrize("seed", range(6))
+def test_lost_and_garbled_counts_do_not_hide_an_object_nor_invent_one(variant, seed):
+    for width in (None, 0.012):
+        rig = Rig(variant, calibrated=False)
+        rig.emulated.jaws.object_opening = width
+        rig.gripper.calibrate()
+        kinds = (FaultKind.LOST, FaultKind.FLIPPED, FaultKind.LATE, FaultKind.GARBAGE)
+        for number in range(12):
+            rig.live(0.05 + 0.011 * seed)
+            if rig.state.phase is Phase.CALIBRATING:
+                rig.adapter.inject(kinds[(number + seed) % 4])
+        state = rig.wait_for(Phase.UNCALIBRATED, Phase.READY)
+        if width is not None:
+            assert state.phase is Phase.UNCALIBRATED
+        else:
+            assert state.phase is Phase.READY or "replies were lost" in state.message
+
+
+@both_variants
+def test_a_stroke_that_the_settings_do_not_have_is_refused(variant):
+    rig = Rig(variant, calibrated=False, stroke=0.040)
+    rig.gripper.calibrate()
+    assert "gripper.stroke" in rig.wait_for(Phase.UNCALIBRATED, Phase.READY).message
+
+
+@both_variants
+def test_a_gripper_that_does_not_tell_its_encoder_is_calibrated_and_that_is_said(rig):
+    sent = rig.bus.send
+    rig.bus.send = lambda message: None if message.id == 0x038 else sent(message)
+    rig.gripper.calibrate()
+    assert "is not known" in rig.wait_for(Phase.UNCALIBRATED, Phase.READY).message
+    assert rig.state.phase is Phase.READY
 
 
 @both_variants

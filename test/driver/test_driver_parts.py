@@ -12,6 +12,7 @@ from finforce_driver.machine.exchange import MARKERS, Exchange, Request
 from finforce_driver.machine.knowledge import History, Telemetry
 from finforce_driver.machine.move import GRACE, Goal, MoveJob, MoveWatch
 from finforce_driver.machine.orders import Orders
+from finforce_driver.settings import GripperSettings
 from finforce_driver.state import MoveOutcome
 from finforce_driver.units import Pace
 
@@ -99,8 +100,10 @@ def test_a_slow_move_begins_where_the_jaws_are_not_where_they_were_thought_to_be
 
 
 def test_the_first_reply_that_says_calibrated_does_not_end_a_calibration():
-    run = CalibrationRun(calibrated=False, reset=False)
+    run = CalibrationRun(GripperSettings(), calibrated=False, reset=False)
     run.start(0.0)
+    for _ in range(3):
+        run.travel.miss()  # it does not tell its encoder
     steps = []
     for time, position, calibrated in ((0.5, 0, False), (1.0, 255, False), (2.0, 255, True), (2.02, 255, True)):
         run.take(reply(position=position, calibrated=calibrated, current_mA=-400), time)
