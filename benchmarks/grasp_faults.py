@@ -49,6 +49,7 @@ HELD = 1.5  # [s] that is held before the user is content
 WATCHED = 1.2  # [s] after the end
 SOUND = 1.0  # [s] for which camera and link have to have been sound for a held force to be judged
 DEBOUNCED = 0.1  # [s] in which jaws that are said to be ready may come to rest
+SILENT = 0.15  # [s] without a believed reply after which the link counts as away
 SETTLED = 0.3  # [s] in which a stop may take effect, from when the link is there
 CREEP = 2.2  # [counts] of closing that are none
 # left out: another program that drives the jaws, a gripper that takes itself for none and lets go of them unseen (both
@@ -192,7 +193,7 @@ class FaultyGrasp(World):
         """Let the fingers live and look at them."""
         super().step(dt)
         now = self.clock.now()
-        if not self.adapter.plugged or self.gripper.state.phase in (Phase.DISCONNECTED, Phase.PROBING):
+        if not self.adapter.plugged or not now - self.gripper.state.stamp <= SILENT:
             self._unlinked = now
         if self.force > LIMIT:
             self._complain("pressed")

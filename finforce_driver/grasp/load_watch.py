@@ -20,6 +20,7 @@ from finforce_driver.grasp.settings import GraspSettings
 
 _LARGEST_OFFSET = 0.2  # [N] that an unloaded estimate may show
 _CONFIRMED = 2  # images in a row that make an onset, or a jump
+_FROZEN, _FROZEN_WAY = 4, 0.4e-3  # images in a row with the same force to the last digit, and [m] closed meanwhile
 _EMPTY = 3  # images in a row without force after which the object is gone
 
 
@@ -71,7 +72,8 @@ class LoadWatch:
         self.force = self.opening = math.nan
         self.peak = self.stddev = 0.0
         self._idle: deque[float] = deque([0.0], maxlen=15)
-        self._above = self._doubts = self._empty = 0
+        self._above = self._doubts = self._empty = self._same = 0
+        self._last = self._last_opening = math.nan
 
     @property
     def pressing(self) -> float:
@@ -91,8 +93,9 @@ class LoadWatch:
             touching: the jaws are said to touch, so that one image makes an onset.
 
         Raises:
-            GraspError: the force is above the limit, a jump was confirmed, or the object is gone.
+            GraspError: the force is above the limit or frozen, a jump was confirmed, or the object is gone.
         """
+        self._check_life(sample)
         self.doubtful = self._is_jump(sample)
         if self.doubtful:
             return
@@ -161,6 +164,23 @@ class LoadWatch:
     @property
     def _bound(self) -> str:
         return f"{1e-3 * self._settings.largest_stiffness:g} N/mm (largest_stiffness)"
+
+    def _check_life(self, sample: LocatedForce) -> None:
+        """Refuse a force that stays the same while the jaws close; none at all always does.
+
+        Raises:
+            GraspError: several images in a row have the same force to the last digit.
+        """
+        if sample.force != self._last or sample.force <= 0.0:
+            self._same, self._last, self._last_opening = 0, sample.force, sample.opening
+            return
+        self._same += 1
+        # below the onset an offset may be the same for ever
+        if sample.force > self.onset and self._same >= _FROZEN - 1 and self._last_opening - sample.opening > _FROZEN_WAY:
+            raise GraspError(
+                f"the force is {sample.force} N to the last digit in {self._same + 1} images, although the jaws close: "
+                "is the estimator frozen?"
+            )
 
     def _check_presence(self, force: float) -> None:
         """Refuse to press on after the force has gone.

@@ -28,6 +28,8 @@ _BACK_STEPS = 1.5  # by which it must lie behind while the jaws move, where a st
 _SPEED_CHANGE = 1.25  # ratio at which a new speed is worth a command
 _CALM = 0.15  # [N] stated deviation of the force above which the jaws go slower
 _CONTRADICTED = 0.5  # share of the speed while the contact estimator says that nothing touches
+_WITNESS_TIME = 0.15  # [s] from a force to the stop that the motor's current brings about
+_FRICTION = 1.0  # [N] by which the motor's current may tell too little
 _SURE = 2.0  # stated deviations of the force within which it is reckoned with
 _HYSTERESIS = 0.3  # [steps] of force beyond the tolerance before jaws at rest open again
 
@@ -84,7 +86,14 @@ class GraspPlan:
         """
         way = abs(self._load.opening - target)
         due = self._feed.latency + 1.5 * self._feed.period + _REACTION
-        return min(self._goal.speed * self._sureness, max(_LEAST_SPEED, way / due))
+        return min(self._goal.speed * self._sureness, self._blind_speed, max(_LEAST_SPEED, way / due))
+
+    @property
+    def _blind_speed(self) -> float:
+        """Speed [m/s] at which the motor's current tells early enough that something presses where nothing is seen."""
+        given = self._settings
+        spare = max(0.0, given.force_limit - given.motor_margin - _FRICTION)
+        return max(_LEAST_SPEED, spare / (given.largest_stiffness * _WITNESS_TIME))
 
     @property
     def _sureness(self) -> float:

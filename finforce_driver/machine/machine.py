@@ -193,8 +193,14 @@ class GripperMachine:
         """Stop in place and hold, or end a calibration, limp; a gripper that stands or was let go stays as it is.
 
         Raises:
-            GripperStateError: the jaws are limp, or unknown.
+            GripperStateError: the jaws are limp, or unknown. One that has just fallen silent is held as soon as it
+                answers again.
         """
+        if self._silent and self.calibration is None and self.known.driving:
+            self._end_job(MoveOutcome.REPLACED)
+            self._postpone_hold()
+            self._refresh()
+            raise GripperStateError("hold pending: the gripper does not answer; it is held as soon as it does")
         self._require("hold", (*USABLE, Phase.CALIBRATING))
         self._hold(now)
         self._refresh()
