@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from finforce_driver.gripper import Gripper
 
 CALIBRATION_TIMEOUT = 50.0  # s; the driver gives up after 35 s, and a reset may go before
+STOP_TIMEOUT = 0.2  # s in which a gripper says that it stands; usually 0.02 s
 CLEARING_TIMEOUT = 2.0  # s; it takes 0.2 s
 WATCH_PERIOD = 0.1  # s
 MOVE_MARGIN = 5.0  # s beyond the time that the way takes
@@ -58,14 +59,16 @@ class GripperTasks:
         return "the gripper holds in place"
 
     def estop(self) -> str:
-        """Stop at once, limp; before anything else is looked at.
+        """Stop at once, limp, before anything else is looked at; return when the gripper says that it stands.
 
         Raises:
-            GripperStateError: no gripper answers; the stop is pending.
+            GripperStateError: it does not say so, or no gripper answers; the stop is pending.
         """
         self._gripper.estop()
         self._command(lambda: None, "emergency stop")
-        if self._gripper.state.phase in ABSENT:
+        with suppress(GripperTimeoutError):
+            self._gripper.wait(lambda state: not state.stop_pending, STOP_TIMEOUT)
+        if self._gripper.state.phase in ABSENT or self._gripper.state.stop_pending:
             raise GripperStateError(
                 "emergency stop pending: no link to the gripper, whose jaws may go on moving; it is sent once one "
                 "answers, until clear_errors ends it"

@@ -51,6 +51,7 @@ class GripperState:
         activated: its power stage may move it.
         faults: names of what is latched, in the gripper's order.
         estopped: an emergency stop is latched, by us or by it.
+        stop_pending: an emergency stop was asked for, and the gripper has not said yet that it stands.
         outcome: of the last move.
         message: one sentence: how it is, and what would help.
         temperature: of the motor [deg C]; NaN unknown.
@@ -72,6 +73,7 @@ class GripperState:
     activated: bool = False
     faults: tuple[str, ...] = ()
     estopped: bool = False
+    stop_pending: bool = False
     outcome: MoveOutcome = MoveOutcome.NONE
     message: str = ""
     temperature: float = math.nan
@@ -89,6 +91,7 @@ OTHER_MASTER = "another program commands this gripper ({what}): stop it, then co
 REBOOTED = "the gripper lost its calibration, it was probably restarted: calibrate it"
 UNCALIBRATED = "the gripper is not calibrated: keep the jaws clear, then calibrate"
 HALF_CALIBRATED = "a calibration was cut short: calibrate again, which restarts the gripper and takes 3 s longer"
+STOP_PENDING = "emergency stop pending: the gripper has not confirmed it, its jaws may go on moving; it is sent again"
 STOPPED = "emergency stop: make the place safe, then clear the errors"
 FAULTS = {
     "temperature": "the motor is too hot: let it cool, use less force, then clear the errors",

@@ -176,7 +176,11 @@ class LoadWatch:
             return
         self._same += 1
         # below the onset an offset may be the same for ever
-        if sample.force > self.onset and self._same >= _FROZEN - 1 and self._last_opening - sample.opening > _FROZEN_WAY:
+        if (
+            sample.force > self.onset
+            and self._same >= _FROZEN - 1
+            and self._last_opening - sample.opening > _FROZEN_WAY
+        ):
             raise GraspError(
                 f"the force is {sample.force} N to the last digit in {self._same + 1} images, although the jaws close: "
                 "is the estimator frozen?"

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from finforce_driver.machine.move import CLEAR_CURRENT, CONTACT_TIME, push_direction
-from finforce_driver.state import HALF_CALIBRATED, GripperState, Phase, describe
+from finforce_driver.machine.stop import StopStage
+from finforce_driver.state import HALF_CALIBRATED, STOP_PENDING, GripperState, Phase, describe
 
 if TYPE_CHECKING:
     from finforce_driver.machine.machine import GripperMachine
@@ -36,6 +37,7 @@ def build_state(machine: GripperMachine, link_counts: Mapping[str, int]) -> Grip
         calibrated=placed,
         activated=bool(reply and reply.activated),
         faults=faults,
+        stop_pending=machine.stop.stage is StopStage.WANTED,
         estopped=stopped or "E-stop" in faults,
         outcome=machine.outcome,
         message=_sentence(machine, phase, faults),
@@ -68,6 +70,8 @@ def _push(machine: GripperMachine) -> int:
 
 def _sentence(machine: GripperMachine, phase: Phase, faults: tuple[str, ...]) -> str:
     """Return how the gripper is, and what would help."""
+    if machine.stop.stage is StopStage.WANTED:
+        return STOP_PENDING
     if machine.note and phase is not Phase.FAULT:
         return machine.note
     if phase is Phase.UNCALIBRATED and machine.known.half_calibrated:

@@ -218,3 +218,10 @@ def test_the_standard_action_is_offered_where_its_type_is_installed(probe, monke
     assert result.result().reached_goal and goal.ends == ["succeed"]
     node.destroy_node()
     assert node.action.destroyed
+
+
+def test_an_emergency_stop_that_the_gripper_does_not_confirm_is_pending(probe):
+    gripper, _ = driver(probe)
+    gripper.reply(stop_pending=True, estopped=True, phase=Phase.FAULT)
+    answer = call(probe, Trigger, "estop")
+    assert not answer.success and "emergency stop pending" in answer.message
