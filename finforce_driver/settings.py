@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from finforce.settings import check_bounds, setting
 from finforce_driver.errors import TargetError
 
+LEAST_WATCHDOG = 0.2  # [s]
+
 
 @dataclass(frozen=True, kw_only=True)
 class GripperSettings:
@@ -28,6 +30,13 @@ class GripperSettings:
     default_speed: float = setting(0.02, "of the opening, where a command names none", "m/s", 1e-4, 0.37)
     default_current: float = setting(0.5, "current limit where a command names no force", "A", 0.15, 1.5)
     telemetry_period: float = setting(1.0, "between two questions for temperature, supply or errors", "s", 0.05, 3600.0)
+    watchdog: float = setting(
+        0.0,
+        "silence of the driver after which the gripper goes limp by itself; 0: it goes on with its order",
+        "s",
+        0,
+        60,
+    )
     release_on_stop: bool = setting(False, "let go when the driver ends; else it goes on holding", "")
 
     @property
@@ -51,9 +60,15 @@ class GripperSettings:
         """Refuses values out of bounds.
 
         Raises:
-            TargetError: a value is out of its bounds, or the default current lies outside the currents' range.
+            TargetError: a value is out of its bounds, the watchdog too short, or the default current lies outside the
+                currents' range.
         """
         check_bounds(self, TargetError)
+        if 0.0 < self.watchdog < LEAST_WATCHDOG:
+            raise TargetError(
+                f"watchdog: got {self.watchdog:g} s, expected 0 for none, or {LEAST_WATCHDOG:g} s at least: a computer "
+                "stands still for a moment now and then"
+            )
         if not self.least_current <= self.default_current <= self.largest_current:
             raise TargetError(
                 f"default_current: got {self.default_current:g} A, expected {self.least_current:g} to "

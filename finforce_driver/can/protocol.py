@@ -199,6 +199,15 @@ def encode_command(node: int, command: Command) -> CanMessage:
     return CanMessage(id=identifier(node, command))
 
 
+def encode_watchdog(node: int, seconds: float) -> list[CanMessage]:
+    """Return what sets the gripper's watchdog [s], 0 for none: in the form of newer firmware and in that of older.
+
+    Each takes the form that it knows and ignores the other one; neither is answered.
+    """
+    data = round(1e3 * seconds).to_bytes(4, "big", signed=True)
+    return [CanMessage(id=identifier(node, Command.WATCHDOG), data=form) for form in (data + b"\x00", data)]
+
+
 def encode_request(node: int, command: Command) -> CanMessage:
     """Return the remote message that asks for a value; the answer has the same command."""
     return CanMessage(id=identifier(node, command), remote=True)

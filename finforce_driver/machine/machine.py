@@ -11,7 +11,7 @@ from collections import Counter, deque
 from collections.abc import Mapping
 
 from finforce_driver.can.bus import CanMessage
-from finforce_driver.can.protocol import Command, Flag, Move, Reply, decode_reply, split_identifier
+from finforce_driver.can.protocol import Command, Flag, Move, Reply, decode_reply, encode_watchdog, split_identifier
 from finforce_driver.errors import GripperStateError, TargetError
 from finforce_driver.machine.calibration import CalibrationRun, CalibrationStep
 from finforce_driver.machine.exchange import Exchange, Request
@@ -99,6 +99,7 @@ class GripperMachine:
         self._joined = self._silent = False
         self._arrival: Arrival | None = None
         self._order_sent = -math.inf
+        self.farewell: deque[CanMessage] = deque()
         self._link_counts: Mapping[str, int] = {}
         self._requests = RequestSource(self)
         self._sent: deque[CanMessage] = deque(maxlen=ECHOES)
@@ -153,7 +154,7 @@ class GripperMachine:
     @property
     def has_orders(self) -> bool:
         """Whether an order or an emergency stop has still to be sent."""
-        return self.orders.pending or (self.stop.active and not self.known.error)
+        return self.orders.pending or bool(self.farewell) or (self.stop.active and not self.known.error)
 
     @property
     def must_reopen(self) -> bool:
@@ -283,6 +284,9 @@ class GripperMachine:
             self.activate(False, now)
         elif self.phase in (*USABLE, Phase.CALIBRATING):
             self.hold(now)
+        if self.settings.watchdog and not self.settings.release_on_stop:
+            # what is held stays held, with nobody to feed the watchdog
+            self.farewell = deque(encode_watchdog(self.settings.node_id, 0.0))
 
     # What the carrier asks and tells
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import (
     LARGEST_NODE,
     Command,
@@ -14,6 +15,7 @@ from finforce_driver.can.protocol import (
     encode_move,
     encode_poll,
     encode_request,
+    encode_watchdog,
 )
 from finforce_driver.machine.calibration import CalibrationStep
 from finforce_driver.machine.exchange import Request
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 
 LATEST_REPLY = 0.5  # [s] after which no reply is expected any more
 SPACING = 0.001  # [s] before a reply is asked for again
+WATCHDOG_PERIOD = 1.0  # [s] between two settings of the gripper's watchdog
 SEARCH_MISSES = 10  # requests without a reply after which other nodes are looked for
 
 
@@ -39,6 +42,8 @@ class RequestSource:
         self._node = machine.settings.node_id
         self._next_poll = -math.inf
         self._polled = False
+        self._next_watchdog = -math.inf
+        self._watchdogs: list[CanMessage] = []
         # an order leaves on the word of a reply, not on that of an old one
         self._freshness = 1.5 / machine.settings.poll_rate + machine.settings.reply_timeout
         self._searched = machine.settings.node_id
@@ -51,6 +56,7 @@ class RequestSource:
             self._doubt,
             self._sequence,
             self._travel,
+            self._watchdog,
             self._poll,
             self._telemetry,
         )
@@ -146,6 +152,18 @@ class RequestSource:
         self._polled = False
         message = encode_request(self._node, Command.ENCODER)
         return Request(message=message, answer=Command.ENCODER, node=self._node, counted=False)
+
+    def _watchdog(self, now: float) -> Request | None:
+        """The gripper's watchdog, again and again, since it forgets it when it restarts; none at the end."""
+        machine, seconds = self._machine, self._machine.settings.watchdog
+        if machine.farewell:
+            return Request(message=machine.farewell.popleft())
+        if not seconds or machine.known.reply is None or machine.calibration is not None:
+            return None
+        if now >= self._next_watchdog:
+            self._next_watchdog = now + WATCHDOG_PERIOD
+            self._watchdogs = encode_watchdog(self._node, seconds)
+        return Request(message=self._watchdogs.pop(0)) if self._watchdogs else None
 
     def _order(self, now: float) -> Request | None:
         """The wanted order, where it differs from the gripper's and may leave."""
