@@ -1,19 +1,19 @@
-"""The standard action GripperCommand as a move of the gripper.
+"""The standard actions of grippers, GripperCommand and ParallelGripperCommand, as moves.
 
-The position is the opening between the jaws [m], `max_effort` the grip force by the maker's curve [N], 0 for that of
-the driver's settings; a goal that cannot be is rejected. Both an opening that is reached and something that is grasped
-on the way are a success; the result says which.
+Both an opening that is reached and something that is grasped on the way are a success; the result says which. A goal
+that cannot be is rejected.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from finforce_driver.errors import DriverError
-from finforce_driver.messages import move_from_gripper_command
+from finforce_driver.messages import MoveRequest, fill_joint_state, move_from_gripper_command, move_from_joint_state
 from finforce_driver.services import GripperTasks
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 
@@ -23,36 +23,55 @@ if TYPE_CHECKING:
 SUCCESSES = (MoveOutcome.REACHED, MoveOutcome.GRASPED)
 
 
-class GripperCommandAction:
-    """Executes goals of the action, each in the thread that calls.
+class MoveAction(ABC):
+    """Executes goals of an action, each in the thread that calls.
 
     Args:
-        kind: the action type, control_msgs/action/GripperCommand.
+        kind: the action's type.
         gripper: that moves.
         tasks: its commands.
     """
 
     def __init__(self, kind: Any, gripper: Gripper, tasks: GripperTasks) -> None:
-        self._kind, self._gripper, self._tasks = kind, gripper, tasks
+        self.kind, self._gripper, self._tasks = kind, gripper, tasks
+
+    @abstractmethod
+    def read(self, goal: Any) -> MoveRequest:
+        """Return the move of a goal.
+
+        Raises:
+            TargetError: it is none.
+        """
+
+    @abstractmethod
+    def tell(self, message: Any, state: GripperState) -> None:
+        """Fill a result or feedback with a state."""
 
     def refusal(self, goal: Any) -> str:
         """Return why a goal cannot be carried out, with what was expected; empty when it can."""
         try:
-            request = move_from_gripper_command(goal.command)
+            request = self.read(goal)
             self._gripper.check_move(request.opening, request.speed, request.force)
         except DriverError as error:
             return str(error)
         return ""
 
+    def remark(self, goal: Any) -> str:
+        """Return what a goal leaves to the settings; empty where it leaves nothing."""
+        if self.read(goal).force is not None:
+            return ""
+        settings = self._gripper.settings
+        force = settings.default_current * settings.force_per_current
+        return f"no effort, or 0: {force:.0f} N of grip force by the motor's current, gripper.default_current"
+
     def execute(self, handle: Any) -> Any:
         """Move as a goal says and return the result, when the move is over or the goal is cancelled.
 
         Args:
-            handle: of the goal: `request.command`, `is_cancel_requested`, `publish_feedback`, `succeed`, `abort`,
-                `canceled`.
+            handle: of the goal: `request`, `is_cancel_requested`, `publish_feedback`, `succeed`, `abort`, `canceled`.
         """
         try:
-            state = self._tasks.go(move_from_gripper_command(handle.request.command), leave=self._teller(handle))
+            state = self._tasks.go(self.read(handle.request), leave=self._teller(handle))
             if state.phase is Phase.MOVING:
                 self._tasks.stop()
         except DriverError:
@@ -63,24 +82,64 @@ class GripperCommandAction:
             handle.succeed()
         else:
             handle.abort()
-        return self._describe(self._kind.Result(), state)
+        result = self.kind.Result()
+        self.tell(result, state)
+        _judge(result, state)
+        return result
 
     def _teller(self, handle: Any) -> Callable[[GripperState], bool]:
         """Return what tells how far a move has come, and says whether it is to be ended."""
 
         def tell(state: GripperState) -> bool:
-            handle.publish_feedback(self._describe(self._kind.Feedback(), state))
+            feedback = self.kind.Feedback()
+            self.tell(feedback, state)
+            handle.publish_feedback(feedback)
             return handle.is_cancel_requested
 
         return tell
 
-    def _describe(self, message: Any, state: GripperState) -> Any:
-        """Return a result or feedback with a state in it; what is not known is 0."""
+
+def _judge(message: Any, state: GripperState) -> None:
+    message.stalled = state.outcome is MoveOutcome.GRASPED
+    message.reached_goal = state.outcome is MoveOutcome.REACHED
+
+
+class GripperCommandAction(MoveAction):
+    """control_msgs/action/GripperCommand: position = opening [m], effort = grip force by the motor's current [N].
+
+    An effort of 0 is that of the settings; what is not known of the state is 0.
+    """
+
+    def read(self, goal: Any) -> MoveRequest:
+        """Return the move of a goal."""
+        return move_from_gripper_command(goal.command)
+
+    def tell(self, message: Any, state: GripperState) -> None:
+        """Fill a result or feedback with a state."""
         message.position, message.effort = (
             value if math.isfinite(value) else 0.0 for value in (state.opening, state.force)
         )
-        message.stalled, message.reached_goal = (
-            state.outcome is MoveOutcome.GRASPED,
-            state.outcome is MoveOutcome.REACHED,
-        )
-        return message
+        _judge(message, state)
+
+
+class ParallelGripperCommandAction(MoveAction):
+    """control_msgs/action/ParallelGripperCommand: a JointState, as that of `~/command`, and one back.
+
+    Args:
+        joints: names of the two jaws' joints, whose value is half the opening.
+        effort: returns the trusted force [N]; None: there is none, and the field stays empty.
+        options: of `MoveAction`.
+    """
+
+    def __init__(self, joints: Sequence[str], effort: Callable[[], float | None], *options: Any) -> None:
+        super().__init__(*options)
+        self._joints, self._effort = joints, effort
+
+    def read(self, goal: Any) -> MoveRequest:
+        """Return the move of a goal."""
+        request = move_from_joint_state(goal.command, self._joints)
+        return replace(request, force=request.force or None, speed=request.speed or None)
+
+    def tell(self, message: Any, state: GripperState) -> None:
+        """Fill a result or feedback with a state."""
+        fill_joint_state(message.state, self._joints, state, self._effort())

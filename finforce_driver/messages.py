@@ -1,13 +1,15 @@
-"""Messages into what a gripper is asked for."""
+"""Messages into what a gripper is asked for, and its state into a message."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from finforce_driver.errors import TargetError
 from finforce_driver.grasp.settings import GraspGoal
+from finforce_driver.state import GripperState
 
 JOINTS_DIFFER = 1e-4  # [m] by which the joints of one command may differ
 
@@ -50,14 +52,14 @@ def move_from_joint_state(message: Any, joints: Sequence[str] = ()) -> MoveReque
 
 
 def _move_of_joints(message: Any, joints: Sequence[str]) -> MoveRequest:
-    """Return the move of a command that names its joints, one or both.
+    """Return the move of a command that names its joints, one or both; one value for both is that of each.
 
     Raises:
         TargetError: a joint is not one of the gripper, or both are told to differ.
     """
     if not set(message.name) <= set(joints) or len(set(message.name)) != len(message.name):
         raise TargetError(f"joints {list(message.name)}; expected {' or '.join(joints)}, or both, or no name")
-    if len(message.position) != len(message.name):
+    if len(message.position) not in (1, len(message.name)):
         raise TargetError(f"{len(message.position)} positions of {len(message.name)} joints; expected one for each")
     speeds = [abs(speed) for speed in message.velocity]
     if max(message.position) - min(message.position) > JOINTS_DIFFER or len(set(speeds)) > 1:
@@ -73,6 +75,22 @@ def _move_of_joints(message: Any, joints: Sequence[str]) -> MoveRequest:
 def move_from_gripper_command(command: Any) -> MoveRequest:
     """Return the move of a control_msgs/GripperCommand: position = opening, max_effort = grip force, 0 for none."""
     return MoveRequest(opening=command.position, force=command.max_effort or None)
+
+
+def fill_joint_state(message: Any, joints: Sequence[str], state: GripperState, effort: float | None) -> None:
+    """Write a gripper's state into a sensor_msgs/JointState: what is not known stays empty.
+
+    Args:
+        message: to be filled.
+        joints: names of the two jaws' joints, whose value is half the opening.
+        state: of the gripper.
+        effort: force [N]; None: there is none that is trusted.
+    """
+    known = math.isfinite(state.opening) and math.isfinite(state.velocity)
+    message.name = list(joints)
+    message.position = [0.5 * state.opening] * 2 if known else []
+    message.velocity = [0.5 * state.velocity] * 2 if known else []
+    message.effort = [effort] * 2 if known and effort is not None else []
 
 
 def goal_from_joint_state(message: Any, last: GraspGoal) -> GraspGoal:

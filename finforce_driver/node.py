@@ -21,8 +21,10 @@ from finforce.health import Level, Outcome, Report
 from finforce.messages import stamp_of
 from finforce.optional import import_library
 from finforce.ros import node as ros
-from finforce_driver.actions import GripperCommandAction
+from finforce_driver.actions import GripperCommandAction, ParallelGripperCommandAction
 from finforce_driver.clock import MessageTimes
+from finforce_driver.errors import GraspError
+from finforce_driver.grasp.controller import check_force_value
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.grasp.settings import GraspSettings
@@ -43,6 +45,7 @@ from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState
 
 JAWS = ("left", "right")
+ACTIONS = {"GripperCommand": "~/gripper_cmd", "ParallelGripperCommand": "~/parallel_gripper_cmd"}
 
 
 class GripperDriverNode(Node):
@@ -71,6 +74,8 @@ class GripperDriverNode(Node):
         self.health = GripperHealth(source=parameters.port, stale_after=parameters.max_age)
         self.qos = ros.QosWatch(self)
         self.out = DriverOutputs(self.qos, parameters)
+        self.seen: ForceSample | None = None
+        self.stale_after, self.noise = grasp.stale_after, grasp.noise
         self.arrived: deque[GripperState] = deque(maxlen=100)
         self.published = -math.inf
         self._serve()
@@ -88,28 +93,37 @@ class GripperDriverNode(Node):
             # what waits for an earlier call would move the jaws after a stop
             ros.serve_trigger(self, f"~/{name}", getattr(tasks, name), ReentrantCallbackGroup())
         ros.serve_switch(self, "~/activate", tasks.activate)
-        self.action = self._offer_action()
+        self.actions = [action for action in map(self._offer_action, ACTIONS) if action is not None]
         ros.publish_diagnostics(self, self.qos, "finforce: gripper", self.parameters.diagnostics_period, self._report)
 
-    def _offer_action(self) -> ActionServer | None:
-        """Offer the standard action, if it is installed; a newer goal ends an older one."""
+    def _offer_action(self, name: str) -> ActionServer | None:
+        """Offer a standard action, if it is installed; a newer goal ends an older one."""
+        topic = ACTIONS[name]
         try:
-            kind = import_library("control_msgs.action", "~/gripper_cmd").GripperCommand
+            kind = getattr(import_library("control_msgs.action", topic), name, None)
         except MissingDependencyError:
-            self.get_logger().info("no action ~/gripper_cmd: control_msgs is not installed")
+            kind = None
+        if kind is None:
+            self.get_logger().info(f"no action {topic}: control_msgs, or its {name}, is not installed")
             return None
-        action = GripperCommandAction(kind, self.gripper, self.tasks)
+        if name == "GripperCommand":
+            action = GripperCommandAction(kind, self.gripper, self.tasks)
+        else:
+            joints = self.parameters.joint_names
+            action = ParallelGripperCommandAction(joints, self._effort, kind, self.gripper, self.tasks)
 
         async def execute(handle: Any) -> Any:
             return await ros.run_aside(self, partial(action.execute, handle))
 
         def judge(goal: Any) -> GoalResponse:
             if refusal := action.refusal(goal):
-                self.get_logger().warning(f"goal of ~/gripper_cmd rejected: {refusal}")
+                self.get_logger().warning(f"goal of {topic} rejected: {refusal}")
+            elif remark := action.remark(goal):
+                self.get_logger().info(f"goal of {topic}: {remark}")
             return GoalResponse.REJECT if refusal else GoalResponse.ACCEPT
 
         accept = {"goal_callback": judge, "cancel_callback": lambda _: CancelResponse.ACCEPT}
-        return ActionServer(self, kind, "~/gripper_cmd", execute, **accept)
+        return ActionServer(self, kind, topic, execute, **accept)
 
     def _subscribe(self) -> None:
         """Create the subscriptions; a node that has them is ready."""
@@ -135,10 +149,24 @@ class GripperDriverNode(Node):
                 self.published = state.stamp
                 self.health.take(state, self.gripper.clock.now())
                 with self._refusals("joint state"):
-                    self.out.send_joints(self.times.to_stamp(state.stamp, self._now()), state)
+                    self.out.send_joints(self.times.to_stamp(state.stamp, self._now()), state, self._effort(state))
             if self.health.is_news("gripper", text := news_of_state(state)):
                 self._log(outcome_of_state(state).level, text)
         self._tell_grasp()
+
+    def _effort(self, state: GripperState | None = None) -> float | None:
+        """Return the force for joint_states [N]; None where none is trusted."""
+        state = self.gripper.state if state is None else state
+        if self.parameters.joint_effort == "motor":
+            return state.force if math.isfinite(state.force) else None
+        status, seen = self.session.status, self.seen
+        wrong = self.parameters.joint_effort == "none" or seen is None or (status is not None and status.unseen)
+        if wrong or self.gripper.clock.now() - seen.stamp > self.stale_after:
+            return None
+        try:
+            return check_force_value(seen.force, self.noise)
+        except GraspError:
+            return None
 
     def _tell_grasp(self) -> None:
         """Publish how the grasp is, and log that it failed."""
@@ -160,8 +188,8 @@ class GripperDriverNode(Node):
 
     def _on_command(self, message: JointState) -> None:
         """Move as a message says."""
-        with self._refusals("command", stream=False):
-            self.tasks.move(move_from_joint_state(message, self.parameters.joint_names))
+        with self._refusals("command"):
+            self.tasks.stream(move_from_joint_state(message, self.parameters.joint_names))
 
     def _on_goal(self, message: JointState) -> None:
         """Set the goal of the grasp that runs, and of the next."""
@@ -172,7 +200,9 @@ class GripperDriverNode(Node):
         """Hand the force of an image to the grasp."""
         with self._refusals("force"):
             force, stamp = ros.grasp_force(message, self.parameters.gripper_frame), self._enter("force", message)
-            self.session.take_force(ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force))
+            sample = ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force)
+            self.session.take_force(sample)
+            self.seen = sample
             self._tell_grasp()
 
     def _on_stddev(self, side: str, message: WrenchStamped) -> None:
@@ -220,8 +250,8 @@ class GripperDriverNode(Node):
         self.tasks.close()
         self.forget()
         self.gripper.close()
-        if self.action is not None:
-            self.action.destroy()
+        while self.actions:
+            self.actions.pop().destroy()
         super().destroy_node()
 
 

@@ -25,6 +25,11 @@ class DriverParameters(TimeParameters):
     joint_names: tuple[str, ...] = setting(
         ("left_jaw_joint", "right_jaw_joint"), "of the two jaws in joint_states; the value of each is half the opening"
     )
+    joint_effort: str = setting(
+        "vision",
+        "effort in joint_states: vision: grasp_wrench while it is fresh; motor: by the motor's current; none: empty",
+        choices=("vision", "motor", "none"),
+    )
     gripper_frame: str = setting("gripper_base", "frame of grasp_wrench")
     grasp_force: float = setting(1.0, "that grasp holds until grasp_goal says another", "N", 0.1, 30.0)
     grasp_speed: float = setting(0.004, "of the opening while a grasp closes", "m/s", 1e-4, 0.1)

@@ -9,6 +9,7 @@ from typing import Any
 from finforce.health import Health, Level, Outcome, Report
 from finforce.ros import node as ros
 from finforce_driver.grasp.settings import GraspPhase, GraspStatus
+from finforce_driver.messages import fill_joint_state
 from finforce_driver.parameters import DriverParameters
 from finforce_driver.state import GripperState, MoveOutcome, Phase, describe
 
@@ -27,12 +28,17 @@ class DriverOutputs:
         self.joints = qos.publisher(ros.JointState, "joint_states", ros.RESULT)
         self.grasp = qos.publisher(ros.DiagnosticStatus, "~/grasp_state", ros.LATCHED)
 
-    def send_joints(self, stamp: int, state: GripperState) -> None:
-        """Send the joints as a reply at `stamp` [ns] shows them, unless it does not tell all of them."""
-        values = (state.opening / 2.0, state.velocity / 2.0, state.force)
-        if all(map(math.isfinite, values)):
-            header = ros.Header(stamp=ros.stamp_message(stamp))
-            self.joints.publish(ros.joint_state_message(header, self._names, *([value] * 2 for value in values)))
+    def send_joints(self, stamp: int, state: GripperState, effort: float | None) -> None:
+        """Send the joints as a reply at `stamp` [ns] shows them; what is not known stays empty.
+
+        Args:
+            stamp: of the reply [ns].
+            state: with it.
+            effort: force that is trusted [N]; None: none is.
+        """
+        message = ros.JointState(header=ros.Header(stamp=ros.stamp_message(stamp)))
+        fill_joint_state(message, self._names, state, effort)
+        self.joints.publish(message)
 
     def send_grasp(self, status: GraspStatus | None) -> None:
         """Send how the grasp is, when its phase or its reason has changed."""

@@ -39,10 +39,25 @@ class GripperTasks:
     def __init__(self, gripper: Gripper, session: GraspSession, parameters: DriverParameters) -> None:
         self._gripper, self._session, self._parameters = gripper, session, parameters
         self._commands = 0
+        self._streamed: tuple[MoveRequest, int] | None = None  # the last command of a stream, and its number
 
     def close(self) -> None:
         """End what is under way, and have nobody wait any longer."""
         self._command(lambda: None, "the driver ends")
+
+    def stream(self, request: MoveRequest) -> None:
+        """Go to an opening as one of many commands says; one that repeats what is done changes nothing.
+
+        Raises:
+            DriverError: the move was refused.
+        """
+        state = self._gripper.state
+        works = state.phase is Phase.MOVING or (
+            state.phase is Phase.READY and state.outcome in (MoveOutcome.REACHED, MoveOutcome.GRASPED)
+        )
+        if not (works and (request, self._commands) == self._streamed):
+            self.move(request)
+            self._streamed = (request, self._commands)
 
     def move(self, request: MoveRequest, reason: str = "another move was commanded") -> None:
         """Go to an opening; return at once.

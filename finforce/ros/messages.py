@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3, Wrench, WrenchStamped
 from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
+from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
@@ -134,20 +134,6 @@ def is_touching(cloud: PointCloud2, frame: str) -> bool:
     """
     check_cloud(cloud, frame, "the contact")
     return bool(np.any(decode_columns(cloud, (), ("touching",)).get("touching", 0) == 1))
-
-
-def joint_state_message(
-    header: Header, names: Sequence[str], positions: ArrayLike, velocities: ArrayLike, efforts: ArrayLike
-) -> JointState:
-    """Return the state of joints (n,) by position [m], velocity [m/s] and effort [N].
-
-    Raises:
-        ObservationError: a number is not finite; such a state must not leave.
-    """
-    columns = [[float(value) for value in values] for values in (positions, velocities, efforts)]
-    if not all(math.isfinite(value) for values in columns for value in values):
-        raise ObservationError(f"the joints' state is not finite: {columns}")
-    return JointState(header=header, name=list(names), position=columns[0], velocity=columns[1], effort=columns[2])
 
 
 def pose_message(header: Header, numbers: Sequence[float]) -> PoseStamped:

@@ -40,7 +40,6 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
     grasp_force,
     image_message,
     is_touching,
-    joint_state_message,
     points_marker,
     pose_message,
     stamp_message,

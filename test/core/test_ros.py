@@ -77,15 +77,6 @@ def test_a_wrench_that_is_not_finite_cannot_be_made(bad):
         ros.wrench_message(Header(), (1, 2, 3), (4, bad, 6))
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_joint_state_that_is_not_finite_cannot_be_made(bad):
-    state = ros.joint_state_message(Header(), ("a", "b"), (1, 2), (3, 4), (5, 6))
-    assert (list(state.name), list(state.position), list(state.velocity)) == (["a", "b"], [1.0, 2.0], [3.0, 4.0])
-    assert list(state.effort) == [5.0, 6.0]
-    with pytest.raises(ObservationError, match="not finite"):
-        ros.joint_state_message(Header(), ("a", "b"), (1, 2), (3, bad), (5, 6))
-
-
 def test_a_cloud_touches_if_any_of_its_contacts_does():
     points = np.zeros((2, 3))
     for touching in ([0, 0], [0, 1]):

@@ -27,6 +27,11 @@ def joints(position=(), velocity=(), effort=(), name=()):
     return SimpleNamespace(name=name, position=position, velocity=velocity, effort=effort)
 
 
+def test_one_value_for_both_joints_is_that_of_each():
+    # what a hardware interface sends for a joint and another one that mimics it
+    assert move_from_joint_state(joints([0.01], name=JOINTS), JOINTS).opening == pytest.approx(0.02)
+
+
 def test_a_command_leaves_to_the_driver_what_it_does_not_say():
     move = move_from_joint_state(joints(position=[0.02]))
     assert (move.opening, move.speed, move.force) == (0.02, None, None)
@@ -48,7 +53,8 @@ def test_a_command_that_names_joints_means_their_values_each_half_the_opening(na
             joints([0.01], name=["finger_joint"]),
             r"joints \['finger_joint'\]; expected left_jaw_joint or right_jaw_joint",
         ),
-        (joints([0.01], name=JOINTS), "1 positions of 2 joints"),
+        (joints([], name=JOINTS), "0 positions of 2 joints"),
+        (joints([0.01, 0.01, 0.01], name=JOINTS), "3 positions of 2 joints"),
         (joints([0.01, 0.02], name=JOINTS), "expected the same for both joints"),
         (joints([0.01] * 2, name=[JOINTS[0]] * 2), "or both, or no name"),
     ],

@@ -16,7 +16,9 @@ from driver_node_fakes import (
     driver,
     gripper_state,
     send,
+    wrench,
 )
+from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
@@ -36,7 +38,7 @@ def test_joint_states_have_half_the_opening_and_the_time_of_the_reply(probe):
     assert list(joints.name) == ["left_jaw_joint", "right_jaw_joint"]
     assert list(joints.position) == [0.015] * 2
     assert list(joints.velocity) == [-0.002] * 2
-    assert list(joints.effort) == [5.0] * 2
+    assert list(joints.effort) == []  # nobody sees the force, and the motor's current is not it
     # the stamp is taken from two clocks, one after the other
     assert before - SECOND // 1000 < stamp_of(joints) < time_ns()
 
@@ -60,15 +62,56 @@ def test_an_old_reply_is_not_published_again(probe):
     assert len(probe.got["joint_states"]) == 1
 
 
-@pytest.mark.parametrize("unknown", ["opening", "velocity", "force"])
-def test_nothing_leaves_while_a_joint_is_not_known(probe, unknown):
-    gripper, _ = driver(probe)
+@pytest.mark.parametrize("unknown", ["opening", "velocity"])
+def test_joints_are_named_from_the_first_reply_on_and_have_no_values_while_they_are_not_known(probe, unknown):
+    gripper, _ = driver(probe, joint_effort="motor")
     gripper.reply(phase=Phase.UNCALIBRATED, message="calibrate first", **{unknown: math.nan})
     gripper_state(probe, Level.WARN, "calibrate first")
-    assert not probe.got["joint_states"]
+    joints = probe.got["joint_states"][0]
+    assert len(joints.name) == 2
+    assert [len(values) for values in (joints.position, joints.velocity, joints.effort)] == [0, 0, 0]
     gripper.reply(phase=Phase.READY, **{unknown: getattr(READY, unknown)})
+    probe.wait_for(lambda: len(probe.got["joint_states"]) > 1)
+    assert list(probe.got["joint_states"][1].position) == [0.5 * READY.opening] * 2
+
+
+@pytest.mark.parametrize(("source", "effort"), [("vision", [1.5] * 2), ("motor", [5.0] * 2), ("none", [])])
+def test_effort_is_the_force_of_its_source(probe, source, effort):
+    gripper, _ = driver(probe, joint_effort=source)
+    out = probe.speak("grasp_wrench", WrenchStamped)
+    probe.connected(out)
+    out.publish(wrench(1.5))
+    probe.spin(0.1)
+    gripper.reply(force=5.0)
     probe.wait_for(lambda: probe.got["joint_states"])
-    assert len(probe.got["joint_states"]) == 1
+    assert list(probe.got["joint_states"][-1].effort) == effort
+
+
+def test_effort_is_empty_when_the_force_has_become_old(probe):
+    gripper, _ = driver(probe)
+    out = probe.speak("grasp_wrench", WrenchStamped)
+    probe.connected(out)
+    out.publish(wrench(1.5))
+    probe.spin(0.4)
+    gripper.reply()
+    probe.wait_for(lambda: probe.got["joint_states"])
+    assert list(probe.got["joint_states"][-1].effort) == []
+
+
+def test_a_command_that_is_repeated_as_controllers_do_moves_once(probe):
+    gripper, _ = driver(probe)
+    gripper.reply()
+    for _ in range(5):
+        send(probe, COMMAND, JointState(name=["left_jaw_joint", "right_jaw_joint"], position=[0.01]))
+        probe.spin(0.02)
+    assert gripper.calls == [("move", 0.02, None, None)]
+    gripper.reply(phase=Phase.READY, outcome=MoveOutcome.GRASPED)
+    send(probe, COMMAND, JointState(name=["left_jaw_joint", "right_jaw_joint"], position=[0.01]))
+    probe.spin(0.05)
+    assert len(gripper.calls) == 1
+    assert call(probe, Trigger, "stop").success
+    send(probe, COMMAND, JointState(name=["left_jaw_joint", "right_jaw_joint"], position=[0.01]))
+    probe.wait_for(lambda: len(gripper.calls) == 3)  # after the stop it is a new one
 
 
 def test_a_command_moves(probe):
@@ -204,20 +247,22 @@ class FakeServer:
 def test_the_standard_action_is_offered_where_its_type_is_installed(probe, monkeypatch):
     kind = SimpleNamespace(Result=SimpleNamespace, Feedback=SimpleNamespace)
     package = ModuleType("control_msgs.action")
-    package.GripperCommand = kind
+    package.GripperCommand = package.ParallelGripperCommand = kind
     monkeypatch.setitem(sys.modules, "control_msgs", ModuleType("control_msgs"))
     monkeypatch.setitem(sys.modules, "control_msgs.action", package)
     monkeypatch.setattr("finforce_driver.node.ActionServer", FakeServer)
     gripper, node = driver(probe)
-    assert (node.action.kind, node.action.name) == (kind, "~/gripper_cmd")
+    actions = list(node.actions)
+    assert [action.name for action in actions] == ["~/gripper_cmd", "~/parallel_gripper_cmd"]
+    action = actions[0]
     goal = FakeGoal(0.02)
-    result = probe.spinner.create_task(node.action.execute, goal)
+    result = probe.spinner.create_task(action.execute, goal)
     probe.wait_for(lambda: gripper.calls)
     gripper.reply(phase=Phase.READY, outcome=MoveOutcome.REACHED)
     probe.wait_for(result.done)
     assert result.result().reached_goal and goal.ends == ["succeed"]
     node.destroy_node()
-    assert node.action.destroyed
+    assert all(action.destroyed for action in actions)
 
 
 def test_an_emergency_stop_that_the_gripper_does_not_confirm_is_pending(probe):
