@@ -24,6 +24,7 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/config", glob("config/*.yaml")),
+        (f"share/{NAME}/config/moveit", glob("config/moveit/*")),
         (f"share/{NAME}/rviz", glob("rviz/*")),
         (f"share/{NAME}/urdf", glob("urdf/*")),
     ],
@@ -59,13 +60,14 @@ setup(
         "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
-        "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0"],
+        "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0", "xacro"],
         "lint": ["ruff", "import-linter"],
     },
     entry_points={
         "console_scripts": [
             "finforce = finforce_eval.cli.main:main",
             "contact_estimator = finforce.ros.start:contact_estimator",
+            "emulated_gripper = finforce.ros.start:emulated_gripper",
             "gripper_driver = finforce.ros.start:gripper_driver",
             "ifea_solver = finforce.ros.start:ifea_solver",
             "keypoint_detector = finforce.ros.start:keypoint_detector",

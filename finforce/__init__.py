@@ -5,7 +5,7 @@
 - the force: `load_jaw`, `load_calibration`, `JawEstimator`, `Observation`, `Contact`, `Solution`;
 - the contact: `load_object_mesh`, `ContactEstimator`, and `ForceLoop`, contact and force together;
 - the images: `KeypointDetector`, `build_detector`, `RgbdImage`;
-- the gripper: `Gripper`, `build_bus`;
+- the gripper: `Gripper`, `build_bus`; `GripperClient`, for a driver node that runs elsewhere;
 - recordings: `read_recording`, `play`, `find_mesh`, `DEMO`, the one that comes with finforce.
 """
 
@@ -18,6 +18,7 @@ _HOMES = {
     "DEMO": "finforce_eval.recordings.recording",
     "ForceLoop": "finforce_contact.jaw_contact",
     "Gripper": "finforce_driver.gripper",
+    "GripperClient": "finforce.ros.client",
     "JawEstimator": "finforce_ifea.estimator",
     "KeypointDetector": "finforce_keypoints.detector",
     "Observation": "finforce_ifea.observation",

@@ -15,3 +15,7 @@ class ObservationError(FinforceError, ValueError):
 
 class PoseError(FinforceError, ValueError):
     """Numbers that were given as a pose are none."""
+
+
+class ServiceError(FinforceError, RuntimeError):
+    """A service of a node is not there, does not answer, or could not do what was asked; the message says which."""

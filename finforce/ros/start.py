@@ -12,6 +12,7 @@ NODES = {
     "contact_estimator": "finforce_contact.node",
     "keypoint_detector": "finforce_keypoints.node",
     "gripper_driver": "finforce_driver.node",
+    "emulated_gripper": "finforce_driver.emulator.pty_port",
     "recording_player": "finforce_eval.replay.node",
     "twin_camera": "finforce_twin.node",
 }
@@ -36,6 +37,13 @@ def keypoint_detector() -> int:
 def gripper_driver() -> int:
     """Run the driver of the gripper."""
     return start("gripper_driver")
+
+
+def emulated_gripper() -> int:
+    """Run the emulated gripper, which is no node; what `ros2 launch` adds for nodes is left out."""
+    if "--ros-args" in sys.argv:
+        del sys.argv[sys.argv.index("--ros-args") :]
+    return start("emulated_gripper")
 
 
 def recording_player() -> int:

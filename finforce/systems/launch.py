@@ -80,6 +80,22 @@ def gripper_arguments() -> list[Any]:
     ]
 
 
+def stack_arguments() -> list[Any]:
+    """Return the launch arguments of the gripper in a manipulation stack."""
+    from launch.actions import DeclareLaunchArgument as Argument
+
+    return [
+        Argument("description", default_value=NONE, description="xacro or URDF file of the robot; none: the gripper"),
+        Argument("semantics", default_value=NONE, description="its SRDF file, for MoveIt; none: that of the gripper"),
+        Argument("controllers", default_value=NONE, description="YAML file of controllers; none: the gripper's"),
+        Argument("gripper", default_value="true", choices=SWITCH, description="drive the gripper"),
+        Argument("gripper_port", default_value=NONE, description="port of the CAN adapter, or the CAN channel"),
+        Argument("gripper_interface", default_value=NONE, description="slcan, or python-can's name, as socketcan"),
+        Argument("parameter_file", default_value=NONE, description="YAML file with parameters of the driver"),
+        Argument("sim", default_value="false", choices=SWITCH, description="an emulated gripper, no hardware"),
+    ]
+
+
 def options_from_texts(record: type[OptionsT], texts: Mapping[str, str]) -> OptionsT:
     """Return an options record from launch arguments, each turned into the type of its default.
 

@@ -11,9 +11,11 @@ import pytest
 from finforce.errors import MissingDependencyError
 from finforce.systems import launch as launch_module
 from finforce.systems.processes import BenchOptions, ReplayOptions, RobotOptions
+from finforce.systems.stacks import StackOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted((ROOT / "launch").glob("*.launch.py"))
+SYSTEMS = [path for path in FILES if path.name.split(".")[0] in ("bench", "replay", "robot")]
 ROBOT = ROOT / "launch" / "robot.launch.py"
 ACTIONS = ("DeclareLaunchArgument", "GroupAction", "IncludeLaunchDescription", "LogInfo", "OpaqueFunction")
 STAND_INS = {
@@ -65,7 +67,7 @@ def start(path, **texts):
     return {action.kwargs["name"]: action.kwargs for action in act(path, **texts) if "name" in action.kwargs}
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", SYSTEMS, ids=lambda path: path.name)
 def test_a_launch_file_starts_a_solver_with_its_configuration(recorded_launch, path):
     nodes = start(path)
     solver = nodes["left_ifea_solver"]
@@ -105,6 +107,7 @@ def test_the_end_of_the_player_ends_the_launch(recorded_launch):
 
 
 RECORDS = {"bench": BenchOptions, "replay": ReplayOptions, "robot": RobotOptions}
+RECORDS |= dict.fromkeys(("ros2_control", "moveit"), StackOptions)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)

@@ -1,0 +1,162 @@
+"""The gripper for a script: the driver node's services and topics as calls."""
+
+from __future__ import annotations
+
+import math
+from threading import Thread
+from time import monotonic, sleep
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from finforce.errors import ServiceError
+from finforce.ros import node as ros
+
+FRESH = 0.5  # [s] for which a force or an opening is what there is
+DISCOVERY = 10.0  # [s] in which the driver is found
+TOLD = 0.2  # [s] in which a goal reaches a driver before it is asked to grasp
+LONGEST = 120.0  # [s] that a service may take
+
+
+class GripperClient:
+    """Calls a gripper driver that runs elsewhere, from a script without a node of its own.
+
+    Args:
+        driver: name of the driver's node.
+        context: of rclpy; None: the default one, which is initialised where it is not, and shut down at the end.
+    """
+
+    def __init__(self, driver: str = "gripper_driver", context: Any = None) -> None:
+        self._driver, self._owned = driver, context is None and not rclpy.ok()
+        if self._owned:
+            rclpy.init()
+        self._node = rclpy.create_node("gripper_client", context=context)
+        self._force: tuple[float, float] = (-math.inf, math.nan)  # when [s], and how much [N]
+        self._opening: tuple[float, float] = (-math.inf, math.nan)
+        self._grasp = ""
+        node = self._node
+        self._goals = node.create_publisher(JointState, f"{driver}/grasp_goal", ros.RESULT)
+        node.create_subscription(WrenchStamped, "grasp_wrench", self._take_force, ros.SENSOR)
+        node.create_subscription(JointState, "joint_states", self._take_joints, ros.RESULT)
+        node.create_subscription(DiagnosticStatus, f"{driver}/grasp_state", self._take_grasp, ros.LATCHED)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(node)
+        self._thread = Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> GripperClient:
+        """Return the client."""
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """End the client; the gripper stays as it is."""
+        self.close()
+
+    def close(self) -> None:
+        """End the client; the gripper stays as it is."""
+        self._executor.shutdown()
+        self._thread.join(DISCOVERY)
+        self._node.destroy_node()
+        if self._owned:
+            rclpy.shutdown()
+
+    @property
+    def force(self) -> float | None:
+        """The grasp force [N]; None while none comes that is trusted."""
+        return _fresh(self._force)
+
+    @property
+    def opening(self) -> float | None:
+        """The opening between the jaws [m]; None while it is not known."""
+        return _fresh(self._opening)
+
+    @property
+    def grasp_state(self) -> str:
+        """What the driver says of the last grasp, as "holding: holds the set force"; empty before the first."""
+        return self._grasp
+
+    def calibrate(self) -> str:
+        """Find the end stops, over the whole stroke; return the driver's answer when that is done.
+
+        Raises:
+            ServiceError: it failed, with the driver's reason; so for all calls.
+        """
+        return self._call("calibrate")
+
+    def grasp(self, force: float, speed: float | None = None) -> str:
+        """Close until a force [N] is held, at a speed of the opening [m/s]; return the driver's answer.
+
+        The driver goes on holding the force, until something else is asked for.
+        """
+        self._wait_for_listener()
+        self._goals.publish(JointState(effort=[float(force)], velocity=[] if speed is None else [float(speed)]))
+        sleep(TOLD)
+        return self._call("grasp")
+
+    def release(self) -> str:
+        """Open; return the driver's answer when that is done."""
+        return self._call("release")
+
+    def stop(self) -> str:
+        """Hold in place."""
+        return self._call("stop")
+
+    def estop(self) -> str:
+        """Stop at once, limp."""
+        return self._call("estop")
+
+    def clear_errors(self) -> str:
+        """Clear faults and emergency stops."""
+        return self._call("clear_errors")
+
+    def _call(self, name: str) -> str:
+        service = f"{self._driver}/{name}"
+        client = self._node.create_client(Trigger, service)
+        try:
+            if not client.wait_for_service(DISCOVERY):
+                raise ServiceError(f"{service}: not there for {DISCOVERY:g} s; is the driver running, in this domain?")
+            answer = client.call_async(Trigger.Request())
+            end = monotonic() + LONGEST
+            while not answer.done():
+                if monotonic() > end:
+                    raise ServiceError(f"{service}: no answer for {LONGEST:g} s")
+                sleep(0.005)
+            if not answer.result().success:
+                raise ServiceError(f"{service}: {answer.result().message}")
+            return answer.result().message
+        finally:
+            self._node.destroy_client(client)
+
+    def _wait_for_listener(self) -> None:
+        end = monotonic() + DISCOVERY
+        while not self._goals.get_subscription_count():
+            if monotonic() > end:
+                raise ServiceError(f"{self._driver}: nobody listens to its grasp_goal; is the driver running?")
+            sleep(0.01)
+
+    def _take_force(self, message: WrenchStamped) -> None:
+        self._force = monotonic(), message.wrench.force.x
+
+    def _take_joints(self, message: JointState) -> None:
+        jaws = [
+            position
+            for name, position in zip(message.name, message.position, strict=False)
+            if name.endswith("jaw_joint")
+        ]
+        if len(jaws) == 2:
+            self._opening = monotonic(), sum(jaws)
+
+    def _take_grasp(self, message: DiagnosticStatus) -> None:
+        phase = next((entry.value for entry in message.values if entry.key == "grasp"), "")
+        self._grasp = f"{phase}: {message.message}"
+
+
+def _fresh(last: tuple[float, float]) -> float | None:
+    when, value = last
+    return value if monotonic() - when < FRESH else None

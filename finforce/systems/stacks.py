@@ -1,0 +1,141 @@
+"""The gripper under ros2_control, and under MoveIt."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from finforce.optional import import_library
+from finforce.systems.processes import Process, given
+
+STATES = "gripper_driver/joint_states"  # of the driver, where joint_states are those of the whole robot
+CONTROLLERS = ("joint_state_broadcaster", "finray_gripper_controller")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackOptions:
+    """What can be asked of a gripper that a manipulation stack drives.
+
+    Attributes:
+        description: xacro or URDF file of the robot; empty: the gripper alone.
+        semantics: SRDF file that belongs to it, for MoveIt; empty: that of the gripper.
+        controllers: YAML file of the controllers; empty: those of the gripper.
+        gripper: start the driver.
+        gripper_port: of the CAN adapter; empty: that of the parameter file.
+        gripper_interface: slcan, or python-can's name of one; empty: that of the parameter file.
+        parameter_file: of the driver; empty: config/robot.yaml.
+        sim: an emulated gripper stands in for the real one.
+    """
+
+    description: str = ""
+    semantics: str = ""
+    controllers: str = ""
+    gripper: bool = True
+    gripper_port: str = ""
+    gripper_interface: str = ""
+    parameter_file: str = ""
+    sim: bool = False
+
+
+def control_processes(options: StackOptions, share: Path) -> list[Process]:
+    """Return driver, ros2_control and its controllers, which start one after the other.
+
+    Raises:
+        MissingDependencyError: the description is a xacro file, and xacro is not installed.
+    """
+    model = describe(options.description or share / "urdf" / "finray_gripper_control.urdf.xacro")
+    controllers = options.controllers or str(share / "config" / "ros2_control.yaml")
+    return [
+        *gripper_processes(options, share),
+        _publisher(model),
+        Process(
+            package="controller_manager",
+            executable="ros2_control_node",
+            name="controller_manager",
+            parameter_file=controllers,
+            remappings={"~/robot_description": "/robot_description"},
+        ),
+        Process(
+            package="controller_manager",
+            executable="spawner",
+            name="gripper_spawner",
+            arguments=(*CONTROLLERS, "--param-file", controllers),
+        ),
+    ]
+
+
+def moveit_processes(options: StackOptions, share: Path) -> list[Process]:
+    """Return driver and move_group, which moves the jaws by the driver's own action.
+
+    Raises:
+        MissingDependencyError: the description is a xacro file, and xacro is not installed.
+    """
+    folder = share / "config" / "moveit"
+    model = describe(options.description or share / "urdf" / "finray_gripper.urdf")
+    semantics = describe(options.semantics or folder / "finray_gripper.srdf")
+    controllers = yaml.safe_load(Path(options.controllers or folder / "controllers.yaml").read_text(encoding="utf-8"))
+    limits = yaml.safe_load((folder / "joint_limits.yaml").read_text(encoding="utf-8"))
+    parameters = {
+        "robot_description": model,
+        "robot_description_semantic": semantics,
+        **flatten(controllers),
+        **flatten({"robot_description_planning": limits}),
+    }
+    return [
+        *gripper_processes(options, share, {}),
+        _publisher(model),
+        Process(package="moveit_ros_move_group", executable="move_group", name="move_group", parameters=parameters),
+    ]
+
+
+def gripper_processes(options: StackOptions, share: Path, remappings: dict[str, str] | None = None) -> list[Process]:
+    """Return the driver, and with `sim` the emulated gripper; without remappings its joint_states are `STATES`."""
+    port, interface = options.gripper_port, options.gripper_interface
+    processes = []
+    if options.sim:
+        port = port or str(Path(tempfile.gettempdir()) / f"finforce_gripper_{os.getpid()}")
+        interface = "slcan"
+        processes.append(Process(executable="emulated_gripper", name="emulated_gripper", arguments=("--link", port)))
+    if options.gripper:
+        driver = Process(
+            executable="gripper_driver",
+            name="gripper_driver",
+            parameters=given({"port": port, "interface": interface}),
+            parameter_file=options.parameter_file or str(share / "config" / "robot.yaml"),
+            remappings={"joint_states": STATES} if remappings is None else remappings,
+        )
+        processes.append(driver)
+    return processes
+
+
+def describe(path: str | Path) -> str:
+    """Return the XML of a file, which xacro makes of one with that ending.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    if str(path).endswith(".xacro"):
+        return import_library("xacro", "a description with xacro").process_file(str(path)).toxml()
+    return Path(path).read_text(encoding="utf-8")
+
+
+def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested parameters by their names with dots."""
+    flat = {}
+    for name, value in tree.items():
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
+
+
+def _publisher(model: str) -> Process:
+    return Process(
+        package="robot_state_publisher",
+        executable="robot_state_publisher",
+        name="robot_state_publisher",
+        parameters={"robot_description": model},
+    )

@@ -1,0 +1,130 @@
+"""Claims about the examples: they run against the simulated robot, and the lift ends with what it holds."""
+
+import os
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from threading import Thread
+from time import monotonic, sleep
+
+import pytest
+from emulator_fakes import Bench, Fingers
+from geometry_msgs.msg import TwistStamped
+from node_fakes import ros_domain
+
+from finforce import GripperClient
+from finforce.errors import ServiceError
+from finforce.ros.transport import free_domain
+from finforce.systems.live import robot_processes
+from finforce.systems.processes import RobotOptions
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+START = 240.0  # s in which the twin has drawn its images, on a machine that does other things as well
+
+
+def run(name, domain, *arguments, patience=START):
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    command = [sys.executable, EXAMPLES / name, *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=patience, check=False)
+
+
+@pytest.fixture
+def simulation(tmp_path):
+    """The domain of a robot with `sim:=true`, once its jaws are watched."""
+    domain = free_domain()
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    options = RobotOptions(sim=True, camera_name="", gripper_port=str(tmp_path / "gripper"))
+    parts = [part for part in robot_processes(options, ROOT) if part.package == "finforce"]
+    log = (tmp_path / "log").open("w+")
+    nodes = [subprocess.Popen(part.command(), env=environment, stdout=log, stderr=log) for part in parts]
+    until = monotonic() + START
+    while "playing as the gripper" not in (tmp_path / "log").read_text():
+        assert monotonic() < until and all(node.poll() is None for node in nodes), (tmp_path / "log").read_text()
+        sleep(0.5)
+    sleep(4.0)  # the solvers take their tare
+    yield domain
+    for node in nodes:
+        node.terminate()
+    assert [node.wait(20.0) for node in nodes] == [0] * len(nodes), (tmp_path / "log").read_text()
+
+
+def test_the_examples_hold_two_newtons_and_lift_on_the_simulated_robot(simulation):
+    done = run("hold_two_newtons.py", simulation)
+    assert done.returncode == 0, done.stdout + done.stderr
+    calibrated, opened, held, force, _ = done.stdout.splitlines()
+    assert "calibrated" in calibrated and "open: 48.0 mm" in opened
+    assert "holds" in held and "set 2.00 N" in held
+    assert float(force.split()[0]) == pytest.approx(2.0, abs=0.4)
+    lifted = run("lift_until_slip.py", simulation)
+    assert lifted.returncode == 0 and "lifted, after 100 mm" in lifted.stdout + lifted.stderr
+
+
+def test_ten_lines_are_enough():
+    lines = [line for line in (EXAMPLES / "hold_two_newtons.py").read_text().splitlines() if line.strip()]
+    assert len(lines) <= 10
+
+
+@pytest.fixture
+def bench():
+    with ros_domain() as probe, ExitStack() as stack:
+        made = Bench(probe, grasp_force=2.0)
+        stack.callback(made.close)
+        made.fingers = Fingers(made)
+        probe.hear("/lift_until_slip/lift", TwistStamped)
+        made.lifts = probe.got["/lift_until_slip/lift"]
+        yield made
+
+
+def beside(bench, call):
+    """What a call in a thread of its own returns, while the driver lives."""
+    found = []
+    thread = Thread(target=lambda: found.append(call()), daemon=True)
+    thread.start()
+    bench.probe.wait_for(lambda: not thread.is_alive(), 60.0)
+    return found[0]
+
+
+def test_the_lift_stops_when_what_is_held_slips(bench):
+    domain = bench.probe.context.get_domain_id()
+
+    def slip():
+        if len(bench.lifts) == 20:
+            bench.fingers.TOUCH = 0.0
+
+    bench.probe.create_timer(0.01, slip)
+    done = beside(bench, lambda: run("lift_until_slip.py", domain, "--ros-args", "-p", "way:=5.0", patience=60.0))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "slip" in done.stdout + done.stderr
+    assert bench.lifts[0].twist.linear.z == pytest.approx(0.05)
+    bench.probe.wait_for(lambda: bench.lifts[-1].twist.linear.z == 0.0)
+    assert len(bench.lifts) < 60  # within a second
+
+
+def test_the_client_tells_what_the_driver_says(bench):
+    with GripperClient(context=bench.probe.context) as client:
+        answer = beside(bench, lambda: client.grasp(1.0))
+        assert "set 1.00 N" in answer
+        bench.probe.wait_for(lambda: client.force is not None and client.opening is not None)
+        assert client.force == pytest.approx(1.0, abs=0.3)
+        assert client.opening == pytest.approx(bench.gripper.true_opening, abs=4e-4)
+        assert client.grasp_state.startswith("holding")
+        beside(bench, client.estop)
+        with pytest.raises(ServiceError, match="gripper_driver/grasp: "):
+            beside_error(bench, lambda: client.grasp(1.0))
+
+
+def beside_error(bench, call):
+    """Raise what a call in a thread of its own raises."""
+    found = []
+
+    def caught():
+        try:
+            call()
+        except ServiceError as error:
+            found.append(error)
+        return None
+
+    beside(bench, caught)
+    raise found[0]
