@@ -28,6 +28,7 @@ class ForceGrasp:
         settings: limits and expectations.
         resolution: opening per step of the gripper [m].
         closed_opening: opening of the closed gripper [m].
+        stroke: of the gripper [m].
 
     Raises:
         TargetError: the set force is above the limit of the settings.
@@ -40,12 +41,15 @@ class ForceGrasp:
         *,
         resolution: float,
         closed_opening: float = 0.0,
+        stroke: float = 0.048,
     ) -> None:
         self.goal, self.settings = goal, settings or GraspSettings()
         self._set_force = self.settings.check_force(goal.force)
         self._feed = ForceFeed(self.settings.stale_after)
         self._load = LoadWatch(self.settings, min(self.settings.onset_force, 0.5 * goal.force))
-        self._jaws = JawHistory(resolution=resolution, closed_opening=closed_opening)
+        self._jaws = JawHistory(
+            resolution=resolution, closed_opening=closed_opening, stroke=stroke, reaction=self.settings.reaction
+        )
         self._place = JawPlace(opening=math.nan, resting=False)
         self._plan = GraspPlan(goal, self.settings, self._load, self._jaws, self._feed)
         self._pending: deque[ForceSample | TouchSample] = deque()

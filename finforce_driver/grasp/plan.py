@@ -15,13 +15,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from finforce_driver.can.protocol import LARGEST_BYTE
 from finforce_driver.errors import GraspError
 from finforce_driver.grasp.load_watch import ForceFeed, LoadWatch
 from finforce_driver.grasp.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GripperState
 
-_REACTION = 0.05  # [s] from a command to the motion it asks for
 _LEAST_SPEED = 0.001  # [m/s] slower would only cost time: the target is bounded anyway
 _FEW_STEPS = 3.5  # by which a target may lie ahead of the one that was sent
 _BACK_STEPS = 1.5  # by which it must lie behind while the jaws move, where a step is noise
@@ -85,7 +83,7 @@ class GraspPlan:
         It is less where the force is uncertain, and where contact and force contradict each other.
         """
         way = abs(self._load.opening - target)
-        due = self._feed.latency + 1.5 * self._feed.period + _REACTION
+        due = self._feed.latency + 1.5 * self._feed.period + self._settings.reaction
         return min(self._goal.speed * self._sureness, self._blind_speed, max(_LEAST_SPEED, way / due))
 
     @property
@@ -121,7 +119,7 @@ class GraspPlan:
             return steps < -_BACK_STEPS
         left = opening - jaws.target
         slower, faster = jaws.speed / _SPEED_CHANGE, jaws.speed * _SPEED_CHANGE
-        is_due = left < 2.0 * jaws.speed * (self._feed.period + _REACTION)
+        is_due = left < 2.0 * jaws.speed * (self._feed.period + self._settings.reaction)
         return is_due or steps > _FEW_STEPS or not slower < speed < faster
 
     def overshoot_bound(self, set_force: float) -> float:
@@ -164,8 +162,7 @@ class GraspPlan:
         return max(1, round(excess / (self.stiffness * self._jaws.resolution)))
 
 
-# A command waits for its turn on the bus, the jaws come to rest, and the driver may step them one by one.
-SETTLING = 0.08  # [s]
+SETTLING = 0.03  # [s] beside the reaction: the jaws come to rest, and the driver may step them one by one
 _NEAR = 2.0  # steps between target and reported opening at rest: the byte is truncated, and flickers by one
 _SMALL = 2.5  # steps: fewer are not planned anew on the way
 _POWERED_AFTER = 0.3  # [s] of the first command, which switches the power stage on
@@ -190,6 +187,8 @@ class JawHistory:
     Args:
         resolution: a step of the gripper [m].
         closed_opening: of the closed gripper [m].
+        stroke: of the gripper [m].
+        reaction: from a command to the motion it asks for [s].
 
     Attributes:
         closed: the same.
@@ -199,9 +198,10 @@ class JawHistory:
         stepping: the last command was a few steps from rest, whose effect is to be seen at rest again.
     """
 
-    def __init__(self, *, resolution: float, closed_opening: float) -> None:
+    def __init__(self, *, resolution: float, closed_opening: float, stroke: float, reaction: float) -> None:
         self.resolution = resolution
-        self.closed, self.widest = closed_opening, closed_opening + LARGEST_BYTE * resolution
+        self._settling = reaction + SETTLING
+        self.closed, self.widest = closed_opening, closed_opening + stroke
         self.target = math.nan
         self.speed = 0.0
         self.stepping = False
@@ -222,7 +222,7 @@ class JawHistory:
         if math.isnan(self.target):
             self._powered_from = now + _POWERED_AFTER
         self.target, self.speed = target, speed
-        self._arrives = now + abs(target - here.opening) / speed + SETTLING
+        self._arrives = now + abs(target - here.opening) / speed + self._settling
 
     def check_power(self, state: GripperState) -> None:
         """Refuse jaws that have gone limp since the first command.

@@ -172,8 +172,7 @@ class GraspSession:
 
     def _begin(self) -> None:
         """Make a grasp and let it look at the gripper."""
-        resolution, closed = self._gripper.resolution, self._gripper.settings.closed_opening
-        self._grasp = ForceGrasp(self.goal, self._settings, resolution=resolution, closed_opening=closed)
+        self._grasp = _grasp_of(self._gripper, self.goal, self._settings)
         self.status = None
         self.update(self._gripper.state)
 
@@ -198,6 +197,18 @@ class GraspSession:
 
     def _is_settled(self) -> bool:
         return self.status is not None and self.status.phase in SETTLED
+
+
+def _grasp_of(gripper: Gripper, goal: GraspGoal, settings: GraspSettings | None) -> ForceGrasp:
+    """Return a grasp for a gripper."""
+    mechanism = gripper.settings
+    return ForceGrasp(
+        goal,
+        settings,
+        resolution=gripper.resolution,
+        closed_opening=mechanism.closed_opening,
+        stroke=mechanism.stroke,
+    )
 
 
 def _check_opening(goal: GraspGoal, gripper: Gripper) -> None:
@@ -261,7 +272,7 @@ def hold_force(
         GraspError: the grasp was ended for safety. Here, and whatever else is raised, the gripper holds in place, if
             it can.
     """
-    grasp = ForceGrasp(goal, settings, resolution=gripper.resolution, closed_opening=gripper.settings.closed_opening)
+    grasp = _grasp_of(gripper, goal, settings)
     is_done = until or (lambda status: status.phase is GraspPhase.HOLDING)
     try:
         while not is_done(status := _turn(gripper, forces, grasp)):

@@ -55,6 +55,7 @@ class GraspSettings:
     onset_force: float = setting(0.25, "above what was seen without load, it says that jaws are loaded", "N", 0.05, 2.0)
     noise: float = setting(0.05, "standard deviation of the force that is expected at first", "N", 0.005, 1.0)
     jump: float = setting(1.0, "change of the force between two images that motion does not explain", "N", 0.1, 10.0)
+    reaction: float = setting(0.05, "from a command to the motion that it asks for, of the gripper", "s", 0.0, 1.0)
     stale_after: float = setting(0.25, "age of the newest image with a force at which a grasp ends", "s", 0.05, 2.0)
     touch_timeout: float = setting(1.0, "wait for a force once the jaws are said to touch", "s", 0.1, 10.0)
     silence_timeout: float = setting(2.0, "wait for the first word of the camera", "s", 0.1, 60.0)

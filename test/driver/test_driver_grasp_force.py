@@ -199,7 +199,7 @@ def test_a_force_that_noise_makes_negative_is_none():
 
 
 def test_course_snaps_towards_open():
-    course = JawHistory(resolution=STEP, closed_opening=0.01)
+    course = JawHistory(resolution=STEP, closed_opening=0.01, stroke=0.048, reaction=0.05)
     assert course.snap(0.01) == pytest.approx(0.01)
     assert course.snap(0.01 + 0.1 * STEP) == pytest.approx(0.01 + STEP)
     assert course.nearest(0.01 + 0.6 * STEP) == pytest.approx(0.01 + STEP)
@@ -208,7 +208,7 @@ def test_course_snaps_towards_open():
 
 
 def test_jaws_rest_after_their_way_and_not_before():
-    course = JawHistory(resolution=STEP, closed_opening=0.0)
+    course = JawHistory(resolution=STEP, closed_opening=0.0, stroke=0.048, reaction=0.05)
     course.command(10 * STEP, 0.004, 1.0, JawPlace(opening=31 * STEP, resting=False))  # 4 mm: one second
     assert not course.rests_at(1.9, 10 * STEP)
     assert course.rests_at(2.1, 11 * STEP)
