@@ -28,6 +28,8 @@ from finforce_driver.grasp.controller import check_force_value
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.grasp.settings import GraspSettings
+from finforce_driver.joint.node import LINKS, JointLink
+from finforce_driver.joint.settings import JointSettings
 from finforce_driver.messages import goal_from_joint_state, move_from_joint_state
 from finforce_driver.parameters import DriverParameters, build_gripper
 from finforce_driver.publishers import (
@@ -64,8 +66,13 @@ class GripperDriverNode(Node):
         self.parameters = parameters = ros.declare_record(self, DriverParameters)
         settings = ros.declare_record(self, GripperSettings, "gripper")
         grasp = ros.declare_record(self, GraspSettings, "grasp")
+        joint = ros.declare_record(self, JointSettings, "joint")
         ros.name_unknown_parameters(self)
-        self.gripper = build(parameters, settings)
+        is_other = parameters.interface in LINKS
+        if is_other:
+            self.gripper = JointLink(self, parameters.interface, parameters.port, settings, joint).gripper
+        else:
+            self.gripper = build(parameters, settings)
         self.wake = self.create_guard_condition(self._on_states)
         self.session = GraspSession(self.gripper, parameters.goal, grasp, self.wake.trigger)
         self.tasks = GripperTasks(self.gripper, self.session, parameters)
@@ -73,7 +80,7 @@ class GripperDriverNode(Node):
         self.times = MessageTimes(self.gripper.clock, ("force", *JAWS, *(f"{side} stddev" for side in JAWS)), **gate)
         self.health = GripperHealth(source=parameters.port, stale_after=parameters.max_age)
         self.qos = ros.QosWatch(self)
-        self.out = DriverOutputs(self.qos, parameters)
+        self.out = DriverOutputs(self.qos, parameters, own_joints=not is_other)
         self.seen: ForceSample | None = None
         self.stale_after, self.noise = grasp.stale_after, grasp.noise
         self.arrived: deque[GripperState] = deque(maxlen=100)
@@ -93,7 +100,9 @@ class GripperDriverNode(Node):
             # what waits for an earlier call would move the jaws after a stop
             ros.serve_trigger(self, f"~/{name}", getattr(tasks, name), ReentrantCallbackGroup())
         ros.serve_switch(self, "~/activate", tasks.activate)
-        self.actions = [action for action in map(self._offer_action, ACTIONS) if action is not None]
+        # another gripper's driver has its own
+        offered = [] if self.parameters.interface in LINKS else ACTIONS
+        self.actions = [action for action in map(self._offer_action, offered) if action is not None]
         ros.publish_diagnostics(self, self.qos, "finforce: gripper", self.parameters.diagnostics_period, self._report)
 
     def _offer_action(self, name: str) -> ActionServer | None:

@@ -19,7 +19,11 @@ class DriverParameters(TimeParameters):
     """What a gripper driver node is told beside the settings of gripper and grasp; units stand in the metadata."""
 
     port: str = setting("/dev/ttyACM0", "serial port of the CAN adapter, or python-can's channel, such as can0")
-    interface: str = setting("slcan", "slcan: a serial adapter; any other word: python-can's interface of that name")
+    interface: str = setting(
+        "slcan",
+        "slcan: a serial adapter; joint_command, parallel_gripper_command, gripper_command: another gripper, by the "
+        "topic or action that `port` names; any other word: python-can's interface of that name",
+    )
     baud_rate: int = setting(115200, "of the serial port; of no effect on USB", "1/s", 1200, 10_000_000)
     bit_rate: int = setting(1_000_000, "of the CAN bus", "bit/s", 10_000, 1_000_000)
     joint_names: tuple[str, ...] = setting(

@@ -20,12 +20,13 @@ class DriverOutputs:
     Args:
         qos: makes publishers and watches them.
         parameters: names of the joints.
+        own_joints: nobody else tells the state of the joints.
     """
 
-    def __init__(self, qos: ros.QosWatch, parameters: DriverParameters) -> None:
+    def __init__(self, qos: ros.QosWatch, parameters: DriverParameters, *, own_joints: bool = True) -> None:
         self._names, self._source = parameters.joint_names, qos.node.get_name()
         self._told: tuple[str, str] | None = None
-        self.joints = qos.publisher(ros.JointState, "joint_states", ros.RESULT)
+        self.joints = qos.publisher(ros.JointState, "joint_states", ros.RESULT) if own_joints else None
         self.grasp = qos.publisher(ros.DiagnosticStatus, "~/grasp_state", ros.LATCHED)
 
     def send_joints(self, stamp: int, state: GripperState, effort: float | None) -> None:
@@ -36,6 +37,8 @@ class DriverOutputs:
             state: with it.
             effort: force that is trusted [N]; None: none is.
         """
+        if self.joints is None:
+            return
         message = ros.JointState(header=ros.Header(stamp=ros.stamp_message(stamp)))
         fill_joint_state(message, self._names, state, effort)
         self.joints.publish(message)

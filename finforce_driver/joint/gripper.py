@@ -155,11 +155,11 @@ class JointGripper:
         self.settings.check_opening("opening", opening)
         if speed is not None and not 0.0 < speed <= self._joint.largest_speed:
             raise TargetError(f"speed: got {speed:g} m/s, expected above 0 to {self._joint.largest_speed:g} m/s")
-        if force is not None and self._joint.largest_force and not 0.0 < force <= self._joint.largest_force:
-            raise TargetError(f"force: got {force:g} N, expected above 0 to {self._joint.largest_force:g} N")
+        if force is not None and not force > 0.0:
+            raise TargetError(f"force: got {force:g} N, expected above 0")
 
     def move(self, opening: float, speed: float | None = None, force: float | None = None) -> None:
-        """Go to an opening [m], with a speed of it [m/s] and an effort [N] that joints without one ignore.
+        """Go to an opening [m], with a speed of it [m/s] and an effort [N], at most what the joint has.
 
         Raises:
             TargetError: a value is no number or out of bounds.
@@ -170,7 +170,8 @@ class JointGripper:
             self._require("move")
             now = self.clock.now()
             start = self._places[-1][1] if self._way is None else self._way.setpoint(now)
-            effort = math.nan if force is None or not self._joint.largest_force else float(force)
+            largest = self._joint.largest_force
+            effort = math.nan if force is None or not largest else min(float(force), largest)
             pace = self.settings.default_speed if speed is None else speed
             self._way = _Way(target=float(opening), speed=pace, effort=effort, begun=now, start=start)
             self._outcome, self._moved = MoveOutcome.NONE, now

@@ -5,10 +5,15 @@ from contextlib import ExitStack
 import pytest
 from action_msgs.msg import GoalStatus
 from control_msgs.action import GripperCommand, ParallelGripperCommand
-from emulator_fakes import Bench
+from driver_node_fakes import call
+from emulator_fakes import Bench, Fingers
 from node_fakes import ros_domain
 from rclpy.action import ActionClient
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from finforce_driver.node import GripperDriverNode
 
 JOINTS = ["left_jaw_joint", "right_jaw_joint"]
 STEP = 0.048 / 255
@@ -102,3 +107,43 @@ def test_the_older_action_takes_the_opening_and_says_whether_it_is_reached(trial
     status, result = trial.result(trial.single(0.03))
     assert status == GoalStatus.STATUS_SUCCEEDED and result.reached_goal
     assert result.position == pytest.approx(0.03, abs=2 * STEP)
+
+
+@pytest.mark.parametrize(
+    ("interface", "action"),
+    [("parallel_gripper_command", "parallel_gripper_cmd"), ("gripper_command", "gripper_cmd")],
+)
+def test_a_second_driver_holds_a_force_by_the_actions_of_the_first(trial, interface, action):
+    half = interface.startswith("parallel")
+    given = {
+        "interface": interface,
+        "port": f"/gripper_driver/{action}",
+        "joint.names": JOINTS if half else ["left_jaw_joint"],
+        "joint.open": 0.024 if half else 0.048,
+        "joint.states": "/joint_states" if half else "/opening",
+        "joint.rate": 8.0,
+        "joint.resolution": 0.0002,
+        "joint.largest_force": 62.0,
+        "grasp.reaction": 0.3,
+        "grasp.stale_after": 0.75,
+        "max_age": 0.5,
+    }
+    Fingers(trial.bench)
+    if not half:  # whose joint is the opening
+        out = trial.probe.speak("/opening", JointState)
+        double = lambda: out.publish(  # noqa: E731
+            JointState(name=["left_jaw_joint"], position=[2.0 * trial.bench.joints[-1].position[0]])
+        )
+        trial.probe.create_timer(0.02, double)
+    parameters = [Parameter(name, value=value) for name, value in given.items()]
+    remapped = ["--ros-args", "-r", "__node:=second_driver"]
+    second = GripperDriverNode(context=trial.probe.context, parameter_overrides=parameters, cli_args=remapped)
+    trial.probe.spinner.add_node(second)
+    trial.probe.wait_for(lambda: second.gripper.state.phase.value == "ready")
+    client = trial.probe.create_client(Trigger, "/second_driver/grasp")
+    assert client.wait_for_service(10.0)
+    answer = client.call_async(Trigger.Request())
+    trial.probe.wait_for(answer.done, 40.0)
+    assert answer.result().success, answer.result().message
+    assert trial.bench.gripper.jaws.force == pytest.approx(1.0, abs=0.35)
+    assert call(trial.probe, Trigger, "stop").success

@@ -13,4 +13,4 @@ def test_both_actions_move_the_gripper_over_real_ros():
     environment = control_msgs_fakes.environment()
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
-    assert "7 passed" in done.stdout
+    assert "9 passed" in done.stdout
