@@ -37,6 +37,7 @@ from finforce.ros.executor import KeepingExecutor, is_wanted  # noqa: F401 - for
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     KeptMessage,
     cloud_message,
+    force_stddev,
     grasp_force,
     image_message,
     is_touching,

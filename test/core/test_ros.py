@@ -2,7 +2,9 @@
 
 import math
 import os
+import re
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -213,3 +215,13 @@ def test_images_of_a_megabyte_arrive_with_best_effort():
         for count in range(1, 6):
             publisher.publish(ros.image_message(Header(), picture))
             probe.wait_for(lambda count=count: len(probe.got["picture"]) == count)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(Path(ros.__file__).parents[2].glob("finforce*/**/*.py")), ids=lambda path: path.stem
+)
+def test_what_the_nodes_take_from_here_is_here(path):
+    text = path.read_text(encoding="utf-8")
+    if "from finforce.ros import node as ros" in text:
+        names = set(re.findall(r"(?<![\w.])ros\.([A-Za-z_]\w*)", text))
+        assert [name for name in sorted(names) if not hasattr(ros, name)] == []

@@ -177,3 +177,30 @@ def test_the_end_of_a_grasp_is_told_once_and_kept_for_whoever_comes_later(probe)
     probe.create_subscription(type(state[-1]), "/gripper_driver/grasp_state", late.append, ros.LATCHED)
     probe.wait_for(lambda: late)
     assert late[0].message == state[-1].message
+
+
+def stddev(value, frame="left_jaw"):
+    message = WrenchStamped(header=Header(stamp=ros.stamp_message(time_ns()), frame_id=frame))
+    message.wrench.force.x = value
+    return message
+
+
+def test_the_stated_deviation_of_the_jaws_reaches_the_grasp(probe):
+    _, node, _, _ = grasping(probe)
+    send(probe, "left/wrench_stddev", stddev(0.1))
+    send(probe, "right/wrench_stddev", stddev(0.3, "right_jaw"))
+    out = probe.speak("grasp_wrench", WrenchStamped)
+    probe.connected(out)
+
+    def told():
+        out.publish(wrench(0.0))
+        probe.spin(0.02)
+        return node.session.status.stddev == pytest.approx(0.3)
+
+    probe.wait_for(told)
+
+
+def test_a_deviation_that_cannot_be_is_named_and_not_used(probe):
+    grasping(probe)
+    send(probe, "left/wrench_stddev", stddev(math.nan))
+    gripper_state(probe, Level.ERROR, "expected finite numbers from 0")
