@@ -25,6 +25,8 @@ setup(
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/config", glob("config/*.yaml")),
         (f"share/{NAME}/config/moveit", glob("config/moveit/*")),
+        (f"share/{NAME}/config/grippers", glob("config/grippers/*")),
+        (f"share/{NAME}/examples", glob("examples/*.py")),
         (f"share/{NAME}/rviz", glob("rviz/*")),
         (f"share/{NAME}/urdf", glob("urdf/*")),
     ],

