@@ -167,13 +167,13 @@ def _node_action(process: Process) -> Any:
     return Node(
         package=process.package,
         executable=process.executable,
-        name=process.name,
+        name=process.name or None,
         output="screen",
         parameters=[*files, values] if values else files,
         remappings=list(process.remappings.items()),
         arguments=list(process.arguments),
         additional_env=SINGLE_THREAD,
-        on_exit=Shutdown(reason=f"{process.name} has ended") if process.ends_all else None,
+        on_exit=Shutdown(reason=f"{process.name or process.executable} has ended") if process.ends_all else None,
     )
 
 

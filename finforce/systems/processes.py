@@ -23,7 +23,7 @@ class Process:
     Attributes:
         package: that holds the executable.
         executable: as `ros2 run` finds it.
-        name: of the node.
+        name: of the node; empty where a process has several, which would all be called so.
         parameters: ROS parameters that differ from the node's defaults.
         parameter_file: YAML file with more of them, overruled by `parameters`; empty for none.
         remappings: topic names as the node knows them -> as they are here.
@@ -47,7 +47,7 @@ class Process:
     def command(self) -> list[str]:
         """Return the command line that runs one of our nodes with this Python, without `ros2`."""
         words = [sys.executable, "-m", "finforce.ros.start", self.executable, *self.arguments]
-        words += ["--ros-args", "-r", f"__node:={self.name}"]
+        words += ["--ros-args", *(["-r", f"__node:={self.name}"] if self.name else [])]
         if self.parameter_file:
             words += ["--params-file", self.parameter_file]
         for name, value in self.parameters.items():

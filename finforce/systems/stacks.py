@@ -56,14 +56,14 @@ def control_processes(options: StackOptions, share: Path) -> list[Process]:
         Process(
             package="controller_manager",
             executable="ros2_control_node",
-            name="controller_manager",
+            name="",
             parameter_file=controllers,
             remappings={"~/robot_description": "/robot_description"},
         ),
         Process(
             package="controller_manager",
             executable="spawner",
-            name="gripper_spawner",
+            name="",
             arguments=(*CONTROLLERS, "--param-file", controllers),
         ),
     ]
@@ -89,7 +89,7 @@ def moveit_processes(options: StackOptions, share: Path) -> list[Process]:
     return [
         *gripper_processes(options, share, {}),
         _publisher(model),
-        Process(package="moveit_ros_move_group", executable="move_group", name="move_group", parameters=parameters),
+        Process(package="moveit_ros_move_group", executable="move_group", name="", parameters=parameters),
     ]
 
 

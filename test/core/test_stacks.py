@@ -16,7 +16,7 @@ JOINTS = DriverParameters().joint_names
 
 
 def by_name(processes):
-    return {process.name: process for process in processes}
+    return {process.executable: process for process in processes}
 
 
 @pytest.fixture(scope="module")
@@ -31,14 +31,19 @@ def moveit():
 
 
 def test_ros2_control_has_driver_manager_and_controllers(control):
-    assert set(control) == {"gripper_driver", "robot_state_publisher", "controller_manager", "gripper_spawner"}
+    assert set(control) == {"gripper_driver", "robot_state_publisher", "ros2_control_node", "spawner"}
     assert control["gripper_driver"].parameters == {"port": "/dev/ttyACM7"}
-    controllers = yaml.safe_load(Path(control["controller_manager"].parameter_file).read_text())
+    controllers = yaml.safe_load(Path(control["ros2_control_node"].parameter_file).read_text())
     declared = [
         name for name, value in controllers["controller_manager"]["ros__parameters"].items() if name != "update_rate"
     ]
-    assert control["gripper_spawner"].arguments[:2] == tuple(declared)
+    assert control["spawner"].arguments[:2] == tuple(declared)
     assert controllers["finray_gripper_controller"]["ros__parameters"]["joint"] == JOINTS[0]
+
+
+def test_processes_with_several_nodes_leave_them_their_names(control, moveit):
+    for process in (control["ros2_control_node"], control["spawner"], moveit["move_group"]):
+        assert process.name == "" and not any("__node" in word for word in process.command())
 
 
 def test_the_hardware_interface_has_the_joints_and_topics_of_the_driver(control):
