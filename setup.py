@@ -24,6 +24,7 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/config", glob("config/*.yaml")),
+        (f"share/{NAME}/config/ros2_control", glob("config/ros2_control/*")),
         (f"share/{NAME}/config/moveit", glob("config/moveit/*")),
         (f"share/{NAME}/config/grippers", glob("config/grippers/*")),
         (f"share/{NAME}/examples", glob("examples/*.py")),

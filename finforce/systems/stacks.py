@@ -49,7 +49,7 @@ def control_processes(options: StackOptions, share: Path) -> list[Process]:
         MissingDependencyError: the description is a xacro file, and xacro is not installed.
     """
     model = describe(options.description or share / "urdf" / "finray_gripper_control.urdf.xacro")
-    controllers = options.controllers or str(share / "config" / "ros2_control.yaml")
+    controllers = options.controllers or str(share / "config" / "ros2_control" / "controllers.yaml")
     return [
         *gripper_processes(options, share),
         _publisher(model),

@@ -56,7 +56,9 @@ class ForceGrasp:
         self._phase, self._reason = GraspPhase.APPROACH, "waits for the first force"
         self._began = self._held_at = self._spare = self._saturated = math.nan
         self._content = 0
-        self._excess_since = self._start = math.nan
+        self._excess_since = self._start = self._waits_since = math.nan
+        self._free = 0.0  # largest force of the motor [N] while nothing pressed
+        self._motor: deque[tuple[float, float]] = deque()  # times [s] and forces [N] that no image is newer than
         self._asked_to_stop = ""
         self._failed = self._unseen = self._backs_off = False
 
@@ -114,7 +116,9 @@ class ForceGrasp:
             fresh = self._drain(state, now, opening_at)
             self._check_witness(state, now)
             self._check_limits(state, now)
-            move = self._choose_move(state, now) if fresh else None
+            move = self._wait_for_image(state, now)
+            if move is None and fresh and math.isnan(self._waits_since):
+                move = self._choose_move(state, now)
         except BackOffError as error:
             self._phase, self._reason, self._failed, self._backs_off = GraspPhase.STOPPED, str(error), True, True
             self._unseen = isinstance(error, UnseenForceError)
@@ -171,6 +175,26 @@ class ForceGrasp:
             self._reason = words
         return True
 
+    def _wait_for_image(self, state: GripperState, now: float) -> GripperMove | None:
+        """Return a move that stops the approach where the motor meets something that no image shows yet.
+
+        What free motion takes is learnt from the motor's forces up to each image in which nothing presses.
+        """
+        if self._phase is not GraspPhase.APPROACH or not math.isfinite(state.force):
+            self._waits_since = math.nan
+            return None
+        if not self._motor or state.stamp > self._motor[-1][0]:
+            self._motor.append((state.stamp, state.force))
+        while self._motor and self._motor[0][0] <= self._feed.stamp:
+            self._free = max(self._free, self._motor.popleft()[1])
+        if self._feed.stamp > self._waits_since:
+            self._waits_since = math.nan
+        meets = self._free > 0.0 and state.force > self._free + self.settings.motor_onset
+        if not meets or not math.isnan(self._waits_since):
+            return None
+        self._waits_since = now
+        return self._pause(state, now)
+
     def _check_witness(self, state: GripperState, now: float) -> None:
         """Refuse to press harder, by the motor's current, than the camera says by more than friction explains.
 
@@ -223,6 +247,7 @@ class ForceGrasp:
         """Return the next move, None where the jaws are to go on as they do."""
         if self._load.doubtful:
             return self._pause(state, now)
+        self._plan.note_rest()
         wish = self._plan.wish(self._set_force)
         target = self._plan.limit(wish)
         self._watch(wish, target, now)
@@ -231,12 +256,13 @@ class ForceGrasp:
 
     def _watch(self, wish: float, target: float, now: float) -> None:
         """See whether the force is held, and whether the least opening keeps it from being reached."""
-        is_content = self._load.resting and target == self._jaws.target
-        if not (is_content and wish < target):
+        near = 0.5 * self._jaws.resolution  # openings are multiples of it, but for rounding
+        is_content = self._load.resting and abs(target - self._jaws.target) < near
+        if not (is_content and wish < target - near):
             self._saturated = math.nan
         elif math.isnan(self._saturated):
             self._saturated = now
-        held = is_content and wish == target and self._load.loaded
+        held = is_content and abs(wish - target) < near and self._load.loaded
         self._content = self._content + 1 if held else 0
         if self._content >= _CONTENT and self._phase is not GraspPhase.HOLDING:
             self._phase, self._reason, self._held_at = GraspPhase.HOLDING, "holds the set force", target
@@ -251,6 +277,7 @@ class ForceGrasp:
         return self._move(here, self._jaws.speed, state, now) if is_closing else None
 
     def _move(self, target: float, speed: float, state: GripperState, now: float) -> GripperMove:
+        target = min(target, self._jaws.widest)
         self._jaws.command(target, speed, now, self._jaws.locate(now, state, lambda _: state.opening))
         return GripperMove(opening=target, speed=speed, force=self._motor_force)
 

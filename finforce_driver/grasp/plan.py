@@ -28,6 +28,7 @@ _CALM = 0.15  # [N] stated deviation of the force above which the jaws go slower
 _CONTRADICTED = 0.5  # share of the speed while the contact estimator says that nothing touches
 _WITNESS_TIME = 0.15  # [s] from a force to the stop that the motor's current brings about
 _FRICTION = 1.0  # [N] by which the motor's current may tell too little
+_BEYOND_NOISE = 4.0  # deviations of one force, beyond which a step's change of it is no chance
 _SURE = 2.0  # stated deviations of the force within which it is reckoned with
 _HYSTERESIS = 0.3  # [steps] of force beyond the tolerance before jaws at rest open again
 
@@ -49,6 +50,8 @@ class GraspPlan:
         self._goal, self._settings = goal, settings
         self._load, self._jaws, self._feed = load, jaws, feed
         self._least = max(jaws.snap(goal.least_opening), jaws.closed)
+        self._rest = (math.nan, math.nan)  # target [m] and force [N] of the last image at rest
+        self._step_force = 0.0  # [N] that a step of the jaws was seen to change, where that was beyond expectation
 
     @property
     def stiffness(self) -> float:
@@ -73,6 +76,18 @@ class GraspPlan:
             reach = max(reach, jaws.resolution)
         return jaws.snap(jaws.target - reach)
 
+    def note_rest(self) -> None:
+        """Look at what a step between two rests did to the force: of stiff things it may be more than was learnt."""
+        load, jaws = self._load, self._jaws
+        if not (load.loaded and load.resting):
+            return
+        before, self._rest = self._rest, (jaws.target, load.force)
+        steps = abs(before[0] - jaws.target) / jaws.resolution
+        if 0.5 < steps < 1.5:
+            change = abs(load.force - before[1])
+            expected = load.model.likely_stiffness * jaws.resolution + _BEYOND_NOISE * load.model.noise
+            self._step_force = change if change > expected else 0.0
+
     def limit(self, wish: float) -> float:
         """Return a wish [m] within the least opening and what the gripper can open."""
         return min(max(wish, self._least), self._jaws.widest)
@@ -84,7 +99,8 @@ class GraspPlan:
         """
         way = abs(self._load.opening - target)
         due = self._feed.latency + 1.5 * self._feed.period + self._settings.reaction
-        return min(self._goal.speed * self._sureness, self._blind_speed, max(_LEAST_SPEED, way / due))
+        wanted = self._goal.speed if self._load.loaded else min(self._goal.speed, self._settings.approach_speed)
+        return min(wanted * self._sureness, self._blind_speed, max(_LEAST_SPEED, way / due))
 
     @property
     def _blind_speed(self) -> float:
@@ -153,7 +169,7 @@ class GraspPlan:
         if not load.loaded:
             return load.force < load.onset
         largest = max(self._settings.largest_stiffness, 1.05 * load.model.stiffness)
-        return allowed > min(load.model.likely_stiffness, largest) * self._jaws.resolution
+        return allowed > max(min(load.model.likely_stiffness, largest) * self._jaws.resolution, self._step_force)
 
     def _steps_back(self, excess: float) -> int:
         """Return by how many steps jaws at rest are to open for an excess of force [N]."""

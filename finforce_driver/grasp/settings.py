@@ -52,6 +52,16 @@ class GraspSettings:
     approach_share: float = setting(
         0.7, "of the set force that may build up before an image can show the contact", "", 0.05, 1.0
     )
+    approach_speed: float = setting(
+        0.004, "greatest speed of the opening before something presses, whatever the goal says", "m/s", 1e-4, 0.1
+    )
+    motor_onset: float = setting(
+        0.8,
+        "rise of the motor's force above that of free motion, at which jaws wait for the next image",
+        "N",
+        0.2,
+        62.0,
+    )
     onset_force: float = setting(0.25, "above what was seen without load, it says that jaws are loaded", "N", 0.05, 2.0)
     noise: float = setting(0.05, "standard deviation of the force that is expected at first", "N", 0.005, 1.0)
     jump: float = setting(1.0, "change of the force between two images that motion does not explain", "N", 0.1, 10.0)

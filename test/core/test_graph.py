@@ -19,6 +19,8 @@ from finforce.systems.processes import BenchOptions, Process, ReplayOptions, Rob
 from finforce_contact.parameters import ContactParameters
 from finforce_contact.settings import ContactSettings
 from finforce_driver.grasp.settings import GraspSettings
+from finforce_driver.joint.node import LINKS
+from finforce_driver.joint.settings import JointSettings
 from finforce_driver.parameters import DriverParameters
 from finforce_driver.settings import GripperSettings
 from finforce_eval.replay.node import PlayerParameters
@@ -200,11 +202,13 @@ PARAMETERS = {
     "keypoint_detector": defaults_of(DetectorParameters) | defaults_of(DetectorSettings, "detector."),
     "gripper_driver": defaults_of(DriverParameters)
     | defaults_of(GripperSettings, "gripper.")
-    | defaults_of(GraspSettings, "grasp."),
+    | defaults_of(GraspSettings, "grasp.")
+    | defaults_of(JointSettings, "joint."),
     "twin_camera": defaults_of(TwinParameters),
     "/**": defaults_of(TimeParameters),
 }
 NODE_FILES = [path for path in sorted((ROOT / "config").glob("*.yaml")) if path.name != "d405.yaml"]
+GRIPPER_FILES = sorted((ROOT / "config" / "grippers").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", NODE_FILES, ids=lambda path: path.name)
@@ -216,6 +220,19 @@ def test_every_key_of_a_configuration_is_a_parameter_and_differs_from_its_defaul
             assert name in defaults
             assert value != defaults[name]
             assert type(value) is type(defaults[name])
+
+
+@pytest.mark.parametrize("path", GRIPPER_FILES, ids=lambda path: path.name)
+def test_what_says_how_another_gripper_is_can_be_set_on_the_driver(path):
+    ((node, section),) = yaml.safe_load(path.read_text(encoding="utf-8")).items()
+    for name, value in section["ros__parameters"].items():
+        value = tuple(value) if isinstance(value, list) else value
+        assert type(value) is type(PARAMETERS[node][name])
+    given = section["ros__parameters"]
+    joint = {name.removeprefix("joint."): value for name, value in given.items() if name.startswith("joint.")}
+    settings = JointSettings(**joint | {"names": tuple(joint["names"])})
+    assert given["interface"] in LINKS and 0.0 < settings.resolution < 0.01 * given["gripper.stroke"]
+    GraspSettings(reaction=given["grasp.reaction"])
 
 
 @pytest.mark.parametrize("path", NODE_FILES, ids=lambda path: path.name)
