@@ -33,6 +33,7 @@ from finforce_driver.emulator.mechanism import Jaws
 from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
 from finforce_driver.errors import DriverError
 from finforce_driver.gripper import Gripper
+from finforce_driver.machine.machine import INHERITED
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_driver.units import GripperScale
@@ -200,7 +201,9 @@ class FaultRun:
         if split_identifier(message.id).command == Command.MOVE and message.data:
             self.tally.orders += 1
             goal = self.gripper.scale.counts_of(self._goal) if self._allowed else None
-            complaints = self.guard.check(decode_move(message), goal, self._stopped, self._allowed)
+            # jaws that move by somebody's order when a link comes up are held where they are, as documented
+            allowed = self._allowed or self.gripper.state.message == INHERITED
+            complaints = self.guard.check(decode_move(message), goal, self._stopped, allowed)
             self.tally.motion.update(complaints)
             if self._tracing and complaints:
                 print(f"{self.clock.now():.3f} {complaints} {decode_move(message)} {self.gripper.state}")
