@@ -15,7 +15,7 @@ demo: .venv/.$(ROS)-run
 
 # What fails among others, beside real nodes in real time, has one more try alone.
 test: .venv/.$(ROS)-test
-	$(PYTHON) -m pytest -n auto || $(PYTHON) -m pytest --last-failed --last-failed-no-failures none
+	$(PYTHON) -m pytest -n auto --dist worksteal || $(PYTHON) -m pytest --last-failed --last-failed-no-failures none
 
 lint: .venv/.$(ROS)-lint
 	$(PYTHON) -m ruff check .
