@@ -310,11 +310,10 @@ def wrench_from_message(message: Any, frame: str) -> tuple[NDArray, NDArray]:
     return force, torque
 
 
-_LEAN = math.sin(math.radians(15.0))
-
-
 def magnitude_stddev(axes: Sequence[float]) -> float:
-    """Return the standard deviation [N] of the magnitude of a jaw's force, which is along x up to 15 degrees.
+    """Return the standard deviation [N] of the magnitude of a jaw's force: that along x, the closing direction.
+
+    What is uncertain across it, as friction, changes the direction and hardly the magnitude.
 
     Args:
         axes: standard deviations of the force along x, y and z [N].
@@ -325,7 +324,7 @@ def magnitude_stddev(axes: Sequence[float]) -> float:
     x, y, z = (float(value) for value in axes)
     if not all(math.isfinite(value) and value >= 0.0 for value in (x, y, z)):
         raise ObservationError(f"the force's standard deviation: got {(x, y, z)} N, expected finite numbers from 0")
-    return math.hypot(x, _LEAN * y, _LEAN * z)
+    return x
 
 
 def camera_from_info(info: Any, frame: str) -> CameraIntrinsics:

@@ -41,10 +41,11 @@ _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are un
 _UNCALIBRATED = 0.1
 # Relative error of forces at the distance from stored shapes that those are good for.
 _EXTRAPOLATED = 0.015
-# What two jaws hold does not slide out, though their bent faces lean: friction, of which the mechanics knows nothing,
-# takes up to `braced` of the force along the finger. Standard deviations by that: of the magnitude, over the
-# tangent of the lean; of the force along z, over that force. Fitted to the twin, whose objects are held so.
-_BRACED, _BRACED_Z = 0.25, 0.5
+# The mechanics knows no friction. What acts along the face is seen by nobody: half of the cone for one deviation. And
+# what two jaws hold does not slide out, though their bent faces lean: friction takes up the force along the finger, and
+# the magnitude that belongs to the same shape is larger, by a share of the tangent of the lean that the twin's held
+# objects have.
+_TANGENTIAL, _LEANING = 0.5, 0.3
 # Relative error of a jaw that is taken to be linear, 10 mm deep.
 _LINEAR = 0.05
 # Share of a force that nobody has seen along z.
@@ -265,9 +266,9 @@ class JawEstimator:
 
     def _solution(self, track: Track, force: NDArray, used: NDArray) -> Solution:
         extrapolated = _EXTRAPOLATED * track.extrapolation
-        along = self.settings.braced * float(abs(force[2]))
-        braced = _BRACED * along / max(float(abs(force[0])), float(abs(force[2])), 1e-9)
-        share = float(np.sqrt(self._force_error**2 + track.place_error**2 + extrapolated**2 + braced**2))
+        friction = self.settings.friction
+        leaning = _LEANING * min(friction, float(abs(force[2])) / max(float(abs(force[0])), 1e-9))
+        share = float(np.sqrt(self._force_error**2 + track.place_error**2 + extrapolated**2 + leaning**2))
         evidence = ForceEvidence(
             force=force,
             elastic=track.force,
@@ -277,7 +278,7 @@ class JawEstimator:
             place=track.pressure_place,
             place_stddev=track.place_stddev,
         )
-        numbers = find_numbers(evidence, share, _LEAN, _BRACED_Z * along)
+        numbers = find_numbers(evidence, share, _LEAN, _TANGENTIAL * friction)
         return Solution(
             stamp=self._stamp,
             status="ok" if numbers.magnitude > 0.0 else "unloaded",

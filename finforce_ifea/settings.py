@@ -28,8 +28,12 @@ class EstimatorSettings:
     noise: float = setting(0.35e-3, "key point noise assumed until a tare has measured it", "m", 1e-6, 0.01)
     offset_stddev: float = setting(0.4e-3, "constant offset of a key point that no tare has seen", "m", 0.0, 0.01)
     model_error: float = setting(0.01, "error of the mechanics as a share of a key point's way", "1", 0.0, 1.0)
-    braced: float = setting(
-        1.0, "share of the force along a leaning finger that friction may take up, for the stated deviation", "1", 0, 1
+    friction: float = setting(
+        0.4,
+        "coefficient of the friction that may act, for the stated deviations; the mechanics has none",
+        "1",
+        0.0,
+        2.0,
     )
     tare_frames: int = setting(45, "unloaded frames before the first force is reported", "frames", 5, 10000)
     tare_memory: int = setting(300, "unloaded frames over which offsets are averaged", "frames", 5, 100000)

@@ -116,7 +116,7 @@ def grasp_force(message: WrenchStamped, frame: str) -> float:
 
 
 def force_stddev(message: WrenchStamped, frame: str) -> float:
-    """Return the standard deviation [N] of the magnitude of a jaw's force, which is along x up to 15 degrees.
+    """Return the standard deviation [N] of the magnitude of a jaw's force.
 
     Raises:
         ObservationError: the frame is another one, or a deviation is no finite number from 0.

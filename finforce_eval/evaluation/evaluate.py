@@ -168,6 +168,7 @@ class StepLog:
         self.force = np.full((frames, 3), np.nan)
         self.place = np.full((frames, 3), np.nan)
         self.stddev = np.full(frames, np.nan)
+        self.axis_stddev = np.full((frames, 3), np.nan)
         self.residual = np.full(frames, np.nan)
         self.used = np.zeros((frames, track.count), dtype=bool)
         self.status = np.full(frames, "", dtype="U32")
@@ -199,6 +200,7 @@ class StepLog:
         self.force[index] = solution.force
         self.place[index] = solution.contact_place
         self.stddev[index] = solution.magnitude_stddev
+        self.axis_stddev[index] = solution.force_stddev
         magnitude = float(np.linalg.norm(solution.force))
         # two per cent: the surface is copied now and then, not on every frame of a rising force
         if self.phases.scored[index] and magnitude > 1.02 * self.largest:
@@ -231,6 +233,7 @@ class StepLog:
             force=self.force,
             place=self.place,
             stddev=self.stddev,
+            axis_stddev=self.axis_stddev,
             residual=self.residual,
             used=self.used,
             status=self.status,

@@ -298,6 +298,7 @@ class CaseResult:
         contact: where the object was said to touch; None when it does not travel.
         sight: the key points that were found against the true ones; None where nothing says where they truly were.
         detector_ms: (n,) wall time from image to key points [ms], NaN where it was not timed; None without a detector.
+        axis_stddev: (n, 3) stated standard deviation of the force [N], NaN where it is not trusted; None unknown.
         latency_ms: (n,) from what the call began with, images or key points, to the force [ms]; None for `step_ms`.
     """
 
@@ -320,6 +321,7 @@ class CaseResult:
     contact: ContactSeries | None = None
     sight: DetectionErrors | None = None
     detector_ms: NDArray[np.float64] | None = None
+    axis_stddev: NDArray[np.float64] | None = None
     latency_ms: NDArray[np.float64] | None = None
 
     @property

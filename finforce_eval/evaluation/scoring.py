@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from finforce_eval.recordings.tracks import Recording, WrenchTrack
 LEAST_FORCE, ONSET_FORCE = 0.2, 0.02
 # A touch that is not there to stay within so many frames after the true begin is missed.
 WATCHED = 30
+_NOTHING = 1e-3  # [N] along an axis, which needs no standard deviation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,6 +149,11 @@ class Stats:
         nrmsd_pct: the same over the range of the true force [%].
         max_error_N: largest absolute error [N].
         bias_N: mean error [N]; positive when the estimate is too large.
+        vector_rmse_N: root mean square length of the difference of the forces as vectors [N].
+        axis_rmse_N: root mean square difference along x, y and z of the jaw [N].
+        within_3_sigma_pct: share of the frames in which the difference along x, y and z is within three of the stated
+            standard deviations, or 1 mN [%].
+        answered_pct: share of the frames that were to be answered [%].
     """
 
     n: int
@@ -154,6 +161,10 @@ class Stats:
     nrmsd_pct: float | None
     max_error_N: float | None
     bias_N: float | None
+    vector_rmse_N: float | None = None
+    axis_rmse_N: tuple[float, float, float] | None = None
+    within_3_sigma_pct: tuple[float, float, float] | None = None
+    answered_pct: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,6 +306,33 @@ def compute_stats(errors: NDArray[np.float64], span: float) -> Stats:
     )
 
 
+def _vector_stats(cases: Sequence[CaseResult], phase: str) -> dict[str, Any]:
+    """Return what `Stats` says of the force as a vector, and how often there was one.
+
+    A truth that is along x throughout is a magnitude that was written there, and says nothing of the vector.
+    """
+    asked = sum(int((case.scored & _is_phase(case, phase)).sum()) for case in cases)
+    answered = sum(int((case.scored & case.solved & _is_phase(case, phase)).sum()) for case in cases)
+    found: dict[str, Any] = {"answered_pct": 100.0 * answered / asked if asked else None}
+    chosen = [_selected(case, phase) for case in cases]
+    differences = np.concatenate(
+        [case.force[rows] - case.truth[rows] for case, rows in zip(cases, chosen, strict=True)]
+    )
+    if not any(np.nan_to_num(case.truth[:, 1:]).any() for case in cases) or not len(differences):
+        return found
+    axes = np.sqrt((differences**2).mean(axis=0))
+    found |= {"vector_rmse_N": float(np.linalg.norm(axes)), "axis_rmse_N": tuple(axes.tolist())}
+    if all(case.axis_stddev is not None for case in cases):
+        stated = np.concatenate([case.axis_stddev[rows] for case, rows in zip(cases, chosen, strict=True)])
+        within = np.abs(differences) <= np.maximum(3.0 * stated, _NOTHING)
+        found["within_3_sigma_pct"] = tuple((100.0 * within.mean(axis=0)).tolist())
+    return found
+
+
+def _is_phase(result: CaseResult, phase: str) -> NDArray[np.bool_]:
+    return np.ones(len(result.stamps), dtype=bool) if phase == "all" else result.direction == phase
+
+
 def _spread(values: Sequence[float | None]) -> Spread:
     """Return mean and sample standard deviation of the numbers among values."""
     numbers = [value for value in values if value is not None]
@@ -352,7 +390,10 @@ def score_case(results: CaseResult | Sequence[CaseResult], span: float) -> CaseS
     cases = [results] if isinstance(results, CaseResult) else list(results)
     frames = sum(len(case.stamps) for case in cases)
     solved = sum(int(case.solved.sum()) for case in cases)
-    stats = {phase: compute_stats(_errors(cases, phase), span) for phase in ("all", "load", "unload")}
+    stats = {
+        phase: replace(compute_stats(_errors(cases, phase), span), **_vector_stats(cases, phase))
+        for phase in ("all", "load", "unload")
+    }
     each = [compute_stats(case.error[case.counted], span).rmse_N for case in cases]
     return CaseScore(
         frames=frames,

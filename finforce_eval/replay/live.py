@@ -187,6 +187,7 @@ def live_result(
         force=force,
         place=np.full((frames, 3), np.nan),
         stddev=np.linalg.norm(along * _rows(log.stddev, stamps), axis=1),
+        axis_stddev=_rows(log.stddev, stamps) if log.stddev else None,
         residual=np.full(frames, np.nan),
         used=seen,
         status=np.where(np.isfinite(force).all(axis=1), "ok", "no wrench"),

@@ -216,14 +216,14 @@ class ForceEvidence(NamedTuple):
 
 
 @njit(**_OPTIONS)
-def find_numbers(evidence: ForceEvidence, share: float, lean: float, braced: float) -> SolutionNumbers:
+def find_numbers(evidence: ForceEvidence, share: float, lean: float, tangential: float) -> SolutionNumbers:
     """Returns what belongs to a force; see `SolutionNumbers`.
 
     Args:
         evidence: the force that was tracked.
         share: relative standard deviation of the mechanics; it errs in the direction as in the magnitude.
         lean: share of a force that nobody has seen along z.
-        braced: standard deviation of the force along z that friction leaves [N].
+        tangential: standard deviation of what acts along the face, as a share of the force.
     """
     force, elastic, modes, covariance, pressure, place, place_stddev = evidence
     fit, magnitude = measure_along(elastic, modes, covariance), np.sqrt((force * force).sum())
@@ -235,7 +235,9 @@ def find_numbers(evidence: ForceEvidence, share: float, lean: float, braced: flo
     stddev[0] += (share * magnitude) ** 2
     stddev[2] += (share * magnitude) ** 2
     # a larger force leans more: where it is hardly known, its direction is not known either
-    stddev[2] += braced**2
+    # y, along which nothing is solved for, and z
+    stddev[1] += (tangential * magnitude) ** 2
+    stddev[2] += (tangential * magnitude) ** 2
     stddev[2] += (lean * fit**2 / max(magnitude + fit, 1e-300)) ** 2
     stddev = np.sqrt(stddev)
     arm, undeformed = pressure.copy(), place.copy()

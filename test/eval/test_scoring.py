@@ -78,7 +78,8 @@ def test_unsolved_frames_are_skipped_and_never_a_zero_error():
     score = score_case(gaps, span=1.0)
     assert (score.frames, score.solved, score.skipped) == (4, 2, 2)
     assert (score.record_frames, score.record_skipped) == (4, 2)
-    assert score.all == score_case(solved, span=1.0).all
+    assert replace(score.all, answered_pct=100.0) == score_case(solved, span=1.0).all
+    assert score.all.answered_pct == 50.0
 
 
 def test_nothing_solved_gives_no_number_instead_of_zero():
@@ -156,3 +157,39 @@ def test_truth_is_never_extrapolated_nor_carried_over_a_gap():
 def test_single_truth_matches_only_its_own_stamp():
     matched = match_truth(truth_at([10], [3]), np.array([9, 10, 11]))
     np.testing.assert_array_equal(matched[:, 0], [np.nan, -3, np.nan])
+
+
+def vectors(**changes):
+    truth = np.array([[-3.0, 0.0, 0.4], [-2.0, 0.0, 0.2]])
+    given = {"force": truth + [[0.3, 0.0, -0.4], [-0.3, 0.0, 0.0]], "axis_stddev": np.array([[0.2, 0.0, 0.1]] * 2)}
+    return replace(make_result(truth=[3.0, 2.0], force=[3.0, 2.0]), truth=truth, **{**given, **changes})
+
+
+def test_the_force_is_compared_as_a_vector_axis_by_axis():
+    stats = score_case(vectors(), span=1.0).all
+    assert stats.axis_rmse_N == pytest.approx((0.3, 0.0, np.sqrt(0.08)))
+    assert stats.vector_rmse_N == pytest.approx(np.sqrt(0.09 + 0.08))
+    # along x both are within 0.6 N, along y there is no difference, along z one is beyond 0.3 N
+    assert stats.within_3_sigma_pct == pytest.approx((100.0, 100.0, 50.0))
+
+
+def test_without_stated_deviations_nothing_is_said_of_them():
+    stats = score_case(vectors(axis_stddev=None), span=1.0).all
+    assert stats.within_3_sigma_pct is None and stats.vector_rmse_N is not None
+
+
+def test_a_truth_that_is_a_magnitude_along_x_says_nothing_of_the_vector():
+    stats = score_case(make_result(truth=[1.0, 2.0], force=[1.1, 2.0]), span=1.0).all
+    assert (stats.vector_rmse_N, stats.axis_rmse_N, stats.within_3_sigma_pct) == (None, None, None)
+
+
+def test_answered_is_the_share_of_what_was_to_be_answered():
+    result = make_result(
+        truth=[1.0, 1.0, 1.0, 1.0],
+        force=[1.0, np.nan, 1.0, np.nan],
+        direction=np.array(["load", "load", "unload", "unload"]),
+        scored=np.array([True, True, True, False]),
+    )
+    score = score_case(result, span=1.0)
+    assert score.all.answered_pct == pytest.approx(200.0 / 3.0)
+    assert (score.load.answered_pct, score.unload.answered_pct) == (50.0, 100.0)
