@@ -202,6 +202,7 @@ class LoadWatch:
 _AHEAD = 0.005  # [s] that a stamp may lie ahead of its arrival: the two clocks are read one after the other
 _PERIOD = 1.0 / 30.0  # [s] of a D405, until it is measured
 _LATENCY = 0.1  # [s] until it is measured
+_SOONEST = 0.1  # of the median latency: a pipeline that others have left alone becomes several times as fast
 _KNOWN = 8  # samples after which the latency is known
 
 
@@ -324,7 +325,7 @@ class ForceFeed:
         if self.heard and sample.stamp <= self.stamp:
             return "out of order"
         # a clock that was set makes images seem newer than they are, and jaws farther than they were
-        if len(self._latencies) >= _KNOWN and latency < 0.25 * self.latency:
+        if len(self._latencies) >= _KNOWN and latency < _SOONEST * self.latency:
             return "sooner than can be"
         return ""
 

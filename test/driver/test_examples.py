@@ -35,7 +35,7 @@ def smaller(part):
     """A process with smaller images, which are drawn in half the time."""
     if part.executable != "twin_camera":
         return part
-    return replace(part, parameters={**part.parameters, "size": "320x240"})
+    return replace(part, parameters={**part.parameters, "size": "480x360"})
 
 
 @pytest.fixture

@@ -171,7 +171,17 @@ def test_right_jaw_is_evaluated_on_its_own_topics():
     assert score_results([result], [recording]).total.all.rmse_N == 0.0
 
 
-STATS = {"n", "rmse_N", "nrmsd_pct", "max_error_N", "bias_N"}
+STATS = {
+    "n",
+    "rmse_N",
+    "nrmsd_pct",
+    "max_error_N",
+    "bias_N",
+    "vector_rmse_N",
+    "axis_rmse_N",
+    "within_3_sigma_pct",
+    "answered_pct",
+}
 CASE = {"frames", "solved", "skipped", "all", "load", "unload", "step_ms"}
 
 
