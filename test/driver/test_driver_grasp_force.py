@@ -118,7 +118,7 @@ def fed(count=20, latency=0.06):
         (sample(19 / 30), "out of order"),
         (sample(10.0, latency=-0.01), "from the future"),
         (sample(10.0, latency=0.26), "too old"),
-        (sample(10.0, latency=0.01), "sooner than can be"),
+        (sample(10.0, latency=0.003), "sooner than can be"),
         (replace(sample(10.0), stamp=math.nan), "no time"),
     ],
 )

@@ -3,13 +3,14 @@
 import os
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 from time import monotonic, sleep
 
 import pytest
+import rclpy
 from emulator_fakes import Bench, Fingers
 from geometry_msgs.msg import TwistStamped
 from node_fakes import ros_domain
@@ -38,6 +39,18 @@ def smaller(part):
     return replace(part, parameters={**part.parameters, "size": "480x360"})
 
 
+@contextmanager
+def watching(domain):
+    """A client in a domain of its own."""
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    try:
+        with GripperClient(context=context) as client:
+            yield client
+    finally:
+        rclpy.shutdown(context=context)
+
+
 @pytest.fixture
 def simulation(tmp_path):
     """The domain of a robot with `sim:=true`, once its jaws are watched."""
@@ -51,7 +64,10 @@ def simulation(tmp_path):
     while "playing as the gripper" not in (tmp_path / "log").read_text():
         assert monotonic() < until and all(node.poll() is None for node in nodes), (tmp_path / "log").read_text()
         sleep(0.5)
-    sleep(4.0)  # the solvers take their tare
+    with watching(domain) as client:  # until the solvers have taken their tare
+        while client.force is None:
+            assert monotonic() < until, (tmp_path / "log").read_text()
+            sleep(0.5)
     yield domain
     for node in nodes:
         node.terminate()
