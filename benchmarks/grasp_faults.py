@@ -25,7 +25,6 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -163,7 +162,6 @@ class FaultyGrasp(World):
 
     def play(self) -> GraspTally:
         """Live through it and return what came of it."""
-        self.emulated.calibrated = True
         self._prepare()
         self._began = self.clock.now()
         goal = GraspGoal(force=self._case.force, speed=self._case.speed, time_limit=8.0)
@@ -199,15 +197,14 @@ class FaultyGrasp(World):
             self._complain("pressed")
         self._check_rest(now)
 
-    def _prepare(self) -> None:
-        """Leave the gripper open before the object, with the camera on."""
-        gripper, plant = self.gripper, self._case.plant
-        load, self.emulated.jaws.load = self.emulated.jaws.load, None
-        gripper.wait(lambda state: state.phase is Phase.READY, 5.0)
-        gripper.move(plant.touch_opening + self._draw.uniform(0.0005, 0.003), speed=0.1)
-        gripper.wait(lambda state: state.phase is Phase.READY and state.at_target, 10.0)
-        self.emulated.jaws.load = load
-        self.clock.attach(self)
+    def _make_ready(self) -> None:
+        """Take the gripper as calibrated, to save the time."""
+        self.emulated.calibrated = True
+        self.gripper.wait(lambda state: state.phase is Phase.READY, 5.0)
+
+    def _clearance(self) -> float:
+        """Return how far before the first touch the jaws stand [m]."""
+        return self._draw.uniform(0.0005, 0.003)
 
     def take(self) -> list[Any]:
         """Return the forces that have arrived; those of a slow camera come late."""
@@ -291,7 +288,7 @@ def play_all(cases: int, seed: int, jobs: int) -> GraspTally:
 
 def _results(seeds: range, jobs: int) -> Iterator[GraspTally]:
     if jobs == 1:
-        yield from map(partial(play), seeds)
+        yield from map(play, seeds)
         return
     with ProcessPoolExecutor(jobs) as pool:
         yield from pool.map(play, seeds, chunksize=20)

@@ -157,6 +157,8 @@ class World:
     def run(self) -> GraspTrace:
         """Calibrate, open, grasp, hold, and return what happened."""
         self._prepare()
+        # an estimator has its tare to make first
+        self.gripper.wait(lambda state: bool(self._arrivals), 5.0)
         goal = GraspGoal(force=self._case.force, speed=self._case.speed)
         try:
             hold_force(self.gripper, self, goal, self._settings, until=self._is_over)
@@ -166,20 +168,24 @@ class World:
         return self.course
 
     def _prepare(self) -> None:
-        """Calibrate the gripper and leave it open before the object, with the camera on."""
+        """Make the gripper ready and leave it open before the object, with the camera on."""
         gripper, plant = self.gripper, self._case.plant
         load, self.emulated.jaws.load = self.emulated.jaws.load, None
-        gripper.wait(lambda state: state.phase is Phase.UNCALIBRATED, 5.0)
-        gripper.calibrate()
-        gripper.wait(lambda state: state.phase is Phase.READY, 40.0)
-        # seeds begin at other places between two steps
-        shift = float(np.random.default_rng(self._case.seed).uniform(0.0, 0.002))
-        gripper.move(plant.touch_opening + CLEARANCE + shift, speed=0.1)
+        self._make_ready()
+        gripper.move(plant.touch_opening + self._clearance(), speed=0.1)
         gripper.wait(lambda state: state.phase is Phase.READY and state.at_target, 10.0)
         self.emulated.jaws.load = load
         self.clock.attach(self)
-        # an estimator has its tare to make first
-        gripper.wait(lambda state: bool(self._arrivals), 5.0)
+
+    def _make_ready(self) -> None:
+        """Calibrate the gripper."""
+        self.gripper.wait(lambda state: state.phase is Phase.UNCALIBRATED, 5.0)
+        self.gripper.calibrate()
+        self.gripper.wait(lambda state: state.phase is Phase.READY, 40.0)
+
+    def _clearance(self) -> float:
+        """Return how far before the first touch the jaws stand [m]; seeds begin at other places between two steps."""
+        return CLEARANCE + float(np.random.default_rng(self._case.seed).uniform(0.0, 0.002))
 
     def _photograph(self, now: float, opening: float) -> None:
         """Send what an image shows on its way, if it does not get lost."""

@@ -8,6 +8,7 @@ falls or jumps as no motion of the jaws explains, the grasp ends, and so does th
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped, WrenchStamped
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import JointState
@@ -88,6 +89,7 @@ def main():
     node.start()
     while rclpy.ok() and not node.outcome:
         rclpy.spin_once(node)
+    node.lift.wait_for_all_acked(Duration(seconds=1.0))  # the last one stops the lift, and must not end with us
     node.destroy_node()
     rclpy.shutdown()
 

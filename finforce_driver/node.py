@@ -68,8 +68,10 @@ class GripperDriverNode(Node):
         grasp = ros.declare_record(self, GraspSettings, "grasp")
         joint = ros.declare_record(self, JointSettings, "joint")
         ros.name_unknown_parameters(self)
-        is_other = parameters.interface in LINKS
-        if is_other:
+        self.is_other = (
+            parameters.interface in LINKS
+        )  # another gripper's driver has joint states and actions of its own
+        if self.is_other:
             self.gripper = JointLink(self, parameters.interface, parameters.port, settings, joint).gripper
         else:
             self.gripper = build(parameters, settings)
@@ -80,7 +82,7 @@ class GripperDriverNode(Node):
         self.times = MessageTimes(self.gripper.clock, ("force", *JAWS, *(f"{side} stddev" for side in JAWS)), **gate)
         self.health = GripperHealth(source=parameters.port, stale_after=parameters.max_age)
         self.qos = ros.QosWatch(self)
-        self.out = DriverOutputs(self.qos, parameters, own_joints=not is_other)
+        self.out = DriverOutputs(self.qos, parameters, own_joints=not self.is_other)
         self.seen: ForceSample | None = None
         self.stale_after, self.noise = grasp.stale_after, grasp.noise
         self.arrived: deque[GripperState] = deque(maxlen=100)
@@ -100,8 +102,7 @@ class GripperDriverNode(Node):
             # what waits for an earlier call would move the jaws after a stop
             ros.serve_trigger(self, f"~/{name}", getattr(tasks, name), ReentrantCallbackGroup())
         ros.serve_switch(self, "~/activate", tasks.activate)
-        # another gripper's driver has its own
-        offered = [] if self.parameters.interface in LINKS else ACTIONS
+        offered = [] if self.is_other else ACTIONS
         self.actions = [action for action in map(self._offer_action, offered) if action is not None]
         ros.publish_diagnostics(self, self.qos, "finforce: gripper", self.parameters.diagnostics_period, self._report)
 
@@ -207,7 +208,7 @@ class GripperDriverNode(Node):
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         """Hand the force of an image to the grasp."""
-        with self._refusals("force"):
+        with self._refusals("force", told=self.session.refuse):
             force, stamp = ros.grasp_force(message, self.parameters.gripper_frame), self._enter("force", message)
             sample = ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force)
             self.session.take_force(sample)
@@ -231,14 +232,13 @@ class GripperDriverNode(Node):
         return self.times.enter(source, stamp_of(message), self._now())
 
     @contextmanager
-    def _refusals(self, what: str, stream: bool = True) -> Iterator[None]:
+    def _refusals(self, what: str, stream: bool = True, told: Callable[[str], None] = lambda _: None) -> Iterator[None]:
         """Survive what is wrong with a message, and say it; in a stream only once while its kind is the same."""
         kind = ""
         try:
             yield
         except FinforceError as error:
-            if what == "force":
-                self.session.refuse(str(error))
+            told(str(error))
             self.health.refuse(outcome := Outcome.of_error(error))
             kind = outcome.reason
             if self.health.is_news(what, kind) or not stream:

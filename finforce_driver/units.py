@@ -40,6 +40,17 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
 
 
+def check_numbers(**values: object) -> None:
+    """Refuse what is no number among the values of a move, by name; None stands for a default.
+
+    Raises:
+        TargetError: a value is none.
+    """
+    for name, value in values.items():
+        if value is not None and not is_number(value):
+            raise TargetError(f"{name}: got {value!r}, expected a number; the gripper stays as it was")
+
+
 def opening_per_tick(pinion_radius: float) -> float:
     """Return the opening [m] of a tick of the encoder: both racks move by the pinion's circumference a turn."""
     return 4.0 * math.pi * pinion_radius / TICKS_PER_TURN

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from threading import Thread
 from time import monotonic, sleep
 from types import TracebackType
@@ -94,7 +95,8 @@ class GripperClient:
 
         The driver goes on holding the force, until something else is asked for.
         """
-        self._wait_for_listener()
+        missing = f"{self._driver}: nobody listens to its grasp_goal; is the driver running?"
+        _await(lambda: self._goals.get_subscription_count() > 0, DISCOVERY, missing)
         self._goals.publish(JointState(effort=[float(force)], velocity=[] if speed is None else [float(speed)]))
         sleep(TOLD)
         return self._call("grasp")
@@ -122,23 +124,12 @@ class GripperClient:
             if not client.wait_for_service(DISCOVERY):
                 raise ServiceError(f"{service}: not there for {DISCOVERY:g} s; is the driver running, in this domain?")
             answer = client.call_async(Trigger.Request())
-            end = monotonic() + LONGEST
-            while not answer.done():
-                if monotonic() > end:
-                    raise ServiceError(f"{service}: no answer for {LONGEST:g} s")
-                sleep(0.005)
+            _await(answer.done, LONGEST, f"{service}: no answer for {LONGEST:g} s")
             if not answer.result().success:
                 raise ServiceError(f"{service}: {answer.result().message}")
             return answer.result().message
         finally:
             self._node.destroy_client(client)
-
-    def _wait_for_listener(self) -> None:
-        end = monotonic() + DISCOVERY
-        while not self._goals.get_subscription_count():
-            if monotonic() > end:
-                raise ServiceError(f"{self._driver}: nobody listens to its grasp_goal; is the driver running?")
-            sleep(0.01)
 
     def _take_force(self, message: WrenchStamped) -> None:
         self._force = monotonic(), message.wrench.force.x
@@ -155,6 +146,15 @@ class GripperClient:
     def _take_grasp(self, message: DiagnosticStatus) -> None:
         phase = next((entry.value for entry in message.values if entry.key == "grasp"), "")
         self._grasp = f"{phase}: {message.message}"
+
+
+def _await(condition: Callable[[], bool], longest: float, complaint: str) -> None:
+    """Return when a condition holds; raise ServiceError if it does not for the longest time [s]."""
+    end = monotonic() + longest
+    while not condition():
+        if monotonic() > end:
+            raise ServiceError(complaint)
+        sleep(0.005)
 
 
 def _fresh(last: tuple[float, float]) -> float | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from finforce.systems.processes import (
     SolverOptions,
     contact_processes,
     detector_processes,
+    emulated_port,
     given,
     read_numbers,
     solver_process,
@@ -111,7 +111,7 @@ def simulated(options: OptionsT) -> OptionsT:
         images=True,
         object_mesh=options.object_mesh or str(SIM_OBJECT),
         calibration_file=options.calibration_file or SIM_CALIBRATION,
-        gripper_port=options.gripper_port or str(Path(tempfile.gettempdir()) / f"finforce_gripper_{os.getpid()}"),
+        gripper_port=options.gripper_port or emulated_port(),
         gripper_interface="slcan",
     )
 

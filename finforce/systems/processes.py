@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -207,6 +209,11 @@ def viewer(options: SolverOptions, share: Path, config: str = "finforce.rviz") -
             advice="or leave rviz:=true out",
         )
     ]
+
+
+def emulated_port() -> str:
+    """Return the path of an emulated gripper's port, another one for each process that asks."""
+    return str(Path(tempfile.gettempdir()) / f"finforce_gripper_{os.getpid()}")
 
 
 @dataclass(frozen=True, kw_only=True)

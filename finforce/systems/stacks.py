@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,7 @@ from typing import Any
 import yaml
 
 from finforce.optional import import_library
-from finforce.systems.processes import Process, given
+from finforce.systems.processes import Process, emulated_port, given
 
 STATES = "gripper_driver/joint_states"  # of the driver, where joint_states are those of the whole robot
 CONTROLLERS = ("joint_state_broadcaster", "finray_gripper_controller")
@@ -51,7 +49,7 @@ def control_processes(options: StackOptions, share: Path) -> list[Process]:
     model = describe(options.description or share / "urdf" / "finray_gripper_control.urdf.xacro")
     controllers = options.controllers or str(share / "config" / "ros2_control" / "controllers.yaml")
     return [
-        *gripper_processes(options, share),
+        *gripper_processes(options, share, {"joint_states": STATES}),
         _publisher(model),
         Process(
             package="controller_manager",
@@ -93,12 +91,12 @@ def moveit_processes(options: StackOptions, share: Path) -> list[Process]:
     ]
 
 
-def gripper_processes(options: StackOptions, share: Path, remappings: dict[str, str] | None = None) -> list[Process]:
-    """Return the driver, and with `sim` the emulated gripper; without remappings its joint_states are `STATES`."""
+def gripper_processes(options: StackOptions, share: Path, remappings: dict[str, str]) -> list[Process]:
+    """Return the driver with remapped topics, and with `sim` the emulated gripper."""
     port, interface = options.gripper_port, options.gripper_interface
     processes = []
     if options.sim:
-        port = port or str(Path(tempfile.gettempdir()) / f"finforce_gripper_{os.getpid()}")
+        port = port or emulated_port()
         interface = "slcan"
         processes.append(Process(executable="emulated_gripper", name="emulated_gripper", arguments=("--link", port)))
     if options.gripper:
@@ -107,7 +105,7 @@ def gripper_processes(options: StackOptions, share: Path, remappings: dict[str, 
             name="gripper_driver",
             parameters=given({"port": port, "interface": interface}),
             parameter_file=options.parameter_file or str(share / "config" / "robot.yaml"),
-            remappings={"joint_states": STATES} if remappings is None else remappings,
+            remappings=remappings,
         )
         processes.append(driver)
     return processes

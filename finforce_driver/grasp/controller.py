@@ -60,7 +60,7 @@ class ForceGrasp:
         self._free = 0.0  # largest force of the motor [N] while nothing pressed
         self._motor: deque[tuple[float, float]] = deque()  # times [s] and forces [N] that no image is newer than
         self._asked_to_stop = ""
-        self._failed = self._unseen = self._backs_off = False
+        self._failure: type[GraspError] | None = None
 
     def take_force(self, sample: ForceSample) -> None:
         """Take the force of an image; it counts with the next `update`."""
@@ -119,13 +119,11 @@ class ForceGrasp:
             move = self._wait_for_image(state, now)
             if move is None and fresh and math.isnan(self._waits_since):
                 move = self._choose_move(state, now)
-        except BackOffError as error:
-            self._phase, self._reason, self._failed, self._backs_off = GraspPhase.STOPPED, str(error), True, True
-            self._unseen = isinstance(error, UnseenForceError)
-            return GraspStep(move=self._back_off(state, now), stop=False, status=self._status(state, now))
         except GraspError as error:
             self._phase, self._reason = GraspPhase.STOPPED, str(error)
-            self._failed = not self._asked_to_stop
+            self._failure = None if self._asked_to_stop else type(error)
+            if isinstance(error, BackOffError):
+                return self._step(self._back_off(state, now), state, now)
             return GraspStep(move=None, stop=is_working(state), status=self._status(state, now))
         return self._step(move, state, now)
 
@@ -307,10 +305,8 @@ class ForceGrasp:
             peak=load.peak,
             resolution=self._plan.resolution,
             target=self._jaws.target,
-            failed=self._failed,
             stddev=load.stddev,
-            backs_off=self._backs_off,
-            unseen=self._unseen,
+            failure=self._failure,
             refused=dict(feed.refused),
         )
 

@@ -262,11 +262,14 @@ class ForceFeed:
 
     def is_touching(self, now: float) -> bool:
         """Whether the newest fresh word says that the jaws touch."""
-        return self.touch is not None and self.touch.touching and now - self.touch.stamp <= self._stale_after
+        return (touch := self._fresh_touch(now)) is not None and touch.touching
 
     def is_apart(self, now: float) -> bool:
         """Whether the newest fresh word says that the jaws do not touch."""
-        return self.touch is not None and not self.touch.touching and now - self.touch.stamp <= self._stale_after
+        return (touch := self._fresh_touch(now)) is not None and not touch.touching
+
+    def _fresh_touch(self, now: float) -> TouchSample | None:
+        return self.touch if self.touch is not None and now - self.touch.stamp <= self._stale_after else None
 
     @property
     def latency(self) -> float:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from threading import Condition, Lock
 from typing import TYPE_CHECKING, Protocol
 
-from finforce_driver.errors import BackOffError, DriverError, GraspError, GripperTimeoutError, UnseenForceError
+from finforce_driver.errors import BackOffError, DriverError, GraspError, GripperTimeoutError
 from finforce_driver.grasp.controller import ForceGrasp
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus, GraspStep
@@ -139,7 +139,7 @@ class GraspSession:
             try:
                 self._act(step)
             except DriverError as error:
-                self._end(str(error), failed=True)
+                self._end(str(error), GraspError)
                 with suppress(DriverError):
                     self._gripper.hold()
 
@@ -168,7 +168,7 @@ class GraspSession:
     def _acknowledge(self) -> None:
         """Take a command for a sign that somebody knows of a grasp that failed."""
         if self.status is not None and self.status.failed:
-            self.status = replace(self.status, failed=False, unseen=False)
+            self.status = replace(self.status, failure=None)
 
     def _begin(self) -> None:
         """Make a grasp and let it look at the gripper."""
@@ -183,12 +183,12 @@ class GraspSession:
         elif step.move is not None:
             self._gripper.move(step.move.opening, step.move.speed, step.move.force)
 
-    def _end(self, reason: str, *, failed: bool = False) -> None:
-        """Forget the grasp that runs and say why."""
+    def _end(self, reason: str, failure: type[GraspError] | None = None) -> None:
+        """Forget the grasp that runs and say why, and how it failed if it did."""
         if self._grasp is not None:
             self._grasp = None
             last = self.status or GraspStatus(phase=GraspPhase.STOPPED, reason=reason, goal=self.goal.force)
-            self._tell(replace(last, phase=GraspPhase.STOPPED, reason=reason, failed=failed))
+            self._tell(replace(last, phase=GraspPhase.STOPPED, reason=reason, failure=failure))
             self._ended()
 
     def _tell(self, status: GraspStatus) -> None:
@@ -302,8 +302,7 @@ def _turn(gripper: Gripper, forces: ForceSource, grasp: ForceGrasp) -> GraspStat
     if step.move is not None:
         gripper.move(step.move.opening, step.move.speed, step.move.force)
     if step.status.phase is GraspPhase.STOPPED:
-        backing = UnseenForceError if step.status.unseen else BackOffError
-        raise (backing if step.status.backs_off else GraspError)(step.status.reason)
+        raise (step.status.failure or GraspError)(step.status.reason)
     return step.status
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from finforce.settings import check_bounds, setting
-from finforce_driver.errors import TargetError
+from finforce_driver.errors import BackOffError, GraspError, TargetError, UnseenForceError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,10 +135,8 @@ class GraspStatus:
         peak: largest force measured while loaded [N]; 0 before.
         resolution: change of the force with one step of the gripper [N].
         target: opening that the jaws were told to go to [m]; NaN before the first move.
-        failed: it was not ended by a command, and nothing has been commanded since.
         stddev: of the newest force, as its source states it [N].
-        backs_off: it failed, and the jaws go back to where it began.
-        unseen: it failed because the motor pressed much harder than the camera said.
+        failure: how it failed; None: it did not, it was ended by a command, or something has been commanded since.
         refused: forces and touches that were set aside, by reason.
     """
 
@@ -155,11 +153,24 @@ class GraspStatus:
     peak: float = 0.0
     resolution: float = math.nan
     target: float = math.nan
-    failed: bool = False
     stddev: float = 0.0
-    backs_off: bool = False
-    unseen: bool = False
+    failure: type[GraspError] | None = None
     refused: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def failed(self) -> bool:
+        """Whether it failed."""
+        return self.failure is not None
+
+    @property
+    def backs_off(self) -> bool:
+        """Whether it failed, and the jaws go back to where it began."""
+        return self.failed and issubclass(self.failure, BackOffError)
+
+    @property
+    def unseen(self) -> bool:
+        """Whether it failed because the motor pressed much harder than the camera said."""
+        return self.failed and issubclass(self.failure, UnseenForceError)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,23 +7,19 @@ calibration; an emergency stop holds it where it is, and refuses moves until it 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Event, RLock
 
-import numpy as np
-
 from finforce_driver.clock import Clock, MonotonicClock
 from finforce_driver.errors import GripperStateError, GripperTimeoutError, TargetError
 from finforce_driver.joint.settings import JointSettings
+from finforce_driver.machine.knowledge import History
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
-from finforce_driver.units import is_number
+from finforce_driver.units import check_numbers, is_number
 
 Listener = Callable[[GripperState], None]
-HISTORY = 5.0  # [s] of openings that are known
-SPAN = 0.1  # [s] over which the speed is measured
 NEAR = 1.5  # steps within which the target is reached
 STILL, STALL = 1e-3, 0.4  # [m/s], and [s] without motion after which the jaws are stalled
 PATIENCE = 2.0  # [s] beyond the way's time
@@ -93,7 +89,8 @@ class JointGripper:
         self.state = GripperState(phase=Phase.PROBING, message=f"waiting for the first state of {joint.names[0]}")
         self._send, self._joint = send, joint
         self._listeners: list[Listener] = []
-        self._places: deque[tuple[float, float]] = deque()  # stamps [s] and openings [m]
+        self._history = History()  # of openings [m]
+        self._stamp = -math.inf  # of the newest [s]
         self._way: _Way | None = None
         self._sent = -math.inf
         self._moved = -math.inf  # when the jaws were last seen to move [s]
@@ -115,12 +112,10 @@ class JointGripper:
             raise TargetError(f"{self._joint.names[0]}: got {position!r}, expected a number")
         opening = self.settings.closed_opening + (position - self._joint.closed) * self._per_unit
         with self._lock:
-            if self._places and stamp <= self._places[-1][0]:
+            if stamp <= self._stamp:
                 return
-            self._places.append((stamp, opening))
-            while self._places[0][0] < stamp - HISTORY:
-                self._places.popleft()
-            self._effort = effort
+            self._history.add(stamp, opening)
+            self._stamp, self._effort = stamp, effort
             self._judge(stamp)
         self._tell()
 
@@ -134,7 +129,7 @@ class JointGripper:
                 if now > self._way.arrives and self._outcome is not MoveOutcome.NONE:
                     self._way = None  # it stays at its last command
             silent = self.state.phase not in (Phase.PROBING, Phase.DISCONNECTED)
-            silent &= bool(self._places) and now - self._places[-1][0] > self._joint.silence
+            silent &= now - self._stamp > self._joint.silence
             if silent:
                 self._end(MoveOutcome.ABORTED)
                 self._refresh()
@@ -149,9 +144,7 @@ class JointGripper:
         Raises:
             TargetError: a value is no number or out of bounds.
         """
-        for name, value in {"opening": opening, "speed": speed, "force": force}.items():
-            if value is not None and not is_number(value):
-                raise TargetError(f"{name}: got {value!r}, expected a number; the gripper stays as it was")
+        check_numbers(opening=opening, speed=speed, force=force)
         self.settings.check_opening("opening", opening)
         if speed is not None and not 0.0 < speed <= self._joint.largest_speed:
             raise TargetError(f"speed: got {speed:g} m/s, expected above 0 to {self._joint.largest_speed:g} m/s")
@@ -169,7 +162,7 @@ class JointGripper:
         with self._lock:
             self._require("move")
             now = self.clock.now()
-            start = self._places[-1][1] if self._way is None else self._way.setpoint(now)
+            start = self._history.last if self._way is None else self._way.setpoint(now)
             largest = self._joint.largest_force
             effort = math.nan if force is None or not largest else min(float(force), largest)
             pace = self.settings.default_speed if speed is None else speed
@@ -195,7 +188,7 @@ class JointGripper:
         """Stop in place, and refuse moves until it is cleared; a joint does not go limp."""
         with self._lock:
             self._stopped = True
-            if self._places:
+            if self._is_known:
                 self._hold()
             self._refresh()
         self._tell()
@@ -240,7 +233,7 @@ class JointGripper:
     def close(self) -> None:
         """Hold in place, where the joint is there, and end."""
         with self._lock:
-            if self._places and self.state.phase is Phase.MOVING:
+            if self.state.phase is Phase.MOVING:
                 self._hold()
             self._closed = True
 
@@ -252,10 +245,7 @@ class JointGripper:
     def opening_at(self, time: float) -> float:
         """Return the opening [m] at a time of the last 5 s [s]; NaN where it is not known."""
         with self._lock:
-            if not self._places or not self._places[0][0] <= time <= self._places[-1][0]:
-                return math.nan
-            stamps, openings = zip(*self._places, strict=True)
-        return float(np.interp(time, stamps, openings))
+            return self._history.place_at(time, 0.0)
 
     def wait(self, condition: Callable[[GripperState], bool], timeout: float) -> GripperState:
         """Return the first state that fulfils a condition.
@@ -276,6 +266,10 @@ class JointGripper:
 
     # Within
 
+    @property
+    def _is_known(self) -> bool:
+        return self._stamp > -math.inf
+
     def _require(self, what: str, *, stopped: bool = False) -> None:
         if self.state.phase in (Phase.PROBING, Phase.DISCONNECTED):
             raise GripperStateError(f"{what}: no state of {self._joint.names[0]} comes ({self.state.message})")
@@ -283,9 +277,8 @@ class JointGripper:
             raise GripperStateError(f"{what}: an emergency stop is latched: clear the errors first")
 
     def _hold(self) -> None:
-        now = self.clock.now()
         self._end(MoveOutcome.REPLACED)
-        self._command(self._places[-1][1], now)
+        self._command(self._history.last, self.clock.now())
 
     def _end(self, outcome: MoveOutcome) -> None:
         if self._way is not None and self._outcome is MoveOutcome.NONE:
@@ -304,17 +297,11 @@ class JointGripper:
             )
         )
 
-    def _speed(self) -> float:
-        """Return the speed of the opening over the last moment [m/s]."""
-        last = self._places[-1]
-        first = next(place for place in self._places if place[0] >= last[0] - SPAN)
-        return 0.0 if last[0] <= first[0] else (last[1] - first[1]) / (last[0] - first[0])
-
     def _judge(self, stamp: float) -> None:
         """Judge the move by a new state."""
-        if abs(self._speed()) > STILL:
+        if abs(self._history.speed()) > STILL:
             self._moved = stamp
-        way, opening = self._way, self._places[-1][1]
+        way, opening = self._way, self._history.last
         if way is not None and self._outcome is MoveOutcome.NONE:
             over = stamp > way.arrives
             if over and abs(opening - way.target) <= NEAR * self.resolution:
@@ -328,11 +315,10 @@ class JointGripper:
 
     def _refresh(self) -> None:
         """Make the state anew."""
-        if not self._places:
+        if not self._is_known:
             self.state = replace(self.state, estopped=self._stopped)
             return
-        stamp, opening = self._places[-1]
-        away = self.clock.now() - stamp > self._joint.silence
+        away = self.clock.now() - self._stamp > self._joint.silence
         moving = self._way is not None and self._outcome is MoveOutcome.NONE
         phase = Phase.MOVING if moving else Phase.READY
         phase = Phase.FAULT if self._stopped else phase
@@ -346,9 +332,9 @@ class JointGripper:
             phase, message = Phase.DISCONNECTED, f"no state of {self._joint.names[0]} for {self._joint.silence:g} s"
         self.state = GripperState(
             phase=phase,
-            stamp=stamp,
-            opening=opening,
-            velocity=self._speed(),
+            stamp=self._stamp,
+            opening=self._history.last,
+            velocity=self._history.speed(),
             force=self._effort if self._joint.effort_is_force else math.nan,
             target=math.nan if self._way is None else self._way.target,
             at_target=self._outcome is MoveOutcome.REACHED,

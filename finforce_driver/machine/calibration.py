@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import Enum, auto
 
 from finforce_driver.can.protocol import CanMessage, Reply, decode_encoder
@@ -59,7 +60,7 @@ class Travel:
     @property
     def next_time(self) -> float:
         """When the encoder is asked next [s]; infinite where it never answers."""
-        return self._next_time if self.answers or self._silences < SILENCES else float("inf")
+        return self._next_time if self.answers or self._silences < SILENCES else math.inf
 
     def ask(self, now: float) -> None:
         """Note that the encoder is asked."""
@@ -85,7 +86,7 @@ class Travel:
 
     def has_seen(self, time: float) -> bool:
         """Whether a count was believed after a time [s], or none is to be had."""
-        return self.next_time == float("inf") or (self._believed is not None and self._believed > time)
+        return self.next_time == math.inf or (self._believed is not None and self._believed > time)
 
     def find_doubt(self) -> str:
         """Return what is wrong with the way that was gone; empty where nothing is."""

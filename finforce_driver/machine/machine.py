@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import Command, Flag, Move, Reply, decode_reply, encode_watchdog, split_identifier
-from finforce_driver.errors import GripperStateError, TargetError
+from finforce_driver.errors import GripperStateError
 from finforce_driver.machine.calibration import CalibrationRun, CalibrationStep
 from finforce_driver.machine.exchange import Exchange, Request
 from finforce_driver.machine.knowledge import Knowledge
@@ -31,7 +31,7 @@ from finforce_driver.state import (
     MoveOutcome,
     Phase,
 )
-from finforce_driver.units import SLOWEST_BYTE, GripperScale, is_number
+from finforce_driver.units import SLOWEST_BYTE, GripperScale, check_numbers
 
 SHORT_SILENCE = 5  # requests in a row without a reply after which the gripper is taken to be absent
 PROBES = 20  # the same before the first reply: a second
@@ -71,6 +71,7 @@ class GripperMachine:
         calibration: under way; None: none is.
         job: the last move; None: none, or it was replaced by something else.
         outcome: of the last move.
+        farewell: messages that have still to leave before the end.
         hold_wanted: the jaws are to be held where the next reply says that they are.
         note: sentence that stays until the next command.
         counts: of events by name.
@@ -423,9 +424,7 @@ class GripperMachine:
 
     def _make_goal(self, opening: float, speed: float | None, force: float | None) -> Goal:
         """Return a move in the gripper's units; raises TargetError."""
-        for name, value in {"opening": opening, "speed": speed, "force": force}.items():
-            if value is not None and not is_number(value):
-                raise TargetError(f"{name}: got {value!r}, expected a number; the gripper stays as it was")
+        check_numbers(opening=opening, speed=speed, force=force)
         default = round(1e3 * self.settings.default_current)
         return Goal(
             opening=float(opening),
@@ -460,7 +459,7 @@ class GripperMachine:
         kept, place = self.orders.wanted, self._place_now(now)
         if standing or not drives or (kept is not None and (not kept.drives or abs(kept.position - place) <= 1.0)):
             return
-        self.orders.want(self.order(position=self.place_for_order(now), flags=GO), urgent=True)
+        self._hold_here(now)
 
     def _let_go(self, flags: Flag, now: float) -> None:
         """Want an order that moves nothing and holds nothing."""

@@ -343,7 +343,7 @@ def _spread(values: Sequence[float | None]) -> Spread:
 
 def _selected(result: CaseResult, phase: str) -> NDArray[np.bool_]:
     """Return the frames (n,) that count for "all", "load" or "unload"."""
-    return result.counted if phase == "all" else result.counted & (result.direction == phase)
+    return result.counted & _is_phase(result, phase)
 
 
 def _errors(results: Sequence[CaseResult], phase: str) -> NDArray[np.float64]:

@@ -123,16 +123,6 @@ def summary_lines(evaluation: Evaluation) -> list[str]:
     step = total.step_ms
     rmse = {name: score.all.rmse_N for name, score in evaluation.scores.items()}
     worst = max(rmse, key=lambda name: rmse[name] or 0.0)
-    vector = total.all
-    axes = [] if vector.axis_rmse_N is None else ["/".join(format_number(value) for value in vector.axis_rmse_N)]
-    if axes and vector.within_3_sigma_pct is not None:
-        axes.append("/".join(format_number(value, 1) for value in vector.within_3_sigma_pct))
-    words = ("x/y/z {} N", "within three stated deviations x/y/z {} %")
-    lines = [
-        f"As a vector: RMSE {format_number(vector.vector_rmse_N)} N, "
-        + ", ".join(text.format(value) for text, value in zip(words, axes, strict=False))
-        + "."
-    ]
     return [
         f"Mean RMSE of {len(rmse)} case{'s' if rmse.keys() - {worst} else ''}: "
         f"{format_number(total.mean_rmse_N, 3)} N, worst {format_number(rmse[worst], 3)} N ({worst}). "
@@ -142,8 +132,22 @@ def summary_lines(evaluation: Evaluation) -> list[str]:
         f"{total.record_frames - total.record_skipped} of {total.record_frames} solved. "
         f"Step: p50 {format_number(step.p50)}, p95 {format_number(step.p95)}, "
         f"p99 {format_number(step.p99)}, max {format_number(step.max)} ms.",
-        *(lines if axes else []),
+        *vector_lines(total.all),
     ]
+
+
+def vector_lines(stats: Stats) -> list[str]:
+    """Return what is known of the force as a vector; nothing where the truth is a magnitude."""
+    if stats.axis_rmse_N is None:
+        return []
+    line = f"As a vector: RMSE {format_number(stats.vector_rmse_N)} N, x/y/z {_per_axis(stats.axis_rmse_N, 2)} N"
+    if stats.within_3_sigma_pct is not None:
+        line += f", within three stated deviations x/y/z {_per_axis(stats.within_3_sigma_pct, 1)} %"
+    return [f"{line}."]
+
+
+def _per_axis(values: Sequence[float], digits: int) -> str:
+    return "/".join(format_number(value, digits) for value in values)
 
 
 def markdown_table(evaluation: Evaluation) -> str:

@@ -234,10 +234,10 @@ def find_numbers(evidence: ForceEvidence, share: float, lean: float, tangential:
                 stddev[a] += modes[a, i] * covariance[i, j] * modes[a, j]
     stddev[0] += (share * magnitude) ** 2
     stddev[2] += (share * magnitude) ** 2
-    # a larger force leans more: where it is hardly known, its direction is not known either
-    # y, along which nothing is solved for, and z
+    # along the face: y, for which nothing is solved, and z
     stddev[1] += (tangential * magnitude) ** 2
     stddev[2] += (tangential * magnitude) ** 2
+    # a larger force leans more: where it is hardly known, its direction is not known either
     stddev[2] += (lean * fit**2 / max(magnitude + fit, 1e-300)) ** 2
     stddev = np.sqrt(stddev)
     arm, undeformed = pressure.copy(), place.copy()

@@ -23,23 +23,14 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
 from finforce.health import Level
-from finforce.messages import decode_cloud, stamp_of
+from finforce.messages import decode_columns, stamp_of
 from finforce.ros import node as ros
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 
 
 def columns(cloud, *names):
-    found = decode_cloud(
-        cloud.fields,
-        cloud.data,
-        width=cloud.width,
-        height=cloud.height,
-        point_step=cloud.point_step,
-        row_step=cloud.row_step,
-        is_bigendian=cloud.is_bigendian,
-        names=names,
-    )
+    found = decode_columns(cloud, names)
     return [found[name] for name in names]
 
 
