@@ -28,17 +28,15 @@ class EstimatorSettings:
     noise: float = setting(0.35e-3, "key point noise assumed until a tare has measured it", "m", 1e-6, 0.01)
     offset_stddev: float = setting(0.4e-3, "constant offset of a key point that no tare has seen", "m", 0.0, 0.01)
     model_error: float = setting(0.01, "error of the mechanics as a share of a key point's way", "1", 0.0, 1.0)
-    friction: float = setting(
-        0.4,
-        "coefficient of the friction that may act, for the stated deviations; the mechanics has none",
-        "1",
-        0.0,
-        2.0,
+    friction: float = setting(0.4, "expected coefficient of friction of an object that is not smooth", "1", 0.0, 2.0)
+    friction_stddev: float = setting(0.2, "uncertainty of that coefficient", "1", 1e-3, 2.0)
+    smooth_share: float = setting(
+        0.65, "probability that an object is no rougher than those that the finger was calibrated on", "1", 0.0, 1.0
     )
     tare_frames: int = setting(45, "unloaded frames before the first force is reported", "frames", 5, 10000)
     tare_memory: int = setting(300, "unloaded frames over which offsets are averaged", "frames", 5, 100000)
     automatic_tare: bool = setting(True, "tare by itself at the start while nothing presses", "")
-    height_stddev: float = setting(0.5e-3, "uncertainty of the given height of first touch", "m", 1e-6, 0.05)
+    height_stddev: float = setting(0.2e-3, "uncertainty of the given height of first touch", "m", 1e-6, 0.05)
     radius: float = setting(0.012, "expected radius of curvature of the object where it touches", "m", 0.002, 0.5)
     radius_log_stddev: float = setting(0.7, "uncertainty of the logarithm of that radius", "1", 0.01, 3.0)
     tilt_stddev: float = setting(

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact
 from finforce_ifea.contact_mechanics.indenter import Indenter, RoundIndenter
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import JawModel
@@ -52,9 +53,10 @@ class PressedState:
     Attributes:
         touches: whether any surface point is in contact.
         correction: Newton step of the unknowns towards equilibrium (size,); with contact, within the model's reach.
-        modes: motions of the unknowns by depth [per m], shape and height [per m], (size, 3).
+        modes: motions of the unknowns by depth [per m], shape and height [per m], (size, 3); where forces
+            may lean, by that too (size, 4).
         force: total contact force on the jaw after `correction` (3,) [N].
-        force_modes: its derivatives (3, 3), columns as in modes.
+        force_modes: its derivatives (3, 3 or 4), columns as in modes.
         pressure_point: pressure centre on the deformed surface (3,) [m]; NaN without contact.
         pressure_place: the same on the undeformed surface (3,) [m]; NaN without contact.
         smallest_det: smallest det F of all elements [-].
@@ -75,7 +77,11 @@ class PressedState:
 
 
 class RollingContact:
-    """A model, its contact surface, and the object pressed into it."""
+    """A model, its contact surface, and the object pressed into it.
+
+    Attributes:
+        rubbing: none; the tangent is symmetric.
+    """
 
     def __init__(self, model: JawModel, surface: ContactSurface, face_x: float) -> None:
         """Keeps the model, its contact surface and the plane x = face_x [m] of the undeformed surface.
@@ -89,6 +95,7 @@ class RollingContact:
         )
         self.face_x = face_x
         self.indenter: Indenter = RoundIndenter()
+        self.rubbing: LeaningContact | Friction | None = None
 
     def set_indenter(self, indenter: Indenter) -> None:
         """Takes another object, which is pressed in from now on."""

@@ -12,7 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.indenter import Indenter, RoundIndenter
+from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact, RubbedContact
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, Indenter, RoundIndenter
+from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, PressedState, find_share_that_meets
 from finforce_ifea.fem.factorisation import Factor
 from finforce_ifea.fem.model import LARGEST_MOVE, JawModel, Linearization
@@ -201,12 +203,17 @@ _LARGE_STEP, _TOO_FAR, _BISECTIONS = 0.3, 0.5, 6
 
 
 class ReducedContact:
-    """A reduced model, its contact surface, and the object pressed into it."""
+    """A reduced model, its contact surface, and the object pressed into it.
+
+    Attributes:
+        rubbing: what acts along the surface: a lean of all forces, or friction with its history.
+    """
 
     def __init__(self, model: ReducedModel, surface: ContactSurface, face_x: float) -> None:
         """Keeps the model, its contact surface, one point per height, and the plane x = face_x [m]."""
         self.model, self.surface, self.face_x = model, surface, face_x
         self.indenter: Indenter = RoundIndenter()
+        self.rubbing: LeaningContact | Friction = LeaningContact()
         shares = share_rows(model.manifold.heights, surface.heights)
         upper = np.clip(np.searchsorted(model.manifold.heights, surface.heights) - 1, 0, shares.shape[1] - 1)
         share = shares[np.arange(len(upper)), upper]
@@ -230,8 +237,8 @@ class ReducedContact:
         """Linearises the equilibrium with the object at a place (depth, shape, height); see `RollingContact`."""
         moves = self.model.moves(q)
         points = place_contact(self._face, moves)
-        contact = self.indenter.press(points, self.surface.stiffness, self.face_x, place)
-        parts = (contact.forces, contact.springs, contact.by_shape)
+        contact = self._rub(points, place)
+        parts = (contact.forces, contact.springs, contact.changes)
         step = step_contact(q, self._tables, self._face, moves, points, parts)
         correction, force = step.correction, step.force
         if step.touches and step.size > _LARGE_STEP and not correction[-2:].any():
@@ -251,6 +258,24 @@ class ReducedContact:
             extrapolation=step.away / self._farthest,
         )
 
+    def _press(self, points: NDArray, place: NDArray) -> PenaltyContact:
+        return self.indenter.press(points, self.surface.stiffness, self.face_x, place)
+
+    def _rub(self, points: NDArray, place: NDArray) -> RubbedContact:
+        """Returns the contact of points (p, 3) [m] with the object at a place (3,), friction included."""
+        return self.rubbing.rub(self._press(points, place), points, self.surface.stiffness, _find_origin(place))
+
+    def with_friction(self) -> "ReducedContact":
+        """Returns another contact of the same jaw, of which friction is not known but followed."""
+        other = ReducedContact(self.model, self.surface, self.face_x)
+        other.rubbing = Friction(len(self.surface.points))
+        return other
+
+    def settle(self, q: NDArray, place: NDArray) -> float:
+        """Remembers an equilibrium for the friction; returns how far the cone is used, from -1 to 1."""
+        points = place_contact(self._face, self.model.moves(q))
+        return self.rubbing.settle(self._press(points, place), points, self.surface.stiffness, _find_origin(place))
+
     def _find_share(self, q: NDArray, points: NDArray, step: NDArray, place: NDArray) -> float:
         """Returns the share of a step up to which the energy of jaw and object falls; corners make it rise again.
 
@@ -261,7 +286,7 @@ class ReducedContact:
         motion, moved = place_contact(self._face, after) - points, after - self.model.moves(q)
 
         def change_energy(share: float) -> float:
-            contact = self.indenter.press(points + share * motion, self.surface.stiffness, self.face_x, place)
+            contact = self._rub(points + share * motion, place)
             return float((q[:-2] + share * step[:-2]) @ moved - (contact.forces * motion).sum())
 
         share, low, high = 1.0, 0.0, 1.0
@@ -280,6 +305,11 @@ class ReducedContact:
             return self.indenter.find_gap(points, self.face_x, place)
 
         return find_share_that_meets(find_gap) * step
+
+
+def _find_origin(place: NDArray) -> NDArray:
+    """Returns where an object at a place (depth, shape, height) has gone, x and z [m]."""
+    return np.array([-place[DEPTH], place[HEIGHT]])
 
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -311,9 +341,9 @@ class ContactStep(NamedTuple):
 
     Attributes:
         correction: of the unknowns (2 n + 2,).
-        modes: (2 n + 2, 3).
+        modes: (2 n + 2, 4).
         force: (3,) [N].
-        force_modes: (3, 3).
+        force_modes: (3, 4).
         pressure_point: (3,) [m], NaN without contact.
         pressure_place: (3,) [m], NaN without contact.
         size: of the whole correction, as a share of what is allowed at once.
@@ -402,11 +432,11 @@ def _add_springs(spring, weight, row, low, share, stiffness):
 
 @njit(**_OPTIONS)
 def _gather(face, contact, loads, stiffness):
-    """Adds contact at points (forces, springs, by_shape) to the rows: loads (2 n, 4), band stiffness (2 n, 7).
+    """Adds contact at points (forces, springs, changes) to the rows: loads (2 n, 5), band stiffness (2 n, 7).
 
-    Columns of loads: now, by depth, by shape, by height. The band holds entries i - 3 ... i + 3 of each line i.
+    Columns of loads: now, and by what changes the contact. The band holds entries i - 3 ... i + 3 of each line i.
     """
-    forces, springs, by_shape = contact
+    forces, springs, changes = contact
     for p in range(len(forces)):
         if springs[p, 0, 0] == 0.0 and springs[p, 2, 2] == 0.0:
             continue
@@ -417,15 +447,14 @@ def _gather(face, contact, loads, stiffness):
             for a in range(2):
                 k = 2 * row + a
                 loads[k, 0] += w * forces[p, 2 * a]
-                loads[k, 1] -= w * springs[p, 2 * a, 0]
-                loads[k, 2] += w * by_shape[p, 2 * a]
-                loads[k, 3] += w * springs[p, 2 * a, 2]
+                for c in range(changes.shape[2]):
+                    loads[k, c + 1] += w * changes[p, 2 * a, c]
             _add_springs(springs[p], w, row, face.low[p], face.share[p], stiffness)
 
 
 @njit(**_OPTIONS)
 def _solve_rows(q, compliance, loads, stiffness):
-    """Returns (2 n, 4): the step of the loads to equilibrium, and their derivatives by the place; and its motion [m].
+    """Returns (2 n, 5): the step of the loads to equilibrium, and their derivatives by the place; and its motion [m].
 
     With loads p(u) of the object at the rows, springs S = -dp/du and compliance C, one step of Newton's method on
     lambda = p(u(lambda)) solves
@@ -454,9 +483,10 @@ def _solve_rows(q, compliance, loads, stiffness):
 
 @njit(**_OPTIONS)
 def _hold_base(q, compliance, face, contact, steps):
-    """Returns what of the contact force the clamp holds below the first row, and its derivatives (2, 4) [N]."""
-    out, moved = np.zeros((2, 4)), np.zeros((2, 4))
-    forces, springs, by_shape = contact
+    """Returns what of the contact force the clamp holds below the first row, and its derivatives (2, 5) [N]."""
+    forces, springs, changes = contact
+    columns = changes.shape[2] + 1
+    out, moved = np.zeros((2, columns)), np.zeros((2, columns))
     if not ((face.low < 0) & (springs[:, 0, 0] + springs[:, 2, 2] > 0.0)).any():
         return out
     rows = np.empty((2, len(steps)))
@@ -468,10 +498,9 @@ def _hold_base(q, compliance, face, contact, steps):
             continue
         for a in range(2):
             out[a, 0] += held * forces[p, 2 * a]
-            out[a, 1] -= held * spring[2 * a, 0]
-            out[a, 2] += held * by_shape[p, 2 * a]
-            out[a, 3] += held * spring[2 * a, 2]
-            for c in range(4):
+            for c in range(1, columns):
+                out[a, c] += held * changes[p, 2 * a, c - 1]
+            for c in range(columns):
                 share = spring[2 * a, 0] * moved[0, c] + spring[2 * a, 2] * moved[1, c]
                 out[a, c] -= held * face.share[p] * share
     return out
@@ -490,10 +519,10 @@ def step_contact(
         face: the contact points on the rows.
         moves: of the rows now (2 n,) [m].
         points: contact points now (p, 3) [m].
-        contact: forces (p, 3), springs (p, 3, 3) and derivatives by the shape (p, 3).
+        contact: forces (p, 3), springs (p, 3, 3) and changes (p, 3, 4); see `RubbedContact`.
     """
-    count = len(moves)
-    loads, stiffness = np.zeros((count, 4)), np.zeros((count, 7))
+    count, columns = len(moves), contact[2].shape[2]
+    loads, stiffness = np.zeros((count, columns + 1)), np.zeros((count, 7))
     _gather(face, contact, loads, stiffness)
     total, point, place = 0.0, np.zeros(3), np.zeros(3)
     for p in range(len(points)):
@@ -507,7 +536,7 @@ def step_contact(
     size = moved / LARGEST_MOVE
     if total > 0.0 and size > 1.0:
         steps[:, 0] /= size
-    correction, modes = np.zeros(count + 2), np.zeros((count + 2, 3))
+    correction, modes = np.zeros(count + 2), np.zeros((count + 2, columns))
     correction[:count], modes[:count] = steps[:, 0], steps[:, 1:]
     after = moves.copy()
     first, last = find_ends(correction[:count])
@@ -524,7 +553,7 @@ def step_contact(
         correction[count:] = 0.0
     size = max(size, turned)
     held = _hold_base(q, tables[1], face, contact, steps)
-    force, force_modes = np.zeros(3), np.zeros((3, 3))
+    force, force_modes = np.zeros(3), np.zeros((3, columns))
     force[::2], force_modes[::2] = held[:, 0], held[:, 1:]
     for k in range(count):
         axis = 2 * (k % 2)

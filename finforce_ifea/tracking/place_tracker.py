@@ -14,6 +14,7 @@ from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
+from finforce_ifea.tracking.friction_estimate import FrictionEstimate, FrictionFrame
 from finforce_ifea.tracking.influence import measure_influence
 from finforce_ifea.tracking.place_update import (
     Average,
@@ -25,6 +26,7 @@ from finforce_ifea.tracking.place_update import (
     update_place,
     weigh_residuals,
 )
+from finforce_ifea.tracking.slip_history import SlipHistory
 from finforce_ifea.tracking.track import Track, explain_offsets
 
 # The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
@@ -46,6 +48,8 @@ _LOST_STDDEV = 1e-3
 _FARTHEST_HEIGHT = 8.0
 # Fewer points in agreement with the forecast than this share call for a leap; a forecast is never wider than this [m].
 _LEAST_AGREEMENT = 0.6
+# What of the friction the mechanics does not follow, and lean of a force that is never excluded [-].
+_UNFOLLOWED, _LEAN = 0.25, 0.08
 _WIDEST_FORECAST = 1e-3
 
 
@@ -61,6 +65,8 @@ class PlaceTracker:
         self._rest = contact.model.positions(self.probe, np.zeros(contact.model.size))
         self.response = measure_influence(contact, self.probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
+        self._slips = SlipHistory(contact.with_friction()) if contact.rubbing is not None else None
+        self._roughness = FrictionEstimate(settings)
         self._face = contact.surface.heights[[0, -1]]
         self.reset()
 
@@ -80,6 +86,8 @@ class PlaceTracker:
         self._motion = np.array([self._find_touch(np.r_[0.0, self._prior]), 0.0])
         self._motion_covariance = np.diag([0.1e-3, 1e-3]) ** 2
         self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
+        if self._slips is not None:
+            self._slips.reset()
         self._released, self._jumped = 0, False
         self._forget_place()
 
@@ -121,11 +129,13 @@ class PlaceTracker:
             share *= 0.5 if rocks else 1.0
             missing = update.place - aim if share > _UNDECIDED else np.zeros(3)
             last, moved, place = aim - place, self._reachable(aim) - mechanical, aim
-            q = q + limit_step(self.contact.model, state.modes @ moved)
+            q = q + limit_step(self.contact.model, state.modes[:, :3] @ moved)
             settled = self._is_settled(state, moved, missing)
         if update is None or not state.touches:
             return self._lose()
-        self._keep(q, place, update, state.modes)
+        self._keep(q, place, update, state.modes[:, :3])
+        if self._slips is not None and settled:
+            self._learn_friction(state, data, update, forecast)
         return self._report(state, place, moved, data, update, iteration, settled)
 
     def _bound(self, asked: NDArray, place: NDArray, share: float) -> NDArray:
@@ -161,6 +171,20 @@ class PlaceTracker:
         state = self.contact.linearize(q, self._reachable(np.r_[-1.0, self._prior]))
         return self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
 
+    def _learn_friction(self, state: PressedState, data: Residuals, update: PlaceUpdate, forecast: Forecast) -> None:
+        """Follows how the object slides, and learns its coefficient where something presses."""
+        if self._reached[DEPTH] - self._find_touch(self._reached) < _LOADED_DEPTH or self._jumped:
+            return
+        expected = np.r_[self._reached[DEPTH], self._prior]
+        before, known = self._slips.mobilised, self._roughness.coefficient.mean
+        self._slips.set_indenter(self.contact.indenter)
+        mobilised = self._slips.follow(self.q, expected, float(np.sqrt(update.depth_variance)), known)
+        normal = float(np.hypot(*state.force[::2]))
+        moved, away = update.place - forecast.place, update.place[1:] - self._prior
+        frame = FrictionFrame(data, self._motions[:, ::2], normal, before, self.contact.rubbing.lean, moved, away)
+        found = self._roughness.update(frame, self._prior_variance)
+        self.contact.rubbing.lean = found.mean * mobilised
+
     def resume(self, q: NDArray) -> None:
         """Starts anew from the shape (size,) that another tracker has found."""
         self.reset()
@@ -195,6 +219,8 @@ class PlaceTracker:
             change = after.field.front - before.field.front
             self._motion[0] += change
             self._reached[DEPTH] += change
+            if self._slips is not None:
+                self._slips.shift(change)
 
     def _predict(self, dt: float) -> Forecast:
         """Returns the place dt [s] later: constant speed of the depth under white acceleration."""
@@ -221,10 +247,10 @@ class PlaceTracker:
     ) -> Residuals:
         """Returns the residuals of a state at a place (3,) that has moved by `moved` (3,) since the forecast."""
         model = self.contact.model
-        motions = model.project(self.probe, q, state.modes)
+        self._motions = model.project(self.probe, q, state.modes)
         below = float(place[DEPTH] - self._reachable(place)[DEPTH])
         positions = model.positions(self.probe, q)
-        return weigh_residuals(measured, positions, self._rest, motions, moved, below, chance)
+        return weigh_residuals(measured, positions, self._rest, self._motions[:, :, :3], moved, below, chance)
 
     def _update_place(self, data: Residuals, forecast: Forecast) -> PlaceUpdate:
         """Returns the place that the residuals ask for."""
@@ -274,7 +300,7 @@ class PlaceTracker:
         iterations: int,
         settled: bool,
     ) -> Track:
-        force = state.force + state.force_modes @ moved
+        force = state.force + state.force_modes[:, :3] @ moved
         pressed = place[DEPTH] - self._find_touch(place)
         if pressed < _LEAST_DEPTH:
             force = force * max(0.0, pressed / _LEAST_DEPTH)
@@ -284,7 +310,7 @@ class PlaceTracker:
         return Track(
             covariance=covariance,
             force=force,
-            force_modes=state.force_modes,
+            force_modes=state.force_modes[:, :3],
             pressure_point=state.pressure_point,
             pressure_place=state.pressure_place,
             weights=data.weights,
@@ -303,6 +329,13 @@ class PlaceTracker:
             agreement=data.agreed / data.known,
             condition=update.condition,
             place_stddev=float(np.sqrt(max(update.covariance[HEIGHT, HEIGHT], 0.0))),
+        )
+
+    def _describe_lean(self) -> float:
+        """Returns the standard deviation of the lean of the force that friction leaves [-]."""
+        found = self._roughness.coefficient
+        return float(
+            np.sqrt((found.stddev * abs(self._slips.mobilised)) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _LEAN**2)
         )
 
     def _stiffening(self, force: NDArray, place: NDArray) -> float:

@@ -1,0 +1,165 @@
+"""How rough an object is, told by the way that the key points differ between loading and unloading.
+
+What is left of the key points' residuals at the expected place is explained by
+
+    shape and height of the object, as far as they may differ from what was expected,
+    mu m,  m the lean of the forces that the history of the contact predicts for a coefficient of one,
+    b,     a lean that the mechanics or the calibration err by, whatever the motion,
+    c,     a tangential force that errors of the tare look like,
+
+with the depth of each frame free. m changes its sign when the motion does, b and c do not: loops tell mu from them.
+Either the object is as smooth as those that the finger was calibrated on, or mu is anything about the expected one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tracking.place_update import Residuals
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+# Standard deviations of b [-] and c [N].
+_LEAN_ERROR, _FORCE_ERROR = 0.07, 0.1
+# The errors of successive frames are not independent: so many count for one. Beyond this many frames old ones fade.
+_ALIKE, _MEMORY = 3.0, 3000.0
+# A smooth object is as smooth as those of the calibration within this.
+_SMOOTH_STDDEV = 0.02
+_LARGEST = 1.5
+
+
+class Coefficient(NamedTuple):
+    """A coefficient of friction and its standard deviation."""
+
+    mean: float
+    stddev: float
+
+
+class FrictionFrame(NamedTuple):
+    """What one frame may say of friction.
+
+    Attributes:
+        data: residuals about the reference place.
+        modes: of the key points by the place and a lean of the force (K, 2, 4).
+        normal: force [N].
+        mobilised: how far friction is made use of, from -1 to 1.
+        lean: of the force, with which the residuals were found [-].
+        moved: the place that was found minus the reference (3,).
+        away: shape and height that were found minus the expected ones (2,).
+    """
+
+    data: Residuals
+    modes: NDArray
+    normal: float
+    mobilised: float
+    lean: float
+    moved: NDArray
+    away: NDArray
+
+
+class FrictionEstimate:
+    """Learns the coefficient of friction of one object.
+
+    Attributes:
+        coefficient: of friction, as far as it is known.
+    """
+
+    def __init__(self, settings: EstimatorSettings, calibrated: float = 0.0) -> None:
+        """Keeps what is expected of objects; `calibrated` is the coefficient of those of the calibration."""
+        self._rough = Coefficient(settings.friction, settings.friction_stddev)
+        self._smooth, self._share = Coefficient(calibrated, _SMOOTH_STDDEV), settings.smooth_share
+        self.reset()
+
+    def reset(self) -> None:
+        """Starts with an object of which nothing is known."""
+        self._information, self._vector = np.zeros((5, 5)), np.zeros(5)
+        self._prior = np.ones(2)
+        self.coefficient = self._judge(np.inf, 0.0)
+
+    def update(self, frame: "FrictionFrame", prior: NDArray) -> Coefficient:
+        """Takes one frame and returns the coefficient; `prior` is the variance of shape and height (2,)."""
+        self._prior = prior
+        _accumulate(frame, self._information, self._vector)
+        self.coefficient = self._judge(*_solve(self._information, self._vector, prior))
+        return self.coefficient
+
+    @property
+    def seen(self) -> Coefficient:
+        """What the key points alone say of the coefficient; its deviation is infinite where they say nothing."""
+        variance, mean = _solve(self._information, self._vector, self._prior)
+        return Coefficient(mean, float(np.sqrt(variance)))
+
+    def _judge(self, variance: float, mean: float) -> Coefficient:
+        """Returns the coefficient for what the key points alone say of it."""
+        parts = []
+        for share, known in ((self._share, self._smooth), (1.0 - self._share, self._rough)):
+            own = max(known.stddev, 1e-6) ** 2
+            if not np.isfinite(variance):
+                parts.append((share, known.mean, own))
+                continue
+            total = own + variance
+            weight = share * np.exp(-0.5 * min((mean - known.mean) ** 2 / total, 1e3)) / np.sqrt(total)
+            parts.append((weight, (known.mean * variance + mean * own) / total, own * variance / total))
+        weights, means, variances = np.array(parts).T
+        means = np.clip(means, 0.0, _LARGEST)
+        weights = weights / weights.sum() if weights.sum() > 0 else np.array([0.0, 1.0])
+        middle = float(weights @ means)
+        return Coefficient(middle, float(np.sqrt(weights @ (variances + (means - middle) ** 2))))
+
+
+@njit(**_OPTIONS)
+def _accumulate(frame, information, vector):
+    """Adds one frame, its depth eliminated, to information (5, 5) and vector (5,) on shape, height, mu, b and c."""
+    data, modes, normal, mobilised, lean, moved, away = frame
+    A, g = np.zeros((6, 6)), np.zeros(6)
+    row, left = np.zeros((6, 2)), np.zeros(2)
+    for k in range(len(data.weights)):
+        w = data.weights[k]
+        if w <= 0.0:
+            continue
+        n00, n11, n01 = data.noise[k, 0, 0], data.noise[k, 1, 1], data.noise[k, 0, 1]
+        det = n00 * n11 - n01 * n01
+        p00, p11, p01 = w * n11 / det, w * n00 / det, -w * n01 / det
+        for a in range(2):
+            for i in range(3):
+                row[i, a] = modes[k, a, i]
+            leaning = modes[k, a, 3]
+            row[3, a], row[4, a], row[5, a] = mobilised * leaning, leaning, leaning / normal
+            left[a] = data.r[k, a] + leaning * lean - row[0, a] * moved[0]
+            for i in range(1, 3):
+                left[a] += row[i, a] * (away[i - 1] - moved[i])
+        for i in range(6):
+            q0, q1 = p00 * row[i, 0] + p01 * row[i, 1], p01 * row[i, 0] + p11 * row[i, 1]
+            g[i] += q0 * left[0] + q1 * left[1]
+            for j in range(6):
+                A[i, j] += q0 * row[j, 0] + q1 * row[j, 1]
+    if not A[0, 0] > 0.0:
+        return
+    for i in range(5):
+        vector[i] = (1.0 - 1.0 / _MEMORY) * vector[i] + (g[i + 1] - A[i + 1, 0] * g[0] / A[0, 0]) / _ALIKE
+        for j in range(5):
+            added = (A[i + 1, j + 1] - A[i + 1, 0] * A[0, j + 1] / A[0, 0]) / _ALIKE
+            information[i, j] = (1.0 - 1.0 / _MEMORY) * information[i, j] + added
+
+
+@njit(**_OPTIONS)
+def _solve(information, vector, prior):
+    """Returns variance and mean of mu by the key points alone; infinite where they say nothing."""
+    A = information.copy()
+    A[0, 0] += 1.0 / prior[0]
+    A[1, 1] += 1.0 / prior[1]
+    A[3, 3] += 1.0 / _LEAN_ERROR**2
+    A[4, 4] += 1.0 / _FORCE_ERROR**2
+    others = np.array([0, 1, 3, 4])
+    B, v, a = np.empty((4, 4)), np.empty(4), np.empty(4)
+    for i in range(4):
+        v[i], a[i] = vector[others[i]], A[2, others[i]]
+        for j in range(4):
+            B[i, j] = A[others[i], others[j]]
+    known = np.linalg.solve(B, np.stack((v, a), axis=1))
+    left = A[2, 2] - a @ np.ascontiguousarray(known[:, 1])
+    if not left > 1e-9:
+        return np.inf, 0.0
+    return 1.0 / left, (vector[2] - a @ np.ascontiguousarray(known[:, 0])) / left
