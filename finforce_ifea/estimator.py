@@ -82,7 +82,7 @@ class JawEstimator:
         self.calibration = calibration
         self.jaw = calibration.apply(jaw) if calibration else jaw
         self.mechanics: Mechanics = build_chosen(self.jaw, self.settings)
-        self._rolling = PlaceTracker(self.mechanics.contact, self.jaw.keypoints, self.settings)
+        self._rolling = PlaceTracker(self.mechanics, self.jaw.keypoints, self.settings)
         self._pointed = PointTracker(self.jaw, self.mechanics, self.settings, self._rolling.response)
         self._tracker: PlaceTracker | PointTracker = self._rolling
         self._gate = KeypointGate(self.jaw, self.settings)
@@ -126,11 +126,11 @@ class JawEstimator:
 
     def surface(self) -> NDArray:
         """Returns the deformed mesh vertices (n, 3) [m], in mesh order."""
-        return self.mechanics.model.vertices(self._tracker.q)
+        return self._tracker.vertices()
 
     def keypoints_model(self) -> NDArray:
         """Returns the key points (K, 3) [m] of the deformed model."""
-        return self.mechanics.model.positions(self._tracker.probe, self._tracker.q)
+        return self._tracker.positions()
 
     def update(self, observation: Observation, contact: Contact | None) -> Solution:
         """Takes one image's key points and returns what they say.
@@ -198,7 +198,7 @@ class JawEstimator:
         free = (contact.free or contact.outline is not None) and self.settings.solver != "paper"
         chosen = self._rolling if free else self._pointed
         if chosen is not self._tracker:
-            chosen.resume(self._tracker.q)
+            chosen.resume(self._tracker.give_shape())
             self._tracker = chosen
         chosen.follow(contact)
 

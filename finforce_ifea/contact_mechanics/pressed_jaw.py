@@ -7,14 +7,15 @@ and spreads along the finger by itself as the finger bends.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact
-from finforce_ifea.contact_mechanics.indenter import Indenter, RoundIndenter
+from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact, RubbedContact
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, Indenter, RoundIndenter
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.jaw.jaw import Jaw
@@ -76,11 +77,16 @@ class PressedState:
     extrapolation: float = 0.0
 
 
+def find_origin(place: NDArray) -> NDArray:
+    """Returns where an object at a place (depth, shape, height) has gone, x and z [m]."""
+    return np.array([-place[DEPTH], place[HEIGHT]])
+
+
 class RollingContact:
     """A model, its contact surface, and the object pressed into it.
 
     Attributes:
-        rubbing: none; the tangent is symmetric.
+        rubbing: what acts along the surface: a lean of all forces, or friction with its history.
     """
 
     def __init__(self, model: JawModel, surface: ContactSurface, face_x: float) -> None:
@@ -95,7 +101,7 @@ class RollingContact:
         )
         self.face_x = face_x
         self.indenter: Indenter = RoundIndenter()
-        self.rubbing: LeaningContact | Friction | None = None
+        self.rubbing: LeaningContact | Friction = LeaningContact()
 
     def set_indenter(self, indenter: Indenter) -> None:
         """Takes another object, which is pressed in from now on."""
@@ -105,37 +111,53 @@ class RollingContact:
         """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
         return np.zeros(self.model.size)
 
+    def rub(self, points: NDArray, place: NDArray) -> RubbedContact:
+        """Returns the contact of surface points (p, 3) [m] with the object at a place (3,)."""
+        contact = self.indenter.press(points, self.surface.stiffness, self.face_x, place)
+        return self.rubbing.rub(contact, points, self.surface.stiffness, find_origin(place))
+
+    def with_friction(self) -> "RollingContact":
+        """Returns another contact of the same jaw, of which friction is not known but followed."""
+        other = copy(self)
+        other.rubbing = Friction(len(self.surface.points))
+        return other
+
+    def settle(self, q: NDArray, place: NDArray) -> float:
+        """Remembers an equilibrium for the friction; returns how far the cone is used, from -1 to 1."""
+        points = self.place_points(q)
+        contact = self.indenter.press(points, self.surface.stiffness, self.face_x, place)
+        return self.rubbing.settle(contact, points, self.surface.stiffness, find_origin(place))
+
+    def place_points(self, q: NDArray) -> NDArray:
+        """Returns the surface points (p, 3) [m] of the deformed jaw."""
+        return self.model.positions(self.surface.probe, q)
+
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
         """Linearises the equilibrium f_int(q) = J^T p(J q, place) at unknowns q and place (depth, shape, height).
 
-        With S the springs of all points and e_x, e_z unit motions of the object, the loads by depth and height are
-        -J^T S e_x and J^T S e_z; as S is symmetric, the same loads give the forces that the jaw's motion takes away.
+        The springs of tangential forces are not symmetric; the tangent takes their symmetric part, which Newton's
+        method forgives.
         """
         model, probe = self.model, self.surface.probe
-        points = model.positions(probe, q)
-        contact = self.indenter.press(points, self.surface.stiffness, self.face_x, place)
+        points = self.place_points(q)
+        contact = self.rub(points, place)
         state = model.linearize(q)
-        model.stiffen(state.tangent, probe, q, contact.springs)
-        along_x = np.ascontiguousarray(contact.springs[:, :, 0])
-        along_z = np.ascontiguousarray(contact.springs[:, :, 2])
-        load_x, load_z = model.load(probe, q, along_x), model.load(probe, q, along_z)
+        model.stiffen(state.tangent, probe, q, 0.5 * (contact.springs + contact.springs.transpose(0, 2, 1)))
         imbalance = model.load(probe, q, contact.forces) - state.force
-        loads = np.stack([imbalance, -load_x, model.load(probe, q, contact.by_shape), load_z], axis=1)
+        changes = [np.ascontiguousarray(change) for change in np.moveaxis(contact.changes, 2, 0)]
+        loads = np.stack([imbalance, *(model.load(probe, q, change) for change in changes)], axis=1)
         steps = model.factorise(state.tangent).solve(loads)
-        modes, size = steps[:, 1:], np.hypot(contact.forces[:, 0], contact.forces[:, 2])
+        relief = np.einsum("pab,pbk->ak", contact.springs, model.project(probe, q, steps))
+        size = np.hypot(contact.forces[:, 0], contact.forces[:, 2])
         total = size.sum()
         share = size / total if total > 0 else np.full(len(size), np.nan)
-        force_modes = np.stack([-along_x.sum(0), contact.by_shape.sum(0), along_z.sum(0)], axis=1)
-        force_modes[0] -= load_x @ modes
-        force_modes[2] -= load_z @ modes
-        relief = np.array([load_x @ steps[:, 0], 0.0, load_z @ steps[:, 0]])
         reached = measure_step(model, steps[:, 0])
         return PressedState(
             touches=bool(total > 0),
             correction=steps[:, 0] / max(reached, 1.0) if total > 0 else steps[:, 0],
-            modes=modes,
-            force=contact.forces.sum(0) - relief,
-            force_modes=force_modes,
+            modes=steps[:, 1:],
+            force=contact.forces.sum(0) - relief[:, 0],
+            force_modes=contact.changes.sum(0) - relief[:, 1:],
             pressure_point=share @ points,
             pressure_place=share @ self.surface.points,
             smallest_det=state.smallest_det,
@@ -146,8 +168,7 @@ class RollingContact:
         """Returns the step of a jaw that has lost contact, cut where its surface meets the object again."""
 
         def find_gap(share: float) -> float:
-            points = self.model.positions(self.surface.probe, q + share * step)
-            return self.indenter.find_gap(points, self.face_x, place)
+            return self.indenter.find_gap(self.place_points(q + share * step), self.face_x, place)
 
         return find_share_that_meets(find_gap) * step
 
@@ -177,11 +198,19 @@ def limit_step(model: JawModel, step: NDArray) -> NDArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mechanics:
-    """A jaw's mesh, its model, and the model with its contact surface."""
+    """A jaw's mesh, its model, and the model with its contact surface.
+
+    Attributes:
+        mesh: of the jaw.
+        model: of its unknowns.
+        contact: of its inner face with an object.
+        full: the mechanics that a reduced one stands for, where that may be asked; None otherwise.
+    """
 
     mesh: VolumeMesh
     model: JawModel
     contact: RollingContact
+    full: Mechanics | None = None
 
 
 Across = Literal["middle", "half", "both"]

@@ -135,7 +135,12 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
     middle[:, 1] = 0.0
     stiffness = surface.stiffness.reshape(-1, surface.across).sum(1)
     surface = replace(surface, points=middle, across=1, stiffness=stiffness, probe=None)
-    return Mechanics(mesh=full.mesh, model=model, contact=ReducedContact(model, surface, full.contact.face_x))
+    return Mechanics(
+        mesh=full.mesh,
+        model=model,
+        contact=ReducedContact(model, surface, full.contact.face_x),
+        full=None if linear else full,
+    )
 
 
 def name_manifold(full: Mechanics, jaw: Jaw) -> str:

@@ -12,10 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact, RubbedContact
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, Indenter, RoundIndenter
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact
-from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, PressedState, find_share_that_meets
+from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact
+from finforce_ifea.contact_mechanics.indenter import Indenter, RoundIndenter
+from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, PressedState, RollingContact
 from finforce_ifea.fem.factorisation import Factor
 from finforce_ifea.fem.model import LARGEST_MOVE, JawModel, Linearization
 from finforce_ifea.reduced.equilibria import (
@@ -163,9 +162,13 @@ class ReducedModel:
 
     def vertices(self, q: NDArray) -> NDArray:
         """Returns the deformed mesh vertices (v, 3) [m], in mesh order."""
+        return self._full.vertices(self.expand(q))
+
+    def expand(self, q: NDArray) -> NDArray:
+        """Returns the unknowns of the full model (m,) at this one's (size,), as far as its basis goes."""
         still = np.zeros((self.manifold.basis.shape[1], 1))
         shape = place_points(still, self.manifold.shapes, self.shape_compliance, self.loads, q)
-        return self._full.vertices(self.manifold.basis @ shape.ravel())
+        return self.manifold.basis @ shape.ravel()
 
 
 def scale_manifold(manifold: Manifold, factor: float) -> Manifold:
@@ -202,7 +205,7 @@ _FARTHEST_SHAPE = 0.0056
 _LARGE_STEP, _TOO_FAR, _BISECTIONS = 0.3, 0.5, 6
 
 
-class ReducedContact:
+class ReducedContact(RollingContact):
     """A reduced model, its contact surface, and the object pressed into it.
 
     Attributes:
@@ -223,9 +226,9 @@ class ReducedContact:
         self._farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
         self._tables = (model.manifold.moves, model.compliance, model.loads)
 
-    def set_indenter(self, indenter: Indenter) -> None:
-        """Takes another object, which is pressed in from now on."""
-        self.indenter = indenter
+    def place_points(self, q: NDArray) -> NDArray:
+        """See `RollingContact`."""
+        return place_contact(self._face, self.model.moves(q))
 
     def begin(self, height: float) -> NDArray:
         """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
@@ -237,7 +240,7 @@ class ReducedContact:
         """Linearises the equilibrium with the object at a place (depth, shape, height); see `RollingContact`."""
         moves = self.model.moves(q)
         points = place_contact(self._face, moves)
-        contact = self._rub(points, place)
+        contact = self.rub(points, place)
         parts = (contact.forces, contact.springs, contact.changes)
         step = step_contact(q, self._tables, self._face, moves, points, parts)
         correction, force = step.correction, step.force
@@ -258,24 +261,6 @@ class ReducedContact:
             extrapolation=step.away / self._farthest,
         )
 
-    def _press(self, points: NDArray, place: NDArray) -> PenaltyContact:
-        return self.indenter.press(points, self.surface.stiffness, self.face_x, place)
-
-    def _rub(self, points: NDArray, place: NDArray) -> RubbedContact:
-        """Returns the contact of points (p, 3) [m] with the object at a place (3,), friction included."""
-        return self.rubbing.rub(self._press(points, place), points, self.surface.stiffness, _find_origin(place))
-
-    def with_friction(self) -> "ReducedContact":
-        """Returns another contact of the same jaw, of which friction is not known but followed."""
-        other = ReducedContact(self.model, self.surface, self.face_x)
-        other.rubbing = Friction(len(self.surface.points))
-        return other
-
-    def settle(self, q: NDArray, place: NDArray) -> float:
-        """Remembers an equilibrium for the friction; returns how far the cone is used, from -1 to 1."""
-        points = place_contact(self._face, self.model.moves(q))
-        return self.rubbing.settle(self._press(points, place), points, self.surface.stiffness, _find_origin(place))
-
     def _find_share(self, q: NDArray, points: NDArray, step: NDArray, place: NDArray) -> float:
         """Returns the share of a step up to which the energy of jaw and object falls; corners make it rise again.
 
@@ -286,7 +271,7 @@ class ReducedContact:
         motion, moved = place_contact(self._face, after) - points, after - self.model.moves(q)
 
         def change_energy(share: float) -> float:
-            contact = self._rub(points + share * motion, place)
+            contact = self.rub(points + share * motion, place)
             return float((q[:-2] + share * step[:-2]) @ moved - (contact.forces * motion).sum())
 
         share, low, high = 1.0, 0.0, 1.0
@@ -296,20 +281,6 @@ class ReducedContact:
             share = 0.5 * (low + high)
             low, high = (low, share) if change_energy(share) > 0.0 else (share, high)
         return share
-
-    def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
-        """Returns the step of a jaw that has lost contact, cut where its surface meets the object again."""
-
-        def find_gap(share: float) -> float:
-            points = place_contact(self._face, self.model.moves(q + share * step))
-            return self.indenter.find_gap(points, self.face_x, place)
-
-        return find_share_that_meets(find_gap) * step
-
-
-def _find_origin(place: NDArray) -> NDArray:
-    """Returns where an object at a place (depth, shape, height) has gone, x and z [m]."""
-    return np.array([-place[DEPTH], place[HEIGHT]])
 
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}

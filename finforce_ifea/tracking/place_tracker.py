@@ -5,11 +5,13 @@ Kalman filter with constant velocity. Shape and height change slowly: the maximu
 averaged over the last frames, so that their priors count once and errors of the mechanics are no information.
 """
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
-from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RollingContact, limit_step
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, PressedState, RollingContact, limit_step
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
@@ -48,24 +50,40 @@ _LOST_STDDEV = 1e-3
 _FARTHEST_HEIGHT = 8.0
 # Fewer points in agreement with the forecast than this share call for a leap; a forecast is never wider than this [m].
 _LEAST_AGREEMENT = 0.6
+# Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
+# object has gone back to this share of its depth.
+_STRANGE, _BACK = 1.0, 0.8
+# Between two corners of an object a place may not settle; it matters where the force changes by more than this [N].
+_AMBIGUOUS = 0.15
 # What of the friction the mechanics does not follow, and lean of a force that is never excluded [-].
 _UNFOLLOWED, _LEAN = 0.25, 0.08
 _WIDEST_FORECAST = 1e-3
 
 
-class PlaceTracker:
-    """Tracks the place of the pressing object; holds the jaw in equilibrium with it."""
+class _Level(NamedTuple):
+    """One of the mechanics of a jaw: its contact, the probe of the key points, and these at rest (K, 3) [m]."""
 
-    def __init__(self, contact: RollingContact, keypoints: NDArray, settings: EstimatorSettings) -> None:
-        """Attaches key points (K, 3) [m, undeformed] to the contact's model; raises MeshError when one is off it."""
-        self.contact = contact
+    contact: RollingContact
+    probe: Any
+    rest: NDArray
+
+
+class PlaceTracker:
+    """Tracks the place of the pressing object; holds the jaw in equilibrium with it.
+
+    Where a reduced jaw bends as none of its stored shapes does, as around large flat things, the full one takes over.
+    """
+
+    def __init__(self, mechanics: Mechanics, keypoints: NDArray, settings: EstimatorSettings) -> None:
+        """Attaches key points (K, 3) [m, undeformed] to the model; raises MeshError when one is off it."""
         self.settings = settings
-        self.probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
+        self._levels = [_attach(level.contact, keypoints) for level in (mechanics, mechanics.full) if level is not None]
+        self._stand_on(0)
         self._stiffness: float | None = None
-        self._rest = contact.model.positions(self.probe, np.zeros(contact.model.size))
+        contact = self.contact
         self.response = measure_influence(contact, self.probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
-        self._slips = SlipHistory(contact.with_friction()) if contact.rubbing is not None else None
+        self._slips = SlipHistory(contact.with_friction())
         self._roughness = FrictionEstimate(settings)
         self._face = contact.surface.heights[[0, -1]]
         self.reset()
@@ -74,20 +92,58 @@ class PlaceTracker:
         """Starts anew, unloaded, with an unknown object that will first touch at `height` [m], the middle if None."""
         settings = self.settings
         self._given = height
+        self._stand_on(0)
         height = float(np.median(self.contact.surface.heights)) if height is None else height
         self.contact.set_indenter(RoundIndenter())
         self._prior = np.array([np.log(settings.radius), height])
         self._prior_variance = np.array([settings.radius_log_stddev, settings.height_stddev]) ** 2
         self._begin()
 
+    def _stand_on(self, level: int) -> None:
+        """Takes one of the mechanics for the next frames."""
+        self._level = level
+        self.contact, self.probe, self._rest = self._levels[level]
+
+    def _change_level(self, extrapolation: float) -> None:
+        """Goes on with the full mechanics where the shape is too far from those stored, and back where it bends less.
+
+        Args:
+            extrapolation: of the shape that was found; see `PressedState`.
+        """
+        before, pressed = self.contact, float(self._motion[0])
+        if self._level == 0 and extrapolation > _STRANGE and len(self._levels) > 1:
+            self._left = (self.q, _BACK * pressed)
+            q = before.model.expand(self.q)
+            self._stand_on(1)
+        elif self._level == 1 and pressed < self._left[1]:
+            q = self._left[0]
+            self._stand_on(0)
+        else:
+            return
+        self.contact.set_indenter(before.indenter)
+        self.contact.rubbing.lean = before.rubbing.lean
+        self.q, self._modes = q, np.zeros((self.contact.model.size, 3))
+
+    def vertices(self) -> NDArray:
+        """Returns the deformed mesh vertices (n, 3) [m], in mesh order."""
+        return self.contact.model.vertices(self.q)
+
+    def positions(self) -> NDArray:
+        """Returns the key points (K, 3) [m] of the deformed jaw."""
+        return self.contact.model.positions(self.probe, self.q)
+
+    def give_shape(self) -> NDArray:
+        """Returns the shape (size,) for another tracker to begin with."""
+        return self.q if self._level == 0 else self._left[0]
+
     def _begin(self) -> None:
         """Starts with the undeformed jaw and an object that just touches."""
+        self._stand_on(0)
         self.q = self.contact.begin(self._prior[1])
         self._motion = np.array([self._find_touch(np.r_[0.0, self._prior]), 0.0])
         self._motion_covariance = np.diag([0.1e-3, 1e-3]) ** 2
         self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
-        if self._slips is not None:
-            self._slips.reset()
+        self._slips.reset()
         self._released, self._jumped = 0, False
         self._forget_place()
 
@@ -134,9 +190,11 @@ class PlaceTracker:
         if update is None or not state.touches:
             return self._lose()
         self._keep(q, place, update, state.modes[:, :3])
-        if self._slips is not None and settled:
+        if settled:
             self._learn_friction(state, data, update, forecast)
-        return self._report(state, place, moved, data, update, iteration, settled)
+        track = self._report(state, place, moved, data, update, iteration, settled)
+        self._change_level(state.extrapolation)
+        return track
 
     def _bound(self, asked: NDArray, place: NDArray, share: float) -> NDArray:
         """Returns the place asked for, within a share of where the linearisation about the present one holds."""
@@ -178,7 +236,7 @@ class PlaceTracker:
         expected = np.r_[self._reached[DEPTH], self._prior]
         before, known = self._slips.mobilised, self._roughness.coefficient.mean
         self._slips.set_indenter(self.contact.indenter)
-        mobilised = self._slips.follow(self.q, expected, float(np.sqrt(update.depth_variance)), known)
+        mobilised = self._slips.follow(self.give_shape(), expected, float(np.sqrt(update.depth_variance)), known)
         normal = float(np.hypot(*state.force[::2]))
         moved, away = update.place - forecast.place, update.place[1:] - self._prior
         frame = FrictionFrame(data, self._motions[:, ::2], normal, before, self.contact.rubbing.lean, moved, away)
@@ -219,8 +277,7 @@ class PlaceTracker:
             change = after.field.front - before.field.front
             self._motion[0] += change
             self._reached[DEPTH] += change
-            if self._slips is not None:
-                self._slips.shift(change)
+            self._slips.shift(change)
 
     def _predict(self, dt: float) -> Forecast:
         """Returns the place dt [s] later: constant speed of the depth under white acceleration."""
@@ -319,7 +376,7 @@ class PlaceTracker:
             misfit=update.misfit,
             kkt=update.kkt,
             iterations=iterations,
-            converged=settled,
+            converged=settled or float(np.linalg.norm(state.force_modes[:, :3] @ moved)) < _AMBIGUOUS,
             sound=bool(finite and state.smallest_det > 0),
             quiet=bool(pressed < _TOUCH_DEPTH),
             loaded=bool(pressed > _LOADED_DEPTH),
@@ -344,3 +401,9 @@ class PlaceTracker:
         if self._stiffness is None or pressed < _LOADED_DEPTH:
             return 1.0
         return float(np.linalg.norm(force) / (self._stiffness * pressed))
+
+
+def _attach(contact: RollingContact, keypoints: NDArray) -> _Level:
+    """Returns the mechanics of a contact with key points (K, 3) [m]; raises MeshError when one is off the jaw."""
+    probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
+    return _Level(contact, probe, contact.model.positions(probe, np.zeros(contact.model.size)))

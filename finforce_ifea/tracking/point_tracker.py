@@ -67,6 +67,18 @@ class PointTracker:
         self.reset()
         self.q = q.copy()
 
+    def vertices(self) -> NDArray:
+        """Returns the deformed mesh vertices (n, 3) [m], in mesh order."""
+        return self.mechanics.model.vertices(self.q)
+
+    def positions(self) -> NDArray:
+        """Returns the key points (K, 3) [m] of the deformed jaw."""
+        return self.mechanics.model.positions(self.probe, self.q)
+
+    def give_shape(self) -> NDArray:
+        """Returns the shape (size,) for another tracker to begin with."""
+        return self.q
+
     def follow(self, contact: Contact) -> None:
         """Takes a contact over: its heights and weights."""
         heights = contact.points[:, 2]
