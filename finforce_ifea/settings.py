@@ -36,7 +36,7 @@ class EstimatorSettings:
     tare_frames: int = setting(45, "unloaded frames before the first force is reported", "frames", 5, 10000)
     tare_memory: int = setting(300, "unloaded frames over which offsets are averaged", "frames", 5, 100000)
     automatic_tare: bool = setting(True, "tare by itself at the start while nothing presses", "")
-    height_stddev: float = setting(0.2e-3, "uncertainty of the given height of first touch", "m", 1e-6, 0.05)
+    height_stddev: float = setting(0.5e-3, "uncertainty of the given height of first touch", "m", 1e-6, 0.05)
     radius: float = setting(0.012, "expected radius of curvature of the object where it touches", "m", 0.002, 0.5)
     radius_log_stddev: float = setting(0.7, "uncertainty of the logarithm of that radius", "1", 0.01, 3.0)
     tilt_stddev: float = setting(

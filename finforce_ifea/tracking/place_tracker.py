@@ -53,8 +53,6 @@ _LEAST_AGREEMENT = 0.6
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
 # object has gone back to this share of its depth.
 _STRANGE, _BACK = 1.0, 0.8
-# Between two corners of an object a place may not settle; it matters where the force changes by more than this [N].
-_AMBIGUOUS = 0.15
 # What of the friction the mechanics does not follow, and lean of a force that is never excluded [-].
 _UNFOLLOWED, _LEAN = 0.25, 0.08
 _WIDEST_FORECAST = 1e-3
@@ -95,6 +93,7 @@ class PlaceTracker:
         self._stand_on(0)
         height = float(np.median(self.contact.surface.heights)) if height is None else height
         self.contact.set_indenter(RoundIndenter())
+        self.contact.rubbing.lean = 0.0
         self._prior = np.array([np.log(settings.radius), height])
         self._prior_variance = np.array([settings.radius_log_stddev, settings.height_stddev]) ** 2
         self._begin()
@@ -190,7 +189,7 @@ class PlaceTracker:
         if update is None or not state.touches:
             return self._lose()
         self._keep(q, place, update, state.modes[:, :3])
-        if settled:
+        if settled and self._outline is self.contact.indenter:
             self._learn_friction(state, data, update, forecast)
         track = self._report(state, place, moved, data, update, iteration, settled)
         self._change_level(state.extrapolation)
@@ -376,7 +375,8 @@ class PlaceTracker:
             misfit=update.misfit,
             kkt=update.kkt,
             iterations=iterations,
-            converged=settled or float(np.linalg.norm(state.force_modes[:, :3] @ moved)) < _AMBIGUOUS,
+            converged=settled,
+            ambiguity=0.0 if settled else float(np.linalg.norm(state.force_modes[:, :3] @ moved)),
             sound=bool(finite and state.smallest_det > 0),
             quiet=bool(pressed < _TOUCH_DEPTH),
             loaded=bool(pressed > _LOADED_DEPTH),

@@ -37,6 +37,7 @@ class Track:
         kkt: gradient of the objective that is left, relative to its parts.
         iterations: Newton iterations.
         converged: whether the last one changed nothing that matters.
+        ambiguity: change of the force by the last iteration where that has not converged [N].
         sound: whether the mesh is in order and the numbers are finite.
         quiet: whether nothing seems to press.
         loaded: whether something surely presses.
@@ -64,6 +65,7 @@ class Track:
     place_error: float = 0.0
     place_stddev: float = 0.0
     condition: float = 1.0
+    ambiguity: float = np.inf
 
 
 def compute_magnitude_stddev(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
@@ -106,6 +108,8 @@ def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
     return float(fit.gain @ tare.offsets[seen][:, [0, 2]].ravel() / fit.stddev)
 
 
+# Between two corners of an object a place may not settle; it matters where the force changes by more than this [N].
+_AMBIGUOUS = 0.15
 # Beyond these a force is not reported: misfit of the shape, stiffening, standard deviation [N], its share of the force.
 _LARGEST_MISFIT = 2.0
 _LARGEST_STIFFENING = 5.0
@@ -125,7 +129,7 @@ def find_doubt(track: Track, *, settles: bool) -> str:
         track: of one frame.
         settles: whether the solver iterates until nothing changes, so that one that has not is in doubt.
     """
-    if settles and not track.converged:
+    if settles and not track.converged and track.ambiguity > _AMBIGUOUS:
         return f"the shape has not settled within {track.iterations} iterations; is the contact's place right?"
     if track.extrapolation > _STRANGEST:
         return "the jaw's shape is too far from the stored ones; solver solid or frame knows any shape"
