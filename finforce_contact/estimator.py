@@ -168,7 +168,8 @@ class ContactEstimator:
         if mesh is not None:
             low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
             self._centre, self._half = 0.5 * (low + high), 0.5 * (high - low)
-            self._sections = SectionKeeper(mesh, self.face.half_width, self.settings)
+            span = (float(self.face.heights[0]), float(self.face.heights[-1]))
+            self._sections = SectionKeeper(mesh, self.face.half_width, self.settings, span)
         self._mesh = mesh
         self.reset()
 
@@ -346,7 +347,11 @@ class ContactEstimator:
             return None
         bias = np.array([self.settings.pose_bias, self.settings.pose_bias, self.settings.rotation_bias])
         stddev = np.hypot(pose.stddev[[0, 2, 4]], bias)
-        return ObjectOutline(polygons=section.polygons, origin=section.origin, tilt=section.tilt, stddev=stddev)
+        middle, spread = section.across
+        across = np.array([middle, float(np.sqrt(spread**2 + pose.stddev[1] ** 2 + self.settings.pose_bias**2))])
+        return ObjectOutline(
+            polygons=section.polygons, origin=section.origin, tilt=section.tilt, stddev=stddev, across=across
+        )
 
     def _give_up(self, stamp: float, status: str, message: str, reason: str = "") -> ContactEstimate:
         """Returns an estimate without rows; nothing of the last contact is kept."""

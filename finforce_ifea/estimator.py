@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
+from finforce_ifea.contact_mechanics.torsion import measure_torsion
 from finforce_ifea.errors import ContactError, NotEnoughDataError, UnobservableError
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw
@@ -41,11 +42,10 @@ _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are un
 _UNCALIBRATED = 0.1
 # Relative error of forces at the distance from stored shapes that those are good for.
 _EXTRAPOLATED = 0.015
-# The mechanics knows no friction. What acts along the face is seen by nobody: half of the cone for one deviation. And
-# what two jaws hold does not slide out, though their bent faces lean: friction takes up the force along the finger, and
+# What two jaws hold does not slide out, though their bent faces lean: friction takes up the force along the finger, and
 # the magnitude that belongs to the same shape is larger, by a share of the tangent of the lean that the twin's held
 # objects have.
-_TANGENTIAL, _LEANING = 0.5, 0.3
+_LEANING = 0.3
 # Relative error of a jaw that is taken to be linear, 10 mm deep.
 _LINEAR = 0.05
 # Share of a force that nobody has seen along z.
@@ -82,7 +82,8 @@ class JawEstimator:
         self.calibration = calibration
         self.jaw = calibration.apply(jaw) if calibration else jaw
         self.mechanics: Mechanics = build_chosen(self.jaw, self.settings)
-        self._rolling = PlaceTracker(self.mechanics, self.jaw.keypoints, self.settings)
+        torsion = measure_torsion(self.jaw, self.mechanics.mesh)
+        self._rolling = PlaceTracker(self.mechanics, self.jaw.keypoints, self.settings, torsion)
         self._pointed = PointTracker(self.jaw, self.mechanics, self.settings, self._rolling.response)
         self._tracker: PlaceTracker | PointTracker = self._rolling
         self._gate = KeypointGate(self.jaw, self.settings)
@@ -256,6 +257,8 @@ class JawEstimator:
             return self._fail("unobservable", doubt, used, track.iterations)
         self._taring.note(quiet=track.quiet, loaded=track.loaded)
         force = self._relax(track.force)
+        elastic = float(np.linalg.norm(track.force))
+        force[1] = track.across.force * (float(np.linalg.norm(force)) / elastic if elastic > 0.0 else 1.0)
         return self._solution(track, force, used)
 
     def _relax(self, elastic: NDArray) -> NDArray:
@@ -277,8 +280,10 @@ class JawEstimator:
             pressure=track.pressure_point,
             place=track.pressure_place,
             place_stddev=track.place_stddev,
+            across=track.across,
+            along=track.lean_stddev,
         )
-        numbers = find_numbers(evidence, share, _LEAN, _TANGENTIAL * friction)
+        numbers = find_numbers(evidence, share, _LEAN)
         return Solution(
             stamp=self._stamp,
             status="ok" if numbers.magnitude > 0.0 else "unloaded",

@@ -63,7 +63,7 @@ def outline_from_cloud(cloud: Any, frame: str, previous: ObjectOutline | None) -
         ContactError: the corners are no outline.
     """
     check_cloud(cloud, frame, "the outline")
-    return outline_from_columns(decode_columns(cloud, COLUMNS), previous)
+    return outline_from_columns(decode_columns(cloud, COLUMNS, ACROSS), previous)
 
 
 def force_from_wrench(message: Any, frame: str, what: str) -> NDArray[np.float64]:
@@ -81,6 +81,7 @@ def force_from_wrench(message: Any, frame: str, what: str) -> NDArray[np.float64
 
 
 STDDEVS = ("stddev_x", "stddev_z", "stddev_tilt")
+ACROSS = ("across", "stddev_across")
 COLUMNS = ("x", "z", "u", "v", "polygon", *STDDEVS)
 # Corners that come out farther than this from a turned and shifted outline were not made from one [m].
 _RIGID = 1e-5
@@ -92,6 +93,7 @@ def columns_from_outline(outline: ObjectOutline | None) -> dict[str, NDArray]:
     `x y z` [m] are the corners now, in the jaw frame, `u v` [m] as they were cut, about the outline's origin; the
     motion from `u v` to `x z` is the outline's place and tilt.
     """
+    across = None if outline is None else outline.across
     if outline is None:
         corners, sizes, stddev = np.empty((0, 4)), [], np.zeros(3)
     else:
@@ -99,6 +101,7 @@ def columns_from_outline(outline: ObjectOutline | None) -> dict[str, NDArray]:
         sizes, stddev = [len(polygon) for polygon in outline.polygons], np.asarray(outline.stddev)
     x, z, u, v = corners.astype(np.float32).T
     spread = np.broadcast_to(stddev.astype(np.float32)[:, None], (3, len(x)))
+    known = {} if across is None else {name: np.full_like(x, value) for name, value in zip(ACROSS, across, strict=True)}
     return {
         "x": x,
         "y": np.zeros_like(x),
@@ -107,6 +110,7 @@ def columns_from_outline(outline: ObjectOutline | None) -> dict[str, NDArray]:
         "v": v,
         "polygon": np.repeat(np.arange(len(sizes)), sizes).astype(np.uint16),
         **dict(zip(STDDEVS, spread, strict=True)),
+        **known,
     }
 
 
@@ -116,7 +120,7 @@ def outline_from_columns(columns: Mapping[str, NDArray], previous: ObjectOutline
     Place and tilt are the rigid motion with the least squares of x - (c u - s v) - x0 and z - (s u + c v) - z0.
 
     Args:
-        columns: those named in `COLUMNS`, (n,) each.
+        columns: those named in `COLUMNS` and, if known, in `ACROSS`, (n,) each.
         previous: whose polygons are used again, the same objects, when no corner was cut anew.
 
     Raises:
@@ -139,6 +143,7 @@ def outline_from_columns(columns: Mapping[str, NDArray], previous: ObjectOutline
         origin=now.mean(0) - cut.mean(0) @ turn,
         tilt=tilt,
         stddev=np.array([columns[name][0] for name in STDDEVS], dtype=float),
+        across=np.array([columns[name][0] for name in ACROSS], float) if set(ACROSS) <= set(columns) else None,
     )
 
 

@@ -202,12 +202,15 @@ class ObjectOutline:
         origin: x and z [m] of that origin in the jaw frame.
         tilt: turn of the polygons about the origin [rad]; positive turns x towards z.
         stddev: (3,) of the origin's x and z [m] and of the tilt [rad].
+        across: where along y the object stands nearest, and the standard deviation of the pressure there (2,) [m];
+            None where nobody knows.
     """
 
     polygons: tuple[NDArray, ...]
     origin: NDArray
     tilt: float
     stddev: NDArray
+    across: NDArray | None = None
 
     def __post_init__(self) -> None:
         """Refuses what is no outline.
@@ -224,6 +227,13 @@ class ObjectOutline:
         spread = np.asarray(self.stddev)
         if spread.shape != (3,) or not (np.isfinite(spread) & (spread > 0)).all():
             raise ContactError(f"outline with standard deviations {self.stddev}, expected three finite ones above zero")
+        if self.across is None:
+            return
+        across = np.asarray(self.across)
+        if across.shape != (2,) or not (np.isfinite(across).all() and abs(across[0]) < _LARGEST and across[1] > 0):
+            raise ContactError(
+                f"outline with across {self.across}, expected a place along y and a standard deviation above zero [m]"
+            )
 
     def placed(self) -> tuple[NDArray, ...]:
         """Returns the polygons (n, 2) [m] in x and z of the jaw frame."""

@@ -301,12 +301,14 @@ class Section:
         origin: (2,) x and z [m] of the object's origin in the jaw frame.
         tilt: turn since the cut [rad], positive from x to z.
         cut_edges: of the polygons.
+        across: middle and standard deviation along y of where the object stands nearest (2,) [m].
     """
 
     polygons: tuple[NDArray, ...]
     origin: NDArray
     tilt: float
     cut_edges: Edges
+    across: NDArray
 
     @cached_property
     def edges(self) -> Edges:
@@ -314,12 +316,44 @@ class Section:
         return place_edges(self.cut_edges, self.origin, self.tilt)
 
 
+_ACROSS, _PRESSED = 21, 0.3e-3
+
+
+def find_across(mesh: ObjectMesh, T: NDArray, half_width: float, span: tuple[float, float]) -> NDArray:
+    """Return middle and standard deviation (2,) [m] along y of where an object stands nearest to the finger.
+
+    Its near side is sunk in by 0.3 mm, where it is in front of the finger.
+
+    Args:
+        mesh: the object.
+        T: T_jaw_object (4, 4).
+        half_width: of the finger [m].
+        span: lowest and highest z of the finger [m].
+    """
+    points = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+    start, stop = points[mesh.edges.ends[:, 0]], points[mesh.edges.ends[:, 1]]
+    places, near = half_width * np.linspace(-1.0, 1.0, _ACROSS), np.full(_ACROSS, np.inf)
+    for row, y in enumerate(places):
+        cut = np.flatnonzero((start[:, 1] <= y) != (stop[:, 1] <= y))
+        share = (y - start[cut, 1]) / (stop[cut, 1] - start[cut, 1])
+        x, z = (start[cut][:, ::2] + share[:, None] * (stop[cut] - start[cut])[:, ::2]).T
+        near[row] = x[(z >= span[0]) & (z <= span[1])].min(initial=np.inf)
+    if not np.isfinite(near).any():
+        return np.array([0.0, half_width])
+    overlap = np.maximum(0.0, near.min() + _PRESSED - near)
+    overlap /= overlap.sum()
+    middle = float(overlap @ places)
+    return np.array([middle, float(np.sqrt(overlap @ (places - middle) ** 2))])
+
+
 class SectionKeeper:
     """Cuts an object's outline anew when it turned out of the plane or moved across it, and tilts it in between."""
 
-    def __init__(self, mesh: ObjectMesh, half_width: float, settings: ContactSettings) -> None:
-        """Keeps the mesh and half the width [m] of the finger, which the outline is that of."""
-        self._mesh, self._half_width, self._settings = mesh, half_width, settings
+    def __init__(
+        self, mesh: ObjectMesh, half_width: float, settings: ContactSettings, span: tuple[float, float] = (-1.0, 1.0)
+    ) -> None:
+        """Keeps the mesh, half the width of the finger, which the outline is that of, and its lowest and highest z."""
+        self._mesh, self._half_width, self._settings, self._span = mesh, half_width, settings, span
         self._R: NDArray | None = None
         self.cuts = 0
 
@@ -333,12 +367,15 @@ class SectionKeeper:
             if swing > self._settings.recut_angle or abs(T[1, 3] - self._y) > self._settings.recut_shift:
                 self._cut(T)
                 tilt = 0.0
-        return Section(polygons=self._polygons, origin=T[0:3:2, 3].copy(), tilt=tilt, cut_edges=self._edges)
+        return Section(
+            polygons=self._polygons, origin=T[0:3:2, 3].copy(), tilt=tilt, cut_edges=self._edges, across=self._across
+        )
 
     def _cut(self, T: NDArray) -> None:
         self._R, self._y = T[:3, :3].copy(), float(T[1, 3])
         self._polygons = cut_outline(self._mesh, self._R, self._half_width, self._y)
         self._edges = edges_of(self._polygons)
+        self._across = find_across(self._mesh, T, self._half_width, self._span)
         self.cuts += 1
 
 

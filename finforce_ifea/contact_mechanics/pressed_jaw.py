@@ -116,7 +116,7 @@ class RollingContact:
         contact = self.indenter.press(points, self.surface.stiffness, self.face_x, place)
         return self.rubbing.rub(contact, points, self.surface.stiffness, find_origin(place))
 
-    def with_friction(self) -> "RollingContact":
+    def with_friction(self) -> RollingContact:
         """Returns another contact of the same jaw, of which friction is not known but followed."""
         other = copy(self)
         other.rubbing = Friction(len(self.surface.points))

@@ -93,20 +93,27 @@ class FrictionEstimate:
 
     def _judge(self, variance: float, mean: float) -> Coefficient:
         """Returns the coefficient for what the key points alone say of it."""
-        parts = []
-        for share, known in ((self._share, self._smooth), (1.0 - self._share, self._rough)):
-            own = max(known.stddev, 1e-6) ** 2
-            if not np.isfinite(variance):
-                parts.append((share, known.mean, own))
-                continue
-            total = own + variance
-            weight = share * np.exp(-0.5 * min((mean - known.mean) ** 2 / total, 1e3)) / np.sqrt(total)
-            parts.append((weight, (known.mean * variance + mean * own) / total, own * variance / total))
-        weights, means, variances = np.array(parts).T
-        means = np.clip(means, 0.0, _LARGEST)
-        weights = weights / weights.sum() if weights.sum() > 0 else np.array([0.0, 1.0])
-        middle = float(weights @ means)
-        return Coefficient(middle, float(np.sqrt(weights @ (variances + (means - middle) ** 2))))
+        smooth, rough = (*self._smooth, self._share), (*self._rough, 1.0 - self._share)
+        return Coefficient(*_judge(variance, mean, smooth, rough))
+
+
+@njit(**_OPTIONS)
+def _judge(variance, mean, smooth, rough):
+    """Returns mean and standard deviation for two hypotheses (mean, standard deviation, probability)."""
+    total, first, second = 0.0, 0.0, 0.0
+    for expected, deviation, share in (smooth, rough):
+        own = max(deviation, 1e-6) ** 2
+        weight, middle, spread = share, expected, own
+        if np.isfinite(variance):
+            both = own + variance
+            weight = share * np.exp(-0.5 * min((mean - expected) ** 2 / both, 1e3)) / np.sqrt(both) + 1e-300
+            middle, spread = (expected * variance + mean * own) / both, own * variance / both
+        middle = min(max(middle, 0.0), _LARGEST)
+        total += weight
+        first += weight * middle
+        second += weight * (spread + middle * middle)
+    first /= total
+    return first, np.sqrt(max(second / total - first * first, 0.0))
 
 
 @njit(**_OPTIONS)

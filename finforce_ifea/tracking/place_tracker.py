@@ -5,6 +5,7 @@ Kalman filter with constant velocity. Shape and height change slowly: the maximu
 averaged over the last frames, so that their priors count once and errors of the mechanics are no information.
 """
 
+from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, PressedState, RollingContact, limit_step
+from finforce_ifea.contact_mechanics.torsion import Torsion
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
@@ -29,7 +31,8 @@ from finforce_ifea.tracking.place_update import (
     weigh_residuals,
 )
 from finforce_ifea.tracking.slip_history import SlipHistory
-from finforce_ifea.tracking.track import Track, explain_offsets
+from finforce_ifea.tracking.track import MIDDLE, Track, explain_offsets
+from finforce_ifea.tracking.width_tracker import WidthTracker
 
 # The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
 _LEAST_DEPTH = 3e-5
@@ -53,8 +56,9 @@ _LEAST_AGREEMENT = 0.6
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
 # object has gone back to this share of its depth.
 _STRANGE, _BACK = 1.0, 0.8
-# What of the friction the mechanics does not follow, and lean of a force that is never excluded [-].
-_UNFOLLOWED, _LEAN = 0.25, 0.08
+# What of the friction the mechanics does not follow, a lean of the force that is never excluded, and that of an unknown
+# object as a share of the expected coefficient [-].
+_UNFOLLOWED, _LEAN, _UNKNOWN_LEAN = 0.25, 0.08, 0.5
 _WIDEST_FORECAST = 1e-3
 
 
@@ -72,7 +76,9 @@ class PlaceTracker:
     Where a reduced jaw bends as none of its stored shapes does, as around large flat things, the full one takes over.
     """
 
-    def __init__(self, mechanics: Mechanics, keypoints: NDArray, settings: EstimatorSettings) -> None:
+    def __init__(
+        self, mechanics: Mechanics, keypoints: NDArray, settings: EstimatorSettings, torsion: Torsion | None = None
+    ) -> None:
         """Attaches key points (K, 3) [m, undeformed] to the model; raises MeshError when one is off it."""
         self.settings = settings
         self._levels = [_attach(level.contact, keypoints) for level in (mechanics, mechanics.full) if level is not None]
@@ -83,6 +89,7 @@ class PlaceTracker:
         self._outline: OutlineIndenter | None = None
         self._slips = SlipHistory(contact.with_friction())
         self._roughness = FrictionEstimate(settings)
+        self._width = WidthTracker(torsion, len(keypoints))
         self._face = contact.surface.heights[[0, -1]]
         self.reset()
 
@@ -143,6 +150,7 @@ class PlaceTracker:
         self._motion_covariance = np.diag([0.1e-3, 1e-3]) ** 2
         self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
         self._slips.reset()
+        self._width.reset()
         self._released, self._jumped = 0, False
         self._forget_place()
 
@@ -159,7 +167,7 @@ class PlaceTracker:
         forecast, noise = self._predict(dt), tare.point_noise(stddev)
         place = forecast.place
         q = self.q + self._modes @ (self._reachable(place) - self._reached)
-        measured, unseen = points - tare.offsets, self.settings.offset_stddev
+        measured, unseen = points - tare.offsets - self._width.motions, self.settings.offset_stddev
         chance = self._expect_errors(noise, tare.offset_variance(unseen) + noise.standing, forecast)
         update, settled, iteration, share, last = None, False, 0, 1.0, np.zeros(3)
         far, in_vain = np.inf, 0
@@ -189,9 +197,12 @@ class PlaceTracker:
         if update is None or not state.touches:
             return self._lose()
         self._keep(q, place, update, state.modes[:, :3])
-        if settled and self._outline is self.contact.indenter:
+        if settled and self._is_known:
             self._learn_friction(state, data, update, forecast)
         track = self._report(state, place, moved, data, update, iteration, settled)
+        if self._is_known:
+            variances, aside = (chance.width_variance, chance.offset_variance), points[:, 1] - tare.offsets[:, 1]
+            self._width.update(aside - self._rest[:, 1], data, variances, track.force, track.pressure_place[2])
         self._change_level(state.extrapolation)
         return track
 
@@ -228,11 +239,16 @@ class PlaceTracker:
         state = self.contact.linearize(q, self._reachable(np.r_[-1.0, self._prior]))
         return self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
 
+    @property
+    def _is_known(self) -> bool:
+        """Whether the object is known by its outline."""
+        return self._outline is self.contact.indenter
+
     def _learn_friction(self, state: PressedState, data: Residuals, update: PlaceUpdate, forecast: Forecast) -> None:
         """Follows how the object slides, and learns its coefficient where something presses."""
         if self._reached[DEPTH] - self._find_touch(self._reached) < _LOADED_DEPTH or self._jumped:
             return
-        expected = np.r_[self._reached[DEPTH], self._prior]
+        expected = np.array([self._reached[DEPTH], self._prior[0], self._prior[1]])
         before, known = self._slips.mobilised, self._roughness.coefficient.mean
         self._slips.set_indenter(self.contact.indenter)
         mobilised = self._slips.follow(self.give_shape(), expected, float(np.sqrt(update.depth_variance)), known)
@@ -264,6 +280,8 @@ class PlaceTracker:
     def _follow_outline(self, contact: Contact) -> None:
         """Takes the outline's tilt and height as what is to be expected; an outline cut anew keeps the place."""
         before = self.contact.indenter
+        if contact.outline.across is not None:
+            self._width.expect(*contact.outline.across)
         expected = expect_object(contact, self.settings, self._outline)
         self._prior, self._prior_variance = expected.mean, expected.variance
         self._outline = after = expected.indenter
@@ -376,6 +394,8 @@ class PlaceTracker:
             kkt=update.kkt,
             iterations=iterations,
             converged=settled,
+            across=self._width.across if self._is_known else MIDDLE,
+            lean_stddev=self._describe_lean(),
             ambiguity=0.0 if settled else float(np.linalg.norm(state.force_modes[:, :3] @ moved)),
             sound=bool(finite and state.smallest_det > 0),
             quiet=bool(pressed < _TOUCH_DEPTH),
@@ -389,11 +409,11 @@ class PlaceTracker:
         )
 
     def _describe_lean(self) -> float:
-        """Returns the standard deviation of the lean of the force that friction leaves [-]."""
+        """Returns the standard deviation of the lean of the force along the finger that friction leaves [-]."""
+        if not self._is_known:
+            return _UNKNOWN_LEAN * self.settings.friction
         found = self._roughness.coefficient
-        return float(
-            np.sqrt((found.stddev * abs(self._slips.mobilised)) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _LEAN**2)
-        )
+        return sqrt((found.stddev * self._slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _LEAN**2)
 
     def _stiffening(self, force: NDArray, place: NDArray) -> float:
         """Returns how much stiffer the pressed jaw is than at first touch; 1 until it is surely pressed."""

@@ -4,6 +4,8 @@ A second contact of the same jaw is pressed by the object alone, wherever it was
 Noise is no motion: the object moves there once it has left its last place by more than chance.
 """
 
+from math import ceil, sqrt
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,8 +18,9 @@ _LEAST_COEFFICIENT = 0.15
 # Chance, in standard deviations of the depth, at least [m]; and of a height [m].
 _SIGMAS, _LEAST_PLAY, _PLAY_HEIGHT = 3.0, 0.03e-3, 1e-3
 _ITERATIONS, _SETTLED = 12, 2e-3
-# A way longer than this is no way but another contact [m]; along the way, steps of this [m].
-_LEAP, _LONGEST = 1.5e-3, 0.1e-3
+# A way longer than this is no way but another contact; a shorter one than the second is left for later; along the way,
+# steps of at most the third [m].
+_LEAP, _SHORTEST, _LONGEST = 1.5e-3, 0.08e-3, 0.12e-3
 # Corrections that turn round by this much of their length are halved: points of the contact stick and slide by turns.
 _TURNED, _CALMER, _LEAST_CORRECTION = -0.3, 1.5, 0.1
 
@@ -65,13 +68,13 @@ class SlipHistory:
             self._q, self._place = q.copy(), place.copy()
             return self.mobilised
         play = max(_SIGMAS * stddev, _LEAST_PLAY)
-        aim = place.copy()
-        aim[DEPTH] = _leave_play(self._place[DEPTH], place[DEPTH], play)
-        aim[HEIGHT] = _leave_play(self._place[HEIGHT], place[HEIGHT], _PLAY_HEIGHT)
-        way = float(np.hypot(aim[DEPTH] - self._place[DEPTH], aim[HEIGHT] - self._place[HEIGHT]))
-        if way == 0.0:
+        deeper = leave_play(place[DEPTH] - self._place[DEPTH], play)
+        higher = leave_play(place[HEIGHT] - self._place[HEIGHT], _PLAY_HEIGHT)
+        way = sqrt(deeper * deeper + higher * higher)
+        if way < _SHORTEST:
             return self.mobilised
-        start, steps = self._place, int(np.ceil(way / _LONGEST))
+        aim, start, steps = place.copy(), self._place, ceil(way / _LONGEST)
+        aim[DEPTH], aim[HEIGHT] = start[DEPTH] + deeper, start[HEIGHT] + higher
         for step in range(1, steps + 1):
             if not self._press(start + (aim - start) * (step / steps)):
                 break
@@ -96,9 +99,9 @@ class SlipHistory:
         return False
 
 
-def _leave_play(before: float, now: float, play: float) -> float:
-    """Returns where something has gone that follows with play."""
-    return float(min(max(before, now - play), now + play))
+def leave_play(way: float, play: float) -> float:
+    """Returns the part of a way that something makes which follows with play."""
+    return way - min(max(way, -play), play)
 
 
 def calm_down(correction: NDArray, before: NDArray, calm: float) -> float:

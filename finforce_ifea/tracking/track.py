@@ -13,6 +13,26 @@ from finforce_ifea.tare import Tare
 _COMMON_OFFSET = 1.5e-3
 
 
+class AcrossFinger(NamedTuple):
+    """What acts across a finger.
+
+    Attributes:
+        place: of the pressure along y [m].
+        place_stddev: [m].
+        force: along y [N].
+        lean_stddev: standard deviation of the force along y as a share of all force [-].
+    """
+
+    place: float
+    place_stddev: float
+    force: float
+    lean_stddev: float
+
+
+# Of an object of which nothing is known across the finger.
+MIDDLE = AcrossFinger(0.0, 3e-3, 0.0, 0.2)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:
     """The outcome of one frame.
@@ -37,6 +57,8 @@ class Track:
         kkt: gradient of the objective that is left, relative to its parts.
         iterations: Newton iterations.
         converged: whether the last one changed nothing that matters.
+        across: what acts across the finger.
+        lean_stddev: standard deviation of the lean of the force along the finger [-].
         ambiguity: change of the force by the last iteration where that has not converged [N].
         sound: whether the mesh is in order and the numbers are finite.
         quiet: whether nothing seems to press.
@@ -66,6 +88,8 @@ class Track:
     place_stddev: float = 0.0
     condition: float = 1.0
     ambiguity: float = np.inf
+    across: AcrossFinger = MIDDLE
+    lean_stddev: float = 0.2
 
 
 def compute_magnitude_stddev(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
@@ -160,7 +184,7 @@ class SolutionNumbers(NamedTuple):
         torque: about the jaw frame's origin (3,) [N m].
         force_stddev: (3,) [N].
         torque_stddev: (3,) [N m].
-        contact_point: in the jaw's plane (3,) [m], NaN without a force.
+        contact_point: pressure centre (3,) [m], NaN without a force.
         contact_place: the same on the undeformed surface (3,) [m], NaN without a force.
         normal: direction of the force (3,), NaN without a force.
     """
@@ -208,6 +232,8 @@ class ForceEvidence(NamedTuple):
         pressure: pressure centre on the deformed surface (3,) [m].
         place: the same on the undeformed surface (3,) [m].
         place_stddev: of its height [m].
+        across: what acts across the finger.
+        along: standard deviation of the lean along the finger [-].
     """
 
     force: NDArray
@@ -217,19 +243,21 @@ class ForceEvidence(NamedTuple):
     pressure: NDArray
     place: NDArray
     place_stddev: float
+    across: AcrossFinger
+    along: float
 
 
 @njit(**_OPTIONS)
-def find_numbers(evidence: ForceEvidence, share: float, lean: float, tangential: float) -> SolutionNumbers:
+def find_numbers(evidence: ForceEvidence, share: float, lean: float) -> SolutionNumbers:
     """Returns what belongs to a force; see `SolutionNumbers`.
 
     Args:
         evidence: the force that was tracked.
         share: relative standard deviation of the mechanics; it errs in the direction as in the magnitude.
         lean: share of a force that nobody has seen along z.
-        tangential: standard deviation of what acts along the face, as a share of the force.
     """
-    force, elastic, modes, covariance, pressure, place, place_stddev = evidence
+    force, elastic, modes, covariance, pressure, place, place_stddev, across, along = evidence
+    y, y_stddev, _, lean_across = across
     fit, magnitude = measure_along(elastic, modes, covariance), np.sqrt((force * force).sum())
     stddev = np.zeros(3)
     for a in range(3):
@@ -238,17 +266,21 @@ def find_numbers(evidence: ForceEvidence, share: float, lean: float, tangential:
                 stddev[a] += modes[a, i] * covariance[i, j] * modes[a, j]
     stddev[0] += (share * magnitude) ** 2
     stddev[2] += (share * magnitude) ** 2
-    # along the face: y, for which nothing is solved, and z
-    stddev[1] += (tangential * magnitude) ** 2
-    stddev[2] += (tangential * magnitude) ** 2
+    stddev[1] += (lean_across * magnitude) ** 2
+    stddev[2] += (along * magnitude) ** 2
     # a larger force leans more: where it is hardly known, its direction is not known either
     stddev[2] += (lean * fit**2 / max(magnitude + fit, 1e-300)) ** 2
     stddev = np.sqrt(stddev)
     arm, undeformed = pressure.copy(), place.copy()
-    arm[1] = undeformed[1] = 0.0
-    moment = np.hypot(arm[0] * stddev[2], arm[2] * stddev[0])
-    torque = np.array([-arm[2] * force[1], arm[2] * force[0] - arm[0] * force[2], arm[0] * force[1]])
-    torque_stddev = np.array([0.0, np.hypot(moment, elastic[0] * place_stddev), 0.0])
+    arm[1] = undeformed[1] = y
+    torque, torque_stddev = np.zeros(3), np.zeros(3)
+    arm_stddev = np.array([0.0, y_stddev, place_stddev])
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        torque[a] = arm[b] * force[c] - arm[c] * force[b]
+        torque_stddev[a] += (arm[b] * stddev[c]) ** 2 + (arm[c] * stddev[b]) ** 2
+        torque_stddev[a] += (arm_stddev[b] * force[c]) ** 2 + (arm_stddev[c] * force[b]) ** 2
+    torque_stddev = np.sqrt(torque_stddev)
     if magnitude > 0.0:
         normal = force / magnitude
     else:
