@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from finforce.health import Level, Outcome
 from finforce_contact.mesh.object_mesh import describe_mesh
 
 if TYPE_CHECKING:
     from finforce_contact.estimator import ContactEstimate
     from finforce_contact.jaw_contact import JawContact
+    from finforce_contact.localization.slip import Slip
     from finforce_contact.mesh.triangles import ObjectMesh
     from finforce_contact.pose.source import ObjectPose
     from finforce_contact.session import ContactSession
@@ -19,6 +22,8 @@ LEVELS = {"touching": Level.OK, "apart": Level.OK}  # any other status: WARN
 
 def outcome_of_estimate(estimate: ContactEstimate) -> Outcome:
     """Return the level of an estimate's status and its sentence."""
+    if estimate.slip is not None and estimate.slip.sliding:
+        return Outcome(level=Level.WARN, reason="slip", text=f"the object slides: {describe_slip(estimate.slip)}")
     level = LEVELS.get(estimate.status, Level.WARN)
     return Outcome(level=level, reason=estimate.status, text=estimate.message or estimate.status)
 
@@ -44,9 +49,18 @@ def _describe_contact(jaw: JawContact) -> dict[str, str]:
         "contacts": str(len(last.estimate.points)),
         "pose age [ms]": f"{1e3 * jaw.pose_age():.0f}",
         "jaw surface": "deformed" if jaw.has_surface() else "undeformed: no fresh surface",
+        "slip": describe_slip(last.estimate.slip),
         "last skipped": last.estimate.skipped or "nothing",
         "work": counts,
     }
+
+
+def describe_slip(slip: Slip | None) -> str:
+    """Return how an object moves over a jaw, in words."""
+    if slip is None or not np.isfinite(slip.stddev):
+        return "unknown"
+    speed = 1e3 * float(np.linalg.norm(slip.velocity))
+    return f"{speed:.1f} ± {1e3 * slip.stddev:.1f} mm/s{', slides' if slip.sliding else ''}"
 
 
 def _describe_object(mesh: ObjectMesh | None, pose: ObjectPose | None) -> dict[str, str]:

@@ -20,6 +20,7 @@ from finforce_contact.localization.outline_localizer import (
     build_inner_face,
 )
 from finforce_contact.localization.section import Section, SectionKeeper, count_inside
+from finforce_contact.localization.slip import Slip, SlipWatch, TouchedFace, face_at
 from finforce_contact.localization.touch import SURELY_BENT, StillnessWatch, TouchBelief, describe_conflict
 from finforce_contact.mesh.object_mesh import surrounds
 from finforce_contact.mesh.triangles import ObjectMesh
@@ -61,6 +62,7 @@ class ContactEstimate:
     outline: ObjectOutline | None
     T_jaw_object: NDArray | None
     probability: float
+    slip: Slip | None = None
 
     @property
     def contact(self) -> Contact | None:
@@ -142,6 +144,7 @@ class ContactEstimator:
         self._rest_line = self.face.deform(self.face.mesh.nodes)
         self._samples = np.unique(np.linspace(0, len(self.face.mesh.nodes) - 1, _JAW_SAMPLES).astype(int))
         self._poses, self._belief = PoseFilter(self.settings), TouchBelief(self.settings)
+        self._slips = SlipWatch(self.settings)
         self._rest, self.skips = StillnessWatch(self.settings), skips or Skips(CONTACT)
         self._counts: Counter[str] = Counter(dict.fromkeys(_REASONS, 0))
         self.set_object(mesh)
@@ -181,6 +184,8 @@ class ContactEstimator:
         if self._localizer is not None:
             self._localizer.reset()
         self._counts.update({reason: -count for reason, count in self._counts.items()})
+        self._slips.reset()
+        self._face: TouchedFace | None = None
         self._solved: ContactScene | None = None
         self._place: Place | None = None
 
@@ -215,6 +220,8 @@ class ContactEstimator:
         if watched and surrounds(self._mesh, (invert_pose(T) @ np.append(camera, 1.0))[:3]):
             raise PoseError("this pose puts the object around the camera: check its pose, mesh and unit")
         outcome = self._poses.update(stamp, T, covariance)
+        if outcome == "used" and self._face is not None:
+            self._slips.update(stamp, T, self._face)
         self._counts["late pose"] += outcome == "late"
         self._counts["odd pose"] += outcome == "aside"
 
@@ -327,6 +334,7 @@ class ContactEstimator:
     ) -> ContactEstimate:
         """Returns the estimate of an image."""
         touching = self._belief.touching
+        self._follow_face(scene, touching)
         return ContactEstimate(
             stamp=stamp,
             status="touching" if touching else "apart",
@@ -339,7 +347,17 @@ class ContactEstimator:
             outline=self._outline(pose, scene.section),
             T_jaw_object=pose.T,
             probability=self._belief.probability,
+            slip=self._slips.slip,
         )
+
+    def _follow_face(self, scene: ContactScene, touching: bool) -> None:
+        """Keeps the face where the object touches, for the slip of the next pose."""
+        if not touching or self._place is None:
+            self._face = None
+            self._slips.release()
+            return
+        height = self._slips.place(self._place.patch.mean)
+        self._face = face_at(scene.line, self.face.heights, height)
 
     def _outline(self, pose: FilteredPose, section: Section) -> ObjectOutline | None:
         """Returns the outline for the solver, with the errors of the pose that no average removes."""
@@ -360,7 +378,8 @@ class ContactEstimator:
         self._rest.update(stamp, None)
         if self._localizer is not None:
             self._localizer.reset()
-        self._solved = self._place = None
+        self._solved = self._place = self._face = None
+        self._slips.release()
         return blank_estimate(stamp, status, message)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from finforce.ros import node as ros
 from finforce.skipping import Skips
+from finforce.stamps import SECOND
 from finforce.transforms import pose_numbers
 from finforce_ifea.messages import columns_from_outline
 
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from finforce_contact.camera_feed import StampedPose
     from finforce_contact.estimator import ContactEstimate
     from finforce_contact.jaw_contact import TimedEstimate
+    from finforce_contact.localization.slip import Slip
     from finforce_contact.parameters import ContactParameters
 
 
@@ -33,6 +36,8 @@ class ContactOutputs:
         self._frame, self._skips = parameters.camera_frame, skips
         self.contact = {side: qos.publisher(cloud, f"{side}/contact", ros.RESULT) for side in sides}
         self.outline = {side: qos.publisher(cloud, f"{side}/object_outline", ros.RESULT) for side in sides}
+        self.slip = {side: qos.publisher(ros.TwistStamped, f"{side}/slip", ros.RESULT) for side in sides}
+        self._slip_told = dict.fromkeys(sides, -math.inf)
         self.pose = qos.publisher(ros.PoseStamped, "object_pose", ros.RESULT) if parameters.tracks else None
 
     def send_contact(self, side: str, timed: TimedEstimate) -> None:
@@ -43,6 +48,17 @@ class ContactOutputs:
             self.outline[side].publish(ros.cloud_message(header, columns_from_outline(timed.estimate.outline)))
         if ros.is_wanted(self.contact[side], self._skips):
             self.contact[side].publish(ros.cloud_message(header, contact_columns(timed.estimate)))
+        self._send_slip(side, timed.estimate.slip)
+
+    def _send_slip(self, side: str, slip: Slip | None) -> None:
+        """Send how the object moves over a jaw, once for every pose of the object while it touches."""
+        if slip is None or not slip.stamp > self._slip_told[side] or not np.isfinite(slip.stddev):
+            return
+        self._slip_told[side] = slip.stamp
+        if ros.is_wanted(self.slip[side], self._skips):
+            stamp = ros.stamp_message(round(slip.stamp / SECOND))
+            header = ros.Header(stamp=stamp, frame_id=f"{side}_jaw")
+            self.slip[side].publish(ros.twist_message(header, slip.velocity))
 
     def send_pose(self, found: StampedPose) -> None:
         """Send the object's pose, unless it came by topic."""

@@ -45,6 +45,8 @@ class ContactSettings:
     rotation_noise: float = setting(6e-3, "noise of rotations until the poses have shown theirs", "rad", 1e-5, 0.5)
     pose_bias: float = setting(0.5e-3, "constant error of positions that no average removes", "m", 0.0, 0.05)
     rotation_bias: float = setting(5e-3, "constant error of rotations that no average removes", "rad", 0.0, 0.5)
+    slip_speed: float = setting(1.5e-3, "speed at which a held object is said to slide", "m/s", 1e-4, 0.1)
+    slip_reach: float = setting(8e-3, "the contact may wander by this before its slip is followed anew", "m", 1e-3, 0.1)
     drift: float = setting(
         0.1e-3, "random walk of the object along the jaw; what is more is noticed and followed", "m/s^0.5", 1e-7, 0.1
     )

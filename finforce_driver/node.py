@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import TwistStamped, WrenchStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -142,6 +142,7 @@ class GripperDriverNode(Node):
         self.qos.subscription(WrenchStamped, "grasp_wrench", self._on_wrench, ros.SENSOR)
         for side in JAWS:
             self.qos.subscription(PointCloud2, f"{side}/contact", partial(self._on_contact, side), ros.SENSOR)
+            self.qos.subscription(TwistStamped, f"{side}/slip", partial(self._on_slip, side), ros.RESULT)
             stddev = f"{side}/wrench_stddev"
             self.qos.subscription(WrenchStamped, stddev, partial(self._on_stddev, side), ros.RESULT)
 
@@ -220,6 +221,14 @@ class GripperDriverNode(Node):
         with self._refusals("standard deviation"):
             stddev, stamp = ros.force_stddev(message, f"{side}_jaw"), self._enter(f"{side} stddev", message)
             self.session.take_stddev(side, stddev, stamp)
+
+    def _on_slip(self, side: str, message: TwistStamped) -> None:
+        """Hand to the grasp how fast the object slides over a jaw."""
+        with self._refusals("slip"):
+            speed, stamp = ros.twist_speed(message, f"{side}_jaw"), self._enter(f"{side} slip", message)
+            force = self.session.take_slip(side, speed, stamp)
+            if force is not None:
+                self.get_logger().warning(f"the object slides at {1e3 * speed:.1f} mm/s: goes to {force:.2f} N")
 
     def _on_contact(self, side: str, cloud: PointCloud2) -> None:
         """Hand to the grasp whether a jaw touches the object."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3, Wrench, WrenchStamped
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, TwistStamped, Vector3, Wrench, WrenchStamped
 from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image, PointCloud2, PointField
@@ -103,6 +103,32 @@ def wrench_message(header: Header, force: ArrayLike, torque: ArrayLike = (0.0, 0
 
 def _vector(xyz: Sequence[float]) -> Vector3:
     return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
+
+
+def twist_message(header: Header, linear: ArrayLike) -> TwistStamped:
+    """Return a velocity (3,) [m/s] without rotation.
+
+    Raises:
+        ObservationError: a component is not finite.
+    """
+    numbers = [*map(float, linear)]
+    if not all(map(math.isfinite, numbers)):
+        raise ObservationError(f"the velocity is not finite: {numbers}")
+    return TwistStamped(header=header, twist=Twist(linear=_vector(numbers)))
+
+
+def twist_speed(message: TwistStamped, frame: str) -> float:
+    """Return the linear speed [m/s] of a velocity.
+
+    Raises:
+        ObservationError: the frame is not `frame`, or a component is not finite.
+    """
+    check_frame(message, frame, "the velocity")
+    linear = message.twist.linear
+    speed = math.hypot(linear.x, linear.y, linear.z)
+    if not math.isfinite(speed):
+        raise ObservationError(f"the velocity is not finite: {linear.x}, {linear.y}, {linear.z}")
+    return speed
 
 
 def grasp_force(message: WrenchStamped, frame: str) -> float:

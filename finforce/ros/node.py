@@ -12,7 +12,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: F401 - for those who publish
-from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: F401 - for those who publish
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped  # noqa: F401 - for those who publish
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -45,6 +45,8 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
     pose_message,
     stamp_message,
     status_message,
+    twist_message,
+    twist_speed,
     wrench_message,
     xyz_columns,
 )

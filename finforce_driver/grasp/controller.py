@@ -85,6 +85,16 @@ class ForceGrasp:
         if self._phase is GraspPhase.HOLDING:
             self._phase, self._reason = GraspPhase.LOADING, "goes to another force"
 
+    @property
+    def set_force(self) -> float:
+        """The force that is to be held [N]."""
+        return self._set_force
+
+    @property
+    def phase(self) -> GraspPhase:
+        """Where the grasp is."""
+        return self._phase
+
     def refuse(self, words: str) -> None:
         """Take note of a force that was refused before it came here, and why."""
         self._feed.refuse("refused", words)

@@ -13,6 +13,7 @@ from finforce_driver.errors import BackOffError, DriverError, GraspError, Grippe
 from finforce_driver.grasp.controller import ForceGrasp
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus, GraspStep
+from finforce_driver.grasp.slip_guard import SlipGuard
 from finforce_driver.state import GripperState
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ class GraspSession:
         self._touches: dict[str, TouchSample] = {}
         self._touch_told = -math.inf
         self._stddevs: dict[str, tuple[float, float]] = {}
+        self._slips = SlipGuard(settings)
         self._changed = Condition()
 
     @property
@@ -72,6 +74,7 @@ class GraspSession:
             self.goal = goal
             if self._grasp is not None:
                 self._grasp.change_force(goal.force)
+                self._slips.begin(goal.force)
 
     def run(self, begun: Callable[[], None] = lambda: None) -> GraspStatus:
         """Begin a grasp, if none runs, and wait; return how it is once the force is held, and go on holding it.
@@ -114,6 +117,21 @@ class GraspSession:
             if self._grasp is not None and stamp > self._touch_told and (touching or complete):
                 self._touch_told = stamp
                 self._grasp.take_touch(any(touch.touching for touch in fresh), stamp)
+
+    def take_slip(self, jaw: str, speed: float, stamp: float) -> float | None:
+        """Take the speed [m/s] of the object over a jaw in the image at `stamp` [s].
+
+        Returns:
+            The force [N] to which the grasp goes because the object slides; None where it stays as it is.
+        """
+        with self._changed:
+            grasp = self._grasp
+            if grasp is None or grasp.phase is not GraspPhase.HOLDING:
+                return None
+            force = self._slips.take(jaw, speed, stamp, grasp.set_force)
+            if force is not None:
+                grasp.change_force(force)
+            return force
 
     def take_stddev(self, jaw: str, stddev: float, stamp: float) -> None:
         """Keep the standard deviation of a jaw's force [N] in the image at `stamp` [s], for the forces to come."""
@@ -173,6 +191,7 @@ class GraspSession:
     def _begin(self) -> None:
         """Make a grasp and let it look at the gripper."""
         self._grasp = _grasp_of(self._gripper, self.goal, self._settings)
+        self._slips.begin(self.goal.force)
         self.status = None
         self.update(self._gripper.state)
 

@@ -70,6 +70,11 @@ class GraspSettings:
     touch_timeout: float = setting(1.0, "wait for a force once the jaws are said to touch", "s", 0.1, 10.0)
     silence_timeout: float = setting(2.0, "wait for the first word of the camera", "s", 0.1, 60.0)
     relaxation: float = setting(0.4, "share of the force that holding may make up for by closing", "", 0.05, 1.0)
+    slip_raise: float = setting(
+        0.0, "share of the set force by which it rises while the object slides; 0 leaves it", "", 0.0, 1.0
+    )
+    slip_limit: float = setting(1.5, "times the set force to which it rises at most", "", 1.0, 5.0)
+    slip_speed: float = setting(0.003, "of the object over a jaw, above which it slides", "m/s", 1e-4, 0.1)
     motor_force: float = setting(
         7.5, "grip force by the maker's curve that the motor is limited to; 2.5 set forces if more", "N", 7.0, 62.0
     )

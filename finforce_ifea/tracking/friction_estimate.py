@@ -117,9 +117,21 @@ def _judge(variance, mean, smooth, rough):
 
 
 @njit(**_OPTIONS)
+def _explain(frame, k, row, left):
+    """Fills in the derivatives (6, 2) of key point k by depth, shape, height, mu, b and c, and what is left to them."""
+    data, modes, normal, mobilised, lean, moved, away = frame
+    for a in range(2):
+        leaning = modes[k, a, 3]
+        row[0, a], row[1, a], row[2, a] = modes[k, a, 0], modes[k, a, 1], modes[k, a, 2]
+        row[3, a], row[4, a], row[5, a] = mobilised * leaning, leaning, leaning / normal
+        left[a] = data.r[k, a] + leaning * lean - row[0, a] * moved[0]
+        left[a] += row[1, a] * (away[0] - moved[1]) + row[2, a] * (away[1] - moved[2])
+
+
+@njit(**_OPTIONS)
 def _accumulate(frame, information, vector):
     """Adds one frame, its depth eliminated, to information (5, 5) and vector (5,) on shape, height, mu, b and c."""
-    data, modes, normal, mobilised, lean, moved, away = frame
+    data = frame.data
     A, g = np.zeros((6, 6)), np.zeros(6)
     row, left = np.zeros((6, 2)), np.zeros(2)
     for k in range(len(data.weights)):
@@ -129,14 +141,7 @@ def _accumulate(frame, information, vector):
         n00, n11, n01 = data.noise[k, 0, 0], data.noise[k, 1, 1], data.noise[k, 0, 1]
         det = n00 * n11 - n01 * n01
         p00, p11, p01 = w * n11 / det, w * n00 / det, -w * n01 / det
-        for a in range(2):
-            for i in range(3):
-                row[i, a] = modes[k, a, i]
-            leaning = modes[k, a, 3]
-            row[3, a], row[4, a], row[5, a] = mobilised * leaning, leaning, leaning / normal
-            left[a] = data.r[k, a] + leaning * lean - row[0, a] * moved[0]
-            for i in range(1, 3):
-                left[a] += row[i, a] * (away[i - 1] - moved[i])
+        _explain(frame, k, row, left)
         for i in range(6):
             q0, q1 = p00 * row[i, 0] + p01 * row[i, 1], p01 * row[i, 0] + p11 * row[i, 1]
             g[i] += q0 * left[0] + q1 * left[1]
