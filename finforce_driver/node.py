@@ -79,7 +79,8 @@ class GripperDriverNode(Node):
         self.session = GraspSession(self.gripper, parameters.goal, grasp, self.wake.trigger)
         self.tasks = GripperTasks(self.gripper, self.session, parameters)
         gate = {"max_age": parameters.max_age, "restart_gap": parameters.restart_gap}
-        self.times = MessageTimes(self.gripper.clock, ("force", *JAWS, *(f"{side} stddev" for side in JAWS)), **gate)
+        told = [f"{side} {what}" for side in JAWS for what in ("stddev", "slip")]
+        self.times = MessageTimes(self.gripper.clock, ("force", *JAWS, *told), **gate)
         self.health = GripperHealth(source=parameters.port, stale_after=parameters.max_age)
         self.qos = ros.QosWatch(self)
         self.out = DriverOutputs(self.qos, parameters, own_joints=not self.is_other)

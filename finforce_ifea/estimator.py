@@ -28,10 +28,12 @@ from finforce_ifea.observation import (
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import TareKeeper, TareReport
+from finforce_ifea.tracking.friction_estimate import SMOOTH, Coefficient
 from finforce_ifea.tracking.influence import ReachWatch
 from finforce_ifea.tracking.place_tracker import PlaceTracker
 from finforce_ifea.tracking.point_tracker import PointTracker
-from finforce_ifea.tracking.track import ForceEvidence, Track, find_doubt, find_numbers
+from finforce_ifea.tracking.track import UNSEEN_LEAN, AcrossFinger, ForceEvidence, Track, find_doubt, find_numbers
+from finforce_ifea.tracking.width_tracker import MIDDLE_STDDEV
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 
@@ -83,7 +85,8 @@ class JawEstimator:
         self.jaw = calibration.apply(jaw) if calibration else jaw
         self.mechanics: Mechanics = build_chosen(self.jaw, self.settings)
         torsion = measure_torsion(self.jaw, self.mechanics.mesh)
-        self._rolling = PlaceTracker(self.mechanics, self.jaw.keypoints, self.settings, torsion)
+        smooth = Coefficient(calibration.friction, calibration.friction_stddev) if calibration else SMOOTH
+        self._rolling = PlaceTracker(self.mechanics, self.jaw.keypoints, self.settings, torsion, smooth)
         self._pointed = PointTracker(self.jaw, self.mechanics, self.settings, self._rolling.response)
         self._tracker: PlaceTracker | PointTracker = self._rolling
         self._gate = KeypointGate(self.jaw, self.settings)
@@ -111,9 +114,24 @@ class JawEstimator:
         self._rolling.reset()
         self._pointed.reset()
 
+    def forget(self) -> None:
+        """Forgets the object, too: what was learnt of its friction."""
+        self.reset()
+        self._rolling.forget()
+
+    @property
+    def seen_friction(self) -> Coefficient:
+        """What the key points alone say of the object's coefficient of friction; infinite deviation: nothing."""
+        return self._rolling.seen_friction
+
+    @property
+    def friction(self) -> Coefficient:
+        """The object's coefficient of friction as far as it is known."""
+        return self._rolling.friction
+
     def warm_up(self) -> None:
         """Compiles what is compiled on first use, and leaves no trace."""
-        warm_up(self.jaw, self.settings.tare_frames, self.update, self.reset)
+        warm_up(self.jaw, self.settings.tare_frames, self.update, self.forget)
 
     @property
     def tared(self) -> bool:
@@ -258,7 +276,8 @@ class JawEstimator:
         self._taring.note(quiet=track.quiet, loaded=track.loaded)
         force = self._relax(track.force)
         elastic = float(np.linalg.norm(track.force))
-        force[1] = track.across.force * (float(np.linalg.norm(force)) / elastic if elastic > 0.0 else 1.0)
+        if track.across is not None and elastic > 0.0:
+            force[1] = track.across.force * float(np.linalg.norm(force)) / elastic
         return self._solution(track, force, used)
 
     def _relax(self, elastic: NDArray) -> NDArray:
@@ -272,6 +291,7 @@ class JawEstimator:
         friction = self.settings.friction
         leaning = _LEANING * min(friction, float(abs(force[2])) / max(float(abs(force[0])), 1e-9))
         share = float(np.sqrt(self._force_error**2 + track.place_error**2 + extrapolated**2 + leaning**2))
+        unseen = UNSEEN_LEAN * friction
         evidence = ForceEvidence(
             force=force,
             elastic=track.force,
@@ -280,8 +300,8 @@ class JawEstimator:
             pressure=track.pressure_point,
             place=track.pressure_place,
             place_stddev=track.place_stddev,
-            across=track.across,
-            along=track.lean_stddev,
+            across=track.across or AcrossFinger(0.0, MIDDLE_STDDEV, 0.0, unseen),
+            along=unseen if track.lean_stddev is None else track.lean_stddev,
         )
         numbers = find_numbers(evidence, share, _LEAN)
         return Solution(

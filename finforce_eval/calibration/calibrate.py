@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from finforce_eval.evaluation.contact_source import ContactChoice, first_touch
 from finforce_eval.evaluation.evaluate import check_keypoint_count
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.tracks import Recording
+from finforce_ifea.identification.friction import identify_friction
 from finforce_ifea.identification.identification import CalibrationCase, CalibrationFit, fit_calibration
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.settings import EstimatorSettings
@@ -55,7 +56,7 @@ def calibration_case(
 
 
 def calibrate(cases: Sequence[CalibrationCase], jaw: Jaw, settings: EstimatorSettings) -> CalibrationFit:
-    """Fit the finger to the cases, showing the falling cost.
+    """Fit the finger to the cases, showing the falling cost, and the friction of their objects.
 
     Raises:
         FinforceError: the cases say nothing about the finger.
@@ -68,7 +69,12 @@ def calibrate(cases: Sequence[CalibrationCase], jaw: Jaw, settings: EstimatorSet
             bar.set_postfix(cost=f"{cost:.5g}", refresh=False)
             bar.update()
 
-        return fit_calibration(jaw, cases, settings, show)
+        fit = fit_calibration(jaw, cases, settings, show)
+    rough = identify_friction(jaw, fit.calibration, cases, settings)
+    if rough is None:
+        return fit
+    known = replace(fit.calibration, friction=rough.mean, friction_stddev=rough.stddev)
+    return replace(fit, calibration=known, uncertainty={**fit.uncertainty, "friction": rough.stddev})
 
 
 def fitted_values(fit: CalibrationFit) -> dict[str, float]:

@@ -19,6 +19,8 @@ _KEYS = {
     "clamped_z",
     "relaxation",
     "force_error",
+    "friction",
+    "friction_stddev",
     "jaw",
     "solver",
     "comment",
@@ -41,6 +43,8 @@ class Calibration:
         clamped_z: effective height of the clamp [m].
         relaxation: branches of the material's relaxation.
         force_error: relative standard deviation of forces that is left [-].
+        friction: coefficient of the objects that the finger was calibrated on, 0 where they showed none.
+        friction_stddev: standard deviation of that [-].
         jaw: name of the jaw that it belongs to, empty for any.
         solver: mechanics that it was identified with, "solid", "frame" or "paper"; empty where nobody knows.
     """
@@ -52,6 +56,8 @@ class Calibration:
     clamped_z: float = 0.0
     relaxation: tuple[RelaxationTerm, ...] = ()
     force_error: float = 0.02
+    friction: float = 0.0
+    friction_stddev: float = 0.02
     jaw: str = ""
     solver: str = ""
 
@@ -68,6 +74,8 @@ class Calibration:
             "rib_thickness_factor": (0.3, 3.0),
             "clamped_z": (0.0, 0.05),
             "force_error": (0.0, 1.0),
+            "friction": (0.0, 2.0),
+            "friction_stddev": (1e-3, 2.0),
         }
         for name, (low, high) in bounds.items():
             value = getattr(self, name)

@@ -25,8 +25,6 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 _LEAN_ERROR, _FORCE_ERROR = 0.07, 0.1
 # The errors of successive frames are not independent: so many count for one. Beyond this many frames old ones fade.
 _ALIKE, _MEMORY = 3.0, 3000.0
-# A smooth object is as smooth as those of the calibration within this.
-_SMOOTH_STDDEV = 0.02
 _LARGEST = 1.5
 
 
@@ -35,6 +33,10 @@ class Coefficient(NamedTuple):
 
     mean: float
     stddev: float
+
+
+# Of objects that show no friction, where no calibration says more.
+SMOOTH = Coefficient(0.0, 0.02)
 
 
 class FrictionFrame(NamedTuple):
@@ -66,10 +68,10 @@ class FrictionEstimate:
         coefficient: of friction, as far as it is known.
     """
 
-    def __init__(self, settings: EstimatorSettings, calibrated: float = 0.0) -> None:
-        """Keeps what is expected of objects; `calibrated` is the coefficient of those of the calibration."""
+    def __init__(self, settings: EstimatorSettings, smooth: Coefficient = SMOOTH) -> None:
+        """Keeps what is expected of objects, that of those of the calibration included."""
         self._rough = Coefficient(settings.friction, settings.friction_stddev)
-        self._smooth, self._share = Coefficient(calibrated, _SMOOTH_STDDEV), settings.smooth_share
+        self._smooth, self._share = smooth, settings.smooth_share
         self.reset()
 
     def reset(self) -> None:

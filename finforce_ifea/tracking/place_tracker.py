@@ -18,7 +18,7 @@ from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
-from finforce_ifea.tracking.friction_estimate import FrictionEstimate, FrictionFrame
+from finforce_ifea.tracking.friction_estimate import SMOOTH, Coefficient, FrictionEstimate, FrictionFrame
 from finforce_ifea.tracking.influence import measure_influence
 from finforce_ifea.tracking.place_update import (
     Average,
@@ -31,7 +31,7 @@ from finforce_ifea.tracking.place_update import (
     weigh_residuals,
 )
 from finforce_ifea.tracking.slip_history import SlipHistory
-from finforce_ifea.tracking.track import MIDDLE, Track, explain_offsets
+from finforce_ifea.tracking.track import UNSEEN_LEAN, Track, explain_offsets
 from finforce_ifea.tracking.width_tracker import WidthTracker
 
 # The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
@@ -56,9 +56,8 @@ _LEAST_AGREEMENT = 0.6
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
 # object has gone back to this share of its depth.
 _STRANGE, _BACK = 1.0, 0.8
-# What of the friction the mechanics does not follow, a lean of the force that is never excluded, and that of an unknown
-# object as a share of the expected coefficient [-].
-_UNFOLLOWED, _LEAN, _UNKNOWN_LEAN = 0.25, 0.08, 0.5
+# What of the friction the mechanics does not follow, and a lean of the force that is never excluded [-].
+_UNFOLLOWED, _LEAN = 0.25, 0.08
 _WIDEST_FORECAST = 1e-3
 
 
@@ -77,9 +76,25 @@ class PlaceTracker:
     """
 
     def __init__(
-        self, mechanics: Mechanics, keypoints: NDArray, settings: EstimatorSettings, torsion: Torsion | None = None
+        self,
+        mechanics: Mechanics,
+        keypoints: NDArray,
+        settings: EstimatorSettings,
+        torsion: Torsion | None = None,
+        smooth: Coefficient = SMOOTH,
     ) -> None:
-        """Attaches key points (K, 3) [m, undeformed] to the model; raises MeshError when one is off it."""
+        """Attaches the key points to the model.
+
+        Args:
+            mechanics: of the jaw.
+            keypoints: (K, 3) [m, undeformed].
+            settings: of the estimator.
+            torsion: what acts across the finger does; None where nobody knows.
+            smooth: friction of the objects of the calibration.
+
+        Raises:
+            MeshError: A key point is off the jaw.
+        """
         self.settings = settings
         self._levels = [_attach(level.contact, keypoints) for level in (mechanics, mechanics.full) if level is not None]
         self._stand_on(0)
@@ -88,8 +103,8 @@ class PlaceTracker:
         self.response = measure_influence(contact, self.probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
         self._slips = SlipHistory(contact.with_friction())
-        self._roughness = FrictionEstimate(settings)
-        self._width = WidthTracker(torsion, len(keypoints))
+        self._roughness = FrictionEstimate(settings, smooth)
+        self._width = WidthTracker(torsion, len(keypoints), UNSEEN_LEAN * settings.friction)
         self._face = contact.surface.heights[[0, -1]]
         self.reset()
 
@@ -240,6 +255,21 @@ class PlaceTracker:
         return self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
 
     @property
+    def friction(self) -> Coefficient:
+        """The object's coefficient of friction as far as it is known."""
+        return self._roughness.coefficient
+
+    @property
+    def seen_friction(self) -> Coefficient:
+        """What the key points alone say of that coefficient."""
+        return self._roughness.seen
+
+    def forget(self) -> None:
+        """Forgets what was learnt of the object."""
+        self._roughness.reset()
+        self.reset()
+
+    @property
     def _is_known(self) -> bool:
         """Whether the object is known by its outline."""
         return self._outline is self.contact.indenter
@@ -288,6 +318,8 @@ class PlaceTracker:
         self.contact.set_indenter(after)
         self._given, self._stiffness = None, self.response.stiffness_at(float(expected.mean[1]))
         away = abs(self._slow[1] - expected.mean[1]) > _FARTHEST_HEIGHT * self.settings.height_stddev
+        if isinstance(before, OutlineIndenter) and not after.resembles(before):
+            self._roughness.reset()
         if away or not isinstance(before, OutlineIndenter) or not after.resembles(before):
             self._begin()
         elif after is not before:
@@ -394,8 +426,8 @@ class PlaceTracker:
             kkt=update.kkt,
             iterations=iterations,
             converged=settled,
-            across=self._width.across if self._is_known else MIDDLE,
-            lean_stddev=self._describe_lean(),
+            across=self._width.across if self._is_known else None,
+            lean_stddev=self._describe_lean() if self._is_known else None,
             ambiguity=0.0 if settled else float(np.linalg.norm(state.force_modes[:, :3] @ moved)),
             sound=bool(finite and state.smallest_det > 0),
             quiet=bool(pressed < _TOUCH_DEPTH),
@@ -410,8 +442,6 @@ class PlaceTracker:
 
     def _describe_lean(self) -> float:
         """Returns the standard deviation of the lean of the force along the finger that friction leaves [-]."""
-        if not self._is_known:
-            return _UNKNOWN_LEAN * self.settings.friction
         found = self._roughness.coefficient
         return sqrt((found.stddev * self._slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _LEAN**2)
 

@@ -13,6 +13,10 @@ from finforce_ifea.tare import Tare
 _COMMON_OFFSET = 1.5e-3
 
 
+# What acts along the face is seen by nobody where the object is not known: half of the cone for one deviation.
+UNSEEN_LEAN = 0.5
+
+
 class AcrossFinger(NamedTuple):
     """What acts across a finger.
 
@@ -27,10 +31,6 @@ class AcrossFinger(NamedTuple):
     place_stddev: float
     force: float
     lean_stddev: float
-
-
-# Of an object of which nothing is known across the finger.
-MIDDLE = AcrossFinger(0.0, 3e-3, 0.0, 0.2)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,8 +57,8 @@ class Track:
         kkt: gradient of the objective that is left, relative to its parts.
         iterations: Newton iterations.
         converged: whether the last one changed nothing that matters.
-        across: what acts across the finger.
-        lean_stddev: standard deviation of the lean of the force along the finger [-].
+        across: what acts across the finger, None where nobody knows.
+        lean_stddev: standard deviation of the lean of the force along the finger [-], None where nobody knows.
         ambiguity: change of the force by the last iteration where that has not converged [N].
         sound: whether the mesh is in order and the numbers are finite.
         quiet: whether nothing seems to press.
@@ -88,8 +88,8 @@ class Track:
     place_stddev: float = 0.0
     condition: float = 1.0
     ambiguity: float = np.inf
-    across: AcrossFinger = MIDDLE
-    lean_stddev: float = 0.2
+    across: AcrossFinger | None = None
+    lean_stddev: float | None = None
 
 
 def compute_magnitude_stddev(force: NDArray, modes: NDArray, covariance: NDArray) -> float:

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.torsion import Torsion
 from finforce_ifea.tracking.place_update import Residuals
-from finforce_ifea.tracking.track import MIDDLE, AcrossFinger
+from finforce_ifea.tracking.track import AcrossFinger
 
+# Standard deviation of a place of which nobody knows [m].
+MIDDLE_STDDEV = 3e-3
 # Pressure is spread evenly: its centre strays from the middle by this share of what touches. Standard deviations of the
 # lean, and of what the linear jaw makes of it [-].
 _EVEN, _LEAN, _NONLINEAR = 0.4, 0.1, 0.04
@@ -46,10 +48,13 @@ class WidthTracker:
         across: what acts.
     """
 
-    def __init__(self, torsion: Torsion | None, count: int) -> None:
-        """Keeps the answers of the jaw, whose key points are `count`; None where nothing is known of them."""
-        self._torsion, self._count = torsion, count
-        self._expected = (MIDDLE.place, MIDDLE.place_stddev)
+    def __init__(self, torsion: Torsion | None, count: int, lean: float) -> None:
+        """Keeps the answers of the jaw, whose key points are `count`; None where nothing is known of them.
+
+        `lean` is the standard deviation of what acts across as a share of the force, until something is seen.
+        """
+        self._torsion, self._count, self._lean = torsion, count, lean
+        self._expected = (0.0, MIDDLE_STDDEV)
         self.reset()
 
     def reset(self) -> None:
@@ -57,7 +62,7 @@ class WidthTracker:
         count = self._count
         self._means = _Means(np.zeros(count), np.zeros((count, 2)), np.zeros(count))
         self.motions = np.zeros((count, 3))
-        self.across = AcrossFinger(*self._expected, 0.0, MIDDLE.lean_stddev)
+        self.across = AcrossFinger(*self._expected, 0.0, self._lean)
 
     def expect(self, place: float, stddev: float) -> None:
         """Takes where along y the object stands nearest [m], and how wide it does so."""
