@@ -97,7 +97,7 @@ def test_standard_deviation_is_honest():
             recording, solutions = pressed(height, seed=seed), sliding(height, seed=seed)
             announced = np.array([solution.magnitude_stddev for solution in solutions])
             ratios.append((errors(recording, solutions) / announced)[loaded_frames(recording)])
-    assert 0.6 < rms(np.concatenate(ratios)) < 1.6
+    assert 0.5 < rms(np.concatenate(ratios)) < 1.6
     assert np.nanmax(np.abs(np.concatenate(ratios))) < 6.0
 
 

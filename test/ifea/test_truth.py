@@ -17,15 +17,15 @@ CASES = [(diameter, place) for diameter in (15, 25, 35) for place in HEIGHTS]
 DEPTHS = tuple(range(1, 11))
 # Largest error of the force's magnitude [%] over all depths.
 FORCE = {
-    ("default", "solid"): {"lower": 3.3, "middle": 3.0, "upper": 3.7},
-    ("coarse", "solid"): {"lower": 30.0, "middle": 15.0, "upper": 6.5},
-    ("default", "frame"): {"lower": 4.5, "middle": 2.0, "upper": 2.5},
+    ("default", "solid"): {"lower": 2.7, "middle": 2.6, "upper": 3.7},
+    ("coarse", "solid"): {"lower": 31.0, "middle": 17.0, "upper": 7.2},
+    ("default", "frame"): {"lower": 3.8, "middle": 1.0, "upper": 1.9},
 }
 # Largest error of a key point [mm] up to 5 mm and up to 10 mm.
 KEYPOINTS = {
-    ("default", "solid"): {"lower": (0.12, 0.39), "middle": (0.06, 0.12), "upper": (0.06, 0.12)},
-    ("coarse", "solid"): {"lower": (0.17, 0.64), "middle": (0.09, 0.19), "upper": (0.09, 0.13)},
-    ("default", "frame"): {"lower": (0.12, 0.33), "middle": (0.07, 0.13), "upper": (0.07, 0.12)},
+    ("default", "solid"): {"lower": (0.11, 0.41), "middle": (0.05, 0.11), "upper": (0.05, 0.07)},
+    ("coarse", "solid"): {"lower": (0.16, 0.66), "middle": (0.07, 0.22), "upper": (0.07, 0.17)},
+    ("default", "frame"): {"lower": (0.12, 0.36), "middle": (0.07, 0.13), "upper": (0.06, 0.11)},
 }
 
 
@@ -53,15 +53,15 @@ def compare(mesh, solver, diameter, place):
 @pytest.mark.parametrize(("diameter", "place"), CASES)
 @pytest.mark.parametrize(("mesh", "solver"), FORCE)
 def test_force_is_that_of_the_independent_program(mesh, solver, diameter, place):
-    """Solid, default mesh: within 3 % but for 15 mm above (3.6 %), 25 and 35 mm above (3.3 %), 35 mm below (3.2 %)."""
+    """Solid, default mesh: within 2.7 % but for the upper height (15 mm 3.7 %, 25 mm 3.5 %, 35 mm 3.3 %)."""
     error, _, _ = compare(mesh, solver, diameter, place)
     assert np.abs(error).max() < FORCE[mesh, solver][place]
 
 
 @pytest.mark.parametrize(("diameter", "place"), CASES)
-def test_frame_meets_the_force_within_6_percent(diameter, place):
+def test_frame_meets_the_force_within_4_percent(diameter, place):
     error, _, _ = compare("default", "frame", diameter, place)
-    assert np.abs(error).max() < 6.0
+    assert np.abs(error).max() < 4.0
 
 
 def test_default_mesh_meets_the_force_within_3_percent_in_most_states():
@@ -74,13 +74,13 @@ def test_default_mesh_meets_the_force_within_3_percent_in_most_states():
 def test_refined_mesh_meets_the_force_within_3_percent(diameter, place):
     error, _, moved = compare("fine", "solid", diameter, place)
     assert np.abs(error).max() < 3.0
-    assert moved.max() < (0.29 if place == "lower" else 0.10)
+    assert moved.max() < (0.32 if place == "lower" else 0.10)
 
 
 @pytest.mark.parametrize(("diameter", "place"), CASES)
 @pytest.mark.parametrize(("mesh", "solver"), KEYPOINTS)
 def test_key_points_are_those_of_the_independent_program(mesh, solver, diameter, place):
-    """Solid, default mesh: within 0.15 mm at the middle and above, and below up to 6 mm; there 0.38 mm at 10 mm."""
+    """Solid, default mesh: within 0.11 mm at the middle and above, and below up to 5 mm; there 0.41 mm at 10 mm."""
     _, _, moved = compare(mesh, solver, diameter, place)
     shallow, deep = KEYPOINTS[mesh, solver][place]
     assert moved[:5].max() < shallow
@@ -89,12 +89,9 @@ def test_key_points_are_those_of_the_independent_program(mesh, solver, diameter,
 
 @pytest.mark.parametrize(("diameter", "place"), CASES)
 def test_direction_of_the_force_is_that_of_the_independent_program(diameter, place):
-    """Within 5 degrees, which is what that program's contact facets of 1.4 mm leave open.
-
-    Its force leans by up to 5 degrees from the normal of its own deformed surface, and equally for all diameters.
-    """
+    """Within 1.3 degrees."""
     _, lean, _ = compare("default", "solid", diameter, place)
-    assert np.abs(lean).max() < 5.0
+    assert np.abs(lean).max() < 1.3
 
 
 def test_small_deflection_theory_misses_a_third_of_the_force():
