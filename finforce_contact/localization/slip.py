@@ -18,8 +18,10 @@ from finforce_contact.settings import ContactSettings
 _CHANCE, _MOST, _ALARM = 1.0, 3.0, 4.5
 # Samples over which the place of rest is averaged, time over which a speed is fitted [s], and fewest samples of it.
 _REST_MEMORY, _WINDOW, _FEWEST = 45.0, 0.2, 3
-# Noise is learnt over so many samples.
-_NOISE_MEMORY = 60.0
+# Noise is learnt over so many samples; what is expected of it counts for some.
+_NOISE_MEMORY, _NOISE_PRIOR = 60.0, 4.0
+# Slow samples in a row, after which an object that slid has come to rest.
+_RESTING = 6
 # A jaw that moves along its normal faster than this [m/s] closes or opens: what slides there is no slip of a hold.
 _CLOSING = 1.5e-3
 # A gap between samples that begins anew [s].
@@ -75,7 +77,7 @@ class SlipWatch:
 
     def reset(self) -> None:
         """Forgets the contact."""
-        self._noise = self._settings.pose_noise
+        self._noise, self._learnt = self._settings.pose_noise, _NOISE_PRIOR
         self.release()
 
     def release(self) -> None:
@@ -106,7 +108,8 @@ class SlipWatch:
         if self._samples:
             change = (offset - self._samples[-1][1]) / np.sqrt(2.0)
             square = min(float(change @ change) / 2.0, (_MOST * self._noise) ** 2)
-            self._noise = float(np.sqrt(self._noise**2 + (square - self._noise**2) / _NOISE_MEMORY))
+            self._learnt = min(self._learnt + 1.0, _NOISE_MEMORY)
+            self._noise = float(np.sqrt(self._noise**2 + (square - self._noise**2) / self._learnt))
         self._samples.append((stamp, offset, float(face.point[0])))
         while stamp - self._samples[0][0] > _WINDOW and len(self._samples) > _FEWEST:
             self._samples.popleft()
@@ -121,7 +124,7 @@ class SlipWatch:
         self._on_object = T[:3, :3].T @ (face.point - T[:3, 3])
         self._samples.clear()
         self._rest, self._count = np.zeros(2), 0.0
-        self._above, self._below, self._sliding = np.zeros(2), np.zeros(2), False
+        self._above, self._below, self._sliding, self._slow = np.zeros(2), np.zeros(2), False, 0
 
     def _fit_speed(self) -> tuple[NDArray, float, float]:
         """Returns the slope of the last samples (2,), its standard deviation, and the speed of the face along x."""
@@ -145,9 +148,10 @@ class SlipWatch:
         self._above = np.maximum(0.0, self._above + off - _CHANCE)
         self._below = np.maximum(0.0, self._below - off - _CHANCE)
         fast = float(np.hypot(*speed)) > max(self._settings.slip_speed, 2.0 * stddev)
+        self._slow = 0 if fast else self._slow + 1
         if max(self._above.max(), self._below.max()) > _ALARM:
             self._sliding = fast or self._sliding
-            if not fast:  # it has come to rest elsewhere
+            if self._slow >= _RESTING:  # it has come to rest elsewhere
                 self._rest, self._count, self._sliding = offset.copy(), 1.0, False
                 self._above[:] = self._below[:] = 0.0
             return

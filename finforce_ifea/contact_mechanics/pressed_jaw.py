@@ -87,7 +87,10 @@ class RollingContact:
 
     Attributes:
         rubbing: what acts along the surface: a lean of all forces, or friction with its history.
+        bearable: force beyond which no equilibrium is believed [N], infinite where nobody knows.
     """
+
+    bearable = np.inf
 
     def __init__(self, model: JawModel, surface: ContactSurface, face_x: float) -> None:
         """Keeps the model, its contact surface and the plane x = face_x [m] of the undeformed surface.

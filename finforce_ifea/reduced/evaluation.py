@@ -201,6 +201,7 @@ def share_rows(heights: NDArray, places: NDArray) -> NDArray:
 
 # A shape this share of the finger's length from a stored one has an error of about a per cent of its force.
 _FARTHEST_SHAPE = 0.0056
+_BEARABLE = 0.5
 # A step larger than this share of what is allowed is cut where the energy rises by this share of the fall at its start.
 _LARGE_STEP, _TOO_FAR, _BISECTIONS = 0.3, 0.5, 6
 
@@ -210,6 +211,8 @@ class ReducedContact(RollingContact):
 
     Attributes:
         rubbing: what acts along the surface: a lean of all forces, or friction with its history.
+        bearable: force beyond which no equilibrium is believed [N]: half of the largest that is stored, beside the
+            clamp; in its middle the bench finger bears a sixth of that.
     """
 
     def __init__(self, model: ReducedModel, surface: ContactSurface, face_x: float) -> None:
@@ -224,6 +227,8 @@ class ReducedContact(RollingContact):
         length = surface.heights[-1] - surface.heights[0]
         # the rest alone is stored on purpose where no rod was pressed in
         self._farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
+        x, z = (model.loads[:, :, axis::2].sum(axis=2) for axis in (0, 1))
+        self.bearable = _BEARABLE * float(np.hypot(x, z).max()) if np.isfinite(self._farthest) else np.inf
         self._tables = (model.manifold.moves, model.compliance, model.loads)
 
     def place_points(self, q: NDArray) -> NDArray:

@@ -426,6 +426,7 @@ class PlaceTracker:
             kkt=update.kkt,
             iterations=iterations,
             converged=settled,
+            bearable=self._levels[0].contact.bearable,
             across=self._width.across if self._is_known else None,
             lean_stddev=self._describe_lean() if self._is_known else None,
             ambiguity=0.0 if settled else float(np.linalg.norm(state.force_modes[:, :3] @ moved)),

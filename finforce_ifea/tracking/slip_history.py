@@ -76,13 +76,14 @@ class SlipHistory:
         aim, start, steps = place.copy(), self._place, ceil(way / _LONGEST)
         aim[DEPTH], aim[HEIGHT] = start[DEPTH] + deeper, start[HEIGHT] + higher
         for step in range(1, steps + 1):
-            if not self._press(start + (aim - start) * (step / steps)):
+            there = start + (aim - start) * (step / steps)
+            if not (self._press(self._q, there) or self._press(q, there)):
                 break
         return self.mobilised
 
-    def _press(self, place: NDArray) -> bool:
-        """Presses the jaw at the next place; returns False, and leaves all as it was, where that is not found."""
-        contact, q, calm = self._contact, self._q, 1.0
+    def _press(self, q: NDArray, place: NDArray) -> bool:
+        """Presses the jaw of unknowns q (size,) at the next place; returns False, all as it was, where that fails."""
+        contact, calm = self._contact, 1.0
         corrected = np.zeros(contact.model.size)
         for _ in range(_ITERATIONS):
             state = contact.linearize(q, place)

@@ -57,6 +57,7 @@ class Track:
         kkt: gradient of the objective that is left, relative to its parts.
         iterations: Newton iterations.
         converged: whether the last one changed nothing that matters.
+        bearable: force beyond which no equilibrium is believed [N].
         across: what acts across the finger, None where nobody knows.
         lean_stddev: standard deviation of the lean of the force along the finger [-], None where nobody knows.
         ambiguity: change of the force by the last iteration where that has not converged [N].
@@ -88,6 +89,7 @@ class Track:
     place_stddev: float = 0.0
     condition: float = 1.0
     ambiguity: float = np.inf
+    bearable: float = np.inf
     across: AcrossFinger | None = None
     lean_stddev: float | None = None
 
@@ -166,6 +168,9 @@ def find_doubt(track: Track, *, settles: bool) -> str:
     if track.mistaken > _MISTAKEN and abs(track.away) > _LEAST_AWAY:
         return f"the contact is not where it was said to be: the key points have it {1e3 * track.away:+.0f} mm away"
     magnitude = float(np.linalg.norm(track.force))
+    if magnitude > track.bearable:
+        most = f"expected {track.bearable:.0f} N at most"
+        return f"the shape would take {magnitude:.0f} N, {most}; is the contact elsewhere?"
     stddev = compute_magnitude_stddev(track.force, track.force_modes, track.covariance)
     if not stddev <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
         return f"the visible key points tell the force only within {stddev:.2g} N"

@@ -1,0 +1,97 @@
+"""How a held object moves over a jaw: speed, alarm, and what must not alarm."""
+
+import numpy as np
+import pytest
+
+from finforce_contact.localization.slip import SlipWatch, TouchedFace, face_at
+from finforce_contact.settings import ContactSettings
+
+SETTINGS = ContactSettings()
+FACE = TouchedFace(point=np.array([0.012, 0.0, 0.040]), tangent=np.array([0.0, 0.0, 1.0]))
+
+
+def watch(way, rate=30.0, noise=0.15e-3, seed=0, face=lambda t: FACE):
+    """What a watch says of an object that has moved by way(t) (3,) [m], seen with noise [m] at a rate [Hz]."""
+    random, eyes, said = np.random.default_rng(seed), SlipWatch(SETTINGS), []
+    eyes.place(0.040)
+    for number in range(int(6.0 * rate)):
+        t, T = number / rate, np.eye(4)
+        T[:3, 3] = np.array([0.03, 0.0, 0.04]) + way(t) + noise * random.standard_normal(3)
+        said.append(eyes.update(t, T, face(t)))
+    return said
+
+
+def sliding(speed, start=3.0, axis=2):
+    return lambda t: np.eye(3)[axis] * speed * max(0.0, t - start)
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize("speed", [5e-3, -5e-3, 20e-3])
+def test_speed_is_along_the_face_and_right(speed, axis):
+    last = watch(sliding(speed, axis=axis))[-1]
+    assert last.sliding
+    assert last.velocity[axis] == pytest.approx(speed, abs=4.0 * last.stddev)
+    assert np.abs(np.delete(last.velocity, axis)).max() < 4.0 * last.stddev
+
+
+def test_a_slip_of_5_mm_per_s_is_seen_within_six_images():
+    """The median over seeds at 30 Hz and 0.15 mm: images from its start to the alarm."""
+    delays = []
+    for seed in range(21):
+        said = watch(sliding(5e-3), seed=seed)
+        delays.append(next(s.stamp for s in said if s.sliding and s.stamp > 3.0) - 3.0)
+    assert np.median(delays) * 30.0 <= 6.0
+
+
+def test_noise_alone_hardly_ever_alarms():
+    """Two minutes of rest, twice the noise that was expected: at most one alarm."""
+    alarms = 0
+    for seed in range(20):
+        said = [s.sliding for s in watch(lambda t: np.zeros(3), noise=0.6e-3, seed=seed)]
+        alarms += sum(now and not before for before, now in zip(said, said[1:], strict=False))
+    assert alarms <= 1
+
+
+def test_outliers_are_no_slip():
+    said = watch(lambda t: np.array([0.0, 0.0, 0.02]) if 3.0 < t < 3.02 else np.zeros(3))
+    assert not any(s.sliding for s in said)
+
+
+def test_a_closing_jaw_is_no_slip():
+    def face(t):
+        point = np.array([0.012 - 4e-3 * max(0.0, t - 3.0), 0.0, 0.040 - 1e-3 * max(0.0, t - 3.0)])
+        return TouchedFace(point=point, tangent=FACE.tangent)
+
+    assert not any(s.sliding for s in watch(lambda t: np.zeros(3), face=face))
+
+
+def test_an_object_that_came_to_rest_slides_no_more():
+    said = watch(lambda t: np.array([0.0, 0.0, 10e-3 * np.clip(t - 2.0, 0.0, 0.5)]))
+    assert any(s.sliding for s in said)
+    assert not any(s.sliding for s in said if s.stamp > 3.5)
+
+
+def test_gaps_and_release_begin_anew():
+    eyes, T = SlipWatch(SETTINGS), np.eye(4)
+    eyes.place(0.04)
+    for stamp in (0.0, 0.03, 0.06):
+        eyes.update(stamp, T, FACE)
+    T[2, 3] = 0.01
+    assert not eyes.update(2.0, T, FACE).sliding
+    eyes.release()
+    assert eyes.slip is None
+
+
+def test_the_face_is_found_at_its_material_height():
+    heights = np.linspace(0.0, 0.08, 81)
+    line = np.stack([0.014 - 0.1 * heights, heights], axis=1)
+    face = face_at(line, heights, 0.0405)
+    np.testing.assert_allclose(face.point, [0.014 - 0.00405, 0.0, 0.0405])
+    np.testing.assert_allclose(face.tangent, np.array([-0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0))
+
+
+def test_contact_follows_its_height_until_it_has_gone_elsewhere():
+    eyes = SlipWatch(SETTINGS)
+    assert eyes.place(0.040) == 0.040
+    assert eyes.place(0.044) == 0.040
+    assert eyes.place(0.050) == 0.050

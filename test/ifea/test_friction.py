@@ -1,0 +1,231 @@
+"""Friction between an object and the finger, beside an independent program that knows it.
+
+data/rubbed_bench.npz holds key points [mm] and forces [N] of CalculiX 2.20 for a cylinder of 25 mm pressed 8 mm deep
+and back with a coefficient of friction of 0.3, of the bench finger of Mooney-Rivlin;
+data/pressed_bench_mooney.npz the same without friction.
+"""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from estimator_fakes import BENCH, PERIOD, circle, contact_with
+from scipy.interpolate import interp1d
+
+from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact
+from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
+from finforce_ifea.contact_mechanics.penalty import PenaltyContact, press_cylinder
+from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.jaw.calibration import Calibration, load_calibration
+from finforce_ifea.mechanics import build_chosen
+from finforce_ifea.observation import Observation
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tracking.friction_estimate import Coefficient, FrictionEstimate
+from finforce_ifea.tracking.slip_history import SlipHistory, leave_play
+
+FOLDER = Path(__file__).parents[1] / "data"
+RUBBED, SMOOTH = np.load(FOLDER / "rubbed_bench.npz"), np.load(FOLDER / "pressed_bench_mooney.npz")
+HEIGHTS = {"lower": 0.020, "middle": 0.040, "upper": 0.060}
+FACE = BENCH.inner_face_x
+
+
+@cache
+def mechanics():
+    return build_chosen(load_calibration("bench").apply(BENCH), EstimatorSettings())
+
+
+def flat(count=5):
+    """Points on a face that an object presses along -x with 1 N each, and the stiffness of their springs."""
+    points = np.stack([np.zeros(count), np.zeros(count), 1e-3 * np.arange(count)], axis=1)
+    forces, springs = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    forces[:, 0], springs[:, 0, 0] = -1.0, 1e4
+    return PenaltyContact(forces=forces, springs=springs, by_shape=np.zeros((count, 3))), points, np.full(count, 1e4)
+
+
+class TestCone:
+    def test_a_point_that_is_dragged_pulls_back_until_it_slides(self):
+        friction, (contact, points, stiffness), rest = Friction(5), flat(), np.zeros(2)
+        friction.coefficient = 0.5
+        assert friction.settle(contact, points, stiffness, rest) == 0.0
+        moved = points + [0.0, 0.0, 20e-6]  # 0.2 N of 0.5
+        stuck = friction.rub(contact, moved, stiffness, rest)
+        np.testing.assert_allclose(stuck.forces[:, 2], -0.2)
+        assert stuck.mobilised == pytest.approx(-0.4)
+        far = friction.rub(contact, points + [0.0, 0.0, 1e-3], stiffness, rest)
+        np.testing.assert_allclose(far.forces[:, 2], -0.5)
+        assert far.mobilised == -1.0
+
+    def test_an_object_that_is_dragged_takes_the_points_along(self):
+        friction, (contact, points, stiffness), rest = Friction(5), flat(), np.zeros(2)
+        friction.coefficient = 0.5
+        friction.settle(contact, points, stiffness, rest)
+        np.testing.assert_allclose(
+            friction.rub(contact, points, stiffness, np.array([0.0, 20e-6])).forces[:, 2], 0.2, atol=1e-12
+        )
+
+    def test_the_way_back_begins_where_the_way_there_ended(self):
+        friction, (contact, points, stiffness), rest = Friction(5), flat(), np.zeros(2)
+        friction.coefficient = 0.5
+        friction.settle(contact, points, stiffness, rest)
+        friction.settle(contact, points + [0.0, 0.0, 1e-3], stiffness, rest)
+        back = friction.rub(contact, points + [0.0, 0.0, 0.95e-3], stiffness, rest)
+        np.testing.assert_allclose(back.forces[:, 2], 0.0, atol=1e-9)
+        friction.reset()
+        assert friction.rub(contact, points, stiffness, rest).mobilised == 0.0
+
+    def test_without_friction_nothing_acts_along_the_face(self):
+        friction, (contact, points, stiffness), rest = Friction(5), flat(), np.zeros(2)
+        friction.settle(contact, points, stiffness, rest)
+        rubbed = friction.rub(contact, points + [0.0, 0.0, 1e-3], stiffness, rest)
+        np.testing.assert_array_equal(rubbed.forces, contact.forces)
+
+    @pytest.mark.parametrize("lean", [0.0, 0.4, -0.3])
+    def test_changes_of_a_leaning_contact_are_derivatives(self, lean):
+        points = np.stack([np.full(40, 0.0145), np.zeros(40), np.linspace(0.035, 0.045, 40)], axis=1)
+        stiffness, leaning = np.full(40, 1e4), LeaningContact()
+
+        def press(depth=1e-3, height=0.04, turn=0.0, shift=(0.0, 0.0, 0.0)):
+            moved = points + shift
+            contact = press_cylinder(moved, stiffness, 0.014 + 0.0125 - depth, height, 0.0125)
+            leaning.lean = lean + turn
+            return leaning.rub(contact, moved, stiffness, np.zeros(2))
+
+        there, step = press(), 1e-8
+        by_depth = (press(depth=1e-3 + step).forces - press(depth=1e-3 - step).forces) / (2 * step)
+        by_height = (press(height=0.04 + step).forces - press(height=0.04 - step).forces) / (2 * step)
+        by_lean = (press(turn=1e-6).forces - press(turn=-1e-6).forces) / 2e-6
+        for column, change in ((0, by_depth), (2, by_height), (3, by_lean)):
+            np.testing.assert_allclose(there.changes[:, :, column], change, atol=1e-3 * np.abs(change).max())
+        for axis in (0, 2):
+            move = step * np.eye(3)[axis]
+            change = (press(shift=-move).forces - press(shift=move).forces) / (2 * step)
+            np.testing.assert_allclose(there.springs[:, :, axis], change, atol=1e-3 * np.abs(change).max())
+
+
+class TestHistory:
+    def test_play_is_made_good_before_anything_moves(self):
+        assert leave_play(0.5, 1.0) == 0.0
+        assert leave_play(1.5, 1.0) == 0.5
+        assert leave_play(-1.5, 1.0) == -0.5
+
+    @pytest.mark.parametrize(
+        ("place", "loading", "unloading"), [("lower", 0.02, 0.18), ("middle", 0.02, 0.10), ("upper", 0.08, 0.30)]
+    )
+    def test_friction_is_used_as_the_independent_program_has_it(self, place, loading, unloading):
+        """The share of the cone, from the force's lean against the normal force of the model; 1 mm is left out."""
+        contact, height = mechanics().contact, HEIGHTS[place]
+        history = SlipHistory(contact.with_friction())
+        history.set_indenter(OutlineIndenter(circle(0.0125)))
+        contact.set_indenter(OutlineIndenter(circle(0.0125)))
+        depths, forces = 1e-3 * RUBBED[f"25_{place}_depth"], RUBBED[f"25_{place}_force"]
+        q, last, errors = contact.begin(height), 0.0, []
+        for depth, force in zip(depths, forces, strict=True):
+            for step in np.linspace(last, depth, 1 + int(np.ceil(abs(depth - last) / 0.07e-3)))[1:]:
+                here = np.array([step, 0.0, height])
+                for _ in range(12):
+                    state = contact.linearize(q, here)
+                    q = q + (state.correction if state.touches else contact.approach(q, state.correction, here))
+                contact.rubbing.lean = 0.3 * history.follow(q, here, 0.0, 0.3)
+            last = depth
+            errors.append(np.linalg.norm(contact.linearize(q, here).force - force) / np.linalg.norm(force))
+        contact.rubbing.lean = 0.0
+        there = np.arange(len(depths)) <= np.argmax(depths)
+        assert np.sqrt(np.mean(np.array(errors)[there & (depths > 1.5e-3)] ** 2)) < loading
+        assert np.sqrt(np.mean(np.array(errors)[~there & (depths > 1.5e-3)] ** 2)) < unloading
+
+
+def play(truth, place, seed=0, **settings):
+    """Solutions of a finger that is loaded to 8 mm and back twice at 2 mm/s, with true forces (n, 3) [N]."""
+    depths = np.r_[0.0, truth[f"25_{place}_depth"]]
+    moved = 1e-3 * (truth[f"25_{place}_keypoints"] - truth["keypoints0"])
+    moved, forces = np.concatenate([0 * moved[:1], moved]), np.r_[np.zeros((1, 3)), truth[f"25_{place}_force"]]
+    if depths[-1] > 9.0:  # the way there alone: it is the way back, too
+        keep = depths <= 8.0
+        depths, moved, forces = depths[keep], moved[keep], forces[keep]
+        depths, moved, forces = (np.concatenate([part, part[-2::-1]]) for part in (depths, moved, forces))
+    else:
+        depths, moved, forces = (np.concatenate([part, 0 * part[:1]]) for part in (depths, moved, forces))
+    way = np.r_[0.0, np.cumsum(np.abs(np.diff(depths)))]
+    cycle = np.arange(0.0, way[-1], 2.0 * PERIOD)
+    held = np.sort(np.concatenate([cycle, *(np.full(45, level) for level in (2.0, 5.0, 8.0, 11.0, 14.0))]))
+    course = np.concatenate([np.zeros(75), held, held])
+    points, true = interp1d(way, moved, axis=0)(course), interp1d(way, forces, axis=0)(course)
+    random = np.random.default_rng(seed)
+    estimator = JawEstimator(BENCH, calibration=CALIBRATION, settings=EstimatorSettings(**settings))
+    contact, offsets = contact_with(circle(0.0125), HEIGHTS[place]), 0.3e-3 * random.standard_normal((15, 3))
+    solutions = []
+    for number, point in enumerate(points):
+        seen = BENCH.keypoints + point + offsets + 0.2e-3 * random.standard_normal((15, 3))
+        solutions.append(
+            estimator.update(Observation(stamp=PERIOD * number, points=seen, likelihood=np.ones(15)), contact)
+        )
+    return solutions, true, estimator
+
+
+# Without relaxation: the truth here is quasi-static.
+CALIBRATION = Calibration(**{**load_calibration("bench").__dict__, "relaxation": ()})
+
+
+@cache
+def played(rubs, place):
+    return play(RUBBED if rubs else SMOOTH, place)
+
+
+class TestCoefficient:
+    @pytest.mark.parametrize(
+        ("place", "low", "high"), [("lower", 0.15, 0.35), ("middle", 0.2, 0.42), ("upper", 0.15, 0.38)]
+    )
+    def test_loops_tell_a_rough_object(self, place, low, high):
+        _, _, estimator = played(True, place)
+        assert low < estimator.friction.mean < high
+
+    @pytest.mark.parametrize("place", HEIGHTS)
+    def test_loops_tell_a_smooth_object(self, place):
+        _, _, estimator = played(False, place)
+        assert estimator.friction.mean < 0.03
+
+    @pytest.mark.parametrize("place", HEIGHTS)
+    def test_the_second_loop_has_the_force_along_the_finger(self, place):
+        """At most three fifths of the error that is left without friction."""
+        solutions, true, _ = played(True, place)
+        half = len(true) // 2 + 40
+        error = np.array([s.force for s in solutions[half:]]) - true[half:]
+        blind, _, _ = play(RUBBED, place, friction=0.0, friction_stddev=1e-3, smooth_share=1.0)
+        without = np.array([s.force for s in blind[half:]]) - true[half:]
+        assert np.sqrt((error**2).sum(1).mean()) < 0.6 * np.sqrt((without**2).sum(1).mean())
+
+    @pytest.mark.parametrize(("rubs", "place"), [(True, "middle"), (True, "upper"), (False, "lower"), (False, "upper")])
+    def test_deviations_hold_on_every_axis(self, rubs, place):
+        solutions, true, _ = played(rubs, place)
+        known = [(s, f) for s, f in zip(solutions, true, strict=True) if s.status == "ok"]
+        error = np.array([s.force - f for s, f in known]) / np.array([s.force_stddev for s, _ in known])
+        assert (np.abs(error[:, ::2]) < 3.0).mean(axis=0).min() > 0.98
+
+    def test_a_coefficient_that_is_told_goes_before_loops(self):
+        told = FrictionEstimate(EstimatorSettings(friction=0.6, friction_stddev=0.05, smooth_share=0.0))
+        assert told.coefficient == pytest.approx((0.6, 0.05))
+
+    def test_half_knowledge_is_a_mixture(self):
+        mixed = FrictionEstimate(EstimatorSettings(friction=0.4, friction_stddev=0.2, smooth_share=0.5))
+        assert mixed.coefficient.mean == pytest.approx(0.2)
+        assert mixed.coefficient.stddev > 0.2
+
+    def test_objects_of_the_calibration_are_the_smooth_ones(self):
+        known = FrictionEstimate(EstimatorSettings(smooth_share=1.0), Coefficient(0.35, 0.03))
+        assert known.coefficient == pytest.approx((0.35, 0.03))
+
+    def test_another_object_begins_anew(self):
+        _, _, estimator = play(RUBBED, "middle")
+        assert estimator.friction.mean > 0.2
+        first = FrictionEstimate(estimator.settings).coefficient
+        estimator.forget()
+        assert estimator.friction == first
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("friction", -0.1), ("friction", 2.5), ("friction_stddev", 0.0), ("smooth_share", 1.5)]
+)
+def test_coefficients_that_are_none_are_refused(name, value):
+    with pytest.raises(Exception, match=f"{name}.*expected"):
+        EstimatorSettings(**{name: value})
