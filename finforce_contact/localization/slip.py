@@ -18,8 +18,8 @@ from finforce_contact.settings import ContactSettings
 _CHANCE, _MOST, _ALARM = 1.0, 3.0, 4.5
 # Samples over which the place of rest is averaged, time over which a speed is fitted [s], and fewest samples of it.
 _REST_MEMORY, _WINDOW, _FEWEST = 45.0, 0.2, 3
-# Noise is learnt over so many samples; what is expected of it counts for some.
-_NOISE_MEMORY, _NOISE_PRIOR = 60.0, 4.0
+# Noise is learnt over so many samples; what is expected of it counts for some; before it is learnt, nothing slides.
+_NOISE_MEMORY, _NOISE_PRIOR, _TOO_FEW = 60.0, 4.0, 16.0
 # Slow samples in a row, after which an object that slid has come to rest.
 _RESTING = 6
 # A jaw that moves along its normal faster than this [m/s] closes or opens: what slides there is no slip of a hold.
@@ -139,7 +139,7 @@ class SlipWatch:
 
     def _judge(self, offset: NDArray, speed: NDArray, stddev: float, closing: float) -> None:
         """Decides whether the object slides."""
-        if abs(closing) > _CLOSING:
+        if abs(closing) > _CLOSING or self._learnt < _TOO_FEW:
             self._rest, self._count = offset.copy(), 1.0
             self._above[:] = self._below[:] = 0.0
             self._sliding = False
