@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, Protocol
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from finforce.errors import FinforceError, ObservationError
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactSource
+from finforce_eval.evaluation.manipulation import ManipulationStats, score_manipulation
 from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_detection
 from finforce_eval.evaluation.scoring import CaseScore, force_range, match_truth, score_case
@@ -23,12 +24,13 @@ from finforce_ifea.observation import Contact, Observation
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Scores and time series of one call."""
+    """Scores and time series of one call; `manipulation` has those recordings of which both jaws were evaluated."""
 
     results: Mapping[str, CaseResult]
     scores: Mapping[str, CaseScore]
     total: CaseScore
     span: float
+    manipulation: Mapping[str, ManipulationStats] = field(default_factory=dict)
 
 
 def evaluate_recording(
@@ -132,6 +134,7 @@ def score_results(results: Sequence[CaseResult], recordings: Sequence[Recording]
         scores={result.name: score_case(result, span) for result in results},
         total=score_case(results, span),
         span=span,
+        manipulation=score_manipulation({result.name: result for result in results}),
     )
 
 

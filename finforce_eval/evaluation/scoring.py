@@ -23,7 +23,7 @@ from finforce_eval.recordings.tracks import Recording, WrenchTrack
 LEAST_FORCE, ONSET_FORCE = 0.2, 0.02
 # A touch that is not there to stay within so many frames after the true begin is missed.
 WATCHED = 30
-_NOTHING = 1e-3  # [N] along an axis, which needs no standard deviation
+NOTHING = 1e-3  # [N] along an axis, which needs no standard deviation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -324,7 +324,7 @@ def _vector_stats(cases: Sequence[CaseResult], phase: str) -> dict[str, Any]:
     found |= {"vector_rmse_N": float(np.linalg.norm(axes)), "axis_rmse_N": tuple(axes.tolist())}
     if all(case.axis_stddev is not None for case in cases):
         stated = np.concatenate([case.axis_stddev[rows] for case, rows in zip(cases, chosen, strict=True)])
-        within = np.abs(differences) <= np.maximum(3.0 * stated, _NOTHING)
+        within = np.abs(differences) <= np.maximum(3.0 * stated, NOTHING)
         found["within_3_sigma_pct"] = tuple((100.0 * within.mean(axis=0)).tolist())
     return found
 

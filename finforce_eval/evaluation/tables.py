@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from finforce_eval.evaluation.evaluate import Evaluation
+from finforce_eval.evaluation.manipulation import format_manipulation
 from finforce_eval.evaluation.scoring import CaseScore, Spread, Stats
 
 PHASES = ("all", "load", "unload")
@@ -57,6 +58,8 @@ def format_table(evaluation: Evaluation) -> str:
     lines += [rule, *(_join(row, widths) for row in rows[:-1]), rule, _join(rows[-1], widths)]
     contact = format_contact_table(evaluation)
     below = ["", contact, *contact_lines()] if contact else []
+    net = format_manipulation(evaluation.manipulation)
+    below += ["", *net] if net else []
     below += format_sight(evaluation)
     return "\n".join([*lines, "", *summary_lines(evaluation), *below])
 
@@ -172,7 +175,9 @@ def evaluation_json(evaluation: Evaluation, **about: Any) -> dict[str, Any]:
         about: what else stands at the top: jaw, solver, contact, ...
     """
     cases = {name: asdict(score) | _contact_name(evaluation, name) for name, score in evaluation.scores.items()}
-    return {"cases": cases, "all": asdict(evaluation.total), "force_range_N": evaluation.span, **about}
+    net = {name: asdict(score) for name, score in evaluation.manipulation.items()}
+    both = {"manipulation": net} if net else {}
+    return {"cases": cases, "all": asdict(evaluation.total), **both, "force_range_N": evaluation.span, **about}
 
 
 def _contact_name(evaluation: Evaluation, name: str) -> dict[str, str]:
