@@ -289,7 +289,9 @@ class JawEstimator:
     def _solution(self, track: Track, force: NDArray, used: NDArray) -> Solution:
         extrapolated = _EXTRAPOLATED * track.extrapolation
         friction = self.settings.friction
-        leaning = _LEANING * min(friction, float(abs(force[2])) / max(float(abs(force[0])), 1e-9))
+        leaning = 0.0
+        if self.settings.held != "yes":
+            leaning = _LEANING * min(friction, float(abs(force[2])) / max(float(abs(force[0])), 1e-9))
         share = float(np.sqrt(self._force_error**2 + track.place_error**2 + extrapolated**2 + leaning**2))
         unseen = UNSEEN_LEAN * friction
         evidence = ForceEvidence(

@@ -33,6 +33,12 @@ class EstimatorSettings:
     smooth_share: float = setting(
         0.65, "probability that an object is no rougher than those that the finger was calibrated on", "1", 0.0, 1.0
     )
+    held: str = setting(
+        "auto",
+        "whether the jaws alone hold the object, so that friction takes up what their faces lean; auto: yes in "
+        "recordings of both jaws, else no",
+        choices=("auto", "yes", "no"),
+    )
     tare_frames: int = setting(45, "unloaded frames before the first force is reported", "frames", 5, 10000)
     tare_memory: int = setting(300, "unloaded frames over which offsets are averaged", "frames", 5, 100000)
     automatic_tare: bool = setting(True, "tare by itself at the start while nothing presses", "")

@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as installed
 from pathlib import Path
@@ -40,9 +41,11 @@ class EvaluationSetup:
         """Return the setup of the left or the right jaw; a jaw file describes the left one."""
         return self if side == self.jaw.side else replace(self, jaw=self.jaw.mirrored())
 
-    def estimator(self) -> JawEstimator:
-        """Return a fresh estimator that has nothing left to compile."""
-        estimator = JawEstimator(self.jaw, settings=self.settings, calibration=self.calibration)
+    def estimator(self, held: bool = False) -> JawEstimator:
+        """Return a fresh estimator that has nothing left to compile; `held` where both jaws hold an object."""
+        auto = replace(self.settings, held="yes" if held else "no")
+        settings = auto if self.settings.held == "auto" else self.settings
+        estimator = JawEstimator(self.jaw, settings=settings, calibration=self.calibration)
         estimator.warm_up()
         return estimator
 
@@ -192,12 +195,13 @@ def truth_sides(recording: Recording) -> list[str]:
 
 def _evaluate_case(recording: Recording, side: str, setup: EvaluationSetup, progress: Any) -> CaseResult:
     """Evaluate one jaw of one recording."""
+    both = len(truth_sides(recording)) == 2
     result = evaluate_recording(
         recording,
         setup.jaw,
         setup.source(recording),
         side=side,
-        factory=setup.estimator,
+        factory=partial(setup.estimator, both),
         progress=progress,
     )
-    return result if len(truth_sides(recording)) == 1 else replace(result, name=f"{recording.name}/{side}")
+    return result if not both else replace(result, name=f"{recording.name}/{side}")

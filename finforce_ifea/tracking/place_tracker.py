@@ -56,6 +56,9 @@ _LEAST_AGREEMENT = 0.6
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
 # object has gone back to this share of its depth.
 _STRANGE, _BACK = 1.0, 0.8
+# What is held by the jaws alone does not slide out: no force along the finger is left, as far as friction can. From
+# image to image the lean goes this share of its way there.
+_LARGEST_LEAN, _HELD_GAIN = 0.9, 0.5
 # What of the friction the mechanics does not follow, and a lean of the force that is never excluded [-].
 _UNFOLLOWED, _LEAN = 0.25, 0.08
 _WIDEST_FORECAST = 1e-3
@@ -278,6 +281,10 @@ class PlaceTracker:
         """Follows how the object slides, and learns its coefficient where something presses."""
         if self._reached[DEPTH] - self._find_touch(self._reached) < _LOADED_DEPTH or self._jumped:
             return
+        if self.settings.held == "yes":
+            upright = find_upright_lean(state.force, self.contact.rubbing.lean)
+            self.contact.rubbing.lean += _HELD_GAIN * (upright - self.contact.rubbing.lean)
+            return
         expected = np.array([self._reached[DEPTH], self._prior[0], self._prior[1]])
         before, known = self._slips.mobilised, self._roughness.coefficient.mean
         self._slips.set_indenter(self.contact.indenter)
@@ -443,6 +450,8 @@ class PlaceTracker:
 
     def _describe_lean(self) -> float:
         """Returns the standard deviation of the lean of the force along the finger that friction leaves [-]."""
+        if self.settings.held == "yes":
+            return _LEAN
         found = self._roughness.coefficient
         return sqrt((found.stddev * self._slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _LEAN**2)
 
@@ -458,3 +467,14 @@ def _attach(contact: RollingContact, keypoints: NDArray) -> _Level:
     """Returns the mechanics of a contact with key points (K, 3) [m]; raises MeshError when one is off the jaw."""
     probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
     return _Level(contact, probe, contact.model.positions(probe, np.zeros(contact.model.size)))
+
+
+def find_upright_lean(force: NDArray, lean: float) -> float:
+    """Returns the lean with which a force has nothing along the finger, that has a lean now.
+
+    Args:
+        force: of the object on the jaw (3,) [N].
+        lean: of it now [-].
+    """
+    ahead, along = force[0] - lean * force[2], force[2] + lean * force[0]
+    return min(max(along / ahead, -_LARGEST_LEAN), _LARGEST_LEAN) if ahead != 0.0 else 0.0

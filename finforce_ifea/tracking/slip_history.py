@@ -16,7 +16,7 @@ from finforce_ifea.reduced.evaluation import ReducedContact
 # Below this coefficient there is next to nothing to follow; the way is that of an object as rough as this.
 _LEAST_COEFFICIENT = 0.15
 # Chance, in standard deviations of the depth, at least [m]; and of a height [m].
-_SIGMAS, _LEAST_PLAY, _PLAY_HEIGHT = 3.0, 0.03e-3, 1e-3
+_SIGMAS, _LEAST_PLAY, _PLAY_HEIGHT = 2.4, 0.03e-3, 1e-3
 _ITERATIONS, _SETTLED = 12, 2e-3
 # A way longer than this is no way but another contact; a shorter one than the second is left for later; along the way,
 # steps of at most the third [m].
