@@ -22,6 +22,7 @@ from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.friction_estimate import Coefficient, FrictionEstimate
+from finforce_ifea.tracking.place_tracker import find_upright_lean
 from finforce_ifea.tracking.slip_history import SlipHistory, leave_play
 
 FOLDER = Path(__file__).parents[1] / "data"
@@ -229,3 +230,27 @@ class TestCoefficient:
 def test_coefficients_that_are_none_are_refused(name, value):
     with pytest.raises(Exception, match=f"{name}.*expected"):
         EstimatorSettings(**{name: value})
+
+
+class TestHeld:
+    @pytest.mark.parametrize("lean", [0.0, 0.3, -0.2])
+    def test_the_upright_lean_takes_up_what_the_faces_lean(self, lean):
+        normal = np.array([-5.0, 0.0, -1.0])
+        leaning = np.array([normal[0] + lean * normal[2], 0.0, normal[2] - lean * normal[0]])
+        upright = find_upright_lean(leaning, lean)
+        assert upright == pytest.approx(0.2)
+        assert normal[2] - upright * normal[0] == pytest.approx(0.0)
+
+    def test_friction_has_its_bounds(self):
+        assert find_upright_lean(np.array([-1.0, 0.0, -5.0]), 0.0) == 0.9
+        assert find_upright_lean(np.zeros(3), 0.0) == 0.0
+
+    def test_what_the_jaws_hold_has_no_force_along_them(self):
+        free, _, _ = played(False, "lower")
+        held, _, estimator = play(SMOOTH, "lower", held="yes")
+        pressed = [number for number, s in enumerate(free) if s.status == "ok" and abs(s.force[0]) > 2.0]
+        assert max(abs(free[number].force[2]) for number in pressed) > 1.0
+        settled = [number for number in pressed if np.linalg.norm(held[number].force) > 2.0]
+        along = np.array([held[number].force[2] for number in settled])
+        assert np.sqrt(np.mean(along**2)) < 0.15
+        assert estimator.friction == FrictionEstimate(estimator.settings).coefficient
