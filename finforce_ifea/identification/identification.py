@@ -111,7 +111,9 @@ def fit_calibration(
     )
     covariance = np.linalg.inv(result.jac.T @ result.jac)
     rough = fit.report(result.x, np.sqrt(np.diag(covariance)))
-    history = fit_force_history(jaw, cases, settings, rough.calibration, progress)
+    # magnitudes are compared; friction is looked for once they are known
+    smooth = replace(settings, smooth_share=1.0)
+    history = fit_force_history(jaw, cases, smooth, rough.calibration, progress)
     return replace(
         rough,
         calibration=replace(

@@ -20,8 +20,10 @@ from finforce_ifea.tracking.track import AcrossFinger
 
 # Standard deviation of a place of which nobody knows [m].
 MIDDLE_STDDEV = 3e-3
-# Pressure is spread evenly: its centre strays from the middle by this share of what touches. Standard deviations of the
-# lean, and of what the linear jaw makes of it [-].
+# Pressure is spread evenly: its centre strays from the middle by this share of what touches, and by less where that is
+# the whole width of the finger: by what is left of a square, at least the share below. Standard deviations of the lean,
+# and of what the linear jaw makes of it [-].
+_WIDE = 0.15
 _EVEN, _LEAN, _NONLINEAR = 0.4, 0.1, 0.04
 # A lean of so many standard deviations is believed by half; less is next to nothing.
 _CLEAR = 3.0
@@ -67,7 +69,8 @@ class WidthTracker:
     def expect(self, place: float, stddev: float) -> None:
         """Takes where along y the object stands nearest [m], and how wide it does so."""
         half = self._torsion.half_width if self._torsion else abs(place)
-        self._expected = min(max(float(place), -half), half), _EVEN * float(stddev)
+        narrow = max(_WIDE, 1.0 - 3.0 * (stddev / half) ** 2) if half > 0.0 else 1.0
+        self._expected = min(max(float(place), -half), half), _EVEN * narrow * float(stddev)
 
     def update(self, points: NDArray, data: Residuals, variances: Variances, force: NDArray, height: float) -> None:
         """Takes one frame.
