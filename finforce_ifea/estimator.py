@@ -129,6 +129,11 @@ class JawEstimator:
         """The object's coefficient of friction as far as it is known."""
         return self._rolling.friction
 
+    @property
+    def mobilised(self) -> float:
+        """How far the object makes use of its friction, by the way that it has gone, from -1 to 1."""
+        return self._rolling.mobilised
+
     def warm_up(self) -> None:
         """Compiles what is compiled on first use, and leaves no trace."""
         warm_up(self.jaw, self.settings.tare_frames, self.update, self.forget)

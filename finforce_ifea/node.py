@@ -24,7 +24,13 @@ from finforce_ifea.grasp_force import ForcePairing, single_jaw_grasp
 from finforce_ifea.messages import force_from_wrench, observation_from_cloud
 from finforce_ifea.observation import Solution
 from finforce_ifea.parameters import NodeParameters, build_contact_feed, build_estimator, load_parameter_jaw
-from finforce_ifea.publishers import SolverOutputs, describe_solution, outcome_of_solution, peer_alarms
+from finforce_ifea.publishers import (
+    SolverOutputs,
+    describe_friction,
+    describe_solution,
+    outcome_of_solution,
+    peer_alarms,
+)
 from finforce_ifea.settings import EstimatorSettings
 
 SLOW = 4.0  # s of preparation, after which somebody may wonder
@@ -174,7 +180,7 @@ class IfeaSolverNode(Node):
         """Return how this node is doing."""
         limit = max(1.0, self.parameters.max_age)
         alarms = [*alarms, *peer_alarms(self.parameters.peer, self.pairing.silence, limit)]
-        tared = {"tared": str(self.estimator.tared)}
+        tared = {"tared": str(self.estimator.tared), "friction": describe_friction(self.estimator)}
         return self.health.report(alarms, describe_solution(self.last) | tared | self.skips.describe())
 
     def _now(self) -> int:

@@ -137,6 +137,12 @@ def outcome_of_solution(solution: Solution) -> Outcome:
     return Outcome(level=level, reason=solution.status, text=solution.message or solution.status)
 
 
+def describe_friction(estimator: JawEstimator) -> str:
+    """Return the object's coefficient of friction as far as it is known, and how full the cone is."""
+    mean, stddev = estimator.friction
+    return f"{mean:.2f} ± {stddev:.2f}, cone used to {100.0 * abs(estimator.mobilised):.0f} %"
+
+
 def describe_solution(solution: Solution | None) -> dict[str, str]:
     """Return the figures of the last solution as text, nothing before the first."""
     if solution is None:

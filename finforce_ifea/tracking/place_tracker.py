@@ -263,6 +263,11 @@ class PlaceTracker:
         return self._roughness.coefficient
 
     @property
+    def mobilised(self) -> float:
+        """How far the object makes use of its friction, from -1 to 1."""
+        return self._slips.mobilised
+
+    @property
     def seen_friction(self) -> Coefficient:
         """What the key points alone say of that coefficient."""
         return self._roughness.seen

@@ -166,6 +166,7 @@ def play(truth, place, seed=0, **settings):
 
 # Without relaxation: the truth here is quasi-static.
 CALIBRATION = Calibration(**{**load_calibration("bench").__dict__, "relaxation": ()})
+CALIBRATED = Coefficient(CALIBRATION.friction, CALIBRATION.friction_stddev)
 
 
 @cache
@@ -219,7 +220,7 @@ class TestCoefficient:
     def test_another_object_begins_anew(self):
         _, _, estimator = play(RUBBED, "middle")
         assert estimator.friction.mean > 0.2
-        first = FrictionEstimate(estimator.settings).coefficient
+        first = FrictionEstimate(estimator.settings, CALIBRATED).coefficient
         estimator.forget()
         assert estimator.friction == first
 
@@ -253,4 +254,4 @@ class TestHeld:
         settled = [number for number in pressed if np.linalg.norm(held[number].force) > 2.0]
         along = np.array([held[number].force[2] for number in settled])
         assert np.sqrt(np.mean(along**2)) < 0.15
-        assert estimator.friction == FrictionEstimate(estimator.settings).coefficient
+        assert estimator.friction == FrictionEstimate(estimator.settings, CALIBRATED).coefficient
