@@ -68,9 +68,8 @@ class GripperDriverNode(Node):
         grasp = ros.declare_record(self, GraspSettings, "grasp")
         joint = ros.declare_record(self, JointSettings, "joint")
         ros.name_unknown_parameters(self)
-        self.is_other = (
-            parameters.interface in LINKS
-        )  # another gripper's driver has joint states and actions of its own
+        # another gripper's driver has joint states and actions of its own
+        self.is_other = parameters.interface in LINKS
         if self.is_other:
             self.gripper = JointLink(self, parameters.interface, parameters.port, settings, joint).gripper
         else:

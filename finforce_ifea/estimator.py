@@ -122,17 +122,17 @@ class JawEstimator:
     @property
     def seen_friction(self) -> Coefficient:
         """What the key points alone say of the object's coefficient of friction; infinite deviation: nothing."""
-        return self._rolling.seen_friction
+        return self._rolling.roughness.seen
 
     @property
     def friction(self) -> Coefficient:
         """The object's coefficient of friction as far as it is known."""
-        return self._rolling.friction
+        return self._rolling.roughness.coefficient
 
     @property
     def mobilised(self) -> float:
         """How far the object makes use of its friction, by the way that it has gone, from -1 to 1."""
-        return self._rolling.mobilised
+        return self._rolling.slips.mobilised
 
     def warm_up(self) -> None:
         """Compiles what is compiled on first use, and leaves no trace."""

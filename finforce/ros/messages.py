@@ -95,14 +95,8 @@ def wrench_message(header: Header, force: ArrayLike, torque: ArrayLike = (0.0, 0
     Raises:
         ObservationError: a component is not finite; such a wrench must not leave.
     """
-    numbers = [*map(float, force), *map(float, torque)]
-    if not all(map(math.isfinite, numbers)):
-        raise ObservationError(f"the wrench is not finite: {numbers}")
+    numbers = _finite("the wrench", *force, *torque)
     return WrenchStamped(header=header, wrench=Wrench(force=_vector(numbers[:3]), torque=_vector(numbers[3:])))
-
-
-def _vector(xyz: Sequence[float]) -> Vector3:
-    return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
 
 
 def twist_message(header: Header, linear: ArrayLike) -> TwistStamped:
@@ -111,10 +105,19 @@ def twist_message(header: Header, linear: ArrayLike) -> TwistStamped:
     Raises:
         ObservationError: a component is not finite.
     """
-    numbers = [*map(float, linear)]
+    return TwistStamped(header=header, twist=Twist(linear=_vector(_finite("the velocity", *linear))))
+
+
+def _finite(what: str, *values: float) -> list[float]:
+    """Return numbers of a message; raise ObservationError where one is not finite."""
+    numbers = [*map(float, values)]
     if not all(map(math.isfinite, numbers)):
-        raise ObservationError(f"the velocity is not finite: {numbers}")
-    return TwistStamped(header=header, twist=Twist(linear=_vector(numbers)))
+        raise ObservationError(f"{what} is not finite: {numbers}")
+    return numbers
+
+
+def _vector(xyz: Sequence[float]) -> Vector3:
+    return Vector3(x=xyz[0], y=xyz[1], z=xyz[2])
 
 
 def twist_speed(message: TwistStamped, frame: str) -> float:
@@ -125,10 +128,7 @@ def twist_speed(message: TwistStamped, frame: str) -> float:
     """
     check_frame(message, frame, "the velocity")
     linear = message.twist.linear
-    speed = math.hypot(linear.x, linear.y, linear.z)
-    if not math.isfinite(speed):
-        raise ObservationError(f"the velocity is not finite: {linear.x}, {linear.y}, {linear.z}")
-    return speed
+    return math.hypot(*_finite("the velocity", linear.x, linear.y, linear.z))
 
 
 def grasp_force(message: WrenchStamped, frame: str) -> float:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_eval.evaluation.results import CaseResult
-from finforce_eval.evaluation.scoring import NOTHING
-from finforce_ifea.grasp_force import R_GRIPPER_JAW
+from finforce_eval.evaluation.scoring import compare_vectors
+from finforce_ifea.grasp_force import combine_forces
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,10 +27,10 @@ class ManipulationStats:
     """
 
     n: int
-    vector_rmse_N: float | None
-    axis_rmse_N: tuple[float, float, float] | None
-    within_3_sigma_pct: tuple[float, float, float] | None
-    answered_pct: float | None
+    vector_rmse_N: float | None = None
+    axis_rmse_N: tuple[float, float, float] | None = None
+    within_3_sigma_pct: tuple[float, float, float] | None = None
+    answered_pct: float | None = None
 
 
 def score_manipulation(results: Mapping[str, CaseResult]) -> dict[str, ManipulationStats]:
@@ -51,29 +51,19 @@ def score_pair(left: CaseResult, right: CaseResult) -> ManipulationStats:
     answered = 100.0 * float(both.mean()) if len(both) else None
     mine, theirs = mine[both], theirs[both]
     if not len(mine):
-        return ManipulationStats(
-            n=0, vector_rmse_N=None, axis_rmse_N=None, within_3_sigma_pct=None, answered_pct=answered
-        )
+        return ManipulationStats(n=0, answered_pct=answered)
     found = _combine(left.force[mine], right.force[theirs])
     difference = found - _combine(left.truth[mine], right.truth[theirs])
-    axes = np.sqrt((difference**2).mean(axis=0))
-    within = None
+    stated = None
     if left.axis_stddev is not None and right.axis_stddev is not None:
         # the jaws' frames are turned about z by half a turn: their axes are those of the gripper
         stated = np.hypot(left.axis_stddev[mine], right.axis_stddev[theirs])
-        within = tuple((100.0 * (np.abs(difference) <= np.maximum(3.0 * stated, NOTHING)).mean(axis=0)).tolist())
-    return ManipulationStats(
-        n=len(mine),
-        vector_rmse_N=float(np.linalg.norm(axes)),
-        axis_rmse_N=tuple(axes.tolist()),
-        within_3_sigma_pct=within,
-        answered_pct=answered,
-    )
+    return ManipulationStats(n=len(mine), answered_pct=answered, **compare_vectors(difference, stated))
 
 
 def _combine(left: NDArray, right: NDArray) -> NDArray:
     """Return the net forces (n, 3) [N] in the gripper's frame."""
-    return left @ R_GRIPPER_JAW["left"].T + right @ R_GRIPPER_JAW["right"].T
+    return np.array([combine_forces(mine, theirs).manipulation for mine, theirs in zip(left, right, strict=True)])
 
 
 def format_manipulation(scores: Mapping[str, ManipulationStats]) -> list[str]:

@@ -23,7 +23,7 @@ from finforce_eval.recordings.tracks import Recording, WrenchTrack
 LEAST_FORCE, ONSET_FORCE = 0.2, 0.02
 # A touch that is not there to stay within so many frames after the true begin is missed.
 WATCHED = 30
-NOTHING = 1e-3  # [N] along an axis, which needs no standard deviation
+_NOTHING = 1e-3  # [N] along an axis, which needs no standard deviation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -320,11 +320,23 @@ def _vector_stats(cases: Sequence[CaseResult], phase: str) -> dict[str, Any]:
     )
     if not any(np.nan_to_num(case.truth[:, 1:]).any() for case in cases) or not len(differences):
         return found
-    axes = np.sqrt((differences**2).mean(axis=0))
-    found |= {"vector_rmse_N": float(np.linalg.norm(axes)), "axis_rmse_N": tuple(axes.tolist())}
+    stated = None
     if all(case.axis_stddev is not None for case in cases):
         stated = np.concatenate([case.axis_stddev[rows] for case, rows in zip(cases, chosen, strict=True)])
-        within = np.abs(differences) <= np.maximum(3.0 * stated, NOTHING)
+    return found | compare_vectors(differences, stated)
+
+
+def compare_vectors(differences: NDArray[np.float64], stated: NDArray[np.float64] | None) -> dict[str, Any]:
+    """Return `vector_rmse_N`, `axis_rmse_N` and, where deviations are stated, `within_3_sigma_pct` of `Stats`.
+
+    Args:
+        differences: (n, 3) [N], at least one.
+        stated: standard deviations (n, 3) [N]; None where none is known.
+    """
+    axes = np.sqrt((differences**2).mean(axis=0))
+    found: dict[str, Any] = {"vector_rmse_N": float(np.linalg.norm(axes)), "axis_rmse_N": tuple(axes.tolist())}
+    if stated is not None:
+        within = np.abs(differences) <= np.maximum(3.0 * stated, _NOTHING)
         found["within_3_sigma_pct"] = tuple((100.0 * within.mean(axis=0)).tolist())
     return found
 

@@ -98,35 +98,35 @@ class Friction:
 
 
 @njit(**_OPTIONS)
-def _change(forces, springs, by_shape, lean):
-    """Returns the derivatives (p, 3, 4) of normal forces and of their lean; see `RubbedContact`."""
+def _change(forces, springs, by_shape):
+    """Returns the derivatives (p, 3, 4) of normal forces and by their lean; see `RubbedContact`."""
     changes = np.zeros((len(forces), 3, 4))
     for p in range(len(forces)):
-        for i in range(4):
-            if i == 0:
-                ahead, aside = -springs[p, 0, 0], -springs[p, 2, 0]
-            elif i == 1:
-                ahead, aside = by_shape[p, 0], by_shape[p, 2]
-            elif i == 2:
-                ahead, aside = springs[p, 0, 2], springs[p, 2, 2]
-            else:
-                changes[p, 0, 3], changes[p, 2, 3] = forces[p, 2], -forces[p, 0]
-                continue
-            changes[p, 0, i], changes[p, 2, i] = ahead + lean * aside, aside - lean * ahead
+        for a in range(0, 3, 2):
+            changes[p, a, 0], changes[p, a, 1], changes[p, a, 2] = -springs[p, a, 0], by_shape[p, a], springs[p, a, 2]
+        changes[p, 0, 3], changes[p, 2, 3] = forces[p, 2], -forces[p, 0]
     return changes
+
+
+@njit(**_OPTIONS)
+def _add_lean(lean, springs, stiff, changes):
+    """Adds what a lean of one point's force makes of its springs (3, 3) and derivatives (3, 4), in place."""
+    for b in range(0, 3, 2):
+        stiff[0, b] += lean * springs[2, b]
+        stiff[2, b] -= lean * springs[0, b]
+    for i in range(3):
+        ahead, aside = changes[0, i], changes[2, i]
+        changes[0, i], changes[2, i] = ahead + lean * aside, aside - lean * ahead
 
 
 @njit(**_OPTIONS)
 def _lean(forces, springs, by_shape, lean):
     """Returns the contact with a lean of all its forces."""
-    out, stiff = forces.copy(), springs.copy()
+    out, stiff, changes = forces.copy(), springs.copy(), _change(forces, springs, by_shape)
     for p in range(len(forces)):
         out[p, 0] += lean * forces[p, 2]
         out[p, 2] -= lean * forces[p, 0]
-        for b in range(0, 3, 2):
-            stiff[p, 0, b] += lean * springs[p, 2, b]
-            stiff[p, 2, b] -= lean * springs[p, 0, b]
-    changes = _change(forces, springs, by_shape, lean)
+        _add_lean(lean, springs[p], stiff[p], changes[p])
     return RubbedContact(out, stiff, changes, np.zeros(len(forces)), 0.0)
 
 
@@ -134,8 +134,7 @@ def _lean(forces, springs, by_shape, lean):
 def _rub(contact, points, before, shear_before, stiffness, moved, coefficient):
     """Returns the contact (forces, springs, by_shape) with friction, the object moved by `moved` (x, z) [m]."""
     forces, springs, by_shape = contact
-    out, stiff = forces.copy(), springs.copy()
-    changes = _change(forces, springs, by_shape, 0.0)
+    out, stiff, changes = forces.copy(), springs.copy(), _change(forces, springs, by_shape)
     shear, total, allowed = np.zeros(len(points)), 0.0, 0.0
     for p in range(len(points)):
         normal = np.hypot(forces[p, 0], forces[p, 2])
@@ -147,13 +146,7 @@ def _rub(contact, points, before, shear_before, stiffness, moved, coefficient):
         limit = coefficient * normal
         if abs(shear[p]) > limit:
             shear[p] = limit if shear[p] > 0.0 else -limit
-            lean = shear[p] / normal
-            for b in range(0, 3, 2):
-                stiff[p, 0, b] += lean * springs[p, 2, b]
-                stiff[p, 2, b] -= lean * springs[p, 0, b]
-            for i in range(3):
-                ahead, aside = changes[p, 0, i], changes[p, 2, i]
-                changes[p, 0, i], changes[p, 2, i] = ahead + lean * aside, aside - lean * ahead
+            _add_lean(shear[p] / normal, springs[p], stiff[p], changes[p])
         else:
             held = stiffness[p]
             for a, ta in ((0, tx), (2, tz)):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact, RubbedContact
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, Indenter, RoundIndenter
+from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.jaw.jaw import Jaw
@@ -77,11 +78,6 @@ class PressedState:
     extrapolation: float = 0.0
 
 
-def find_origin(place: NDArray) -> NDArray:
-    """Returns where an object at a place (depth, shape, height) has gone, x and z [m]."""
-    return np.array([-place[DEPTH], place[HEIGHT]])
-
-
 class RollingContact:
     """A model, its contact surface, and the object pressed into it.
 
@@ -116,8 +112,13 @@ class RollingContact:
 
     def rub(self, points: NDArray, place: NDArray) -> RubbedContact:
         """Returns the contact of surface points (p, 3) [m] with the object at a place (3,)."""
-        contact = self.indenter.press(points, self.surface.stiffness, self.face_x, place)
-        return self.rubbing.rub(contact, points, self.surface.stiffness, find_origin(place))
+        return self.rubbing.rub(*self._press(points, place))
+
+    def _press(self, points: NDArray, place: NDArray) -> tuple[PenaltyContact, NDArray, NDArray, NDArray]:
+        """Returns what friction is asked with: the contact without it, points, stiffness, the object's origin."""
+        stiffness = self.surface.stiffness
+        contact = self.indenter.press(points, stiffness, self.face_x, place)
+        return contact, points, stiffness, np.array([-place[DEPTH], place[HEIGHT]])
 
     def with_friction(self) -> RollingContact:
         """Returns another contact of the same jaw, of which friction is not known but followed."""
@@ -127,9 +128,7 @@ class RollingContact:
 
     def settle(self, q: NDArray, place: NDArray) -> float:
         """Remembers an equilibrium for the friction; returns how far the cone is used, from -1 to 1."""
-        points = self.place_points(q)
-        contact = self.indenter.press(points, self.surface.stiffness, self.face_x, place)
-        return self.rubbing.settle(contact, points, self.surface.stiffness, find_origin(place))
+        return self.rubbing.settle(*self._press(self.place_points(q), place))
 
     def place_points(self, q: NDArray) -> NDArray:
         """Returns the surface points (p, 3) [m] of the deformed jaw."""

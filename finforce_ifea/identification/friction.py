@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.identification.identification import CalibrationCase
 from finforce_ifea.jaw.calibration import Calibration
@@ -32,6 +31,7 @@ def identify_friction(
 
     Raises:
         ObservationError: Key points that are none.
+        ContactError: A contact that is not on the jaw.
     """
     known = [case for case in cases if case.contact.outline is not None]
     if not known or settings.solver == "paper":
@@ -41,10 +41,7 @@ def identify_friction(
     for case in known:
         estimator.forget()
         for observation in case.observations:
-            try:
-                estimator.update(observation, case.contact)
-            except ContactError:
-                break
+            estimator.update(observation, case.contact)
         seen = estimator.seen_friction
         if np.isfinite(seen.stddev):
             information += seen.stddev**-2

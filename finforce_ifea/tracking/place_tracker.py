@@ -53,6 +53,7 @@ _LOST_STDDEV = 1e-3
 _FARTHEST_HEIGHT = 8.0
 # Fewer points in agreement with the forecast than this share call for a leap; a forecast is never wider than this [m].
 _LEAST_AGREEMENT = 0.6
+_WIDEST_FORECAST = 1e-3
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
 # object has gone back to this share of its depth.
 _STRANGE, _BACK = 1.0, 0.8
@@ -61,7 +62,6 @@ _STRANGE, _BACK = 1.0, 0.8
 _LARGEST_LEAN, _HELD_GAIN = 0.9, 0.5
 # What of the friction the mechanics does not follow, and a lean of the force that is never excluded [-].
 _UNFOLLOWED, _LEAN = 0.25, 0.08
-_WIDEST_FORECAST = 1e-3
 
 
 class _Level(NamedTuple):
@@ -76,6 +76,10 @@ class PlaceTracker:
     """Tracks the place of the pressing object; holds the jaw in equilibrium with it.
 
     Where a reduced jaw bends as none of its stored shapes does, as around large flat things, the full one takes over.
+
+    Attributes:
+        roughness: what is known of the object's friction.
+        slips: how far the object makes use of it.
     """
 
     def __init__(
@@ -105,8 +109,8 @@ class PlaceTracker:
         contact = self.contact
         self.response = measure_influence(contact, self.probe, len(keypoints))
         self._outline: OutlineIndenter | None = None
-        self._slips = SlipHistory(contact.with_friction())
-        self._roughness = FrictionEstimate(settings, smooth)
+        self.slips = SlipHistory(contact.with_friction())
+        self.roughness = FrictionEstimate(settings, smooth)
         self._width = WidthTracker(torsion, len(keypoints), UNSEEN_LEAN * settings.friction)
         self._face = contact.surface.heights[[0, -1]]
         self.reset()
@@ -167,7 +171,7 @@ class PlaceTracker:
         self._motion = np.array([self._find_touch(np.r_[0.0, self._prior]), 0.0])
         self._motion_covariance = np.diag([0.1e-3, 1e-3]) ** 2
         self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
-        self._slips.reset()
+        self.slips.reset()
         self._width.reset()
         self._released, self._jumped = 0, False
         self._forget_place()
@@ -257,24 +261,9 @@ class PlaceTracker:
         state = self.contact.linearize(q, self._reachable(np.r_[-1.0, self._prior]))
         return self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
 
-    @property
-    def friction(self) -> Coefficient:
-        """The object's coefficient of friction as far as it is known."""
-        return self._roughness.coefficient
-
-    @property
-    def mobilised(self) -> float:
-        """How far the object makes use of its friction, from -1 to 1."""
-        return self._slips.mobilised
-
-    @property
-    def seen_friction(self) -> Coefficient:
-        """What the key points alone say of that coefficient."""
-        return self._roughness.seen
-
     def forget(self) -> None:
         """Forgets what was learnt of the object."""
-        self._roughness.reset()
+        self.roughness.reset()
         self.reset()
 
     @property
@@ -291,13 +280,13 @@ class PlaceTracker:
             self.contact.rubbing.lean += _HELD_GAIN * (upright - self.contact.rubbing.lean)
             return
         expected = np.array([self._reached[DEPTH], self._prior[0], self._prior[1]])
-        before, known = self._slips.mobilised, self._roughness.coefficient.mean
-        self._slips.set_indenter(self.contact.indenter)
-        mobilised = self._slips.follow(self.give_shape(), expected, float(np.sqrt(update.depth_variance)), known)
+        before, known = self.slips.mobilised, self.roughness.coefficient.mean
+        self.slips.set_indenter(self.contact.indenter)
+        mobilised = self.slips.follow(self.give_shape(), expected, float(np.sqrt(update.depth_variance)), known)
         normal = float(np.hypot(*state.force[::2]))
         moved, away = update.place - forecast.place, update.place[1:] - self._prior
         frame = FrictionFrame(data, self._motions[:, ::2], normal, before, self.contact.rubbing.lean, moved, away)
-        found = self._roughness.update(frame, self._prior_variance)
+        found = self.roughness.update(frame, self._prior_variance)
         self.contact.rubbing.lean = found.mean * mobilised
 
     def resume(self, q: NDArray) -> None:
@@ -331,14 +320,14 @@ class PlaceTracker:
         self._given, self._stiffness = None, self.response.stiffness_at(float(expected.mean[1]))
         away = abs(self._slow[1] - expected.mean[1]) > _FARTHEST_HEIGHT * self.settings.height_stddev
         if isinstance(before, OutlineIndenter) and not after.resembles(before):
-            self._roughness.reset()
+            self.roughness.reset()
         if away or not isinstance(before, OutlineIndenter) or not after.resembles(before):
             self._begin()
         elif after is not before:
             change = after.field.front - before.field.front
             self._motion[0] += change
             self._reached[DEPTH] += change
-            self._slips.shift(change)
+            self.slips.shift(change)
 
     def _predict(self, dt: float) -> Forecast:
         """Returns the place dt [s] later: constant speed of the depth under white acceleration."""
@@ -457,8 +446,8 @@ class PlaceTracker:
         """Returns the standard deviation of the lean of the force along the finger that friction leaves [-]."""
         if self.settings.held == "yes":
             return _LEAN
-        found = self._roughness.coefficient
-        return sqrt((found.stddev * self._slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _LEAN**2)
+        found = self.roughness.coefficient
+        return sqrt((found.stddev * self.slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _LEAN**2)
 
     def _stiffening(self, force: NDArray, place: NDArray) -> float:
         """Returns how much stiffer the pressed jaw is than at first touch; 1 until it is surely pressed."""
