@@ -3,13 +3,20 @@
 import logging
 from dataclasses import replace
 
-from finforce_ifea.contact_mechanics.pressed_jaw import Across, Mechanics, RollingContact, build_contact_surface
+from finforce_ifea.contact_mechanics.pressed_jaw import (
+    Across,
+    Mechanics,
+    RollingContact,
+    build_contact_surface,
+    measure_stiffness,
+)
 from finforce_ifea.errors import ContactError, JawFileError
 from finforce_ifea.fem.locking import warn_of_locking
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.fem.tetrahedra import to_tet4
 from finforce_ifea.jaw.jaw import Jaw
+from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.settings import EstimatorSettings
 
 _REDUCED = ("reduced", "linear")
@@ -25,16 +32,20 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
     if settings.solver in _REDUCED:
         return _reduce(jaw, settings)
     name = jaw.model if settings.solver == "default" else settings.solver
-    mesh = jaw.build_mesh(settings.mesh if jaw.drawing is not None else None)
+    density = settings.mesh if jaw.mesh_file is None else None
+    mesh = jaw.build_mesh(density)
     if name == "paper":
-        mesh = to_tet4(jaw.build_mesh("coarse")) if jaw.drawing is not None else mesh
-    if name == "frame":
+        mesh = to_tet4(jaw.build_mesh("coarse")) if jaw.mesh_file is None else mesh
+    if name == "plane":
+        model: JawModel = _build_plane(jaw, mesh, density)
+        across: Across = "middle"
+    elif name == "frame":
         if jaw.drawing is None:
-            raise JawFileError(f"the jaw {jaw.name!r} is a volume mesh; a frame needs a drawing")
+            raise JawFileError(f"the jaw {jaw.name!r} is no drawing, which a frame needs; expected solver {jaw.model}")
         from finforce_ifea.fem.frame import FrameModel
 
-        model: JawModel = FrameModel(jaw.drawing, jaw.material, mesh=mesh)
-        across: Across = "middle"
+        model = FrameModel(jaw.drawing, jaw.material, mesh=mesh)
+        across = "middle"
     else:
         if jaw.drawing is not None and not jaw.drawing.is_solid:
             raise JawFileError(f"the jaw {jaw.name!r} has hinges or rigid bars; only the frame describes it")
@@ -44,6 +55,31 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
         across = "half" if model.symmetric else "both"
     surface = build_contact_surface(jaw, mesh, model, across=across)
     return Mechanics(mesh=mesh, model=model, contact=RollingContact(model, surface, jaw.inner_face_x))
+
+
+def _build_plane(jaw: Jaw, mesh: VolumeMesh, density: str | None) -> JawModel:
+    """Returns the plane model of a jaw's section, as stiff as the solid finger.
+
+    Plane strain holds the width, which is free at both sides: the modulus is lowered by what the solid is softer at
+    rest, both with the coarse mesh, 2 to 4 % for fingers ten and more times as wide as their walls are thick.
+
+    Raises:
+        JawFileError: The jaw is no section.
+        MeshError: The section cannot be divided.
+    """
+    from finforce_ifea.fem.plane import PlaneModel
+
+    plane, section = jaw.build_plane(density), jaw.section
+    coarse = jaw.build_mesh("coarse")
+    solid = SolidModel(coarse, jaw.material)
+    held = PlaneModel(coarse, jaw.build_plane("coarse"), section.width, jaw.material)
+    stiffness = [
+        measure_stiffness(model, build_contact_surface(jaw, coarse, model, across=across))
+        for model, across in ((solid, "half"), (held, "middle"))
+    ]
+    share = stiffness[0] / stiffness[1]
+    material = replace(jaw.material, young_modulus=jaw.material.young_modulus * share)
+    return PlaneModel(mesh, plane, section.width, material)
 
 
 def choose_solver(settings: EstimatorSettings) -> EstimatorSettings:

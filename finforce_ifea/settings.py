@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from finforce.errors import ObservationError
 from finforce.settings import check_bounds, setting
 
-SOLVERS = ("default", "reduced", "solid", "frame", "linear", "paper")
+SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
 _SOLVER_MEANING = (
     "mechanics: default is reduced, the stored equilibria of what the jaw file recommends (solid or frame); these in "
     "full, the compliance at rest alone (linear), or the paper's"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import NoReturn
 
-SOLVERS = ("default", "reduced", "solid", "frame", "linear", "paper")
+SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
 MESHES = ("default", "coarse", "fine")
 UNITS = ("m", "cm", "mm", "inch")
 SOURCES = ("images", "keypoints", "truth")

@@ -263,6 +263,9 @@ def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across
     if len(face) < 2:
         raise MeshError(f"the mesh has no nodes on the inner face x = {jaw.inner_face_x:g} m; check inner_face_x")
     low, high = face[:, 1:].min(0), face[:, 1:].max(0)
+    if jaw.section is not None:  # what touches the clamped part does not bend the jaw
+        held = mesh.nodes[mesh.clamped]
+        low[1] = max(low[1], held[np.abs(held[:, 0] - jaw.inner_face_x) < _ON_FACE, 2].max(initial=-np.inf))
     heights = np.arange(low[1] + _SPACING, high[1] - 0.5 * _SPACING, _SPACING)
     gauss = np.array([0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)])
     right, left = gauss * high[0], gauss[::-1] * low[0]

@@ -58,6 +58,7 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
         mesh: of that jaw, undeformed.
     """
     is_solid = jaw.drawing is None or jaw.drawing.is_solid
+    mesh = mesh if jaw.section is None else jaw.build_mesh("coarse")
     if not is_solid or len(mesh.nodes) > _MOST_NODES:
         return None
     model = SolidModel(mesh, jaw.material, symmetric=False)

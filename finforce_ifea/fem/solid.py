@@ -51,6 +51,8 @@ class SolidModel:
     itself in y = 0 is halved unless `symmetric` is False: loads and shapes are symmetric then.
     """
 
+    _banded_limit = _BANDED_COST_LIMIT
+
     def __init__(self, mesh: VolumeMesh, material: Material, *, symmetric: bool = True) -> None:
         """Builds element stiffnesses and the plan of assembly.
 
@@ -74,22 +76,26 @@ class SolidModel:
         self._X = np.ascontiguousarray(corners - corners.mean(1, keepdims=True))
         self._g = np.ascontiguousarray(centre_gradient(corners))
         self._Ke = np.zeros_like(self._K0)
-        self._number_unknowns(mirror)
+        self.sign = np.ones((len(mesh.nodes), 3))
+        self._mirror_unknowns(mirror)
         self._plan_assembly()
 
-    def _number_unknowns(self, mirror: NDArray | None) -> None:
-        """Numbers the free unknowns in reverse Cuthill-McKee order; mirrored nodes share theirs."""
-        count = len(self.mesh.nodes)
+    def _mirror_unknowns(self, mirror: NDArray | None) -> None:
+        """Numbers the free unknowns; mirrored nodes share theirs."""
         y = self.mesh.nodes[:, 1]
-        master, self.sign, free = np.arange(count), np.ones((count, 3)), np.ones((count, 3), bool)
-        free[self.mesh.clamped] = False
+        master, free = np.arange(len(y)), np.ones((len(y), 3), bool)
         if mirror is not None:
             below = y < -_ON_PLANE
             master[below] = mirror[below]
             self.sign[below, 1] = -1
             free[np.abs(y) <= _ON_PLANE, 1] = False
+        self._number_unknowns(master, free)
+
+    def _number_unknowns(self, master: NDArray, free: NDArray) -> None:
+        """Numbers the free (n, 3) of the unclamped nodes, of small bandwidth; others go with their master."""
+        free[self.mesh.clamped] = False
         ordered = _order_nodes(self._elements)
-        number = np.full((count, 3), -1)
+        number = np.full(free.shape, -1)
         number[ordered] = np.where(free[ordered], np.cumsum(free[ordered]).reshape(-1, 3) - 1, -1)
         self.size = int(free[ordered].sum())
         self.dof = np.where(number[master] >= 0, number[master], self.size)
@@ -103,9 +109,17 @@ class SolidModel:
         e, entry = np.nonzero(keep)
         high, low = np.maximum(row, col)[keep], np.minimum(row, col)[keep]
         self.bandwidth = int((high - low).max())
-        self.banded = self.size * self.bandwidth**2 < _BANDED_COST_LIMIT
+        self.banded = self.size * self.bandwidth**2 < self._banded_limit
         self._source = (e * dof.shape[1] + i[entry]) * dof.shape[1] + j[entry]
-        self._row, self._col = (high - low, low) if self.banded else (high, low)
+        if self.banded:
+            self._row, self._col = high - low, low
+            return
+        # both triangles, column by column: the pattern stays, only values change
+        keys = np.concatenate([low * self.size + high, (high * self.size + low)[high > low]])
+        self._keys, self._slot = np.unique(keys, return_inverse=True)
+        self._source = np.concatenate([self._source, self._source[high > low]])
+        self._pointer = np.searchsorted(self._keys // self.size, np.arange(self.size + 1))
+        self._index = self._keys % self.size
 
     def expand(self, q: NDArray) -> NDArray:
         """Returns the displacements (nodes, 3) [m] of all mesh nodes for unknowns q (size,)."""
@@ -131,8 +145,8 @@ class SolidModel:
 
     def _assemble(self) -> NDArray | sparse.csc_matrix:
         if not self.banded:
-            values = self._Ke.ravel()[self._source]
-            return sparse.coo_matrix((values, (self._row, self._col)), (self.size, self.size)).tocsc()
+            values = np.bincount(self._slot, self._Ke.ravel()[self._source], len(self._keys))
+            return sparse.csc_matrix((values, self._index, self._pointer), (self.size, self.size), copy=False)
         storage = np.zeros((self.bandwidth + 1, self.size), order="F")
         scatter_lower(self._Ke.ravel(), self._source, self._row, self._col, storage)
         return storage
@@ -140,14 +154,12 @@ class SolidModel:
     def factorise(self, tangent: NDArray | sparse.csc_matrix) -> Factor:
         """Factorises a stored tangent; Cholesky, or LU where the state is not stable or the band is wide."""
         if not self.banded:
-            return SparseFactor(self.sparse_tangent(tangent))
+            return SparseFactor(tangent)
         return factorise_banded(tangent) or SparseFactor(sparse_from_banded(tangent))
 
     def sparse_tangent(self, tangent: NDArray | sparse.csc_matrix) -> sparse.csc_matrix:
         """Returns a stored tangent as the full symmetric matrix (size, size) [N/m]."""
-        if self.banded:
-            return sparse_from_banded(tangent)
-        return (tangent + sparse.tril(tangent, -1).T).tocsc()
+        return sparse_from_banded(tangent) if self.banded else tangent
 
     def attach(self, points: NDArray, max_distance: float = 1e-3) -> SolidProbe:
         """Returns a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
@@ -172,7 +184,17 @@ class SolidModel:
 
     def stiffen(self, tangent: NDArray | sparse.csc_matrix, probe: SolidProbe, q: NDArray, blocks: NDArray) -> None:
         """Adds springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""
-        add_probe_springs(probe.dof, probe.weights, blocks, self.size, tangent)
+        if self.banded:
+            _add_banded_springs(probe.dof, probe.weights, blocks, self.size, tangent)
+            return
+        active = np.flatnonzero(np.abs(blocks).max((1, 2)) > 0.0)
+        rows = probe.dof[active].reshape(len(active), probe.dof[0].size)
+        weights = probe.weights[active]
+        values = np.einsum("pma,pab,pkb->pmakb", weights, blocks[active], weights).reshape(*rows.shape, rows.shape[1])
+        row, col = np.broadcast_arrays(rows[:, :, None], rows[:, None, :])
+        keep = (row < self.size) & (col < self.size) & (values != 0.0)
+        slot = np.searchsorted(self._keys, col[keep] * self.size + row[keep])
+        tangent.data += np.bincount(slot, values[keep], len(self._keys))
 
 
 def _order_nodes(elements: NDArray) -> NDArray:
@@ -475,19 +497,3 @@ def _add_banded_springs(dof, weights, blocks, n, storage):
                         col = dof[p, k, b]
                         if col <= row and weights[p, k, b] != 0.0:
                             storage[row - col, col] += weights[p, m, a] * blocks[p, a, b] * weights[p, k, b]
-
-
-def add_probe_springs(dof: NDArray, weights: NDArray, blocks: NDArray, size: int, tangent) -> None:
-    """Adds sum_p W_p^T blocks_p W_p, blocks (p, 3, 3) [N/m], to a lower tangent, banded or sparse, in place."""
-    if isinstance(tangent, np.ndarray):
-        _add_banded_springs(dof, weights, blocks, size, tangent)
-        return
-    active = np.flatnonzero(np.abs(blocks).max((1, 2)) > 0)
-    rows = dof[active].reshape(len(active), -1)
-    values = np.einsum("pma,pab,pkb->pmakb", weights[active], blocks[active], weights[active])
-    values = values.reshape(*rows.shape, rows.shape[1])
-    row, col = np.broadcast_arrays(rows[:, :, None], rows[:, None, :])
-    keep = (row < size) & (col <= row)
-    extra = sparse.coo_matrix((values[keep], (row[keep], col[keep])), (size, size)).tocsc()
-    total = tangent + extra
-    tangent.data, tangent.indices, tangent.indptr = total.data, total.indices, total.indptr

@@ -26,7 +26,7 @@ _KEYS = {
     "comment",
     "uncertainty",
 }
-_MECHANICS = ("solid", "frame", "paper")
+_MECHANICS = ("solid", "frame", "plane", "paper")
 # Forces of the solid and the frame of one finger differ by 1 to 3 % up to 10 mm.
 _MODELS_DIFFER = 0.03
 
@@ -46,7 +46,7 @@ class Calibration:
         friction: coefficient of the objects that the finger was calibrated on, 0 where they showed none.
         friction_stddev: standard deviation of that [-].
         jaw: name of the jaw that it belongs to, empty for any.
-        solver: mechanics that it was identified with, "solid", "frame" or "paper"; empty where nobody knows.
+        solver: mechanics that it was identified with, "solid", "frame", "plane" or "paper"; empty where nobody knows.
     """
 
     young_modulus: float
@@ -98,6 +98,9 @@ class Calibration:
         if self.jaw and self.jaw != jaw.name:
             raise CalibrationError(f"the calibration belongs to the jaw {self.jaw!r}, got {jaw.name!r}")
         material = replace(jaw.material, young_modulus=float(self.young_modulus))
+        if jaw.section is not None and jaw.section.clamped_z is not None:
+            section = replace(jaw.section, clamped_z=max(jaw.section.clamped_z, self.clamped_z))
+            return replace(jaw, section=section, material=material)
         if jaw.drawing is None:
             return replace(jaw, material=material)
         drawing = replace(
@@ -129,7 +132,7 @@ class Calibration:
 
 
 def name_mechanics(jaw: Jaw, solver: str) -> str:
-    """Returns the model behind the name of a solver: "solid", "frame" or "paper"."""
+    """Returns the model behind the name of a solver: "solid", "frame", "plane" or "paper"."""
     return solver if solver in _MECHANICS else jaw.model
 
 

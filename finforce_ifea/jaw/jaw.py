@@ -20,10 +20,13 @@ from finforce_ifea.jaw.jaw_file import (
     parse_keypoints,
     parse_material,
     parse_mesh_file,
+    parse_section,
     read_table,
 )
 from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.jaw.mesh_file import read_volume_mesh
+from finforce_ifea.jaw.section import Section
+from finforce_ifea.jaw.section_mesh import SHARES, PlaneMesh, extrude_section, mesh_section
 
 __all__ = ["Jaw", "Material", "list_shipped_jaws", "load_jaw"]
 
@@ -34,6 +37,7 @@ _KEYS = (
     "name",
     "model",
     "drawing",
+    "section",
     "mesh",
     "inner_face_x",
     "material",
@@ -52,6 +56,7 @@ class Jaw:
         path: the file it was read from.
         side: "left" as in the file, or "right", its mirror image.
         drawing: the parametric finger, or None.
+        section: the section of a prismatic finger of any shape, or None.
         mesh_file: the volume mesh file and how to read it, or None.
         material: what it is made of.
         keypoint_names: (K,), in the order of the key point messages.
@@ -59,13 +64,14 @@ class Jaw:
         reference_point: (3,) [m], the point by which the jaw is found in an image.
         candidates: (C, 3) [m], possible contact places on the inner surface.
         inner_face_x: [m], the plane of the inner surface.
-        model: what the file recommends: "solid" or "frame".
+        model: what the file recommends: "solid", "frame" or "plane".
     """
 
     name: str
     path: Path
     side: Literal["left", "right"] = "left"
     drawing: Drawing | None
+    section: Section | None = None
     mesh_file: MeshFile | None
     material: Material
     keypoint_names: tuple[str, ...]
@@ -73,14 +79,14 @@ class Jaw:
     reference_point: NDArray
     candidates: NDArray
     inner_face_x: float
-    model: Literal["solid", "frame"]
+    model: Literal["solid", "frame", "plane"]
 
     def build_mesh(self, density: MeshDensity | str | None = None) -> VolumeMesh:
         """Build the volume mesh.
 
         Args:
-            density: the number of elements of a drawing, or a preset's name ("coarse", "default", "fine").
-                A mesh file has its own density: leave it out, or "default".
+            density: the number of elements of a drawing, or a preset's name ("coarse", "default", "fine"), which
+                does for a section, too. A mesh file has its own density: leave it out, or "default".
 
         Returns:
             The checked mesh, mirrored for a right jaw.
@@ -90,12 +96,25 @@ class Jaw:
         """
         if self.drawing is not None:
             mesh = mesh_drawing(self.drawing, density or "default")
+        elif self.section is not None:
+            mesh = extrude_section(self.section, _find_share(density))
         elif density in (None, "default"):
             file = self.mesh_file
             mesh = read_volume_mesh(file.path, scale=file.scale, clamp=file.clamp)
         else:
             raise MeshError(f"mesh density {density!r}: {self.mesh_file.path.name} has its own; use 'default'")
         return mesh if self.side == "left" else mesh.mirrored()
+
+    def build_plane(self, density: str | None = None) -> PlaneMesh:
+        """Divide the section into triangles, those that `build_mesh` extrudes with the same density.
+
+        Raises:
+            MeshError: The density is unknown, or the section cannot be divided.
+            JawFileError: The jaw is no section.
+        """
+        if self.section is None:
+            raise JawFileError(f"the jaw {self.name!r} is no section; only one has a plane mesh")
+        return mesh_section(self.section, _find_share(density))
 
     def mirrored(self) -> "Jaw":
         """Return the other side's jaw, the mirror image y -> -y."""
@@ -107,6 +126,15 @@ class Jaw:
             reference_point=self.reference_point * mirror,
             candidates=self.candidates * mirror,
         )
+
+
+def _find_share(density: MeshDensity | str | None) -> float:
+    """Return the size of a section's elements that a preset stands for, as a share of the usual one."""
+    if density is None:
+        return 1.0
+    if density not in SHARES:
+        raise MeshError(f"mesh density of a section: got {density!r}, expected one of {', '.join(SHARES)}")
+    return SHARES[density]
 
 
 def list_shipped_jaws() -> tuple[str, ...]:
@@ -157,32 +185,37 @@ def _find_file(name_or_path: str | Path) -> Path:
 def _parse_jaw(table: Table, path: Path) -> Jaw:
     """Build the jaw from the content of its file."""
     table.expect_keys((), _KEYS)
-    source = table.expect_one_of("drawing", "mesh")
+    source = table.expect_one_of("drawing", "section", "mesh")
     face = ("inner_face_x",) if source == "mesh" else ()
     table.expect_keys((source, *face, "material", "keypoints", "candidates"), ("name", "model", "reference_point"))
     drawing = parse_drawing(table.table("drawing")) if source == "drawing" else None
-    inner_face_x = drawing.inner_face_x if drawing is not None else table.length("inner_face_x")
+    section = parse_section(table.table("section"), path.parent) if source == "section" else None
+    shape = drawing or section
+    inner_face_x = shape.inner_face_x if shape is not None else table.length("inner_face_x")
     keypoints = parse_keypoints(table.table("keypoints"), drawing)
     jaw = Jaw(
         name=table.text("name", path.stem),
         path=path,
         drawing=drawing,
+        section=section,
         mesh_file=parse_mesh_file(table.table("mesh"), path.parent) if source == "mesh" else None,
-        material=parse_material(table.table("material")),
+        material=parse_material(table),
         keypoint_names=tuple(keypoints),
         keypoints=np.array(list(keypoints.values())),
         reference_point=table.point("reference_point", (0.0, 0.0, 0.0)),
         candidates=parse_candidates(table, inner_face_x),
         inner_face_x=inner_face_x,
-        model=_parse_model(table, drawing),
+        model=_parse_model(table, drawing, section),
     )
     _check_candidates(jaw)
     _check_points(jaw)
     return jaw
 
 
-def _parse_model(table: Table, drawing: Drawing | None) -> Literal["solid", "frame"]:
+def _parse_model(table: Table, drawing: Drawing | None, section: Section | None) -> Literal["solid", "frame", "plane"]:
     """Return the recommended model, and refuse one that cannot describe the jaw."""
+    if section is not None:
+        return table.choice("model", ("plane", "solid"), "plane")
     is_solid = drawing is None or drawing.is_solid
     model = table.choice("model", ("solid", "frame"), "solid" if is_solid else "frame")
     if model == "frame" and drawing is None:
@@ -200,8 +233,9 @@ def _check_candidates(jaw: Jaw) -> None:
                 f"candidates[{number}] at {_millimetres(point)} lies off the inner surface; "
                 f"expected x = {jaw.inner_face_x:g} m"
             )
-        if jaw.drawing is not None:
-            half, length = 0.5 * jaw.drawing.width, jaw.drawing.length
+        shape = jaw.drawing or jaw.section
+        if shape is not None:
+            half, length = 0.5 * shape.width, shape.length
             if abs(point[1]) > half or not 0.0 <= point[2] <= length:
                 raise JawFileError(
                     f"candidates[{number}] at {_millimetres(point)} lies off the inner surface; "
@@ -211,8 +245,9 @@ def _check_candidates(jaw: Jaw) -> None:
 
 def _check_points(jaw: Jaw) -> None:
     """Refuse key points off the jaw and, of a mesh, candidates off its surface."""
-    if jaw.drawing is not None:
-        distances = jaw.drawing.distance_to(jaw.keypoints)
+    shape = jaw.drawing or jaw.section
+    if shape is not None:
+        distances = shape.distance_to(jaw.keypoints)
         worst = int(distances.argmax())
         if distances[worst] > KEYPOINT_DISTANCE:
             raise JawFileError(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.drawing import Band, Drawing, Rib
 from finforce_ifea.jaw.mesh_file import ClampRule
+from finforce_ifea.jaw.section import Section, join_loops, order_rings, read_loops
 
 _LARGEST_COUNT = 10_000
 
@@ -252,10 +253,27 @@ class Material:
     Attributes:
         young_modulus: [Pa].
         poisson_ratio: [-].
+        spread: relative standard deviation of the modulus among parts of that material; 0 where it was not stated.
     """
 
     young_modulus: float
     poisson_ratio: float
+    spread: float = 0.0
+
+
+# What printed parts of a material are like before anybody has measured one: Young's modulus at small strain [MPa],
+# Poisson's ratio, and the relative spread over makers, printers, infill, temperature and age. Moduli from data sheets
+# (NinjaFlex, Ultimaker, Bambu and eSun TPU, Formlabs) and, where those give none, from the Shore hardness by Qi, Joyce,
+# Boyce, Rubber Chem. Technol. 76 (2003).
+MATERIALS = {
+    "tpu85a": Material(young_modulus=12.0e6, poisson_ratio=0.47, spread=0.35),
+    "tpu90a": Material(young_modulus=18.0e6, poisson_ratio=0.46, spread=0.35),
+    "tpu95a": Material(young_modulus=26.0e6, poisson_ratio=0.45, spread=0.3),
+    "tpu64d": Material(young_modulus=110.0e6, poisson_ratio=0.43, spread=0.3),
+    "petg": Material(young_modulus=1.9e9, poisson_ratio=0.38, spread=0.15),
+    "pla": Material(young_modulus=2.9e9, poisson_ratio=0.35, spread=0.15),
+    "spring_steel": Material(young_modulus=206.0e9, poisson_ratio=0.3, spread=0.03),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,12 +291,18 @@ class MeshFile:
     clamp: ClampRule
 
 
-def parse_material(table: Table) -> Material:
-    """Read the table `material`.
+def parse_material(top: Table) -> Material:
+    """Read `material`: a name, or its numbers.
 
     Raises:
-        JawFileError: A number is missing or cannot belong to a material.
+        JawFileError: The name is unknown, or a number is missing or cannot belong to a material.
     """
+    name = top.values["material"]
+    if isinstance(name, str):
+        if name.lower() not in MATERIALS:
+            raise JawFileError(f"material: got {name!r}, expected one of {', '.join(MATERIALS)}, or young_modulus [Pa]")
+        return MATERIALS[name.lower()]
+    table = top.table("material")
     table.expect_keys(("young_modulus", "poisson_ratio"), ("name",))
     modulus, ratio = table.number("young_modulus"), table.number("poisson_ratio")
     name = table.name("young_modulus")
@@ -376,6 +400,40 @@ def parse_mesh_file(table: Table, folder: Path) -> MeshFile:
         raise JawFileError(f"{table.name('scale')}: got {scale:g}, expected a positive number")
     clamp = _parse_clamp(table.table("clamped"))
     return MeshFile(path=folder / table.text("file", ""), scale=scale, clamp=clamp)
+
+
+def parse_section(table: Table, folder: Path) -> Section:
+    """Read the table `section`; its path is relative to the folder of the jaw file.
+
+    Raises:
+        JawFileError: It does not describe a section.
+    """
+    table.expect_keys(("file", "clamped"), ("width", "size"))
+    path = folder / table.text("file", "")
+    loops, width = read_loops(path)
+    try:
+        rings = order_rings(join_loops(loops))
+    except JawFileError as error:
+        raise JawFileError(f"{path.name}: {error}") from error
+    width = table.length("width") if "width" in table else width
+    if not (width and width > 0.0):
+        raise JawFileError(f"{table.name('width')}: got {width}, expected a positive length in metres")
+    size = table.length("size", largest=_LARGEST_THICKNESS) if "size" in table else None
+    if size is not None and size <= 0.0:
+        raise JawFileError(f"{table.name('size')}: got {size:g}, expected a positive length in metres")
+    clamp = table.table("clamped")
+    clamp.expect_keys((), ("z_below", "circles"))
+    circles = clamp.values.get("circles", [])
+    if not isinstance(circles, list) or not ("z_below" in clamp or circles):
+        raise JawFileError(f"{clamp.prefix}: expected z_below, or circles, a list of [x, z, radius]")
+    circles = np.array([parse_point(circle, f"{clamp.name('circles')}[{i}]") for i, circle in enumerate(circles)])
+    return Section(
+        rings=rings,
+        width=width,
+        clamped_z=clamp.length("z_below") if "z_below" in clamp else None,
+        clamped_circles=circles.reshape(-1, 3),
+        size=size,
+    )
 
 
 def _parse_clamp(table: Table) -> ClampRule:

@@ -13,7 +13,7 @@ from finforce_ifea.jaw.jaw import load_jaw
 POINTS = {"a": [0.0132, 0.01, 0.009]}
 BAD_VALUES = [
     ("drawng", {}, "unknown key 'drawng'; did you mean 'drawing'"),
-    ("drawing", ..., "the file: got none, expected exactly one of drawing, mesh"),
+    ("drawing", ..., "the file: got none, expected exactly one of drawing, section, mesh"),
     ("colour", "red", "unknown key 'colour'; expected one of name, model, drawing"),
     ("inner_face_x", 0.014, "unknown key 'inner_face_x'; expected one of drawing"),
     ("drawing.lenght", 0.08, "unknown key 'drawing.lenght'; did you mean 'length'"),

@@ -12,7 +12,7 @@ from finforce_ifea.fem.solid import SolidModel
 def wide():
     """A block that is taken to be so wide that its tangent is stored sparse."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("finforce_ifea.fem.solid._BANDED_COST_LIMIT", 1e7)
+        patch.setattr(SolidModel, "_banded_limit", 1e7)
         model = SolidModel(block((8, 8, 8), EDGE), TPU, symmetric=False)
     assert not model.banded
     return model

@@ -1,0 +1,141 @@
+"""A prismatic jaw in plane strain: quadratic triangles of its section, whatever its shape.
+
+St. Venant-Kirchhoff: with F = I + sum u_i g_i^T, E = (F^T F - I) / 2 and S = lambda tr(E) I + 2 mu E the energy of a
+volume dV is S : E / 2 dV, the force of node i is F S g_i dV, and the tangent between nodes i and j, with a = F g,
+is ((g_i . S g_j) I + lambda a_i a_j^T + mu (a_j a_i^T + (g_i . g_j) F F^T)) dV.
+
+Source: Bonet, Wood, Nonlinear Continuum Mechanics for Finite Element Analysis (2008), chapters 6 and 9.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from finforce_ifea.errors import MeshError
+from finforce_ifea.fem.model import LARGEST_MOVE, Linearization
+from finforce_ifea.fem.solid import SolidModel
+from finforce_ifea.jaw.jaw_file import Material
+from finforce_ifea.jaw.mesh import VolumeMesh
+from finforce_ifea.jaw.section_mesh import PlaneMesh
+
+_SAME = 1e-8
+_POINTS = np.array([[1.0, 1.0], [4.0, 1.0], [1.0, 4.0]]) / 6.0
+
+
+class PlaneModel(SolidModel):
+    """The section of a finger in plane strain; see `finforce_ifea.fem.model.JawModel` for what its methods take.
+
+    The unknowns q (size,) [m] are displacements along x and z of the section's free nodes. Nodes of the extruded mesh
+    that differ in y alone move alike.
+    """
+
+    _banded_limit = 0.0
+
+    def __init__(self, mesh: VolumeMesh, plane: PlaneMesh, width: float, material: Material) -> None:
+        """Numbers the unknowns and prepares the triangles.
+
+        Args:
+            mesh: the extruded section, jaw frame [m].
+            plane: its triangles.
+            width: along y [m].
+            material: Young's modulus [Pa] and Poisson's ratio.
+
+        Raises:
+            MeshError: The mesh is not made of that section.
+        """
+        self.mesh = mesh
+        self.rotations, self.reach, self.symmetric = None, LARGEST_MOVE, False
+        self.sign = np.ones((len(mesh.nodes), 3))
+        distance, column = cKDTree(plane.points).query(mesh.nodes[:, [0, 2]])
+        top = np.flatnonzero(mesh.nodes[:, 1] > mesh.nodes[:, 1].max() - _SAME)
+        standing = np.full(len(plane.points), -1)
+        standing[column[top]] = top
+        if distance.max() > _SAME or (standing < 0).any():
+            raise MeshError("the mesh is not the section extruded along y")
+        self._elements = np.ascontiguousarray(standing[plane.triangles])
+        self._gradients, volumes = _differentiate(plane.points[plane.triangles])
+        self._volumes = width * volumes
+        nu = material.poisson_ratio
+        self._shear = 0.5 * material.young_modulus / (1.0 + nu)
+        self._lame = 2.0 * self._shear * nu / (1.0 - 2.0 * nu)
+        self._Ke = np.zeros((len(self._elements), 18, 18))
+        free = np.ones((len(mesh.nodes), 3), bool)
+        free[:, 1] = False
+        self._number_unknowns(standing[column], free)
+        self._plan_assembly()
+
+    def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
+        """Evaluates internal force, energy and, unless `tangent` is False, the tangent stiffness at q (size,) [m]."""
+        f = np.zeros_like(self.mesh.nodes)
+        energy, smallest = _add_triangles(
+            self.expand(q),
+            self._elements,
+            self._gradients,
+            self._volumes,
+            self._lame,
+            self._shear,
+            tangent,
+            f,
+            self._Ke,
+        )
+        force = np.bincount(self.dof.ravel(), f.ravel(), self.size + 1)[: self.size]
+        return Linearization(
+            force=force, energy=energy, smallest_det=smallest, tangent=self._assemble() if tangent else None
+        )
+
+
+def _differentiate(corners: NDArray) -> tuple[NDArray, NDArray]:
+    """Returns shape function gradients (t, 3, 6, 2) [1/m] and areas (t, 3) [m^2] at three points of triangles."""
+    r, s = _POINTS.T
+    t = 1.0 - r - s
+    zero = np.zeros(3)
+    by_r = np.stack([1.0 - 4.0 * t, 4.0 * r - 1.0, zero, 4.0 * (t - r), 4.0 * s, -4.0 * s], axis=1)
+    by_s = np.stack([1.0 - 4.0 * t, zero, 4.0 * s - 1.0, -4.0 * r, 4.0 * r, 4.0 * (t - s)], axis=1)
+    local = np.stack([by_r, by_s], axis=2)
+    jacobian = np.einsum("tni,pnj->tpij", corners, local)
+    gradients = np.einsum("pnj,tpji->tpni", local, np.linalg.inv(jacobian))
+    return np.ascontiguousarray(gradients), np.linalg.det(jacobian) / 6.0
+
+
+@njit(cache=True, error_model="numpy")
+def _add_triangles(u, elements, gradients, volumes, lame, shear, with_tangent, force, K):
+    """Adds nodal forces (n, 3) and fills stiffnesses K (t, 18, 18); returns energy [J] and the smallest det F."""
+    energy, smallest = 0.0, 1e300
+    a = np.empty((6, 2))
+    for e in range(len(elements)):
+        if with_tangent:
+            K[e] = 0.0
+        for p in range(3):
+            g, weight = gradients[e, p], volumes[e, p]
+            xx, xz, zx, zz = 1.0, 0.0, 0.0, 1.0
+            for i in range(6):
+                ux, uz = u[elements[e, i], 0], u[elements[e, i], 2]
+                xx, xz = xx + ux * g[i, 0], xz + ux * g[i, 1]
+                zx, zz = zx + uz * g[i, 0], zz + uz * g[i, 1]
+            smallest = min(smallest, xx * zz - xz * zx)
+            e_xx, e_zz = 0.5 * (xx * xx + zx * zx - 1.0), 0.5 * (xz * xz + zz * zz - 1.0)
+            e_xz = 0.5 * (xx * xz + zx * zz)
+            trace = e_xx + e_zz
+            s_xx, s_zz = lame * trace + 2.0 * shear * e_xx, lame * trace + 2.0 * shear * e_zz
+            s_xz = 2.0 * shear * e_xz
+            energy += 0.5 * weight * (s_xx * e_xx + s_zz * e_zz + 2.0 * s_xz * e_xz)
+            for i in range(6):
+                a[i, 0], a[i, 1] = xx * g[i, 0] + xz * g[i, 1], zx * g[i, 0] + zz * g[i, 1]
+                sx, sz = s_xx * g[i, 0] + s_xz * g[i, 1], s_xz * g[i, 0] + s_zz * g[i, 1]
+                force[elements[e, i], 0] += weight * (xx * sx + xz * sz)
+                force[elements[e, i], 2] += weight * (zx * sx + zz * sz)
+            if not with_tangent:
+                continue
+            k, m = weight * lame, weight * shear
+            f_xx, f_xz, f_zz = xx * xx + xz * xz, xx * zx + xz * zz, zx * zx + zz * zz
+            for i in range(6):
+                sx, sz = s_xx * g[i, 0] + s_xz * g[i, 1], s_xz * g[i, 0] + s_zz * g[i, 1]
+                for j in range(6):
+                    along = weight * (sx * g[j, 0] + sz * g[j, 1])
+                    turn = weight * shear * (g[i, 0] * g[j, 0] + g[i, 1] * g[j, 1])
+                    K[e, 3 * i, 3 * j] += along + k * a[i, 0] * a[j, 0] + m * a[j, 0] * a[i, 0] + turn * f_xx
+                    K[e, 3 * i, 3 * j + 2] += k * a[i, 0] * a[j, 1] + m * a[j, 0] * a[i, 1] + turn * f_xz
+                    K[e, 3 * i + 2, 3 * j] += k * a[i, 1] * a[j, 0] + m * a[j, 1] * a[i, 0] + turn * f_xz
+                    K[e, 3 * i + 2, 3 * j + 2] += along + k * a[i, 1] * a[j, 1] + m * a[j, 1] * a[i, 1] + turn * f_zz
+    return energy, smallest

@@ -1,0 +1,155 @@
+"""The section of a prismatic finger, extruded along its width: polygons, where they are held, and the file of both."""
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from finforce_ifea.errors import JawFileError
+
+UNITS = {"m": 1.0, "mm": 1e-3, "inch": 25.4e-3}
+_LARGEST_FILE, _MOST_VERTICES = 5_000_000, 100_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Section:
+    """A finger as its section in the x-z plane and its width along y.
+
+    Attributes:
+        rings: (n, 2) each, x and z [m, jaw frame]: the outline counterclockwise, then the holes clockwise.
+        width: [m], along y; the finger is symmetric about y = 0.
+        clamped_z: [m], everything up to this height is clamped; None where circles alone do.
+        clamped_circles: (c, 3), x, z and radius [m] about bolts: everything within is clamped.
+        size: [m], of the elements in the section; None for what the thinnest parts ask for.
+    """
+
+    rings: tuple[NDArray, ...]
+    width: float
+    clamped_z: float | None = 0.0
+    clamped_circles: NDArray
+    size: float | None = None
+
+    @cached_property
+    def polygon(self) -> shapely.Polygon:
+        """The section as one polygon with holes."""
+        return shapely.Polygon(self.rings[0], self.rings[1:])
+
+    @cached_property
+    def free_area(self) -> float:
+        """The area [m^2] above the clamp."""
+        if self.clamped_z is None:
+            return float(self.polygon.area)
+        low_x, _, high_x, high_z = self.polygon.bounds
+        return float(self.polygon.intersection(shapely.box(low_x, self.clamped_z, high_x, high_z)).area)
+
+    @property
+    def inner_face_x(self) -> float:
+        """The plane x [m] of the inner face: the largest x."""
+        return float(self.rings[0][:, 0].max())
+
+    @property
+    def length(self) -> float:
+        """The largest z [m]."""
+        return float(self.rings[0][:, 1].max())
+
+    def find_clamped(self, points: NDArray) -> NDArray:
+        """Return which of points (n, 2) [m] are clamped, (n,) bool."""
+        held = np.zeros(len(points), bool)
+        if self.clamped_z is not None:
+            held |= points[:, 1] <= self.clamped_z + 1e-9
+        for x, z, radius in self.clamped_circles:
+            held |= np.hypot(points[:, 0] - x, points[:, 1] - z) <= radius + 1e-9
+        return held
+
+    def distance_to(self, points: NDArray) -> NDArray:
+        """Compute the distances (n,) [m] of points (n, 3) [m, jaw frame] from the finger, 0 inside."""
+        beside = np.maximum(np.abs(points[:, 1]) - 0.5 * self.width, 0.0)
+        in_plane = shapely.distance(self.polygon, shapely.points(points[:, [0, 2]]))
+        return np.hypot(beside, in_plane)
+
+
+def order_rings(polygon: shapely.Polygon) -> tuple[NDArray, ...]:
+    """Return a polygon's rings (n, 2) without the closing point: counterclockwise outline, clockwise holes."""
+    turned = shapely.geometry.polygon.orient(polygon)
+    return tuple(np.array(ring.coords)[:-1] for ring in (turned.exterior, *turned.interiors))
+
+
+def join_loops(loops: list[NDArray]) -> shapely.Polygon:
+    """Return the one polygon that closed loops (n, 2) bound, whatever their order and sense.
+
+    Raises:
+        JawFileError: The loops bound no area or several areas, cross themselves or each other.
+    """
+    polygons = []
+    for number, loop in enumerate(loops):
+        polygon = shapely.Polygon(loop)
+        if not polygon.is_valid:
+            x, z = _where_invalid(polygon)
+            raise JawFileError(f"loop {number} of the section touches or crosses itself near ({x:.4g}, {z:.4g})")
+        polygons.append(polygon)
+    polygons.sort(key=lambda polygon: -polygon.area)
+    outer = polygons[0]
+    for number, hole in enumerate(polygons[1:], start=1):
+        if not outer.covers(hole):
+            raise JawFileError(
+                f"the section has {len(polygons)} loops, and number {number} by size is not inside the largest: "
+                "expected one body with its holes"
+            )
+    whole = shapely.Polygon(outer.exterior, [hole.exterior for hole in polygons[1:]])
+    if not whole.is_valid:
+        x, z = _where_invalid(whole)
+        raise JawFileError(f"holes of the section touch each other or the outline near ({x:.4g}, {z:.4g})")
+    return whole
+
+
+def _where_invalid(polygon: shapely.Polygon) -> tuple[float, float]:
+    """Return where a polygon is no polygon."""
+    text = shapely.is_valid_reason(polygon)
+    numbers = text[text.find("[") + 1 : text.find("]")].split() if "[" in text else ()
+    return (float(numbers[0]), float(numbers[1])) if len(numbers) == 2 else (np.nan, np.nan)
+
+
+def read_loops(path: Path) -> tuple[list[NDArray], float | None]:
+    """Read the loops (n, 2) [m] of a section file, and its width [m] if it names one.
+
+    The file is JSON: `unit` ("m", "mm", "inch"), `loops`, a list of lists of [x, z], and perhaps `width` or `width_mm`.
+
+    Raises:
+        JawFileError: The file is missing, too large, or not of that form.
+    """
+    if not path.is_file():
+        raise JawFileError(f"there is no section file {path.name}; the path is relative to the jaw file")
+    if path.stat().st_size > _LARGEST_FILE:
+        raise JawFileError(f"{path.name}: {path.stat().st_size} bytes, expected at most {_LARGEST_FILE}")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        unit = UNITS[content["unit"]]
+        loops = [np.array(loop, float) * unit for loop in content["loops"]]
+        width = content.get("width", content["width_mm"] * 1e-3 / unit if "width_mm" in content else None)
+        width = None if width is None else float(width) * unit
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise JawFileError(
+            f"{path.name}: expected JSON with unit ({', '.join(UNITS)}) and loops, lists of [x, z] "
+            f"({type(error).__name__}: {error})"
+        ) from error
+    check_loops(loops, path.name)
+    return loops, width
+
+
+def check_loops(loops: list[NDArray], name: str) -> None:
+    """Refuse loops that are no lists of points.
+
+    Raises:
+        JawFileError: None, of another shape, not finite, or too many points.
+    """
+    for number, loop in enumerate(loops):
+        if loop.ndim != 2 or loop.shape[1:] != (2,) or len(loop) < 3 or not np.isfinite(loop).all():
+            raise JawFileError(f"{name}: loops[{number}] has shape {loop.shape}, expected (n, 2), finite, n >= 3")
+    if not loops or sum(map(len, loops)) > _MOST_VERTICES:
+        raise JawFileError(
+            f"{name}: {len(loops)} loops, {sum(map(len, loops))} points; expected 1 to {_MOST_VERTICES} points"
+        )

@@ -1,0 +1,236 @@
+"""Quadratic triangles in a finger's section, and quadratic tetrahedra in what it becomes when it is extruded."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay, cKDTree
+
+from finforce_ifea.errors import MeshError
+from finforce_ifea.jaw.mesh import EDGES_TET10, VolumeMesh, build_volume_mesh
+from finforce_ifea.jaw.section import Section
+
+# Size [m] of the elements of the default mesh, unless that makes too many, and of presets as a share of it.
+_SIZE, _MOST_TRIANGLES = 0.8e-3, 1500
+SHARES = {"coarse": 2.0, "default": 1.0, "fine": 0.6}
+# A turn of the outline by more than this [rad] is a corner, less is a curve, of which a full turn has so many elements.
+_CORNER, _PER_TURN = np.radians(25.0), 12
+# The least size [m] along a curve, and how fast sizes grow with the distance from it [-].
+_LEAST, _GROWTH = 2e-4, 0.35
+# What is clamped, so many elements below the edge of the clamp, may be so much coarser.
+_EDGE, _COARSER = 3.0, 2.5
+_FLAT = 1e-3
+_PASSES = 20
+_EDGES = ((0, 1), (1, 2), (2, 0))
+_EQUILATERAL = 0.433
+_MOST_POINTS = 8_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlaneMesh:
+    """Six-node triangles.
+
+    Attributes:
+        points: (n, 2) [m], x and z; corners first.
+        triangles: (t, 6) indices, corners counterclockwise in (x, z), then the middles of edges 01, 12, 20.
+        corners: how many of the points are corners.
+    """
+
+    points: NDArray
+    triangles: NDArray
+    corners: int
+
+
+def mesh_section(section: Section, share: float = 1.0) -> PlaneMesh:
+    """Divide a section into quadratic triangles.
+
+    Points stand along all rings, closer where they curve; inside, where there is room, on a lattice. Delaunay's
+    triangles of them keep every edge of the rings, which are halved where it takes that. Middles lie on the chords.
+
+    Args:
+        section: the finger's section.
+        share: of the elements' size: the section's, else 0.8 mm, or more where that makes more than 1500 triangles.
+
+    Raises:
+        MeshError: The section asks for too many elements, or cannot be divided.
+    """
+    size = section.size or max(_SIZE, float(np.sqrt(section.free_area / (_EQUILATERAL * _MOST_TRIANGLES))))
+    field = _SizeField(section, share * size)
+    rings = [_resample(ring, field) for ring in section.rings]
+    points = np.concatenate(rings)
+    if len(points) > _MOST_POINTS:
+        raise MeshError(
+            f"the section asks for {len(points)} points along its outline, expected at most {_MOST_POINTS}: give "
+            "`size`, or leave out what is that thin"
+        )
+    first = np.cumsum([0, *map(len, rings)])
+    edges = np.concatenate([_close(start, len(ring)) for start, ring in zip(first, rings, strict=False)])
+    polygon = shapely.Polygon(rings[0], rings[1:])
+    inside = _fill(polygon, points, field)
+    points, triangles = _triangulate(points, edges, inside)
+    centres = points[triangles].mean(axis=1)
+    triangles = triangles[shapely.contains_xy(polygon, centres) & (_measure_quality(points[triangles]) > _FLAT)]
+    used, triangles = np.unique(triangles, return_inverse=True)
+    return _add_middles(points[used], _turn(points[used], triangles.reshape(-1, 3)))
+
+
+class _SizeField:
+    """The wanted size of elements at any place."""
+
+    def __init__(self, section: Section, size: float) -> None:
+        self.size = size
+        self._still = -np.inf if section.clamped_z is None else section.clamped_z - _EDGE * size
+        places, sizes = [], []
+        for ring in section.rings:
+            length = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
+            turn = _measure_turns(ring)
+            curve = turn / (0.5 * (length + np.roll(length, 1)))
+            curve[turn > _CORNER] = 0.0
+            places.append(ring)
+            sizes.append(np.maximum(2.0 * np.pi / _PER_TURN / np.maximum(curve, 1.0), _LEAST))
+        self._sizes = np.concatenate(sizes)
+        self._tree = cKDTree(np.concatenate(places))
+        self._count = min(40, len(self._sizes))
+
+    def read(self, points: NDArray) -> NDArray:
+        """Return the size (n,) [m] at points (n, 2) [m]."""
+        distance, index = self._tree.query(points, k=self._count)
+        wanted = (self._sizes[index] + _GROWTH * distance).reshape(len(points), -1)
+        largest = np.where(points[:, 1] < self._still, _COARSER * self.size, self.size)
+        return np.minimum(wanted.min(axis=1), largest)
+
+
+def _measure_turns(ring: NDArray) -> NDArray:
+    """Return by how much a ring (n, 2) turns at each of its points (n,) [rad], without sign."""
+    along = np.roll(ring, -1, axis=0) - ring
+    angle = np.arctan2(along[:, 1], along[:, 0])
+    return np.abs((angle - np.roll(angle, 1) + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def _resample(ring: NDArray, field: _SizeField) -> NDArray:
+    """Return points (m, 2) along a ring: its corners, and between them as many as the sizes ask for."""
+    length = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
+    ring = ring[length > 1e-7]
+    length = length[length > 1e-7]
+    corners = np.flatnonzero(_measure_turns(ring) > _CORNER)
+    corners = corners if len(corners) else np.array([0])
+    arc = np.concatenate([[0.0], np.cumsum(length)])
+    closed = np.vstack([ring, ring[:1]])
+    pieces = []
+    for begin, end in zip(corners, np.roll(corners, -1), strict=True):
+        start, stop = arc[begin], arc[end] + (arc[-1] if end <= begin else 0.0)
+        fine = np.linspace(start, stop, max(int((stop - start) / _LEAST), 2) + 1)
+        middles = 0.5 * (fine[1:] + fine[:-1])
+        count = np.concatenate([[0.0], np.cumsum(np.diff(fine) / field.read(_walk(middles, arc, closed)))])
+        number = max(int(np.ceil(count[-1] - 1e-6)), 1)
+        pieces.append(_walk(np.interp(np.arange(number) * count[-1] / number, count, fine), arc, closed))
+    return np.concatenate(pieces)
+
+
+def _walk(distance: NDArray, arc: NDArray, closed: NDArray) -> NDArray:
+    """Return the points (n, 2) at distances (n,) [m] along a closed ring."""
+    distance = distance % arc[-1]
+    return np.stack([np.interp(distance, arc, closed[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _close(first: int, count: int) -> NDArray:
+    """Return the edges (n, 2) of a ring of points numbered from `first` on."""
+    index = np.arange(count)
+    return first + np.stack([index, np.roll(index, -1)], axis=1)
+
+
+def _fill(polygon: shapely.Polygon, points: NDArray, field: _SizeField) -> NDArray:
+    """Return points (n, 2) on a lattice of triangles inside the section, away from those on its rings."""
+    low_x, low_z, high_x, high_z = polygon.bounds
+    step = field.size
+    x, z = np.arange(low_x, high_x, 0.95 * step), np.arange(low_z, high_z, 0.82 * step)
+    lattice = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1)
+    lattice[:, 1::2, 0] += 0.475 * step
+    lattice = lattice.reshape(-1, 2)
+    lattice = lattice[shapely.contains_xy(polygon, lattice)]
+    if len(lattice) == 0:
+        return lattice
+    return lattice[cKDTree(points).query(lattice)[0] > 0.7 * field.read(lattice)]
+
+
+def _triangulate(points: NDArray, edges: NDArray, inside: NDArray) -> tuple[NDArray, NDArray]:
+    """Return Delaunay's triangles (t, 3) and the points (n, 2); edges that are none of theirs are halved.
+
+    Raises:
+        MeshError: An edge stays missing.
+    """
+    for _ in range(_PASSES):
+        everything = np.vstack([points, inside])
+        triangles = Delaunay(everything).simplices
+        sides = np.sort(triangles[:, _EDGES].reshape(-1, 2), axis=1)
+        stride = len(everything)
+        known = np.unique(sides[:, 0] * stride + sides[:, 1])
+        wanted = np.sort(edges, axis=1)
+        missing = ~np.isin(wanted[:, 0] * stride + wanted[:, 1], known)
+        if not missing.any():
+            return everything, triangles
+        begin, end = edges[missing].T
+        middle = len(points) + np.arange(len(begin))
+        points = np.vstack([points, 0.5 * (points[begin] + points[end])])
+        halves = np.concatenate([np.stack([begin, middle], axis=1), np.stack([middle, end], axis=1)])
+        edges = np.concatenate([edges[~missing], halves])
+    x, z = 1e3 * points[edges[0, 0]]
+    raise MeshError(f"the section cannot be divided near ({x:.3f}, {z:.3f}) mm: its outline folds onto itself there")
+
+
+def _measure_quality(corners: NDArray) -> NDArray:
+    """Return twice the area over the square of the longest edge (t,) [-] of triangles (t, 3, 2)."""
+    longest = np.max([np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a, b in _EDGES], axis=0)
+    return np.abs(_measure_area(corners)) * 2.0 / longest**2
+
+
+def _measure_area(corners: NDArray) -> NDArray:
+    """Return the signed area (t,) [m^2] of triangles (t, 3, 2)."""
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return 0.5 * (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+
+
+def _turn(points: NDArray, triangles: NDArray) -> NDArray:
+    """Return the triangles (t, 3), all counterclockwise."""
+    return np.where((_measure_area(points[triangles]) < 0.0)[:, None], triangles[:, [0, 2, 1]], triangles)
+
+
+def _add_middles(points: NDArray, triangles: NDArray) -> PlaneMesh:
+    """Return six-node triangles, with the middles of all edges after the corners."""
+    sides = np.sort(triangles[:, _EDGES].reshape(-1, 2), axis=1)
+    edges, number = np.unique(sides, axis=0, return_inverse=True)
+    middles = points[edges].mean(axis=1)
+    return PlaneMesh(
+        points=np.vstack([points, middles]),
+        triangles=np.hstack([triangles, len(points) + number.reshape(-1, 3)]),
+        corners=len(points),
+    )
+
+
+def extrude_section(section: Section, share: float = 1.0) -> VolumeMesh:
+    """Return the finger as 10-node tetrahedra, one layer of prisms on either side of y = 0, three to a prism.
+
+    Raises:
+        MeshError: The section cannot be divided, or nothing of it is clamped.
+    """
+    plane = mesh_section(section, share)
+    corners, triangles = plane.points[: plane.corners], np.sort(plane.triangles[:, :3], axis=1)
+    count = len(corners)
+    levels = 0.5 * section.width * np.array([-1.0, 0.0, 1.0])
+    nodes = np.concatenate([np.insert(corners, 1, y, axis=1) for y in levels])
+    middle, tets = triangles + count, []
+    for end in (triangles, triangles + 2 * count):
+        # the diagonals of all sides start at the smallest number in the middle plane: both halves mirror each other
+        (a, b, c), (d, e, f) = middle.T, end.T
+        tets += [np.stack(four, axis=1) for four in ((a, b, c, f), (a, b, f, e), (a, e, f, d))]
+    tets = np.concatenate(tets)
+    edges = [nodes[tets[:, k]] - nodes[tets[:, 0]] for k in (1, 2, 3)]
+    flipped = np.einsum("ij,ij->i", np.cross(edges[0], edges[1]), edges[2]) < 0.0
+    tets = np.where(flipped[:, None], tets[:, [0, 2, 1, 3]], tets)
+    sides, number = np.unique(np.sort(tets[:, EDGES_TET10].reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+    tets = np.hstack([tets, len(nodes) + number.reshape(-1, 6)])
+    held = section.find_clamped(nodes[:, [0, 2]])
+    held = np.concatenate([held, held[sides].all(axis=1)])
+    nodes = np.vstack([nodes, nodes[sides].mean(axis=1)])
+    return build_volume_mesh(nodes=nodes, tets=tets, clamped=np.flatnonzero(held))
