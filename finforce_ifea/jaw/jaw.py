@@ -187,11 +187,14 @@ def _parse_jaw(table: Table, path: Path) -> Jaw:
     table.expect_keys((), _KEYS)
     source = table.expect_one_of("drawing", "section", "mesh")
     face = ("inner_face_x",) if source == "mesh" else ()
-    table.expect_keys((source, *face, "material", "keypoints", "candidates"), ("name", "model", "reference_point"))
+    own = ("inner_face_x",) if source == "section" else ()
+    required = (source, *face, "material", "keypoints", "candidates")
+    table.expect_keys(required, ("name", "model", "reference_point", *own))
     drawing = parse_drawing(table.table("drawing")) if source == "drawing" else None
     section = parse_section(table.table("section"), path.parent) if source == "section" else None
     shape = drawing or section
-    inner_face_x = shape.inner_face_x if shape is not None else table.length("inner_face_x")
+    given = table.length("inner_face_x") if "inner_face_x" in table else None
+    inner_face_x = shape.inner_face_x if given is None else given
     keypoints = parse_keypoints(table.table("keypoints"), drawing)
     jaw = Jaw(
         name=table.text("name", path.stem),

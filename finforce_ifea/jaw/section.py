@@ -48,7 +48,7 @@ class Section:
 
     @property
     def inner_face_x(self) -> float:
-        """The plane x [m] of the inner face: the largest x."""
+        """The plane x [m] of the inner face unless another is named: the largest x."""
         return float(self.rings[0][:, 0].max())
 
     @property

@@ -1,0 +1,54 @@
+"""`finforce jaw`: from the file of a printed finger to a jaw file."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    from finforce_ifea.jaw.jaw_file import MATERIALS
+    from finforce_ifea.jaw.section import UNITS
+
+    parser.add_argument("file", type=Path, help="the finger: .stl and other surfaces, .step, .dxf, .svg, .json")
+    parser.add_argument("-o", "--output", type=Path, help="the jaw file to write (default: the finger's name, .yaml)")
+    parser.add_argument("--name", help="of the finger (default: the file's)")
+    parser.add_argument("--unit", choices=tuple(UNITS), help="of the file (default: by the finger's size)")
+    parser.add_argument("--body", type=int, metavar="N", help="which one of several bodies, from 1")
+    parser.add_argument("--width", type=float, metavar="M", help="along y [m]; a drawing does not know it")
+    parser.add_argument("--material", default="tpu95a", choices=tuple(MATERIALS), help="what it is printed of")
+    parser.add_argument("--clamp", type=float, metavar="Z", help="height [m] below which the holder keeps it")
+    parser.add_argument("--face-x", type=float, metavar="X", help="x [m] of the inner face in the jaw frame")
+    parser.add_argument("--flip", action="store_true", help="base and tip are the other way round")
+    parser.add_argument("--other-face", action="store_true", help="the other side is the one that touches objects")
+    parser.add_argument("--picture", type=Path, help="the picture to draw (default: beside the jaw file, .png)")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Read a finger, say what was found, and write jaw file, section and picture."""
+    from finforce_eval.errors import OptionError
+    from finforce_eval.fingers.make_jaw import make_jaw
+    from finforce_eval.fingers.recognition import Wishes
+
+    for name in ("width", "clamp", "face_x"):
+        value = getattr(options, name)
+        if value is not None and not -0.5 < value < 0.5:
+            raise OptionError(f"--{name.replace('_', '-')} {value:g}: expected metres, such as {value / 1e3:g}")
+    started = time.monotonic()
+    output = options.output or Path(f"{options.file.stem}.yaml")
+    made = make_jaw(
+        options.file,
+        output,
+        name=options.name or options.file.stem,
+        material=options.material,
+        unit=options.unit,
+        body=options.body,
+        width=options.width,
+        wishes=Wishes(flip=options.flip, other_face=options.other_face, clamp_z=options.clamp, face_x=options.face_x),
+        picture=options.picture,
+    )
+    for note in made.notes:
+        print(f"  {note}")
+    print(f"{', '.join(str(path) for path in made.files)}, {time.monotonic() - started:.1f} s")

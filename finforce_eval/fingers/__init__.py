@@ -1,0 +1,1 @@
+"""From the file of a printed finger to a jaw file."""

@@ -1,0 +1,322 @@
+"""The section of a prismatic finger out of the files that people print: surfaces, STEP, DXF, SVG, JSON."""
+
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import shapely
+import trimesh
+from numpy.typing import NDArray
+from shapely.ops import polygonize, unary_union
+
+from finforce.errors import MissingDependencyError
+from finforce_ifea.errors import JawFileError
+from finforce_ifea.jaw.section import UNITS, check_loops, join_loops, read_loops
+
+SURFACES = (".stl", ".obj", ".ply", ".off", ".3mf", ".glb")
+SUFFIXES = (*SURFACES, ".step", ".stp", ".dxf", ".svg", ".json")
+# Largest size of a finger in its file's numbers: below the first it is metres, below the second inches, else mm.
+_METRES, _INCHES = 0.5, 15.0
+_MOST_TRIANGLES, _LARGEST_FILE = 2_000_000, 200_000_000
+# A surface is prismatic when so much of it stands upright on, or lies across, the direction of extrusion.
+_UPRIGHT, _PRISMATIC = 0.02, 0.97
+# Cuts across it at these shares of the width may differ in area by so much.
+_CUTS, _ALIKE = (0.3, 0.5, 0.7), 0.03
+# Ends of cut triangles are joined on a grid of this size [m].
+_GRID = 2e-7
+_CHORD = 2e-5
+_DXF_UNITS = {1: "inch", 4: "mm", 6: "m"}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawSection:
+    """A finger's section as it stands in its file.
+
+    Attributes:
+        polygon: in metres, in a plane of the file's.
+        width: along the extrusion [m]; None where the file is flat.
+        notes: what was found and guessed, a line each.
+        tapered: the body [m] of a finger that is not prismatic, whose middle cut the section is; else None.
+    """
+
+    polygon: shapely.Polygon
+    width: float | None
+    notes: list[str] = field(default_factory=list)
+    tapered: trimesh.Trimesh | None = None
+
+
+def read_section(path: Path, *, unit: str | None = None, body: int | None = None) -> RawSection:
+    """Read the section of a finger.
+
+    Args:
+        path: a surface (.stl and others), a solid (.step), a drawing (.dxf, .svg), or a section (.json).
+        unit: "m", "mm" or "inch"; None to guess it by the size.
+        body: which one of several bodies, from 1.
+
+    Raises:
+        JawFileError: The file cannot be read, or holds no finger; the message says what it holds and what to do.
+        MissingDependencyError: An optional reader is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise JawFileError(f"{path.name}: files of this kind are not read; expected one of {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise JawFileError(f"there is no file {path}")
+    if path.stat().st_size > _LARGEST_FILE:
+        raise JawFileError(
+            f"{path.name}: {path.stat().st_size // 1_000_000} MB, expected at most "
+            f"{_LARGEST_FILE // 1_000_000} MB: export it with fewer triangles"
+        )
+    try:
+        if suffix == ".json":
+            loops, width = read_loops(path)
+            return RawSection(polygon=join_loops(loops), width=width, notes=["a section file"])
+        if suffix in (".dxf", ".svg"):
+            loops, named = _read_dxf(path) if suffix == ".dxf" else _read_svg(path)
+            check_loops(loops, path.name)
+            extent = np.ptp(np.concatenate(loops), axis=0).max()
+            scale, note = _choose_unit(float(extent), unit or named)
+            return RawSection(polygon=_join_lines([scale * loop for loop in loops]), width=None, notes=[note])
+        return _cut_surface(_load_surface(path, suffix), unit, body)
+    except JawFileError as error:
+        raise JawFileError(f"{path.name}: {error}" if path.name not in str(error) else str(error)) from error
+
+
+def _choose_unit(extent: float, unit: str | None) -> tuple[float, str]:
+    """Return the metres of a file's unit, and a line that says which one it is."""
+    if unit is not None:
+        return UNITS[unit], f"unit: {unit}, {1e3 * extent * UNITS[unit]:.4g} mm in its largest direction"
+    guess = "m" if extent < _METRES else "inch" if extent < _INCHES else "mm"
+    size = 1e3 * extent * UNITS[guess]
+    return UNITS[guess], f"unit: {guess}, since the largest size is {extent:.4g}, thus {size:.4g} mm (--unit)"
+
+
+def _load_surface(path: Path, suffix: str) -> trimesh.Trimesh:
+    """Load the triangles of a file."""
+    if suffix == ".stl":
+        _check_stl(path)
+    if suffix in (".step", ".stp"):
+        try:
+            import cascadio  # noqa: F401
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"reading {path.name} needs cascadio, which is not installed: python -m pip install cascadio, or "
+                "export the finger as STL"
+            ) from error
+    try:
+        mesh = trimesh.load(path, file_type=suffix[1:], force="mesh", process=True)
+    except Exception as error:  # trimesh has no base error
+        reason = " ".join(str(error).split())[:120]
+        raise JawFileError(f"cannot be read as {suffix[1:].upper()} ({type(error).__name__}: {reason})") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise JawFileError(f"holds no triangles, expected the surface of a finger as {suffix[1:].upper()}")
+    if len(mesh.faces) > _MOST_TRIANGLES:
+        raise JawFileError(_say_too_many(len(mesh.faces)))
+    if not np.isfinite(mesh.vertices).all():
+        raise JawFileError("has coordinates that are not finite")
+    mesh.merge_vertices()
+    return mesh
+
+
+def _check_stl(path: Path) -> None:
+    """Refuse an STL file of too many triangles before any is loaded, and one that is cut short."""
+    with path.open("rb") as file:
+        head = file.read(84)
+    if head[:5] == b"solid" and b"facet" in path.open("rb").read(400):
+        return
+    count = struct.unpack("<I", head[80:84])[0] if len(head) == 84 else -1
+    expected, size = 84 + 50 * count, path.stat().st_size
+    if count > _MOST_TRIANGLES and size >= expected:
+        raise JawFileError(_say_too_many(count))
+    if count < 1 or size < expected:
+        raise JawFileError(
+            f"is no STL file, or is cut short: {size} bytes, of {max(count, 0)} triangles that its head names"
+        )
+
+
+def _say_too_many(count: int) -> str:
+    return f"{count} triangles, expected at most {_MOST_TRIANGLES}: export it coarser"
+
+
+def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> RawSection:
+    """Return the section of a closed surface across the direction in which it was extruded."""
+    scale, note = _choose_unit(float(mesh.extents.max()), unit)
+    notes = [note]
+    mesh = _choose_body(mesh, body, scale, notes)
+    mesh.apply_scale(scale)
+    if not mesh.is_watertight:
+        _, count = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
+        raise JawFileError(
+            f"its surface has {int((count == 1).sum())} open and {int((count > 2).sum())} doubled edges, expected a "
+            "closed one: repair it in the program that it comes from, or in a slicer"
+        )
+    if mesh.volume < 0.0:
+        mesh.invert()
+        notes.append("its surface was inside out and has been turned")
+    axis, share = _find_axis(mesh)
+    low, high = np.sort(mesh.vertices @ axis)[[0, -1]]
+    cuts = [_cut(mesh, axis, low + at * (high - low)) for at in _CUTS]
+    areas = np.array([cut.area for cut in cuts])
+    middle = cuts[int(np.argsort(areas)[len(areas) // 2])]
+    letters = np.round(axis, 3).tolist()
+    if share < _PRISMATIC or np.ptp(areas) > _ALIKE * areas.max():
+        notes.append(
+            f"not prismatic: of its surface {share:.0%} goes with the direction {letters}, and cuts across it have "
+            f"{1e6 * areas.min():.4g} to {1e6 * areas.max():.4g} mm^2"
+        )
+        return RawSection(polygon=middle, width=high - low, notes=notes, tapered=_stand(mesh, axis))
+    notes.append(f"prismatic along {letters} of the file, {1e3 * (high - low):.4g} mm wide")
+    return RawSection(polygon=middle, width=float(high - low), notes=notes)
+
+
+def _choose_body(mesh: trimesh.Trimesh, body: int | None, scale: float, notes: list[str]) -> trimesh.Trimesh:
+    """Return the one body of a file, or the one that is asked for."""
+    bodies = mesh.split(only_watertight=False)
+    # what a few triangles enclose is no part of a finger
+    bodies = sorted((item for item in bodies if len(item.faces) >= 4), key=lambda item: -np.prod(item.extents))
+    if len(bodies) <= 1 and body in (None, 1):
+        return mesh
+    sizes = "; ".join(
+        f"{number}: " + " x ".join(f"{1e3 * scale * value:.3g}" for value in item.extents)
+        for number, item in enumerate(bodies[:8], start=1)
+    )
+    if body is None or not 1 <= body <= len(bodies):
+        asked = "" if body is None else f" and no number {body}"
+        raise JawFileError(
+            f"holds {len(bodies)} bodies{asked}, expected one; choose the finger with --body N (mm, {sizes})"
+        )
+    notes.append(f"body {body} of {len(bodies)}")
+    return bodies[body - 1]
+
+
+def _find_axis(mesh: trimesh.Trimesh) -> tuple[NDArray, float]:
+    """Return the direction (3,) that most of a surface goes with, upright on it or across it, and that share."""
+    normals, areas = mesh.face_normals, mesh.area_faces
+    turned = normals * np.where(normals[:, [2]] + 1e-3 * normals[:, [1]] + 1e-6 * normals[:, [0]] < 0.0, -1.0, 1.0)
+    _, number = np.unique(np.round(turned, 2), axis=0, return_inverse=True)
+    number = number.ravel()
+    weight = np.bincount(number, areas)
+    best, most = np.array([0.0, 0.0, 1.0]), -1.0
+    for cluster in np.argsort(-weight)[:20]:
+        axis = (turned * (areas * (number == cluster))[:, None]).sum(axis=0)
+        axis = axis / np.linalg.norm(axis)
+        along = np.abs(normals @ axis)
+        share = float(areas[(along < _UPRIGHT) | (along > 1.0 - _UPRIGHT**2)].sum() / areas.sum())
+        # a box goes with all three of its directions: the one with the smallest end faces has been extruded least
+        if share > most + 1e-3:
+            best, most = axis, share
+    return best, most
+
+
+def _stand(mesh: trimesh.Trimesh, axis: NDArray) -> trimesh.Trimesh:
+    """Return the body with its extrusion along the third axis, its middle at 0, and its section as `_cut` has it."""
+    frame = np.eye(4)
+    frame[:3, :3] = np.stack([*_span(axis), axis])
+    standing = mesh.copy()
+    standing.apply_transform(frame)
+    standing.apply_translation([0.0, 0.0, -standing.bounds[:, 2].mean()])
+    return standing
+
+
+def _span(axis: NDArray) -> tuple[NDArray, NDArray]:
+    """Return two unit vectors that with an axis make a right-handed frame."""
+    first = np.eye(3)[np.abs(axis).argmin()]
+    first = first - (first @ axis) * axis
+    first = first / np.linalg.norm(first)
+    return first, np.cross(axis, first)
+
+
+def _cut(mesh: trimesh.Trimesh, axis: NDArray, height: float) -> shapely.Polygon:
+    """Return the cut of a body across an axis at a height [m]."""
+    lines = trimesh.intersections.mesh_plane(mesh, axis, height * axis)
+    first, second = _span(axis)
+    flat = np.stack([lines @ first, lines @ second], axis=-1)
+    return _join_lines([line for line in flat])
+
+
+def _join_lines(lines: list[NDArray]) -> shapely.Polygon:
+    """Return the polygon that lines (n, 2) [m], open or closed, bound together.
+
+    Raises:
+        JawFileError: They bound none, or several that lie beside each other.
+    """
+    grid = [np.round(np.asarray(line, float) / _GRID) * _GRID for line in lines]
+    strings = [shapely.LineString(line) for line in grid if np.ptp(line, axis=0).max() > 0.0]
+    areas = sorted(polygonize(unary_union(strings)), key=lambda area: -area.area) if strings else []
+    if not areas:
+        raise JawFileError(f"{len(lines)} lines bound no area, expected closed loops: an outline and its holes")
+    whole = areas[0]
+    beside = [area for area in areas[1:] if not shapely.Polygon(whole.exterior).covers(area.representative_point())]
+    islands = [area for area in areas[1:] if area not in beside and whole.covers(area.representative_point())]
+    if beside or islands:
+        raise JawFileError(f"its section has {1 + len(beside) + len(islands)} separate areas, expected one finger")
+    return whole
+
+
+def _read_dxf(path: Path) -> tuple[list[NDArray], str | None]:
+    """Read the curves of a DXF drawing, and its unit."""
+    try:
+        import ezdxf
+        from ezdxf.path import make_path
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"reading {path.name} needs ezdxf, which is not installed: python -m pip install ezdxf"
+        ) from error
+    try:
+        document = ezdxf.readfile(path)
+    except (OSError, ezdxf.DXFError, UnicodeError, ValueError) as error:
+        raise JawFileError(f"cannot be read as DXF ({' '.join(str(error).split())[:120]})") from error
+    lines = []
+    for entity in document.modelspace():
+        try:
+            curve = make_path(entity)
+        except TypeError:
+            continue
+        points = np.array([(point.x, point.y) for point in curve.flattening(0.01)])
+        if len(points) > 1:
+            lines.append(points)
+    unit = _DXF_UNITS.get(document.header.get("$INSUNITS", 0))
+    return _keep_lines(lines), unit
+
+
+def _read_svg(path: Path) -> tuple[list[NDArray], str | None]:
+    """Read the curves of an SVG drawing; lengths without a unit are CSS pixels, as in browsers, unless one is named."""
+    try:
+        import svgelements
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"reading {path.name} needs svgelements, which is not installed: python -m pip install svgelements"
+        ) from error
+    try:
+        # a pixel is 1/96 inch: at 25.4 per inch everything comes out in millimetres where sizes have units
+        document = svgelements.SVG.parse(str(path), ppi=25.4, reify=True)
+        lines = []
+        for element in document.elements():
+            if not isinstance(element, svgelements.Shape):
+                continue
+            for part in svgelements.Path(element).as_subpaths():
+                lines.append(_sample_curve(svgelements.Path(part)))
+    except (OSError, ValueError, SyntaxError, AttributeError, TypeError, ZeroDivisionError) as error:
+        raise JawFileError(f"cannot be read as SVG ({type(error).__name__}: {str(error)[:120]})") from error
+    return _keep_lines(lines), None
+
+
+def _sample_curve(curve) -> NDArray:
+    """Return points (n, 2) along the segments of an SVG path; y points up."""
+    points = []
+    for segment in curve:
+        kind = type(segment).__name__
+        if kind == "Move" or segment.start is None or segment.end is None:
+            continue
+        count = 1 if kind in ("Line", "Close") else 24
+        points += [segment.point(k / count) for k in range(count)] + [segment.end]
+    return np.array([(point.x, -point.y) for point in points]).reshape(-1, 2)
+
+
+def _keep_lines(lines: list[NDArray]) -> list[NDArray]:
+    """Return the curves that have a length, as closed loops need three points to be checked."""
+    kept = [line if len(line) > 2 else np.vstack([line[0], line.mean(axis=0), line[-1]]) for line in lines if len(line)]
+    if not kept:
+        raise JawFileError("holds no curves, expected the outline of a finger and its holes")
+    return kept

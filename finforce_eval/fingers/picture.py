@@ -1,0 +1,125 @@
+"""The picture of a recognized finger: its section with all that was found, and the finger in three dimensions."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.fingers.proposal import Proposal
+from finforce_eval.fingers.recognition import RecognizedFinger
+from finforce_ifea.jaw.mesh import VolumeMesh
+from finforce_ifea.jaw.section import order_rings
+
+_MATERIAL, _HELD, _INNER, _OUTER, _RIB = "#d9dee6", "#8a93a3", "#c0392b", "#2d6cb5", "#3a8f4d"
+
+
+def draw_finger(finger: RecognizedFinger, proposal: Proposal, mesh: VolumeMesh, path: Path) -> None:
+    """Draw a finger into a PNG file.
+
+    Args:
+        finger: what was recognized.
+        proposal: key points, candidates, reference point.
+        mesh: of the jaw, for the preview.
+        path: of the picture.
+    """
+    from matplotlib.figure import Figure
+
+    size = np.array([np.ptp(np.array(finger.polygon.exterior.coords)[:, 0]), finger.length])
+    figure = Figure(figsize=(13.0, 9.0), layout="constrained")
+    flat = figure.add_subplot(1, 2, 1)
+    solid = figure.add_subplot(1, 2, 2, projection="3d")
+    _draw_section(flat, finger)
+    _draw_walls(flat, finger)
+    _draw_points(flat, finger, proposal, size)
+    flat.set(xlabel="x / mm, towards the object", ylabel="z / mm, base to tip", aspect="equal")
+    flat.set_title(f"{proposal.name}: {1e3 * size[0]:.1f} x {1e3 * finger.width:.1f} x {1e3 * size[1]:.1f} mm")
+    flat.legend(loc="upper left", fontsize=8, framealpha=0.9)
+    _draw_solid(solid, mesh)
+    figure.savefig(path, dpi=110)
+
+
+def _draw_section(axes, finger: RecognizedFinger) -> None:
+    """Draw the material, and what is clamped in a darker tone."""
+    from matplotlib.patches import Circle, PathPatch
+    from matplotlib.path import Path as Curve
+
+    vertices, codes = [], []
+    for ring in order_rings(finger.polygon):
+        vertices.append(1e3 * np.vstack([ring, ring[:1]]))
+        codes.append(np.r_[Curve.MOVETO, np.full(len(ring) - 1, Curve.LINETO), Curve.CLOSEPOLY])
+    curve = Curve(np.concatenate(vertices), np.concatenate(codes))
+    patch = PathPatch(curve, facecolor=_MATERIAL, edgecolor="black", linewidth=0.7)
+    axes.add_patch(patch)
+    bounds = 1e3 * np.array(finger.polygon.bounds)
+    held = axes.axhspan(bounds[1] - 1.0, 1e3 * finger.clamped_z, facecolor=_HELD, label="clamped")
+    held.set_clip_path(patch)
+    for x, z, radius in 1e3 * finger.clamped_circles:
+        around = axes.add_patch(Circle((x, z), radius, facecolor=_HELD))
+        around.set_clip_path(patch)
+    margin = 0.06 * (bounds[3] - bounds[1])
+    axes.set_xlim(bounds[0] - 3.0 * margin, bounds[2] + 3.0 * margin)
+    axes.set_ylim(bounds[1] - margin, bounds[3] + margin)
+
+
+def _draw_walls(axes, finger: RecognizedFinger) -> None:
+    """Draw the centre lines with their thickness."""
+    for wall, colour, name in ((finger.inner, _INNER, "inner band"), (finger.outer, _OUTER, "outer band")):
+        free = wall.line[:, 1] > finger.clamped_z
+        label = f"{name}, {_say(wall.thickness[free])} mm"
+        axes.plot(*(1e3 * wall.line[free].T), color=colour, linewidth=1.2, label=label)
+    for number, rib in enumerate(finger.ribs):
+        ends = 1e3 * np.array([rib.inner, rib.outer])
+        label = f"{len(finger.ribs)} ribs, {_say([rib.wall.usual for rib in finger.ribs])} mm"
+        axes.plot(*ends.T, color=_RIB, linewidth=1.2, label=None if number else label)
+
+
+def _say(values) -> str:
+    low, high = 1e3 * np.percentile(values, [5, 95]) if len(values) else (np.nan, np.nan)
+    return f"{low:.2f}" if high - low < 0.1 else f"{low:.2f} to {high:.2f}"
+
+
+def _draw_points(axes, finger: RecognizedFinger, proposal: Proposal, size: NDArray) -> None:
+    """Draw key points with their names, candidates, reference point and bolts."""
+    points = 1e3 * np.array(list(proposal.keypoints.values()))
+    axes.plot(points[:, 0], points[:, 2], "o", color="black", markersize=5, label=f"{len(points)} key points")
+    middle = float(np.mean(points[:, 0]))
+    for name, (x, _, z) in zip(proposal.keypoints, points, strict=True):
+        right = name.startswith("inner") or (name == "tip" and x >= middle)
+        axes.annotate(
+            name,
+            (x, z),
+            xytext=(7 if right else -7, 0),
+            textcoords="offset points",
+            ha="left" if right else "right",
+            va="center",
+            fontsize=7,
+        )
+    first, step, count = proposal.candidates
+    heights = 1e3 * (first + step * np.arange(count))
+    axes.plot(
+        np.full(count, 1e3 * finger.face_x),
+        heights,
+        "<",
+        color=_INNER,
+        markersize=4,
+        label=f"{count} contact candidates",
+    )
+    axes.plot(*(1e3 * proposal.reference[[0, 2]]), "+", color="black", markersize=11, label="reference point")
+    for x, z, radius in 1e3 * finger.bolts:
+        axes.annotate(f"Ø{2.0 * radius:.2f}", (x, z), ha="center", va="center", fontsize=6)
+
+
+def _draw_solid(axes, mesh: VolumeMesh) -> None:
+    """Draw the surface of a mesh, lit from the camera's side."""
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    corners = 1e3 * mesh.nodes[mesh.surface]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    light = 0.45 + 0.5 * np.clip(normals @ np.array([0.5, 0.7, 0.5]), 0.0, 1.0)
+    colours = np.stack([0.85 * light, 0.88 * light, light, np.ones(len(light))], axis=1)
+    axes.add_collection3d(Poly3DCollection(corners, facecolors=colours, edgecolors=colours, linewidths=0.2))
+    low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), xlabel="x", ylabel="y", zlabel="z")
+    axes.set_box_aspect(high - low)
+    axes.view_init(elev=18.0, azim=52.0)

@@ -1,0 +1,480 @@
+"""What a section shows of a fin-ray finger: its frame, cells, bands, ribs, bolt holes and clamp."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from shapely import affinity
+
+from finforce_ifea.errors import JawFileError
+from finforce_ifea.jaw.section import order_rings
+
+# A hole is round, thus a bolt's, when its area is this share of the circle's with its outline.
+_ROUND, _ROUND_POINTS = 0.955, 8
+# Spacing of the places [m] where walls are measured.
+_SPACING = 3e-4
+# A side is straight where it leaves its line by less than this share of its length.
+_STRAIGHT = 4e-3
+# The section narrows towards the tip, to less than this share of its width at the base.
+_NARROWER = 0.75
+# A bolt holds about so many of its radii above its middle, and around it.
+_GRIP, _WASHER = 3.0, 2.0
+# Least cosine between a cell's side and the face of the band beyond it.
+_FACES = 0.7
+_NEIGHBOURS, _LONGER = 3e-3, 1.4
+_FEWEST = 5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Wall:
+    """A band or a rib.
+
+    Attributes:
+        line: its centre line (n, 2), x and z [m], base to tip, or inner to outer band.
+        thickness: across it (n,) [m].
+    """
+
+    line: NDArray
+    thickness: NDArray
+
+    @property
+    def usual(self) -> float:
+        """The median thickness [m]."""
+        return float(np.median(self.thickness))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecognizedRib:
+    """A rib between two neighbouring cells.
+
+    Attributes:
+        wall: its centre line and thickness.
+        inner: where its centre line meets that of the inner band (2,) [m].
+        outer: where it meets that of the outer band (2,) [m].
+    """
+
+    wall: Wall
+    inner: NDArray
+    outer: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecognizedFinger:
+    """A section in the jaw frame, and its parts.
+
+    Attributes:
+        polygon: x towards the object, z from base to tip [m]; its lowest point is at z = 0.
+        width: along y [m].
+        cells: the rooms between bands and ribs (n, 2) each, base to tip.
+        bolts: bolt holes (b, 3): x, z, radius [m].
+        inner: the band that touches objects.
+        outer: the other one.
+        ribs: base to tip.
+        clamped_z: everything below is clamped [m].
+        clamped_circles: (c, 3), x, z and radius [m] about bolts farther up.
+        face_x: plane of the inner face, x [m].
+        face_deviation: how far the inner face leaves its plane [m].
+        notes: what was found and guessed, a line each.
+    """
+
+    polygon: shapely.Polygon
+    width: float
+    cells: list[NDArray]
+    bolts: NDArray
+    inner: Wall
+    outer: Wall
+    ribs: list[RecognizedRib]
+    clamped_z: float
+    clamped_circles: NDArray
+    face_x: float
+    face_deviation: float
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def length(self) -> float:
+        """From the lowest point to the end of the tip [m]."""
+        return float(self.polygon.bounds[3])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wishes:
+    """What a user knows better than the guesses.
+
+    Attributes:
+        flip: base and tip are the other way round.
+        other_face: the other side is the inner face.
+        clamp_z: height of the clamp [m].
+        face_x: x of the inner face [m].
+    """
+
+    flip: bool = False
+    other_face: bool = False
+    clamp_z: float | None = None
+    face_x: float | None = None
+
+
+def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes) -> RecognizedFinger:
+    """Find the parts of a fin-ray finger in its section.
+
+    Args:
+        polygon: the section [m], anyhow turned.
+        width: of the finger [m].
+        wishes: what is given.
+
+    Raises:
+        JawFileError: The section shows no fin-ray finger; the message says what it shows and what to do.
+    """
+    holes = [np.array(ring.coords)[:-1] for ring in polygon.interiors]
+    bolts = [hole for hole in holes if _is_round(hole)]
+    cells = [hole for hole in holes if not _is_round(hole)]
+    if len(cells) < 2:
+        raise JawFileError(
+            f"its section has {len(cells)} cells between ribs and {len(bolts)} round holes, expected at least two "
+            "cells: ribs that come from a slicer's infill are not in the file; model them, or describe the finger as a "
+            "drawing"
+        )
+    notes: list[str] = []
+    turned = _turn_upright(polygon, cells, wishes, notes)
+    holes = [np.array(ring.coords)[:-1] for ring in turned.interiors]
+    bolts = _fit_bolts([hole for hole in holes if _is_round(hole)])
+    cells = _order_cells([hole for hole in holes if not _is_round(hole)])
+    walls = _measure_walls(turned, cells)
+    inner, outer, ribs = walls
+    clamped_z, circles = _propose_clamp(cells, bolts, inner, wishes, notes)
+    face_x, deviation = _measure_face(turned, cells, clamped_z)
+    shift = _choose_origin(turned, clamped_z, wishes, face_x)
+    move = np.array([shift, 0.0])
+    free = [band.thickness[band.line[:, 1] > clamped_z] for band in (inner, outer)]
+    notes.append(
+        f"{len(cells)} cells, {len(ribs)} ribs of {_say_range([rib.wall.usual for rib in ribs])} mm, inner band "
+        f"{_say_range(free[0])} mm, outer band {_say_range(free[1])} mm; {len(bolts)} bolt holes"
+        + (f" of {_say_range(2.0 * bolts[:, 2])} mm" if len(bolts) else "")
+    )
+    return RecognizedFinger(
+        polygon=affinity.translate(turned, shift, 0.0),
+        width=width,
+        cells=[cell + move for cell in cells],
+        bolts=bolts + [shift, 0.0, 0.0],
+        inner=Wall(line=inner.line + move, thickness=inner.thickness),
+        outer=Wall(line=outer.line + move, thickness=outer.thickness),
+        ribs=[
+            RecognizedRib(
+                wall=Wall(line=rib.wall.line + move, thickness=rib.wall.thickness),
+                inner=rib.inner + move,
+                outer=rib.outer + move,
+            )
+            for rib in ribs
+        ],
+        clamped_z=clamped_z,
+        clamped_circles=circles + [shift, 0.0, 0.0],
+        face_x=face_x + shift,
+        face_deviation=deviation,
+        notes=notes,
+    )
+
+
+def _say_range(values) -> str:
+    """Return the middle of some lengths [m] in millimetres, with their range where they differ."""
+    low, middle, high = 1e3 * np.percentile(values, [5, 50, 95]) if len(values) else (np.nan,) * 3
+    return f"{middle:.2f}" if high - low < 0.15 * middle else f"{middle:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _is_round(hole: NDArray) -> bool:
+    """Whether a hole is a circle of some corners."""
+    shape = shapely.Polygon(hole)
+    return len(hole) >= _ROUND_POINTS and 4.0 * np.pi * shape.area > _ROUND * shape.length**2
+
+
+def _fit_bolts(holes: list[NDArray]) -> NDArray:
+    """Return the middles and radii (b, 3) [m] of round holes, lowest first."""
+    shapes = [shapely.Polygon(hole) for hole in holes]
+    rows = [(shape.centroid.x, shape.centroid.y, float(np.sqrt(shape.area / np.pi))) for shape in shapes]
+    return np.array(sorted(rows, key=lambda row: row[1])).reshape(-1, 3)
+
+
+def _order_cells(cells: list[NDArray]) -> list[NDArray]:
+    """Return the cells by the height of their middles."""
+    return sorted(cells, key=lambda cell: shapely.Polygon(cell).centroid.y)
+
+
+def _turn_upright(polygon: shapely.Polygon, cells: list[NDArray], wishes: Wishes, notes: list[str]) -> shapely.Polygon:
+    """Return the section with its inner face upright at the largest x, and its lowest point at z = 0."""
+    middles = np.array([shapely.Polygon(cell).centroid.coords[0] for cell in cells])
+    around = middles.mean(axis=0)
+    direction = np.linalg.svd(middles - around)[2][0]
+    narrow = _measure_widths(polygon, direction)
+    if narrow[0] < narrow[1]:
+        direction, narrow = -direction, narrow[::-1]
+    if wishes.flip:
+        direction = -direction
+    elif narrow[1] > _NARROWER * narrow[0]:
+        raise JawFileError(
+            f"its section is {1e3 * narrow[0]:.3g} mm wide at one end and {1e3 * narrow[1]:.3g} mm at the other, "
+            "expected a tip that is narrower than the base: no fin-ray finger, or --flip says which end is the tip"
+        )
+    side = np.array([-direction[1], direction[0]])
+    ring = _sample_ring(np.array(polygon.exterior.coords)[:-1])
+    low, high = np.sort(np.concatenate([cell @ direction for cell in cells]))[[0, -1]]
+    beside = ring @ direction
+    height = middles @ direction
+    order = np.argsort(height)
+    chain = np.interp(beside, height[order], (middles @ side)[order])
+    within = (beside > low + 0.05 * (high - low)) & (beside < high - 0.05 * (high - low))
+    faces = []
+    for sign in (1.0, -1.0):
+        points = ring[within & (sign * (ring @ side - chain) > 0.0)]
+        faces.append((sign, *_fit_line(points, direction)))
+    chosen = min(faces, key=lambda face: face[2])
+    if all(face[2] < _STRAIGHT * (high - low) for face in faces):
+        # both are straight: the inner face stands at right angles on the base
+        base = _find_base(polygon, direction)
+        chosen = min(faces, key=lambda face: abs(face[1] @ base))
+    if wishes.other_face:
+        chosen = faces[1] if chosen is faces[0] else faces[0]
+    sign, up, deviation = chosen
+    outward = sign * np.array([-up[1], up[0]])
+    notes.append(
+        f"inner face along ({up[0]:.3f}, {up[1]:.3f}) of the section, straight within {1e3 * deviation:.2f} mm, tip at "
+        "its far end (--flip, --other-face)"
+    )
+    turned = affinity.affine_transform(polygon, [outward[0], outward[1], up[0], up[1], 0.0, 0.0])
+    return affinity.translate(turned, -turned.bounds[2], -turned.bounds[1])
+
+
+def _measure_widths(polygon: shapely.Polygon, direction: NDArray) -> tuple[float, float]:
+    """Return how wide the outline is near its ends, at the lower and the upper end of a direction [m]."""
+    side = np.array([-direction[1], direction[0]])
+    ring = _sample_ring(np.array(polygon.exterior.coords)[:-1])
+    share = ring @ direction
+    share = (share - share.min()) / np.ptp(share)
+    across = ring @ side
+    return tuple(float(np.ptp(across[(share >= low) & (share <= high)])) for low, high in ((0.05, 0.3), (0.85, 0.95)))
+
+
+def _sample_ring(ring: NDArray, spacing: float = _SPACING) -> NDArray:
+    """Return points (n, 2) along a closed ring."""
+    closed = np.vstack([ring, ring[:1]])
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    at = np.linspace(0.0, arc[-1], max(int(arc[-1] / spacing), 8), endpoint=False)
+    return np.stack([np.interp(at, arc, closed[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _fit_line(points: NDArray, direction: NDArray) -> tuple[NDArray, float]:
+    """Return the unit vector of the line through points (n, 2), towards a direction, and how far they leave it [m].
+
+    The line is that of the middle four fifths, without the largest deviations: knobs and lugs are no bend.
+    """
+    if len(points) < _FEWEST:
+        return direction, np.inf
+    kept = points
+    for _ in range(4):
+        middle = kept.mean(axis=0)
+        up = np.linalg.svd(kept - middle, full_matrices=False)[2][0]
+        off = np.abs((points - middle) @ [-up[1], up[0]])
+        limit = max(2.5 * float(np.median(off)), 1e-5)
+        kept = points[off <= limit]
+        if len(kept) < _FEWEST:
+            return direction, np.inf
+    up = up if up @ direction > 0.0 else -up
+    return up, float(np.sqrt(np.mean(off**2)))
+
+
+def _find_base(polygon: shapely.Polygon, direction: NDArray) -> NDArray:
+    """Return the unit vector of the longest straight edge at the base."""
+    ring = np.array(polygon.exterior.simplify(2e-5).coords)
+    begin, end = ring[:-1], ring[1:]
+    height = 0.5 * (begin + end) @ direction
+    low = height < height.min() + 0.25 * np.ptp(height)
+    along = end - begin
+    across = np.abs(along @ [-direction[1], direction[0]])
+    longest = along[np.where(low, across, -1.0).argmax()]
+    return longest / np.linalg.norm(longest)
+
+
+def _choose_origin(polygon: shapely.Polygon, clamped_z: float, wishes: Wishes, face_x: float) -> float:
+    """Return by how much [m] the section is moved along x: what the clamp holds is half on either side of x = 0."""
+    if wishes.face_x is not None:
+        return wishes.face_x - face_x
+    low_x, _, high_x, high_z = polygon.bounds
+    held = polygon.intersection(shapely.box(low_x, -1.0, high_x, max(clamped_z, 0.02 * high_z)))
+    return -0.5 * (held.bounds[0] + held.bounds[2])
+
+
+def _propose_clamp(
+    cells: list[NDArray], bolts: NDArray, inner: Wall, wishes: Wishes, notes: list[str]
+) -> tuple[float, NDArray]:
+    """Return the height below which everything is clamped, and circles about bolts farther up (c, 3) [m].
+
+    A bolt belongs to the base unless a whole cell lies below it.
+    """
+    lowest_top = min(float(cell[:, 1].max()) for cell in cells)
+    base = bolts[bolts[:, 1] <= lowest_top]
+    farther = bolts[bolts[:, 1] > lowest_top]
+    circles = farther * [1.0, 1.0, _WASHER]
+    if wishes.clamp_z is not None:
+        notes.append(f"clamped below z = {1e3 * wishes.clamp_z:.4g} mm, as given")
+        return wishes.clamp_z, circles[circles[:, 1] > wishes.clamp_z]
+    if len(base):
+        height = float((base[:, 1] + _GRIP * base[:, 2]).max())
+        reason = f"a radius of its {len(base)} base bolts above their heads"
+    else:
+        height = max(min(float(cell[:, 1].min()) for cell in cells) - inner.usual, 0.0)
+        reason = "the solid base below its first cell"
+    height = round(2e3 * height) / 2e3
+    around = "".join(f", and around the bolt at z = {1e3 * z:.4g} mm" for _, z, _ in circles)
+    notes.append(f"clamped below z = {1e3 * height:.4g} mm, {reason}{around} (--clamp)")
+    return height, circles
+
+
+def _measure_face(polygon: shapely.Polygon, cells: list[NDArray], clamped_z: float) -> tuple[float, float]:
+    """Return the plane x [m] of the inner face and how far it leaves that, between the clamp and the last cell [m]."""
+    low = max(clamped_z, min(float(cell[:, 1].min()) for cell in cells))
+    high = max(float(cell[:, 1].max()) for cell in cells)
+    reach = np.array([_reach(polygon, z) for z in np.linspace(low, high, 80)[1:-1]])
+    face = float(np.median(reach))
+    return face, float(np.abs(reach - face).max())
+
+
+def _reach(polygon: shapely.Polygon, z: float) -> float:
+    """Return the largest x of a section at a height [m]."""
+    low_x, _, high_x, _ = polygon.bounds
+    cut = polygon.intersection(shapely.LineString([(low_x - 1.0, z), (high_x + 1.0, z)]))
+    return float(cut.bounds[2]) if not cut.is_empty else 0.0
+
+
+def _measure_walls(polygon: shapely.Polygon, cells: list[NDArray]) -> tuple[Wall, Wall, list[RecognizedRib]]:
+    """Return inner band, outer band and ribs: what lies between the cells and around them.
+
+    From places along the sides of each cell a ray goes straight into the material. What it meets says which wall it
+    went through, half its way is a point of the wall's centre line, all of it the thickness.
+    """
+    middles = np.array([shapely.Polygon(cell).centroid.coords[0] for cell in cells])
+    bands: dict[str, list] = {"inner": [], "outer": []}
+    between: list[list] = [[] for _ in cells[1:]]
+    for number, place, normal, far, other in _shoot(polygon, cells):
+        found = (*(place + 0.5 * far * normal), far)
+        if other >= 0:
+            if abs(other - number) == 1:
+                between[min(other, number)].append(found)
+            continue
+        x, z = place + far * normal
+        is_inner = x > np.interp(z, middles[:, 1], middles[:, 0])
+        if is_inner and normal[0] > _FACES:
+            bands["inner"].append(found)
+        elif not is_inner and normal[0] < 0.5 * _FACES and normal[1] > -_FACES:
+            bands["outer"].append(found)
+    inner, outer = (_string_up(np.array(bands[name]).reshape(-1, 3), name) for name in ("inner", "outer"))
+    ribs = []
+    for number, found in enumerate(between, start=1):
+        if len(found) < _FEWEST:
+            raise JawFileError(f"between its cells {number} and {number + 1} there is no rib that could be measured")
+        ribs.append(_string_rib(np.array(found), inner, outer))
+    return inner, outer, ribs
+
+
+def _shoot(polygon: shapely.Polygon, cells: list[NDArray]) -> Iterator[tuple[int, NDArray, NDArray, float, int]]:
+    """Yield cell, place (2,), direction (2,), way [m] and the other cell that is met, or -1, all along the cells."""
+    rings = order_rings(polygon)
+    segments = np.concatenate([np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings])
+    begin, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
+    cell_of = np.concatenate([np.full(len(ring), _find_cell(ring, cells)) for ring in rings])
+    for number, cell in enumerate(cells):
+        for place, normal in _walk_sides(cell):
+            far, segment = _cast(place, normal, begin, along)
+            if segment >= 0 and cell_of[segment] != number:
+                yield number, place, normal, far, int(cell_of[segment])
+
+
+def _find_cell(ring: NDArray, cells: list[NDArray]) -> int:
+    """Return which cell a ring is, -1 for none."""
+    middle = ring.mean(axis=0)
+    size = np.ptp(ring, axis=0)
+    for number, cell in enumerate(cells):
+        if np.abs(cell.mean(axis=0) - middle).max() < 1e-9 and np.abs(np.ptp(cell, axis=0) - size).max() < 1e-9:
+            return number
+    return -1
+
+
+def _walk_sides(cell: NDArray) -> list[tuple[NDArray, NDArray]]:
+    """Return places along the sides of a cell and the directions from there into the material."""
+    ring = np.array(shapely.geometry.polygon.orient(shapely.Polygon(cell), -1.0).exterior.coords)[:-1]
+    found = []
+    for start, end in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        way = end - start
+        size = float(np.linalg.norm(way))
+        if size < 1e-9:
+            continue
+        normal = np.array([-way[1], way[0]]) / size
+        count = max(int(size / _SPACING), 1)
+        found += [(start + (k + 0.5) / count * way, normal) for k in range(count)]
+    return found
+
+
+def _cast(place: NDArray, normal: NDArray, begin: NDArray, along: NDArray) -> tuple[float, int]:
+    """Return how far [m] it is from a place in a direction to the first of some segments, and which one it is."""
+    gap = begin - place
+    across = normal[1] * along[:, 0] - normal[0] * along[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = (gap[:, 1] * along[:, 0] - gap[:, 0] * along[:, 1]) / across
+        share = (normal[0] * gap[:, 1] - normal[1] * gap[:, 0]) / across
+    far = np.where((far > 1e-6) & (share >= 0.0) & (share <= 1.0), far, np.inf)
+    nearest = int(far.argmin())
+    return (float(far[nearest]), nearest) if np.isfinite(far[nearest]) else (np.inf, -1)
+
+
+def _string_up(found: NDArray, name: str) -> Wall:
+    """Return a band from points of its centre line with thickness (n, 3), base to tip.
+
+    Raises:
+        JawFileError: There are too few.
+    """
+    if len(found) < _FEWEST:
+        raise JawFileError(f"beside its cells no {name} band could be measured")
+    found = found[np.argsort(found[:, 1])]
+    # rays through knobs, lugs and the ends of ribs are longer than those beside them
+    near = [found[np.abs(found[:, 1] - z) < _NEIGHBOURS, 2] for z in found[:, 1]]
+    found = found[found[:, 2] <= _LONGER * np.array([np.percentile(ways, 25) for ways in near])]
+    return _thin_out(found)
+
+
+def _thin_out(found: NDArray) -> Wall:
+    """Return a wall with the medians of points (n, 3), sorted along it, over stretches of about a millimetre."""
+    arc = found[:, 1] - found[0, 1]
+    number = np.floor(arc / 1e-3).astype(int)
+    rows = np.array([np.median(found[number == k], axis=0) for k in np.unique(number)])
+    return Wall(line=rows[:, :2], thickness=rows[:, 2])
+
+
+def _string_rib(found: NDArray, inner: Wall, outer: Wall) -> RecognizedRib:
+    """Return a rib from points of its centre line with thickness (n, 3)."""
+    usual = np.median(found[:, 2])
+    found = found[found[:, 2] < 2.0 * usual]
+    middle = np.median(found[:, :2], axis=0)
+    along = np.linalg.svd(found[:, :2] - found[:, :2].mean(axis=0), full_matrices=False)[2][0]
+    along = along if along[0] < 0.0 else -along
+    found = found[np.argsort((found[:, :2] - middle) @ along)]
+    count = max(len(found) // 8, 1)
+    ends = [_meet(found[:count, :2], middle, inner), _meet(found[-count:, :2], middle, outer)]
+    return RecognizedRib(wall=Wall(line=found[:, :2], thickness=found[:, 2]), inner=ends[0], outer=ends[1])
+
+
+def _meet(end: NDArray, middle: NDArray, band: Wall) -> NDArray:
+    """Return where a rib, running on straight from its middle through its end, meets a band's centre line (2,) [m]."""
+    tip = end.mean(axis=0)
+    direction = (tip - middle) / max(np.linalg.norm(tip - middle), 1e-9)
+    line = band.line
+    longer = np.vstack([2.0 * line[0] - line[1], line, 2.0 * line[-1] - line[-2]])
+    crossing = shapely.LineString([tip - 2e-3 * direction, tip + 15e-3 * direction]).intersection(
+        shapely.LineString(longer)
+    )
+    if crossing.is_empty:
+        return line[cKDTree(line).query(tip + 0.5 * band.usual * direction)[1]]
+    places = np.array(
+        [(point.x, point.y) for point in getattr(crossing, "geoms", [crossing]) if point.geom_type == "Point"]
+    )
+    if not len(places):
+        return line[cKDTree(line).query(tip)[1]]
+    return places[np.linalg.norm(places - tip, axis=1).argmin()]
