@@ -4,7 +4,6 @@ import logging
 from dataclasses import replace
 
 from finforce_ifea.contact_mechanics.pressed_jaw import (
-    Across,
     Mechanics,
     RollingContact,
     build_contact_surface,
@@ -37,27 +36,24 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
     if name == "paper":
         mesh = to_tet4(jaw.build_mesh("coarse")) if jaw.mesh_file is None else mesh
     if name == "plane":
-        model: JawModel = _build_plane(jaw, mesh, density)
-        across: Across = "middle"
+        model: JawModel = build_plane_model(jaw, mesh, density)
     elif name == "frame":
         if jaw.drawing is None:
             raise JawFileError(f"the jaw {jaw.name!r} is no drawing, which a frame needs; expected solver {jaw.model}")
         from finforce_ifea.fem.frame import FrameModel
 
         model = FrameModel(jaw.drawing, jaw.material, mesh=mesh)
-        across = "middle"
     else:
         if jaw.drawing is not None and not jaw.drawing.is_solid:
             raise JawFileError(f"the jaw {jaw.name!r} has hinges or rigid bars; only the frame describes it")
         if name != "paper":
             warn_of_locking(jaw, mesh)
         model = SolidModel(mesh, jaw.material, symmetric=settings.force_axes == "normal")
-        across = "half" if model.symmetric else "both"
-    surface = build_contact_surface(jaw, mesh, model, across=across)
+    surface = build_contact_surface(jaw, mesh, model, across=model.across)
     return Mechanics(mesh=mesh, model=model, contact=RollingContact(model, surface, jaw.inner_face_x))
 
 
-def _build_plane(jaw: Jaw, mesh: VolumeMesh, density: str | None) -> JawModel:
+def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) -> JawModel:
     """Returns the plane model of a jaw's section, as stiff as the solid finger.
 
     Plane strain holds the width, which is free at both sides: the modulus is lowered by what the solid is softer at
@@ -74,8 +70,8 @@ def _build_plane(jaw: Jaw, mesh: VolumeMesh, density: str | None) -> JawModel:
     solid = SolidModel(coarse, jaw.material)
     held = PlaneModel(coarse, jaw.build_plane("coarse"), section.width, jaw.material)
     stiffness = [
-        measure_stiffness(model, build_contact_surface(jaw, coarse, model, across=across))
-        for model, across in ((solid, "half"), (held, "middle"))
+        measure_stiffness(model, build_contact_surface(jaw, coarse, model, across=model.across))
+        for model in (solid, held)
     ]
     share = stiffness[0] / stiffness[1]
     material = replace(jaw.material, young_modulus=jaw.material.young_modulus * share)

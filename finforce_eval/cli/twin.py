@@ -30,6 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     record.add_argument("--finger", type=int, default=0, metavar="SEED", help=finger)
     record.add_argument("--light", metavar="WORD", help="bright, dim or any; without it that of the scene")
     record.add_argument("--object", metavar="NAME", help="shape by name, or mesh file; without it that of the scene")
+    record.add_argument("--jaw", metavar="NAME", help="shipped jaw or jaw file; without it that of the scene, bench")
     record.add_argument("--camera", choices=("robot", "bench"), help="two jaws on the wrist, or one on the bench")
     record.add_argument("--size", default="640x480", metavar="WxH", help="of the images (640x480)")
     text = "change a number of the scene, may be repeated; an unknown NAME lists them"
@@ -125,7 +126,7 @@ def scenario_from_options(options: argparse.Namespace) -> Scenario:
     """
     defaults = {entry.name: entry.default for entry in fields(Scenario) if entry.name != "name"}
     changes = parse_changes("--set", "number", options.set, defaults)
-    for name in ("light", "object", "camera"):
+    for name in ("light", "object", "camera", "jaw"):
         if getattr(options, name) is not None:
             changes[name] = getattr(options, name)
     return build_scenario(options.scene, **changes)

@@ -10,6 +10,7 @@ from finforce_eval.fingers.recognition import RecognizedFinger
 from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.jaw.section import order_rings
 
+_VIEW, _LIGHT, _PIXELS = np.array([0.75, 1.0, 0.35]), np.array([0.9, 0.5, 0.6]), 900
 _MATERIAL, _HELD, _INNER, _OUTER, _RIB = "#d9dee6", "#8a93a3", "#c0392b", "#2d6cb5", "#3a8f4d"
 
 
@@ -27,7 +28,7 @@ def draw_finger(finger: RecognizedFinger, proposal: Proposal, mesh: VolumeMesh, 
     size = np.array([np.ptp(np.array(finger.polygon.exterior.coords)[:, 0]), finger.length])
     figure = Figure(figsize=(13.0, 9.0), layout="constrained")
     flat = figure.add_subplot(1, 2, 1)
-    solid = figure.add_subplot(1, 2, 2, projection="3d")
+    solid = figure.add_subplot(1, 2, 2)
     _draw_section(flat, finger)
     _draw_walls(flat, finger)
     _draw_points(flat, finger, proposal, size)
@@ -110,16 +111,24 @@ def _draw_points(axes, finger: RecognizedFinger, proposal: Proposal, size: NDArr
 
 
 def _draw_solid(axes, mesh: VolumeMesh) -> None:
-    """Draw the surface of a mesh, lit from the camera's side."""
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+    """Draw a mesh as seen from the camera's side, lit from there; parallel rays find what is in front."""
+    import open3d as o3d
 
-    corners = 1e3 * mesh.nodes[mesh.surface]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    light = 0.45 + 0.5 * np.clip(normals @ np.array([0.5, 0.7, 0.5]), 0.0, 1.0)
-    colours = np.stack([0.85 * light, 0.88 * light, light, np.ones(len(light))], axis=1)
-    axes.add_collection3d(Poly3DCollection(corners, facecolors=colours, edgecolors=colours, linewidths=0.2))
-    low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), xlabel="x", ylabel="y", zlabel="z")
-    axes.set_box_aspect(high - low)
-    axes.view_init(elev=18.0, azim=52.0)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(mesh.nodes.astype(np.float32), mesh.surface.astype(np.uint32))
+    view = _VIEW / np.linalg.norm(_VIEW)
+    right = np.cross([0.0, 0.0, 1.0], view)
+    right = right / np.linalg.norm(right)
+    up = np.cross(view, right)
+    flat = np.stack([mesh.nodes @ right, mesh.nodes @ up], axis=1)
+    low, high = flat.min(axis=0) - 1e-3, flat.max(axis=0) + 1e-3
+    step = (high - low).max() / _PIXELS
+    across, along = (np.arange(low[k], high[k], step) for k in (0, 1))
+    starts = across[None, :, None] * right + along[::-1, None, None] * up + 0.5 * view
+    rays = np.concatenate([starts, np.broadcast_to(-view, starts.shape)], axis=2).astype(np.float32)
+    hits = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)))
+    normals, seen = hits["primitive_normals"].numpy(), np.isfinite(hits["t_hit"].numpy())
+    light = 0.35 + 0.6 * np.clip(normals @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0, 1.0)
+    picture = np.where(seen[:, :, None], light[:, :, None] * np.array([0.87, 0.9, 1.0]), 1.0)
+    axes.imshow(picture, extent=1e3 * np.array([low[0], high[0], low[1], high[1]]), interpolation="bilinear")
+    axes.set_axis_off()

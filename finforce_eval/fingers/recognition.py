@@ -14,6 +14,8 @@ from finforce_ifea.jaw.section import order_rings
 
 # A hole is round, thus a bolt's, when its area is this share of the circle's with its outline.
 _ROUND, _ROUND_POINTS = 0.955, 8
+# Points closer to the line between their neighbours than this [m] say nothing.
+_CHORD = 4e-6
 # Spacing of the places [m] where walls are measured.
 _SPACING = 3e-4
 # A side is straight where it leaves its line by less than this share of its length.
@@ -137,7 +139,7 @@ def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes) -> Recogni
             "drawing"
         )
     notes: list[str] = []
-    turned = _turn_upright(polygon, cells, wishes, notes)
+    turned = _turn_upright(polygon, cells, wishes, notes).simplify(_CHORD)
     holes = [np.array(ring.coords)[:-1] for ring in turned.interiors]
     bolts = _fit_bolts([hole for hole in holes if _is_round(hole)])
     cells = _order_cells([hole for hole in holes if not _is_round(hole)])

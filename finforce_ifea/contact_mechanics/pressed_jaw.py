@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact, R
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, Indenter, RoundIndenter
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.errors import MeshError
-from finforce_ifea.fem.model import JawModel
+from finforce_ifea.fem.model import Across, JawModel
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
 
@@ -215,7 +215,6 @@ class Mechanics:
     full: Mechanics | None = None
 
 
-Across = Literal["middle", "half", "both"]
 _SPACING = 0.25e-3
 _ON_FACE = 1e-4
 # Penalty per height [N/m per m]: soft enough for several points to share a touch, so that the force moves smoothly from

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.factorisation import Factor, SparseFactor, factorise_banded, sparse_from_banded
-from finforce_ifea.fem.model import LARGEST_MOVE, LARGEST_TURN, Linearization
+from finforce_ifea.fem.model import LARGEST_MOVE, LARGEST_TURN, Across, Linearization
 from finforce_ifea.jaw.drawing import Drawing, Rib
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
@@ -343,6 +343,8 @@ class FrameModel:
     Attributes:
         size, rotations, reach: see there.
     """
+
+    across: Across = "middle"
 
     def __init__(
         self,

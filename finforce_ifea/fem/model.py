@@ -1,13 +1,14 @@
 """What every mechanical model of a jaw offers to the solvers."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from numpy.typing import NDArray
 
 from finforce_ifea.fem.factorisation import Factor
 
 LARGEST_MOVE, LARGEST_TURN = 2e-3, 0.3
+Across = Literal["middle", "half", "both"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,11 +33,14 @@ class JawModel(Protocol):
 
     Attributes:
         size: number of unknowns.
+        across: where along y contact points stand: in the "middle" of a planar model, on "half" of the width where each
+            stands for its mirror image too, or on "both" halves.
         rotations: which unknowns are rotations (size,) bool; None when all are of one kind.
         reach: largest change of each unknown at once (size,), or of all: 2 mm, 0.3 rad.
     """
 
     size: int
+    across: Across
     rotations: NDArray | None
     reach: NDArray | float
 

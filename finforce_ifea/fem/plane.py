@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from finforce_ifea.errors import MeshError
-from finforce_ifea.fem.model import LARGEST_MOVE, Linearization
+from finforce_ifea.fem.model import LARGEST_MOVE, Across, Linearization
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
@@ -31,6 +31,7 @@ class PlaneModel(SolidModel):
     """
 
     _banded_limit = 0.0
+    across: Across = "middle"
 
     def __init__(self, mesh: VolumeMesh, plane: PlaneMesh, width: float, material: Material) -> None:
         """Numbers the unknowns and prepares the triangles.

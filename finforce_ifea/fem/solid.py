@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from finforce_ifea.fem.elements import centre_gradient, elasticity_matrix, hex_stiffness, tet_stiffness
 from finforce_ifea.fem.factorisation import Factor, SparseFactor, factorise_banded, sparse_from_banded
-from finforce_ifea.fem.model import LARGEST_MOVE, Linearization
+from finforce_ifea.fem.model import LARGEST_MOVE, Across, Linearization
 from finforce_ifea.jaw.attachment import attach_points
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
@@ -52,6 +52,11 @@ class SolidModel:
     """
 
     _banded_limit = _BANDED_COST_LIMIT
+
+    @property
+    def across(self) -> Across:
+        """Where along y contact points stand."""
+        return "half" if self.symmetric else "both"
 
     def __init__(self, mesh: VolumeMesh, material: Material, *, symmetric: bool = True) -> None:
         """Builds element stiffnesses and the plan of assembly.

@@ -16,7 +16,7 @@ from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact
 from finforce_ifea.contact_mechanics.indenter import Indenter, RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, PressedState, RollingContact
 from finforce_ifea.fem.factorisation import Factor
-from finforce_ifea.fem.model import LARGEST_MOVE, JawModel, Linearization
+from finforce_ifea.fem.model import LARGEST_MOVE, Across, JawModel, Linearization
 from finforce_ifea.reduced.equilibria import (
     LARGEST_GRID_STEP,
     WATCHED,
@@ -88,6 +88,7 @@ class ReducedModel:
     """
 
     rotations = None
+    across: Across = "middle"
 
     def __init__(self, manifold: Manifold, full: JawModel, young_modulus: float, face_x: float) -> None:
         """Scales a manifold to a modulus [Pa] of the jaw that `full` describes, its inner face in the plane x [m]."""

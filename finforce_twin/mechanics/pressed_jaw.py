@@ -1,6 +1,6 @@
 """One jaw of the twin against an outline: Newton steps, contact forces and what the jaw looks like."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.jaw.jaw_file import Material
+from finforce_ifea.mechanics import build_plane_model
 
 # Finer along bands and ribs than the mesh that the estimator takes by default.
 TWIN_DENSITY = MeshDensity(between_ribs=10, through_band=1, along_rib=10, through_rib=1, tip=2, across_width=2)
@@ -87,8 +88,7 @@ class PressedJaw:
         self.jaw = jaw
         self.mesh = jaw.build_mesh(density if jaw.drawing is not None else None)
         self.model = _build_model(jaw, self.mesh, material, lateral=lateral)
-        across = "middle" if not isinstance(self.model, SolidModel) else "half" if self.model.symmetric else "both"
-        self.surface = build_contact_surface(jaw, self.mesh, self.model, across=across)
+        self.surface = build_contact_surface(jaw, self.mesh, self.model, across=self.model.across)
         self.half_width = float(np.abs(self.mesh.nodes[:, 1]).max())
         self._keypoints = self.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
         self._indenter: OutlineIndenter | None = None
@@ -162,7 +162,9 @@ def _share_pull(forces: NDArray, pull: NDArray) -> NDArray:
 
 
 def _build_model(jaw: Jaw, mesh: Any, material: Material, *, lateral: bool) -> JawModel:
-    """Returns a solid, or the frame of a drawing that no solid describes."""
+    """Returns a solid, the plane model of a section without loads along y, or the frame of what no solid describes."""
+    if jaw.section is not None and not lateral:
+        return build_plane_model(replace(jaw, material=material), mesh)
     if jaw.drawing is None or jaw.drawing.is_solid:
         return SolidModel(mesh, material, symmetric=not lateral)
     from finforce_ifea.fem.frame import FrameModel

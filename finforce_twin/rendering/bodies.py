@@ -67,9 +67,17 @@ class Wardrobe:
 
 def dress_jaw(shape: DrawnJaw, vertices: NDArray, T_camera_jaw: NDArray, wardrobe: Wardrobe) -> list[Body]:
     """Return a jaw with deformed vertices (n, 3) [m], jaw frame, and its holder with the reference dot."""
-    jaw = Body(vertices=_move(vertices, T_camera_jaw), triangles=shape.triangles, rest=shape.rest, paint=wardrobe.jaw)
     dot = Decal(place=shape.jaw.reference_point, radius=wardrobe.dot_radius, color=wardrobe.dot_color)
-    return [jaw, _box(HOLDER, T_camera_jaw, wardrobe.holder, (dot,))]
+    # a finger whose clamped part is in view carries the dot itself
+    own = (dot,) if shape.jaw.reference_point[2] > 0.0 else ()
+    moved = _move(vertices, T_camera_jaw)
+    jaw = Body(vertices=moved, triangles=shape.triangles, rest=shape.rest, paint=wardrobe.jaw, decals=own)
+    holder = HOLDER.copy()
+    if own:
+        # the holder is as wide as the finger that stands in it
+        low, high = shape.rest.min(axis=0), shape.rest.max(axis=0)
+        holder[:, :2] = np.stack((low[:2], high[:2]))
+    return [jaw, _box(holder, T_camera_jaw, wardrobe.holder, () if own else (dot,))]
 
 
 def dress_palm(T_camera_gripper: NDArray, wardrobe: Wardrobe) -> Body:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.settings import check_bounds, setting
+from finforce_ifea.jaw.jaw import load_jaw
 from finforce_twin.errors import ScenarioError
 
 CAMERAS = ("robot", "bench")
@@ -107,6 +108,7 @@ def build_scenario(name: str, **overrides: Any) -> Scenario:
 
     Raises:
         ScenarioError: There is no such scenario or field, or a value is out of its bounds.
+        JawFileError: There is no such jaw.
     """
     if name not in SCENARIOS:
         raise ScenarioError(f"scenario {name!r}: expected one of {', '.join(SCENARIOS)}")
@@ -114,7 +116,23 @@ def build_scenario(name: str, **overrides: Any) -> Scenario:
     if unknown:
         known = ", ".join(Scenario.__dataclass_fields__)
         raise ScenarioError(f"scenario {name!r}: got the field {unknown[0]!r}, expected one of {known}")
-    return replace(SCENARIOS[name], **overrides)
+    return replace(SCENARIOS[name], **_fit_jaw(SCENARIOS[name], overrides), **overrides)
+
+
+def _fit_jaw(scenario: Scenario, overrides: dict[str, Any]) -> dict[str, float]:
+    """Returns height and displacement for another jaw than the scene's, where they are not given.
+
+    The object meets the same share of the jaw's candidates, and a shorter jaw is pressed as much less.
+    """
+    if overrides.get("jaw", scenario.jaw) == scenario.jaw:
+        return {}
+    own, other = (load_jaw(name).candidates[:, 2] for name in (scenario.jaw, overrides["jaw"]))
+    share = (scenario.height - own.min()) / np.ptp(own)
+    fitted = {
+        "height": float(other.min() + share * np.ptp(other)),
+        "displacement": scenario.displacement * min(float(np.ptp(other) / np.ptp(own)), 1.0),
+    }
+    return {key: value for key, value in fitted.items() if key not in overrides}
 
 
 RATE = 30.0  # [Hz] of the images
