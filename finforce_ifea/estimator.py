@@ -40,7 +40,7 @@ __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 _LONGEST_GAP = 1.0
 _BESIDE = 1e-3
 _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
-# Relative standard deviation of forces without a calibration.
+# Relative standard deviation of forces without a calibration, at least: a material known by name has its own.
 _UNCALIBRATED = 0.1
 # Relative error of forces at the distance from stored shapes that those are good for.
 _EXTRAPOLATED = 0.015
@@ -92,7 +92,8 @@ class JawEstimator:
         self._gate = KeypointGate(self.jaw, self.settings)
         self._relaxation = Relaxation(calibration.relaxation if calibration else ())
         solver = self.settings.solver
-        known = calibration.expect_error(self.jaw, solver) if calibration else _UNCALIBRATED
+        uncalibrated = max(_UNCALIBRATED, self.jaw.material.spread)
+        known = calibration.expect_error(self.jaw, solver) if calibration else uncalibrated
         self._force_error = float(np.hypot(known, _LINEAR)) if solver == "linear" else known
         self._taring = TareKeeper(
             self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)

@@ -19,6 +19,8 @@ from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.settings import EstimatorSettings
 
 _REDUCED = ("reduced", "linear")
+# How much softer the solid finger is than its section in plane strain, by shape, Poisson's ratio and size of elements.
+_WIDTH_SHARES: dict[tuple, float] = {}
 
 
 def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
@@ -65,17 +67,18 @@ def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) ->
     """
     from finforce_ifea.fem.plane import PlaneModel
 
-    plane, section = jaw.build_plane(density), jaw.section
-    coarse = jaw.build_mesh("coarse")
-    solid = SolidModel(coarse, jaw.material)
-    held = PlaneModel(coarse, jaw.build_plane("coarse"), section.width, jaw.material)
-    stiffness = [
-        measure_stiffness(model, build_contact_surface(jaw, coarse, model, across=model.across))
-        for model in (solid, held)
-    ]
-    share = stiffness[0] / stiffness[1]
-    material = replace(jaw.material, young_modulus=jaw.material.young_modulus * share)
-    return PlaneModel(mesh, plane, section.width, material)
+    key = (jaw.digest, jaw.material.poisson_ratio, jaw.section.size)
+    if key not in _WIDTH_SHARES:
+        coarse = jaw.build_mesh("coarse")
+        solid = SolidModel(coarse, jaw.material)
+        held = PlaneModel(coarse, jaw.build_plane("coarse"), jaw.section.width, jaw.material)
+        stiffness = [
+            measure_stiffness(model, build_contact_surface(jaw, coarse, model, across=model.across))
+            for model in (solid, held)
+        ]
+        _WIDTH_SHARES[key] = stiffness[0] / stiffness[1]
+    material = replace(jaw.material, young_modulus=jaw.material.young_modulus * _WIDTH_SHARES[key])
+    return PlaneModel(mesh, jaw.build_plane(density), jaw.section.width, material)
 
 
 def choose_solver(settings: EstimatorSettings) -> EstimatorSettings:

@@ -45,14 +45,13 @@ class PlaneModel(SolidModel):
         Raises:
             MeshError: The mesh is not made of that section.
         """
-        self.mesh = mesh
+        self.mesh, self.plane = mesh, plane
         self.rotations, self.reach, self.symmetric = None, LARGEST_MOVE, False
         self.sign = np.ones((len(mesh.nodes), 3))
         distance, column = cKDTree(plane.points).query(mesh.nodes[:, [0, 2]])
-        top = np.flatnonzero(mesh.nodes[:, 1] > mesh.nodes[:, 1].max() - _SAME)
-        standing = np.full(len(plane.points), -1)
-        standing[column[top]] = top
-        if distance.max() > _SAME or (standing < 0).any():
+        # of the nodes over each point the first stands for all: the same ones in the mirrored mesh of the other jaw
+        points, standing = np.unique(column, return_index=True)
+        if distance.max() > _SAME or len(points) < len(plane.points):
             raise MeshError("the mesh is not the section extruded along y")
         self._elements = np.ascontiguousarray(standing[plane.triangles])
         self._gradients, volumes = _differentiate(plane.points[plane.triangles])

@@ -50,7 +50,7 @@ _PRIOR_STDDEV = np.r_[1.0, 0.1, 0.1, 0.1, 0.4, BRANCH_STDDEV]
 _LOW = np.r_[-3.0, 0.6, 0.6, 0.6, 0.0, BRANCH_LOW]
 _HIGH = np.r_[3.0, 1.5, 1.5, 1.5, 2.0, BRANCH_HIGH]
 _DIFFERENCE = np.array([1e-3, 2e-3, 2e-3, 4e-3, 2e-2, 1e-3, 1e-2, 1e-3, 1e-2])
-_GEOMETRY = slice(1, 5)
+_GEOMETRY, _THICKNESSES = slice(1, 5), (1, 2, 3)
 _FORCE_ERROR, _FORCE_FLOOR = 0.015, 0.01
 _SHAPE_ERROR = 0.05e-3
 _ITERATIONS = 12
@@ -161,6 +161,7 @@ class _Fit:
             clamped_z=float(1e-3 * x[4]),
             relaxation=branches_from_parameters(x[5:9]),
             jaw=self.jaw.name,
+            finger=self.jaw.digest,
         )
 
     def residuals(self, x: NDArray) -> NDArray:
@@ -221,6 +222,10 @@ class _Fit:
         centre = self.residuals(x)
         columns = []
         for i, step in enumerate(self.difference):
+            if self.jaw.drawing is None and i in _THICKNESSES:  # only a drawing has bands and ribs to be thickened
+                columns.append(np.zeros(len(centre)))
+                columns[-1][len(centre) - len(x) + i] = 1.0 / self.stddev[i]
+                continue
             step = -step if x[i] + step > self.high[i] else step
             moved = x.copy()
             moved[i] += step

@@ -22,6 +22,7 @@ _KEYS = {
     "friction",
     "friction_stddev",
     "jaw",
+    "finger",
     "solver",
     "comment",
     "uncertainty",
@@ -46,6 +47,7 @@ class Calibration:
         friction: coefficient of the objects that the finger was calibrated on, 0 where they showed none.
         friction_stddev: standard deviation of that [-].
         jaw: name of the jaw that it belongs to, empty for any.
+        finger: digest of that jaw's shape, empty where nobody knows; see `Jaw.digest`.
         solver: mechanics that it was identified with, "solid", "frame", "plane" or "paper"; empty where nobody knows.
     """
 
@@ -59,6 +61,7 @@ class Calibration:
     friction: float = 0.0
     friction_stddev: float = 0.02
     jaw: str = ""
+    finger: str = ""
     solver: str = ""
 
     def __post_init__(self) -> None:
@@ -81,8 +84,9 @@ class Calibration:
             value = getattr(self, name)
             if not (isinstance(value, (int, float)) and np.isfinite(value) and low <= value <= high):
                 raise CalibrationError(f"calibration: {name} = {value!r}, expected a number from {low:g} to {high:g}")
-        if not isinstance(self.jaw, str):
-            raise CalibrationError(f"calibration: jaw = {self.jaw!r}, expected the name of a jaw")
+        for name in ("jaw", "finger"):
+            if not isinstance(getattr(self, name), str):
+                raise CalibrationError(f"calibration: {name} = {getattr(self, name)!r}, expected a text")
         if self.solver not in ("", *_MECHANICS):
             raise CalibrationError(f"calibration: solver = {self.solver!r}, expected one of {', '.join(_MECHANICS)}")
         for term in self.relaxation:
@@ -97,6 +101,11 @@ class Calibration:
         """
         if self.jaw and self.jaw != jaw.name:
             raise CalibrationError(f"the calibration belongs to the jaw {self.jaw!r}, got {jaw.name!r}")
+        if self.finger and self.finger != jaw.digest:
+            raise CalibrationError(
+                f"the calibration belongs to a finger of another shape ({self.finger}, the jaw {jaw.name!r} is "
+                f"{jaw.digest}): calibrate this one"
+            )
         material = replace(jaw.material, young_modulus=float(self.young_modulus))
         if jaw.section is not None and jaw.section.clamped_z is not None:
             section = replace(jaw.section, clamped_z=max(jaw.section.clamped_z, self.clamped_z))

@@ -1,6 +1,8 @@
 """One jaw: its shape, material, key points and contact candidates."""
 
+import hashlib
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Literal
@@ -115,6 +117,16 @@ class Jaw:
         if self.section is None:
             raise JawFileError(f"the jaw {self.name!r} is no section; only one has a plane mesh")
         return mesh_section(self.section, _find_share(density))
+
+    @cached_property
+    def digest(self) -> str:
+        """What the finger's shape is known by: 12 hexadecimal digits of its content, the same for both sides."""
+        shape = self.drawing or self.section
+        if shape is None:
+            content = self.mesh_file.path.read_bytes() + repr((self.mesh_file.scale, self.mesh_file.clamp)).encode()
+        else:
+            content = repr(self.drawing).encode() if self.section is None else self.section.content
+        return hashlib.sha256(content).hexdigest()[:12]
 
     def mirrored(self) -> "Jaw":
         """Return the other side's jaw, the mirror image y -> -y."""

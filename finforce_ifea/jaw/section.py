@@ -38,6 +38,13 @@ class Section:
         """The section as one polygon with holes."""
         return shapely.Polygon(self.rings[0], self.rings[1:])
 
+    @property
+    def content(self) -> bytes:
+        """All that makes the finger's shape and clamp, to a micrometre."""
+        numbers = [self.width, np.nan if self.clamped_z is None else self.clamped_z, *self.clamped_circles.ravel()]
+        rings = [np.round(1e6 * ring).astype(np.int64).tobytes() for ring in self.rings]
+        return b"|".join([np.round(1e6 * np.array(numbers)).tobytes(), *rings])
+
     @cached_property
     def free_area(self) -> float:
         """The area [m^2] above the clamp."""

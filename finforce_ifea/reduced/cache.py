@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.fem.frame import FrameModel
+from finforce_ifea.fem.plane import PlaneModel
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.reduced import build as manifold_build
 from finforce_ifea.reduced.build import build_manifold, build_rest
@@ -145,8 +146,10 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
 
 def name_manifold(full: Mechanics, jaw: Jaw) -> str:
     """Returns the hash of all that the equilibria of a jaw depend on; its modulus is none of it."""
-    mesh = full.mesh
+    mesh, model = full.mesh, full.model
     parts = [mesh.nodes, mesh.elements, mesh.clamped, jaw.material.poisson_ratio, full.contact.face_x]
+    if isinstance(model, PlaneModel):  # one for both sides
+        parts[:2] = [model.plane.points, model.plane.triangles, jaw.section.width]
     if isinstance(full.model, FrameModel):
         parts.append(repr(jaw.drawing))
     return hash_parts(type(full.model).__name__, *map(str, manifold_build.GRID), *parts)
