@@ -42,7 +42,8 @@ setup(
         "pillow",  # picture files
         "rosbags",  # recordings, without ROS
         "manifold3d",  # Boolean intersections and outlines of object meshes
-        "trimesh",  # object mesh files
+        "trimesh",  # object mesh files, surfaces of fingers
+        "shapely",  # polygons: sections of fingers, what lies in them, whether they are sound
         # ray casting, registration with scale, Poisson surfaces; the build without CUDA is a quarter of the size
         "open3d-cpu; platform_machine == 'x86_64' and sys_platform == 'linux'",
         "open3d; platform_machine != 'x86_64' or sys_platform != 'linux'",
@@ -60,10 +61,12 @@ setup(
             "ros-jazzy-common-interfaces",
             "ros-jazzy-ament-index-python",
         ],
+        "cad": ["cascadio", "ezdxf", "svgelements"],  # fingers from STEP, DXF and SVG files
         "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
-        "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0", "xacro"],
+        "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0", "xacro"]
+        + ["cascadio", "ezdxf", "svgelements"],
         "lint": ["ruff", "import-linter"],
     },
     entry_points={

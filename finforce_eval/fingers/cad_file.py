@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from shapely.ops import polygonize, unary_union
 
-from finforce.errors import MissingDependencyError
+from finforce.optional import import_library
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.section import UNITS, check_loops, join_loops, read_loops
 
@@ -97,13 +97,7 @@ def _load_surface(path: Path, suffix: str) -> trimesh.Trimesh:
     if suffix == ".stl":
         _check_stl(path)
     if suffix in (".step", ".stp"):
-        try:
-            import cascadio  # noqa: F401
-        except ImportError as error:
-            raise MissingDependencyError(
-                f"reading {path.name} needs cascadio, which is not installed: python -m pip install cascadio, or "
-                "export the finger as STL"
-            ) from error
+        import_library("cascadio", f"reading {path.name}, which may be exported as STL instead,")
     try:
         mesh = trimesh.load(path, file_type=suffix[1:], force="mesh", process=True)
     except Exception as error:  # trimesh has no base error
@@ -172,7 +166,7 @@ def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> R
 
 def _choose_body(mesh: trimesh.Trimesh, body: int | None, scale: float, notes: list[str]) -> trimesh.Trimesh:
     """Return the one body of a file, or the one that is asked for."""
-    bodies = mesh.split(only_watertight=False)
+    bodies = mesh.split(only_watertight=False, repair=False)
     # what a few triangles enclose is no part of a finger
     bodies = sorted((item for item in bodies if len(item.faces) >= 4), key=lambda item: -np.prod(item.extents))
     if len(bodies) <= 1 and body in (None, 1):
@@ -256,13 +250,8 @@ def _join_lines(lines: list[NDArray]) -> shapely.Polygon:
 
 def _read_dxf(path: Path) -> tuple[list[NDArray], str | None]:
     """Read the curves of a DXF drawing, and its unit."""
-    try:
-        import ezdxf
-        from ezdxf.path import make_path
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"reading {path.name} needs ezdxf, which is not installed: python -m pip install ezdxf"
-        ) from error
+    ezdxf = import_library("ezdxf", f"reading {path.name}")
+    make_path = import_library("ezdxf.path", f"reading {path.name}").make_path
     try:
         document = ezdxf.readfile(path)
     except (OSError, ezdxf.DXFError, UnicodeError, ValueError) as error:
@@ -282,12 +271,7 @@ def _read_dxf(path: Path) -> tuple[list[NDArray], str | None]:
 
 def _read_svg(path: Path) -> tuple[list[NDArray], str | None]:
     """Read the curves of an SVG drawing; lengths without a unit are CSS pixels, as in browsers, unless one is named."""
-    try:
-        import svgelements
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"reading {path.name} needs svgelements, which is not installed: python -m pip install svgelements"
-        ) from error
+    svgelements = import_library("svgelements", f"reading {path.name}")
     try:
         # a pixel is 1/96 inch: at 25.4 per inch everything comes out in millimetres where sizes have units
         document = svgelements.SVG.parse(str(path), ppi=25.4, reify=True)

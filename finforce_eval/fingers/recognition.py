@@ -27,7 +27,7 @@ _GRIP, _WASHER = 3.0, 2.0
 # Least cosine between a cell's side and the face of the band beyond it.
 _FACES = 0.7
 _NEIGHBOURS, _LONGER = 3e-3, 1.4
-_FEWEST = 5
+_FEWEST, _FLAT = 5, 1e-4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -147,6 +147,11 @@ def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes) -> Recogni
     inner, outer, ribs = walls
     clamped_z, circles = _propose_clamp(cells, bolts, inner, wishes, notes)
     face_x, deviation = _measure_face(turned, cells, clamped_z)
+    if deviation > _FLAT:
+        raise JawFileError(
+            f"its inner face leaves its plane by {1e3 * deviation:.2g} mm, expected a plane within {1e3 * _FLAT:g} mm: "
+            "contact on curved faces is not computed (--other-face, if the straight side is the other one)"
+        )
     shift = _choose_origin(turned, clamped_z, wishes, face_x)
     move = np.array([shift, 0.0])
     free = [band.thickness[band.line[:, 1] > clamped_z] for band in (inner, outer)]

@@ -107,9 +107,6 @@ class Calibration:
                 f"{jaw.digest}): calibrate this one"
             )
         material = replace(jaw.material, young_modulus=float(self.young_modulus))
-        if jaw.section is not None and jaw.section.clamped_z is not None:
-            section = replace(jaw.section, clamped_z=max(jaw.section.clamped_z, self.clamped_z))
-            return replace(jaw, section=section, material=material)
         if jaw.drawing is None:
             return replace(jaw, material=material)
         drawing = replace(

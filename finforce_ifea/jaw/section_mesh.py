@@ -12,7 +12,7 @@ from finforce_ifea.jaw.mesh import EDGES_TET10, VolumeMesh, build_volume_mesh
 from finforce_ifea.jaw.section import Section
 
 # Size [m] of the elements of the default mesh, unless that makes too many, and of presets as a share of it.
-_SIZE, _MOST_TRIANGLES = 0.8e-3, 1500
+_SIZE, _MOST_TRIANGLES = 1.0e-3, 1500
 SHARES = {"coarse": 2.0, "default": 1.0, "fine": 0.6}
 # A turn of the outline by more than this [rad] is a corner, less is a curve, of which a full turn has so many elements.
 _CORNER, _PER_TURN = np.radians(25.0), 12
@@ -50,7 +50,7 @@ def mesh_section(section: Section, share: float = 1.0) -> PlaneMesh:
 
     Args:
         section: the finger's section.
-        share: of the elements' size: the section's, else 0.8 mm, or more where that makes more than 1500 triangles.
+        share: of the elements' size: the section's, else 1 mm, or more where that makes more than 1500 triangles.
 
     Raises:
         MeshError: The section asks for too many elements, or cannot be divided.

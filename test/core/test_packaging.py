@@ -24,6 +24,7 @@ KEYS = {
     "onnxruntime": "python3-onnxruntime-pip",
     "opencv-contrib-python-headless": "python3-opencv",
     "pyserial": "python3-serial",
+    "shapely": "python3-shapely",
     "matplotlib": "python3-matplotlib",
     "tqdm": "python3-tqdm",
 }
