@@ -19,12 +19,13 @@ from finforce_eval.evaluation.places import InnerSurface
 from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
+from finforce_ifea.jaw.face import FaceLine
 
 
 def true_places(path: Path, recording: Recording, face_x: float) -> dict[float, tuple[float, float]]:
     """Return by depth [mm] the true place and how far from the cylinder's surface the true surface is met [mm]."""
     data, case = np.load(path), recording.case["object"]
-    surface = InnerSurface(1e-3 * data["vertices0"], face_x)
+    surface = InnerSurface(1e-3 * data["vertices0"], FaceLine.flat(face_x))
     places = {}
     for depth, force, vertices in zip(data["depth"], data["force"], 1e-3 * data["vertices"], strict=True):
         axis = np.array([face_x + 0.5e-3 * case["diameter"] - 1e-3 * depth, 1e-3 * case["z"]])

@@ -387,6 +387,6 @@ def _points_of(place: Place, jaw: Jaw) -> "_RowPoints":
     """Returns the rows of a place as points on the undeformed inner surface."""
     heights = place.patch.heights
     points = np.zeros((len(heights), 3))
-    points[:, 0], points[:, 2] = jaw.inner_face_x, heights
+    points[:, 0], points[:, 2] = jaw.face.read(heights), heights
     candidates = np.abs(jaw.candidates[:, 2] - heights[:, None]).argmin(axis=1)
     return _RowPoints(points=points, candidates=candidates, weights=place.patch.weights)

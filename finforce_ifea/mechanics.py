@@ -52,7 +52,7 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
             warn_of_locking(jaw, mesh)
         model = SolidModel(mesh, jaw.material, symmetric=settings.force_axes == "normal")
     surface = build_contact_surface(jaw, mesh, model, across=model.across)
-    return Mechanics(mesh=mesh, model=model, contact=RollingContact(model, surface, jaw.inner_face_x))
+    return Mechanics(mesh=mesh, model=model, contact=RollingContact(model, surface, jaw.face))
 
 
 def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) -> JawModel:

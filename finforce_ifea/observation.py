@@ -63,7 +63,7 @@ class Contact:
             raise ContactError(
                 f"contact height {1e3 * z:g} mm, expected {1e3 * low:g} to {1e3 * high:g} mm on the jaw {jaw.name!r}"
             )
-        return cls(points=np.array([[jaw.inner_face_x, 0.0, z]]), weights=np.ones(1), free=True)
+        return cls(points=np.array([[jaw.face.read(z), 0.0, z]]), weights=np.ones(1), free=True)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -176,7 +176,7 @@ def check_contact(contact: Contact, jaw: Jaw) -> None:
     points, weights = np.asarray(contact.points), np.asarray(contact.weights)
     if points.ndim != 2 or points.shape[1:] != (3,) or weights.shape != (len(points),):
         raise ContactError(f"contact points {points.shape} with weights {weights.shape}, expected (n, 3) and (n,)")
-    if not np.isfinite(points).all() or (len(points) and np.abs(points[:, 0] - jaw.inner_face_x).max() > 1e-3):
+    if not np.isfinite(points).all() or np.abs(points[:, 0] - jaw.face.read(points[:, 2])).max(initial=0.0) > 1e-3:
         raise ContactError(f"contact points off the undeformed inner surface x = {jaw.inner_face_x:g} m")
     if len(weights) and not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
         raise ContactError(f"contact weights {weights}, expected non-negative numbers that are not all zero")
@@ -184,7 +184,8 @@ def check_contact(contact: Contact, jaw: Jaw) -> None:
 
 def sketch_contact(jaw: Jaw) -> Contact:
     """Returns a contact with the outline of a square that just touches the middle of a jaw, for a first try."""
-    middle = np.array([[jaw.inner_face_x, 0.0, float(np.median(jaw.candidates[:, 2]))]])
+    height = float(np.median(jaw.candidates[:, 2]))
+    middle = np.array([[jaw.face.read(height), 0.0, height]])
     square = 0.01 * np.array([[0.0, -1.0], [2.0, -1.0], [2.0, 1.0], [0.0, 1.0]])
     outline = ObjectOutline(polygons=(square,), origin=middle[0, ::2], tilt=0.0, stddev=np.array([1e-3, 1e-3, 0.1]))
     return Contact(points=middle, weights=np.ones(1), outline=outline)

@@ -20,6 +20,7 @@ class TwinParameters:
     finger: int = setting(0, "seed of the jaws' material", "", 0, 2**31 - 1)
     light: str = setting("", "bright, dim or any; empty: that of the scene")
     object: str = setting("", "a shape by name, or a mesh file; empty: that of the scene")
+    jaw_file: str = setting("", "jaw file, or the name of a shipped jaw; empty: that of the scene, bench")
     size: str = setting("640x480", "of the images, WIDTHxHEIGHT [px]")
     depth_step: float = setting(0.001, "of the depth image", "m", 1e-5, 0.01)
     loop: bool = setting(True, "begin again at the end; else the node ends with the scene")
@@ -35,8 +36,9 @@ class TwinParameters:
 
         Raises:
             ScenarioError: there is no such scene, light or object.
+            JawFileError: there is no such jaw.
         """
         from finforce_twin.scenes.scenarios import build_scenario
 
-        changes = {"light": self.light, "object": self.object}
+        changes = {"light": self.light, "object": self.object, "jaw": self.jaw_file}
         return build_scenario(self.scene, **{name: value for name, value in changes.items() if value})

@@ -36,7 +36,7 @@ TRANSPORT_CHOICES = (
     "FASTDDS_BUILTIN_TRANSPORTS",
 )
 SIM_OBJECT = Path(__file__).parents[2] / "finforce_eval" / "data" / "objects" / "cylinder_25.stl"  # in metres
-SIM_CALIBRATION = "twin"
+SIM_CALIBRATION, SIM_JAWS = "twin", ("", "bench")
 # of a camera, behind its name; a D405 had the other colour topic before realsense2_camera 4.57.4
 COLOR, OLD_COLOR = "color/image_raw", "color/image_rect_raw"
 DEPTH, INFO = "aligned_depth_to_color/image_raw", "color/camera_info"
@@ -110,7 +110,7 @@ def simulated(options: OptionsT) -> OptionsT:
         options,
         images=True,
         object_mesh=options.object_mesh or str(SIM_OBJECT),
-        calibration_file=options.calibration_file or SIM_CALIBRATION,
+        calibration_file=options.calibration_file or (SIM_CALIBRATION if options.jaw_file in SIM_JAWS else ""),
         gripper_port=options.gripper_port or emulated_port(),
         gripper_interface="slcan",
     )
@@ -120,7 +120,12 @@ def twin_processes(scene: str, options: GripperOptions) -> list[Process]:
     """Return the camera of the twin in a scene, with the emulated gripper, if they stand in for hardware."""
     if not options.sim:
         return []
-    asked = {"scene": scene, "object": options.object_mesh, "gripper_link": options.gripper_port}
+    asked = {
+        "scene": scene,
+        "object": options.object_mesh,
+        "jaw_file": options.jaw_file,
+        "gripper_link": options.gripper_port,
+    }
     return [_node("twin_camera", asked, options)]
 
 

@@ -17,7 +17,6 @@ from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
 
 _SPACING = 0.5e-3
-_ON_FACE = 1e-4
 # No jaw bends by more than this share of its length.
 _MOST_BENT = 0.6
 # Where across the width the line is averaged, as shares of the half width.
@@ -31,7 +30,7 @@ class InnerFace:
     Attributes:
         mesh: of the jaw, undeformed.
         heights: (h,) [m] on the undeformed surface, rising.
-        x: [m], the plane of the undeformed surface.
+        x: (h,) [m], of the undeformed surface.
         half_width: [m], along y.
         nodes: (h, m) mesh nodes that carry each height.
         weights: (h, m) of these nodes [-], rows sum to one.
@@ -39,7 +38,7 @@ class InnerFace:
 
     mesh: VolumeMesh
     heights: NDArray
-    x: float
+    x: NDArray
     half_width: float
     nodes: NDArray
     weights: NDArray
@@ -83,7 +82,7 @@ def build_inner_face(jaw: Jaw, density: str) -> InnerFace:
         MeshError: The mesh has no triangles on the plane of the inner face.
     """
     mesh = jaw.build_mesh(density)
-    on_face = np.abs(mesh.nodes[:, 0] - jaw.inner_face_x) < _ON_FACE
+    on_face = jaw.face.holds(mesh.nodes)
     triangles = mesh.surface[on_face[mesh.surface].all(axis=1)]
     if not len(triangles):
         raise MeshError(f"the mesh has no triangles on the inner face x = {jaw.inner_face_x:g} m; check inner_face_x")
@@ -96,7 +95,7 @@ def build_inner_face(jaw: Jaw, density: str) -> InnerFace:
     return InnerFace(
         mesh=mesh,
         heights=heights,
-        x=jaw.inner_face_x,
+        x=jaw.face.read(heights),
         half_width=half_width,
         nodes=triangles[chosen].reshape(len(heights), -1),
         weights=shares.reshape(len(heights), -1) / len(_ACROSS),

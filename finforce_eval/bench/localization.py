@@ -148,7 +148,7 @@ def follow(recording: Recording, mesh: ObjectMesh, every: int) -> Iterator[Locat
     estimator = ContactEstimator(solver.jaw, mesh=mesh)
     lines = true_lines(recording, "left", track.keypoints.stamps, solver.jaw.inner_face_x)
     force = np.linalg.norm(match_truth(recording.truth("left"), track.keypoints.stamps), axis=1)
-    inner = InnerSurface(solver.surface(), solver.jaw.inner_face_x)
+    inner = InnerSurface(solver.surface(), solver.jaw.face)
     seen_object = track_object(recording, "left")
     poses = list(zip(seen_object.stamps, seen_object.poses, strict=True))
     wrench = None

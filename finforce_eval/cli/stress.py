@@ -34,6 +34,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of everything that is drawn (0)")
     parser.add_argument("--solver", default="default", choices=SOLVERS, help="model and objective")
     parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
+    text = "shipped jaw or jaw file of the families about key points and places (bench)"
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     parser.add_argument("--report", metavar="DIR", help="write a page with every family by level")
 
@@ -101,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
     if options.seed < 0:
         raise OptionError(f"--seed {options.seed}: expected zero or above")
     families = choose_families(options.families, find_families())
-    plan = Plan(seed=options.seed, solver=options.solver, mesh=options.mesh, count=options.count)
+    plan = Plan(seed=options.seed, solver=options.solver, mesh=options.mesh, count=options.count, jaw=options.jaw)
     trials = run_families(families, plan)
     summaries = [summarise_family(family, trials[family.name]) for family in families]
     print(format_summaries(summaries))

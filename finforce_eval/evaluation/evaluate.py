@@ -177,7 +177,7 @@ class StepLog:
         self.status = np.full(frames, "", dtype="U32")
         self.step_ms = np.zeros(frames)
         self.surface0 = np.array(estimator.surface())
-        self.contacts = ContactLog(recording, side, source, InnerSurface(self.surface0, jaw.inner_face_x))
+        self.contacts = ContactLog(recording, side, source, InnerSurface(self.surface0, jaw.face))
         self.snapshot: Snapshot | None = None
         self.largest = 0.0
         self.message = ""

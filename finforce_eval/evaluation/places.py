@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from finforce_eval.evaluation.scoring import match_samples
 from finforce_eval.recordings.tracks import Recording
+from finforce_ifea.jaw.face import FaceLine
 
 # A vertex farther than this from the plane of the inner surface is not on it [m]; rows closer than this are one.
 _ON_FACE = 1e-4
@@ -36,13 +37,13 @@ class InnerSurface:
 
     Args:
         surface0: undeformed vertices (n, 3) [m], jaw frame.
-        inner_face_x: plane of the undeformed inner surface [m].
+        face: the undeformed inner face.
     """
 
-    def __init__(self, surface0: NDArray[np.float64], inner_face_x: float) -> None:
+    def __init__(self, surface0: NDArray[np.float64], face: FaceLine) -> None:
         """Gather the vertices of each height."""
-        self.face_x = inner_face_x
-        self._rows = np.flatnonzero(np.abs(surface0[:, 0] - inner_face_x) < _ON_FACE)
+        self.face_x = face.plane
+        self._rows = np.flatnonzero(face.holds(surface0))
         steps = np.round(surface0[self._rows, 2] / _ON_FACE).astype(np.int64)
         _, self._group, self._count = np.unique(steps, return_inverse=True, return_counts=True)
         self.heights = self._average(surface0[:, 2])

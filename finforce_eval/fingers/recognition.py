@@ -148,10 +148,7 @@ def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes) -> Recogni
     clamped_z, circles = _propose_clamp(cells, bolts, inner, wishes, notes)
     face_x, deviation = _measure_face(turned, cells, clamped_z)
     if deviation > _FLAT:
-        raise JawFileError(
-            f"its inner face leaves its plane by {1e3 * deviation:.2g} mm, expected a plane within {1e3 * _FLAT:g} mm: "
-            "contact on curved faces is not computed (--other-face, if the straight side is the other one)"
-        )
+        notes.append(f"inner face curved: it leaves its plane by {1e3 * deviation:.2g} mm")
     shift = _choose_origin(turned, clamped_z, wishes, face_x)
     move = np.array([shift, 0.0])
     free = [band.thickness[band.line[:, 1] > clamped_z] for band in (inner, outer)]
@@ -342,7 +339,9 @@ def _measure_face(polygon: shapely.Polygon, cells: list[NDArray], clamped_z: flo
     high = max(float(cell[:, 1].max()) for cell in cells)
     reach = np.array([_reach(polygon, z) for z in np.linspace(low, high, 80)[1:-1]])
     face = float(np.median(reach))
-    return face, float(np.abs(reach - face).max())
+    deviation = float(np.abs(reach - face).max())
+    # of a curved face the place that is farthest in front
+    return (face if deviation <= _FLAT else float(reach.max())), deviation
 
 
 def _reach(polygon: shapely.Polygon, z: float) -> float:

@@ -205,7 +205,7 @@ def live_result(
 def _contact_series(recording: Recording, side: str, log: JawLog, estimator: Any) -> ContactSeries:
     """Return where the contact was said to be, and where it was."""
     stamps = recording.jaw(side).keypoints.stamps
-    surface = InnerSurface(np.array(estimator.surface()), estimator.jaw.inner_face_x)
+    surface = InnerSurface(np.array(estimator.surface()), estimator.jaw.face)
     lines = true_lines(recording, side, stamps, surface.face_x)
     truth = [
         surface.cut(log.surface[int(stamp)], point, direction) if int(stamp) in log.surface else np.nan

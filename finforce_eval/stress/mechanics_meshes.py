@@ -191,7 +191,7 @@ def build_rig(jaw: Jaw, mesh: VolumeMesh) -> Rig:
     """Returns a jaw of a given mesh, ready to be pressed."""
     model = SolidModel(mesh, jaw.material)
     surface = build_contact_surface(jaw, mesh, model, across="half" if model.symmetric else "both")
-    contact = RollingContact(model, surface, jaw.inner_face_x)
+    contact = RollingContact(model, surface, jaw.face)
     return Rig(mechanics=Mechanics(mesh=mesh, model=model, contact=contact), jaw=jaw, height=HEIGHT)
 
 

@@ -203,7 +203,9 @@ def describe(errors: NDArray, stated: NDArray) -> str:
 # The truth comes from the estimator's own mechanics: no more than this share of a force is left to it.
 FORCE_ERROR = 0.01
 COURSE_STEPS = 16
-OWN_MECHANICS = ("solid", "frame")
+OWN_MECHANICS = ("solid", "frame", "plane")
+# Heights [m] of the bench finger's first and last candidate.
+_BENCH_REACH = (0.008, 0.073)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -235,7 +237,8 @@ class Bench:
     def __init__(self, plan: Plan, *, modulus: float = 1.0, jaw: Jaw | None = None, **settings) -> None:
         """Builds the bench jaw, or another one, with `modulus` times its Young's modulus."""
         self.plan = plan
-        jaw = jaw or load_jaw("bench")
+        jaw = jaw or load_jaw(plan.jaw)
+        self._reach = jaw.candidates[[0, -1], 2]
         calibration = Calibration(
             young_modulus=modulus * jaw.material.young_modulus, force_error=FORCE_ERROR, clamped_z=0.0
         )
@@ -260,7 +263,16 @@ class Bench:
                 continue
 
     def history(self, *, height: float, radius: float, depth: float) -> PressHistory:
-        """Returns the press of a cylinder; raises ContactError where there is no equilibrium."""
+        """Returns the press of a cylinder at a height and depth [m] that are meant for the bench finger.
+
+        Another finger is pressed at the same share of its candidates, and a shorter one as much less.
+
+        Raises:
+            ContactError: There is no equilibrium.
+        """
+        if self.plan.jaw != "bench":
+            larger = float(np.diff(self._reach)[0] / np.diff(_BENCH_REACH)[0])
+            height, depth = float(self._reach[0] + larger * (height - _BENCH_REACH[0])), depth * min(larger, 1.0)
         model, surface = self.mechanics.model, self.mechanics.contact.surface
         depths = np.linspace(0.0, depth, COURSE_STEPS + 1)[1:]
         presses = press_jaw(model, surface, self.jaw.inner_face_x, RigidCylinder(radius=radius), height, depths)

@@ -88,8 +88,10 @@ class Plan:
         solver: name of the estimator's solver.
         mesh: name of its mesh density.
         count: trials; None for as many as the family takes for enough.
+        jaw: shipped jaw or jaw file of the families about key points, contacts and places.
     """
 
+    jaw: str = "bench"
     seed: int = 0
     solver: str = "default"
     mesh: str = "default"

@@ -53,7 +53,11 @@ class Indenter(Protocol):
         ...
 
     def find_touch(self, place: NDArray, low: float, high: float) -> float:
-        """Returns the depth [m] of first touch with an undeformed surface between two heights [m]."""
+        """Returns the depth [m] of first touch with a plane undeformed surface between two heights [m]."""
+        ...
+
+    def find_touch_at(self, points: NDArray, face_x: float, place: NDArray) -> float:
+        """Returns the depth [m] of first touch with an undeformed surface of points (p, 2), x and z [m]."""
         ...
 
 
@@ -82,6 +86,13 @@ class RoundIndenter:
     def find_touch(self, place: NDArray, low: float, high: float) -> float:
         """See `Indenter`; a round object touches at once."""
         return 0.0
+
+    def find_touch_at(self, points: NDArray, face_x: float, place: NDArray) -> float:
+        """See `Indenter`."""
+        radius, beside = float(np.exp(place[SHAPE])), points[:, 1] - place[HEIGHT]
+        met = np.abs(beside) < radius
+        behind = face_x + radius - np.sqrt(radius**2 - beside[met] ** 2) - points[met, 0]
+        return float(behind.min(initial=radius))
 
 
 class OutlineIndenter:
@@ -119,6 +130,20 @@ class OutlineIndenter:
         c, s = np.cos(place[SHAPE]), np.sin(place[SHAPE])
         least = find_leading(self.field.segments, c, s, low - place[HEIGHT], high - place[HEIGHT])
         return least + self.field.front if least < 1.0 else 0.0
+
+    def find_touch_at(self, points: NDArray, face_x: float, place: NDArray) -> float:
+        """See `Indenter`; as `find_touch` where the outline is beside all points."""
+        c, s = np.cos(place[SHAPE]), np.sin(place[SHAPE])
+        turn = np.array([[c, s], [-s, c]])
+        begin, end = self.field.segments[:, :2] @ turn, self.field.segments[:, 2:] @ turn
+        z = points[:, 1, None] - place[HEIGHT]
+        rise = end[:, 1] - begin[:, 1]
+        share = (z - begin[:, 1]) / np.where(rise == 0.0, np.inf, rise)
+        across = (share >= 0.0) & (share <= 1.0) & (rise != 0.0)
+        lead = np.where(across, begin[:, 0] + share * (end[:, 0] - begin[:, 0]), np.inf).min(axis=1)
+        behind = face_x + lead - points[:, 0]
+        nearest = float(behind.min())
+        return nearest + self.field.front if np.isfinite(nearest) else 0.0
 
     def _origin(self, face_x: float, place: NDArray) -> NDArray:
         return np.array([face_x + self.field.front - place[DEPTH], place[HEIGHT]])

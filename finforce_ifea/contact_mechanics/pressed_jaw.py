@@ -19,6 +19,7 @@ from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, Indenter, Ro
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import Across, JawModel
+from finforce_ifea.jaw.face import FaceLine
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
 
@@ -88,8 +89,8 @@ class RollingContact:
 
     bearable = np.inf
 
-    def __init__(self, model: JawModel, surface: ContactSurface, face_x: float) -> None:
-        """Keeps the model, its contact surface and the plane x = face_x [m] of the undeformed surface.
+    def __init__(self, model: JawModel, surface: ContactSurface, face: FaceLine) -> None:
+        """Keeps the model, its contact surface and the undeformed inner face.
 
         The penalty goes with the jaw's own stiffness, so that forces scale with Young's modulus: a stiff jaw does not
         vanish in the object, and a soft one does not meet a wall.
@@ -98,7 +99,7 @@ class RollingContact:
         self.surface = replace(
             surface, stiffness=surface.stiffness * (measure_stiffness(model, surface) / _MEANT_STIFFNESS)
         )
-        self.face_x = face_x
+        self.face, self.face_x = face, face.plane
         self.indenter: Indenter = RoundIndenter()
         self.rubbing: LeaningContact | Friction = LeaningContact()
 
@@ -109,6 +110,12 @@ class RollingContact:
     def begin(self, height: float) -> NDArray:
         """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
         return np.zeros(self.model.size)
+
+    def find_touch(self, place: NDArray) -> float:
+        """Returns the depth [m] at which the object at a place (3,) first touches the undeformed jaw."""
+        if self.face.is_flat:
+            return self.indenter.find_touch(place, *self.surface.heights[[0, -1]])
+        return self.indenter.find_touch_at(self.surface.points[:: self.surface.across, [0, 2]], self.face_x, place)
 
     def rub(self, points: NDArray, place: NDArray) -> RubbedContact:
         """Returns the contact of surface points (p, 3) [m] with the object at a place (3,)."""
@@ -216,7 +223,6 @@ class Mechanics:
 
 
 _SPACING = 0.25e-3
-_ON_FACE = 1e-4
 # Penalty per height [N/m per m]: soft enough for several points to share a touch, so that the force moves smoothly from
 # one to the next; 10 N sink in by 0.07 mm, below what a camera sees.
 _STIFFNESS = 5e7
@@ -258,19 +264,19 @@ def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across
     Raises:
         MeshError: The mesh has no nodes on the plane of the inner face.
     """
-    face = mesh.nodes[np.abs(mesh.nodes[:, 0] - jaw.inner_face_x) < _ON_FACE]
+    face = mesh.nodes[jaw.face.holds(mesh.nodes)]
     if len(face) < 2:
         raise MeshError(f"the mesh has no nodes on the inner face x = {jaw.inner_face_x:g} m; check inner_face_x")
     low, high = face[:, 1:].min(0), face[:, 1:].max(0)
     if jaw.section is not None:  # what touches the clamped part does not bend the jaw
         held = mesh.nodes[mesh.clamped]
-        low[1] = max(low[1], held[np.abs(held[:, 0] - jaw.inner_face_x) < _ON_FACE, 2].max(initial=-np.inf))
+        low[1] = max(low[1], held[jaw.face.holds(held), 2].max(initial=-np.inf))
     heights = np.arange(low[1] + _SPACING, high[1] - 0.5 * _SPACING, _SPACING)
     gauss = np.array([0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)])
     right, left = gauss * high[0], gauss[::-1] * low[0]
     sides = {"middle": np.zeros(1), "half": right, "both": np.r_[left, right]}[across]
     z, y = np.meshgrid(heights, sides, indexing="ij")
-    points = np.stack([np.full(z.size, jaw.inner_face_x), y.ravel(), z.ravel()], axis=1)
+    points = np.stack([jaw.face.read(z.ravel()), y.ravel(), z.ravel()], axis=1)
     stiffness = np.full(len(points), _STIFFNESS * _SPACING / len(sides))
     probe = model.attach(points, 1e-3)
     return ContactSurface(

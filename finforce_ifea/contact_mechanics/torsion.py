@@ -13,7 +13,6 @@ from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
 
 _HEIGHTS = 13
-_ON_FACE = 1e-4
 # The pair of forces that twists stands so far from the middle, as a share of half the width.
 _ARM = 0.8
 # Larger meshes are not worth the time: of theirs only the plane is known.
@@ -62,11 +61,11 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
     if not is_solid or len(mesh.nodes) > _MOST_NODES:
         return None
     model = SolidModel(mesh, jaw.material, symmetric=False)
-    face = mesh.nodes[np.abs(mesh.nodes[:, 0] - jaw.inner_face_x) < _ON_FACE]
+    face = mesh.nodes[jaw.face.holds(mesh.nodes)]
     half, (low, high) = float(face[:, 1].max()), (face[:, 2].min(), face[:, 2].max())
     heights = np.linspace(low + 0.1 * (high - low), high - 0.05 * (high - low), _HEIGHTS)
     arm, rest = _ARM * half, np.zeros(model.size)
-    places = np.array([[jaw.inner_face_x, y, z] for z in heights for y in (-arm, 0.0, arm)])
+    places = np.array([[jaw.face.read(z), y, z] for z in heights for y in (-arm, 0.0, arm)])
     probes = [model.attach(places[3 * row : 3 * row + 3], 1e-3) for row in range(_HEIGHTS)]
     twist, across = np.zeros((3, 3)), np.zeros((3, 3))
     twist[0, 0], twist[2, 0], across[1, 1] = 0.5 / arm, -0.5 / arm, 1.0

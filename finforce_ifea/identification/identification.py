@@ -57,6 +57,8 @@ _FORCE_ERROR, _FORCE_FLOOR = 0.015, 0.01
 _SHAPE_ERROR = 0.05e-3
 _ITERATIONS = 12
 _PER_CASE = 14
+# Of half a millimetre at most to the depth of a steady load: strips bend by centimetres.
+_STEPS = 200
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -283,12 +285,12 @@ class _PlateauSolver:
         """
         self._contact.set_indenter(item.indenter)
         place = np.array([0.0, shape, item.mean[1]])
-        touch = item.indenter.find_touch(place, *self._contact.surface.heights[[0, -1]])
+        touch = self._contact.find_touch(place)
         q = np.zeros(self._model.size) if start is None else start.q
         place[DEPTH] = touch + 0.5e-3 if start is None else start.depth
         seen = np.isfinite(plateau.keypoints[:, 0])
         stddev = np.sqrt(plateau.variance[seen, None] + _SHAPE_ERROR**2)
-        for _ in range(60):
+        for _ in range(_STEPS):
             state = self._contact.linearize(q, place)
             if not state.touches:
                 q = q + self._contact.approach(q, state.correction, place)
@@ -311,6 +313,8 @@ class _PlateauSolver:
 
 
 _UNLOADED = 0.01
+# Of key points in stills [m].
+_STILL_NOISE = 0.3e-3
 _LEAST_FORCE = 0.15
 _STEADY_SPAN = 10
 _STEADY_CHANGE = 0.02
@@ -383,14 +387,24 @@ def _plateaus_of_case(number: int, case: CalibrationCase, jaw: Jaw, settings: Es
     loaded = np.flatnonzero(force > _UNLOADED)
     start = loaded[0] if len(loaded) else len(force)
     tare = compute_tare(list(points[:start]), jaw.keypoints) if start >= settings.tare_frames // 2 else None
-    if tare is None:
-        raise CalibrationError(f"{case.name}: expected at least a second without load at the start, for the tare")
-    rest = np.where(tare.counts[:, None] > 0, jaw.keypoints + tare.offsets, np.nan)
+    if tare is None and start > 0:
+        raise CalibrationError(
+            f"{case.name}: {start} frames without load at the start; expected {settings.tare_frames // 2}, for the "
+            "tare, or none, as of stills"
+        )
+    if (
+        tare is None
+    ):  # stills: key points are taken to be where the jaw file has them, within the offset of untared ones
+        rest, noise, rest_variance = jaw.keypoints, _STILL_NOISE**2, settings.offset_stddev**2
+    else:
+        rest = np.where(tare.counts[:, None] > 0, jaw.keypoints + tare.offsets, np.nan)
+        noise = np.trace(tare.noise) / 3.0
+        rest_variance = noise / np.maximum(tare.counts, 1)
     found = []
     for first, last in _steady_runs(force):
         mean, count = _robust_mean(points[first:last] - rest)
         mean[count < 0.5 * (last - first)] = np.nan
-        variance = np.trace(tare.noise) / 3.0 * (1.0 / np.maximum(count, 1) + 1.0 / np.maximum(tare.counts, 1))
+        variance = noise / np.maximum(count, 1) + rest_variance
         instants = at[np.linspace(first, last - 1, INSTANTS).round().astype(int)]
         found.append(
             Plateau(

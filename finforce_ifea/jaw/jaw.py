@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from finforce_ifea.errors import JawFileError, MeshError
 from finforce_ifea.jaw.attachment import attach_points, attach_surface_points
 from finforce_ifea.jaw.drawing import Drawing, MeshDensity, mesh_drawing
+from finforce_ifea.jaw.face import FaceLine, find_face
 from finforce_ifea.jaw.jaw_file import (
     Material,
     MeshFile,
@@ -119,6 +120,11 @@ class Jaw:
         return mesh_section(self.section, _find_share(density))
 
     @cached_property
+    def face(self) -> FaceLine:
+        """The inner face at rest."""
+        return FaceLine.flat(self.inner_face_x) if self.section is None else find_face(self.section, self.inner_face_x)
+
+    @cached_property
     def digest(self) -> str:
         """What the finger's shape is known by: 12 hexadecimal digits of its content, the same for both sides."""
         shape = self.drawing or self.section
@@ -218,7 +224,9 @@ def _parse_jaw(table: Table, path: Path) -> Jaw:
         keypoint_names=tuple(keypoints),
         keypoints=np.array(list(keypoints.values())),
         reference_point=table.point("reference_point", (0.0, 0.0, 0.0)),
-        candidates=parse_candidates(table, inner_face_x),
+        candidates=parse_candidates(
+            table, FaceLine.flat(inner_face_x) if section is None else find_face(section, inner_face_x)
+        ),
         inner_face_x=inner_face_x,
         model=_parse_model(table, drawing, section),
     )
@@ -243,10 +251,10 @@ def _parse_model(table: Table, drawing: Drawing | None, section: Section | None)
 def _check_candidates(jaw: Jaw) -> None:
     """Refuse candidates off the plane of the inner face."""
     for number, point in enumerate(jaw.candidates):
-        if abs(point[0] - jaw.inner_face_x) > _CANDIDATE_DISTANCE:
+        if abs(point[0] - jaw.face.read(point[2])) > _CANDIDATE_DISTANCE:
             raise JawFileError(
                 f"candidates[{number}] at {_millimetres(point)} lies off the inner surface; "
-                f"expected x = {jaw.inner_face_x:g} m"
+                f"expected x = {jaw.face.read(point[2]):g} m"
             )
         shape = jaw.drawing or jaw.section
         if shape is not None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.drawing import Band, Drawing, Rib
+from finforce_ifea.jaw.face import FaceLine
 from finforce_ifea.jaw.mesh_file import ClampRule
 from finforce_ifea.jaw.section import Section, join_loops, order_rings, read_loops
 
@@ -487,7 +488,7 @@ def _junction_points(drawing: Drawing, side_y: float, tip: bool) -> dict[str, ND
     return points
 
 
-def parse_candidates(table: Table, inner_face_x: float) -> NDArray:
+def parse_candidates(table: Table, face: FaceLine) -> NDArray:
     """Read the contact candidates (C, 3) [m]: a list of points, or first_z, step_z, count on the inner face.
 
     Raises:
@@ -502,4 +503,4 @@ def parse_candidates(table: Table, inner_face_x: float) -> NDArray:
     rule.expect_keys(("first_z", "step_z", "count"), ("y",))
     count = rule.count("count")
     z = rule.length("first_z") + rule.length("step_z") * np.arange(count)
-    return np.column_stack([np.full(count, inner_face_x), np.full(count, rule.length("y", 0.0)), z])
+    return np.column_stack([face.read(z), np.full(count, rule.length("y", 0.0)), z])

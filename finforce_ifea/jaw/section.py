@@ -63,6 +63,12 @@ class Section:
         """The largest z [m]."""
         return float(self.rings[0][:, 1].max())
 
+    def reach(self, z: NDArray) -> NDArray:
+        """Return the largest x (n,) [m] of the section at heights z (n,) [m], NaN where there is none."""
+        low, _, high, _ = self.polygon.bounds
+        lines = shapely.linestrings([[(low - 1.0, height), (high + 1.0, height)] for height in z])
+        return shapely.bounds(shapely.intersection(self.polygon, lines))[:, 2]
+
     def find_clamped(self, points: NDArray) -> NDArray:
         """Return which of points (n, 2) [m] are clamped, (n,) bool."""
         held = np.zeros(len(points), bool)

@@ -55,7 +55,7 @@ class Face:
         """Keeps the rows at heights (n,) [m]."""
         surface, self._model = mechanics.contact.surface, mechanics.model
         across = surface.points[: surface.across, 1]
-        points = np.array([[mechanics.contact.face_x, y, z] for z in heights for y in across])
+        points = np.array([[mechanics.contact.face.read(z), y, z] for z in heights for y in across])
         self._probe, self._across, self._count = self._model.attach(points, 1e-3), len(across), len(heights)
         self.basis = np.zeros((self._model.size, 0))
 
@@ -136,7 +136,6 @@ _LONGEST, _SHORTEST = 0.5e-3, 0.02e-3
 _ITERATIONS, _TOLERANCE, _PASSING = 30, 1e-9, 1e-6
 # Quarters of a path that are tried next where it cannot be divided.
 _KEPT = 3
-_ON_FACE = 1e-4
 _FEWEST_ROWS, _MOST_ROWS = 12, 84
 # Rows of nodes nearer together than this share of their mean distance are those of an unstructured mesh.
 _CLOSEST = 0.1
@@ -231,7 +230,7 @@ def _choose_rows(mechanics: Mechanics) -> NDArray:
     many or too close together, as in unstructured meshes, and of frames the rows divide the face evenly.
     """
     mesh, surface = mechanics.mesh, mechanics.contact.surface
-    on_face = np.abs(mesh.nodes[:, 0] - mechanics.contact.face_x) < _ON_FACE
+    on_face = mechanics.contact.face.holds(mesh.nodes)
     held = np.isin(np.arange(len(mesh.nodes)), mesh.clamped)
     own = np.unique(np.round(mesh.nodes[on_face & ~held, 2], 7))
     base = mesh.nodes[on_face & held, 2].max(initial=-np.inf)
@@ -255,9 +254,10 @@ class _Rod:
         self._contact, self._height = contact, height
         self._radius, self._deepest = _ROD * (high - low), _DEEPEST * (high - low)
         contact.set_indenter(RoundIndenter())
+        self._touch = contact.find_touch(np.array([0.0, np.log(self._radius), height]))
 
     def press(self, hardest: float) -> list[_Equilibrium]:
-        """Returns equilibria at rising depths up to the largest, or to where the jaw gives way or resists."""
+        """Returns equilibria at rising depths below first touch, up to where the jaw gives way or resists."""
         path, step = [], _LONGEST
         while not path or path[-1].depth < self._deepest - 1e-9:
             before = path[-1] if path else None
@@ -294,7 +294,7 @@ class _Rod:
     def _settle(self, start: _Equilibrium | None, depth: float, tolerance: float) -> _Equilibrium | None:
         """Returns the equilibrium at a depth [m] of the rod, to a tolerance of the unknowns; or None."""
         contact, model = self._contact, self._contact.model
-        place = np.array([depth, np.log(self._radius), self._height])
+        place = np.array([self._touch + depth, np.log(self._radius), self._height])
         q = np.zeros(model.size)
         if start is not None:
             q = start.q + limit_step(model, start.state.modes[:, 0] * (depth - start.depth))

@@ -130,7 +130,7 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
         manifold = build_rest(full, modulus)
     else:
         manifold = fetch_manifold(name_manifold(full, jaw), lambda: _build_watched(full, jaw))
-    model = ReducedModel(manifold, full.model, modulus, full.contact.face_x)
+    model = ReducedModel(manifold, full.model, modulus, full.contact.face)
     surface = full.contact.surface
     middle = surface.points[:: surface.across].copy()
     middle[:, 1] = 0.0
@@ -139,7 +139,7 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
     return Mechanics(
         mesh=full.mesh,
         model=model,
-        contact=ReducedContact(model, surface, full.contact.face_x),
+        contact=ReducedContact(model, surface, full.contact.face),
         full=None if linear else full,
     )
 
@@ -148,6 +148,8 @@ def name_manifold(full: Mechanics, jaw: Jaw) -> str:
     """Returns the hash of all that the equilibria of a jaw depend on; its modulus is none of it."""
     mesh, model = full.mesh, full.model
     parts = [mesh.nodes, mesh.elements, mesh.clamped, jaw.material.poisson_ratio, full.contact.face_x]
+    if not full.contact.face.is_flat:
+        parts.append(full.contact.face.x)
     if isinstance(model, PlaneModel):  # one for both sides
         parts[:2] = [model.plane.points, model.plane.triangles, jaw.section.width]
     if isinstance(full.model, FrameModel):

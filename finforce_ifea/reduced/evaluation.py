@@ -17,6 +17,7 @@ from finforce_ifea.contact_mechanics.indenter import Indenter, RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, PressedState, RollingContact
 from finforce_ifea.fem.factorisation import Factor
 from finforce_ifea.fem.model import LARGEST_MOVE, Across, JawModel, Linearization
+from finforce_ifea.jaw.face import FaceLine
 from finforce_ifea.reduced.equilibria import (
     LARGEST_GRID_STEP,
     WATCHED,
@@ -90,9 +91,9 @@ class ReducedModel:
     rotations = None
     across: Across = "middle"
 
-    def __init__(self, manifold: Manifold, full: JawModel, young_modulus: float, face_x: float) -> None:
-        """Scales a manifold to a modulus [Pa] of the jaw that `full` describes, its inner face in the plane x [m]."""
-        self._face_x = face_x
+    def __init__(self, manifold: Manifold, full: JawModel, young_modulus: float, face: FaceLine) -> None:
+        """Scales a manifold to a modulus [Pa] of the jaw that `full` describes, with its inner face."""
+        self._face = face
         factor = young_modulus / manifold.young_modulus
         self.manifold, self._full = scale_manifold(manifold, factor), full
         self.rows = manifold.loads.shape[2]
@@ -128,7 +129,7 @@ class ReducedModel:
         """Returns a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
         points = np.array(points, float)
         low, high = self.manifold.heights[[0, -1]]
-        on_face = (np.abs(points[:, 0] - self._face_x) < _ON_FACE) & (points[:, 2] >= low) & (points[:, 2] <= high)
+        on_face = self._face.holds(points, _ON_FACE) & (points[:, 2] >= low) & (points[:, 2] <= high)
         if on_face.all():
             return FacePoints(points=points, rows=share_rows(self.manifold.heights, points[:, 2]))
         full, basis, zero = self._full, self.manifold.basis, np.zeros(self._full.size)
@@ -216,15 +217,15 @@ class ReducedContact(RollingContact):
             clamp; in its middle the bench finger bears a sixth of that.
     """
 
-    def __init__(self, model: ReducedModel, surface: ContactSurface, face_x: float) -> None:
-        """Keeps the model, its contact surface, one point per height, and the plane x = face_x [m]."""
-        self.model, self.surface, self.face_x = model, surface, face_x
+    def __init__(self, model: ReducedModel, surface: ContactSurface, face: FaceLine) -> None:
+        """Keeps the model, its contact surface, one point per height, and the undeformed inner face."""
+        self.model, self.surface, self.face, self.face_x = model, surface, face, face.plane
         self.indenter: Indenter = RoundIndenter()
         self.rubbing: LeaningContact | Friction = LeaningContact()
         shares = share_rows(model.manifold.heights, surface.heights)
         upper = np.clip(np.searchsorted(model.manifold.heights, surface.heights) - 1, 0, shares.shape[1] - 1)
         share = shares[np.arange(len(upper)), upper]
-        self._face = FaceRows(surface.points, upper - 1, share, model.manifold.rods)
+        self._rows = FaceRows(surface.points, upper - 1, share, model.manifold.rods)
         length = surface.heights[-1] - surface.heights[0]
         # the rest alone is stored on purpose where no rod was pressed in
         self._farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
@@ -234,7 +235,7 @@ class ReducedContact(RollingContact):
 
     def place_points(self, q: NDArray) -> NDArray:
         """See `RollingContact`."""
-        return place_contact(self._face, self.model.moves(q))
+        return place_contact(self._rows, self.model.moves(q))
 
     def begin(self, height: float) -> NDArray:
         """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
@@ -245,10 +246,10 @@ class ReducedContact(RollingContact):
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
         """Linearises the equilibrium with the object at a place (depth, shape, height); see `RollingContact`."""
         moves = self.model.moves(q)
-        points = place_contact(self._face, moves)
+        points = place_contact(self._rows, moves)
         contact = self.rub(points, place)
         parts = (contact.forces, contact.springs, contact.changes)
-        step = step_contact(q, self._tables, self._face, moves, points, parts)
+        step = step_contact(q, self._tables, self._rows, moves, points, parts)
         correction, force = step.correction, step.force
         if step.touches and step.size > _LARGE_STEP and not correction[-2:].any():
             share = self._find_share(q, points, correction, place)
@@ -274,7 +275,7 @@ class ReducedContact(RollingContact):
         (lambda - p)^T du, all as far as the step has gone.
         """
         after = self.model.moves(q + step)
-        motion, moved = place_contact(self._face, after) - points, after - self.model.moves(q)
+        motion, moved = place_contact(self._rows, after) - points, after - self.model.moves(q)
 
         def change_energy(share: float) -> float:
             contact = self.rub(points + share * motion, place)

@@ -108,7 +108,9 @@ def measure_influence(contact: RollingContact, probe: Any, keypoints: int) -> In
     shape = 0.5 * (contact.indenter.shape_range.low + contact.indenter.shape_range.high)
     for row, height in enumerate(heights):
         q = contact.begin(height)
-        state = contact.linearize(q, np.array([_TOUCH, shape, height]))
+        place = np.array([0.0, shape, height])
+        place[DEPTH] = _TOUCH if contact.face.is_flat else contact.find_touch(place) + _TOUCH
+        state = contact.linearize(q, place)
         stiffness[row] = np.linalg.norm(state.force_modes[:, DEPTH])
         modes = contact.model.project(probe, q, state.modes)
         motions[row] = modes[:, ::2, DEPTH] / stiffness[row]

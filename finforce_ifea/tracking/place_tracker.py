@@ -245,7 +245,7 @@ class PlaceTracker:
 
     def _find_touch(self, place: NDArray) -> float:
         """Returns the depth [m] at which the object of a place (3,) first touches the undeformed jaw."""
-        return self.contact.indenter.find_touch(place, self._face[0], self._face[1])
+        return self.contact.find_touch(place)
 
     def _reachable(self, place: NDArray) -> NDArray:
         """Returns the place (3,) at which the mechanics stands for `place`."""

@@ -95,7 +95,7 @@ class PointTracker:
         """Returns the points of a load at one height and their neighbours along the finger."""
         surface = self.mechanics.contact.surface
         if self.paper:
-            points = np.array([[self.jaw.inner_face_x, 0.0, height]])
+            points = np.array([[self.jaw.face.read(height), 0.0, height]])
         else:
             row = int(np.argmin(np.abs(surface.heights - height)))
             points = surface.points[row * surface.across : (row + 1) * surface.across].copy()

@@ -99,8 +99,12 @@ class PressedJaw:
 
     def find_touch(self, height: float, tilt: float) -> float:
         """Returns the x [m] of an outline's origin at the given height [m] where it first touches the jaw at rest."""
-        low, high = float(self.surface.low[1]), float(self.surface.high[1])
-        depth = self._indenter.find_touch(np.array([0.0, tilt, height]), low, high)
+        place = np.array([0.0, tilt, height])
+        if self.jaw.face.is_flat:
+            depth = self._indenter.find_touch(place, float(self.surface.low[1]), float(self.surface.high[1]))
+        else:
+            points = self.surface.points[:: self.surface.across, [0, 2]]
+            depth = self._indenter.find_touch_at(points, self.jaw.inner_face_x, place)
         return self.jaw.inner_face_x + self._indenter.field.front - depth
 
     def find_pressure(self, q: NDArray, load: Load) -> NDArray:

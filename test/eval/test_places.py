@@ -8,6 +8,7 @@ from eval_fakes import BOX, PERIOD, START, make_recording
 
 from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.recordings.tracks import parse_phases
+from finforce_ifea.jaw.face import FaceLine
 
 FACE = 0.014
 HEIGHTS = np.linspace(0.0, 0.08, 41)
@@ -27,14 +28,14 @@ def bend(points):
 
 
 def test_line_across_the_undeformed_surface_is_cut_at_its_own_height():
-    surface = InnerSurface(strip(), FACE)
+    surface = InnerSurface(strip(), FaceLine.flat(FACE))
     np.testing.assert_allclose(surface.heights, HEIGHTS, atol=1e-9)
     height = surface.cut(strip(), np.array([0.03, 0.0333]), np.array([-1.0, 0.0]))
     assert height == pytest.approx(0.0333, abs=1e-9)
 
 
 def test_height_is_that_of_the_material_and_not_of_the_place_in_space():
-    surface = InnerSurface(strip(), FACE)
+    surface = InnerSurface(strip(), FaceLine.flat(FACE))
     for z in (0.011, 0.05, 0.0777):
         there = bend(np.array([[FACE, 0.0, z]]))[0]
         normal = np.array([np.cos(z / 0.2), np.sin(z / 0.2)])
@@ -51,18 +52,18 @@ def test_first_crossing_along_the_force_counts():
     upper = front[:, 2] > 0.04
     folded[upper, 2] = 0.08 - front[upper, 2]
     folded[upper, 0] -= 0.005
-    surface = InnerSurface(front, FACE)
+    surface = InnerSurface(front, FaceLine.flat(FACE))
     assert surface.cut(folded, np.array([0.03, 0.02]), np.array([-1.0, 0.0])) == pytest.approx(0.02)
     assert surface.cut(folded, np.array([-0.03, 0.02]), np.array([1.0, 0.0])) == pytest.approx(0.06)
 
 
 def test_line_that_misses_the_surface_or_is_not_known_has_no_place():
-    surface = InnerSurface(strip(), FACE)
+    surface = InnerSurface(strip(), FaceLine.flat(FACE))
     along = np.array([-1.0, 0.0])
     assert np.isnan(surface.cut(strip(), np.array([0.03, 0.09]), along))
     assert np.isnan(surface.cut(strip(), np.array([np.nan, 0.02]), along))
     assert np.isnan(surface.cut(strip(), np.array([0.03, 0.02]), along * np.nan))
-    assert np.isnan(InnerSurface(strip(), 0.5).cut(strip(), np.array([0.03, 0.02]), along))
+    assert np.isnan(InnerSurface(strip(), FaceLine.flat(0.5)).cut(strip(), np.array([0.03, 0.02]), along))
 
 
 def test_measured_torque_tells_the_line_of_action():
@@ -139,4 +140,4 @@ def test_ramp_without_end_stays_at_its_begin():
 
 
 def test_box_of_the_fakes_has_an_inner_surface():
-    np.testing.assert_allclose(InnerSurface(BOX, FACE).heights, [0.0, 0.08])
+    np.testing.assert_allclose(InnerSurface(BOX, FaceLine.flat(FACE)).heights, [0.0, 0.08])

@@ -48,6 +48,15 @@ def make_section(polygon=None, clamped_z=BASE, width=WIDTH, circles=(), size=Non
     )
 
 
+def draw_keypoints():
+    """Returns places on the bands where the ribs meet them, about, and the tip."""
+    heights = np.linspace(BASE + 10.0, LENGTH - 16.0, 4) * MILLIMETRE
+    points = {f"inner_{k}": [0.0132, 0.01, float(z)] for k, z in enumerate(heights, start=1)}
+    for k, z in enumerate(heights + 4e-3, start=1):
+        points[f"outer_{k}"] = [float(-0.014 + 0.024 * (z - 0.012) / 0.058 + 0.8e-3), 0.01, float(z)]
+    return {**points, "tip": [0.012, 0.01, 0.068]}
+
+
 def write_section_jaw(folder, polygon=None, **changes):
     """Writes a jaw file with its section into a folder; changes replace keys of the file. Returns its path."""
     polygon = draw_polygon() if polygon is None else polygon
@@ -57,7 +66,7 @@ def write_section_jaw(folder, polygon=None, **changes):
         "name": "printed finger",
         "section": {"file": "finger.section.json", "width": 0.02, "clamped": {"z_below": 0.012}},
         "material": "tpu95a",
-        "keypoints": {"low": [0.0132, 0.01, 0.022], "high": [0.0132, 0.01, 0.054], "tip": [0.012, 0.01, 0.068]},
+        "keypoints": draw_keypoints(),
         "candidates": {"first_z": 0.016, "step_z": 0.005, "count": 9},
         **changes,
     }

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from section_fakes import BASE, MILLIMETRE, TPU, draw_polygon, make_section, write_section_jaw
+from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, draw_polygon, make_section, write_section_jaw
 
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
@@ -20,6 +20,7 @@ from finforce_ifea.jaw.jaw_file import MATERIALS, Material
 from finforce_ifea.jaw.mesh import compute_volume
 from finforce_ifea.jaw.section_mesh import extrude_section, mesh_section
 from finforce_ifea.mechanics import build_mechanics
+from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.reduced.cache import name_manifold
 from finforce_ifea.settings import EstimatorSettings
 
@@ -165,6 +166,72 @@ def test_contact_surface_begins_at_the_clamp(jaw):
     surface = build_mechanics(jaw, EstimatorSettings(solver="plane", mesh="coarse")).contact.surface
     assert 0.010 < surface.heights[0] < 0.0125
     assert (surface.points[:, 1] == 0.0).all()
+
+
+BULGE = 1.5
+
+
+@pytest.fixture(scope="module")
+def curved(tmp_path_factory):
+    """A finger whose inner face bulges by 1.5 mm."""
+    folder = tmp_path_factory.mktemp("curved")
+    return load_jaw(write_section_jaw(folder, draw_polygon(bulge=BULGE)))
+
+
+def test_curved_face_is_a_line_of_its_own(curved, jaw):
+    assert jaw.face.is_flat and not curved.face.is_flat
+    z = np.array([0.020, 0.041, 0.060])
+    drawn = 0.014 + 1e-3 * BULGE * np.sin(np.pi * (1e3 * z - BASE) / (LENGTH - BASE))
+    np.testing.assert_allclose(curved.face.read(z), drawn, atol=2e-5)
+    assert curved.inner_face_x == pytest.approx(0.014 + 1e-3 * BULGE, abs=2e-5)
+    np.testing.assert_allclose(curved.candidates[:, 0], curved.face.read(curved.candidates[:, 2]))
+
+
+def test_first_touch_of_a_curved_face_is_where_it_stands_out(curved):
+    """A small rod beside the middle touches as much deeper as the face recedes there, less what is beside it."""
+    contact = build_mechanics(curved, EstimatorSettings(solver="plane", mesh="coarse")).contact
+    radius, places = 1e-3, {}
+    for height in (0.022, 0.041, 0.060):
+        place = np.array([0.0, np.log(radius), height])
+        places[height] = contact.find_touch(place)
+        gap = contact.indenter.find_gap(contact.place_points(np.zeros(contact.model.size)), contact.face_x, place)
+        assert gap > -1e-6
+        place[0] = places[height] + 2e-5
+        assert contact.indenter.find_gap(contact.surface.points, contact.face_x, place) < 0.0
+    assert places[0.041] == pytest.approx(0.0, abs=2e-5)
+    for height in (0.022, 0.060):
+        assert places[height] == pytest.approx(curved.inner_face_x - curved.face.read(height), abs=1e-4)
+
+
+def test_curved_face_has_the_solid_finger_s_force(curved):
+    settings = EstimatorSettings(mesh="coarse")
+    plane, solid = (build_mechanics(curved, replace(settings, solver=name)) for name in ("plane", "solid"))
+    for height in (0.03, 0.05):
+        forces = [press(mechanics, curved, height, depth=3e-3).force for mechanics in (plane, solid)]
+        assert np.linalg.norm(forces[1]) > 0.2
+        np.testing.assert_allclose(forces[0], forces[1], atol=0.03 * np.linalg.norm(forces[1]))
+
+
+@pytest.mark.parametrize("height", [0.030, 0.052])
+def test_force_on_a_curved_face_is_estimated(curved, height):
+    """Key points of the plane model under a rod, by stored equilibria: within 3 % and three deviations."""
+    settings = EstimatorSettings(solver="reduced", mesh="coarse", radius=0.0125, radius_log_stddev=0.05)
+    modelled = replace(curved, material=replace(curved.material, spread=0.0))
+    estimator = JawEstimator(modelled, settings=settings)
+    mechanics = build_mechanics(modelled, replace(settings, solver="plane"))
+    probe = mechanics.model.attach(curved.keypoints, 3e-3)
+    depths = np.linspace(0.25e-3, 4e-3, 16)
+    rod = RigidCylinder(radius=12.5e-3)
+    presses = press_jaw(mechanics.model, mechanics.contact.surface, curved.inner_face_x, rod, height, depths)
+    points = [curved.keypoints] * 50 + [mechanics.model.positions(probe, item.q) for item in presses for _ in range(6)]
+    contact = Contact.fixed(curved, height)
+    for number, place in enumerate(points):
+        seen = Observation(stamp=number / 30.0, points=place, likelihood=np.ones(len(place)))
+        solution = estimator.update(seen, contact)
+    assert solution.status == "ok"
+    true = presses[-1].force
+    assert np.linalg.norm(true) > 0.4
+    assert np.linalg.norm(solution.force - true) < 0.03 * np.linalg.norm(true)
 
 
 def test_truth_of_the_ssg48_finger_is_met():
