@@ -301,7 +301,7 @@ class ContactEstimator:
     def _is_far(self, scene: ContactScene) -> bool:
         """Whether the boxes around object and jaw are apart along x by more than the margin."""
         front = scene.T[0, :3] @ self._centre + scene.T[0, 3] - np.abs(scene.T[0, :3]) @ self._half
-        return front - self.settings.margin > max(scene.line[:, 0].max(), self.face.x)
+        return front - self.settings.margin > max(scene.line[:, 0].max(), self.face.front)
 
     def _is_live(self, scene: ContactScene) -> bool:
         """Whether the surface is that of a solver at work."""

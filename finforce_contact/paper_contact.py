@@ -65,7 +65,7 @@ class IntersectionLocalizer:
         """Returns t_x = l_0 + l_bd / 2 [m] (Eq. 2), corrected for objects whose origin is not in their middle."""
         turned = self._vertices @ T[0, :3]
         low, high = turned.min(), turned.max()
-        return float(self._face.x - self._offset + 0.5 * (high - low) - 0.5 * (high + low))
+        return float(self._face.front - self._offset + 0.5 * (high - low) - 0.5 * (high + low))
 
     def _candidate_of(self, centre: NDArray, surface: NDArray) -> ContactPatch:
         """Returns the candidate of an intersection's centre (3,) [m]."""

@@ -66,6 +66,11 @@ class InnerFace:
             )
         return surface
 
+    @property
+    def front(self) -> float:
+        """Where the undeformed surface stands out most, x [m]."""
+        return float(self.x.max())
+
     def deform(self, surface: NDArray) -> NDArray:
         """Returns x and z (h, 2) [m] of the line on a deformed surface (n, 3) [m] in mesh order."""
         return _average(surface, self.nodes, self.weights)

@@ -439,7 +439,7 @@ def _time_images(estimator: ContactEstimator, count: int, *, tipped: float) -> f
     """Returns the median time [s] of an image with a new pose; the first two, which compile and cut, are left out."""
     estimator.reset()
     times = []
-    for index, T in enumerate(_poses(estimator.face.x, count + 2, tipped)):
+    for index, T in enumerate(_poses(estimator.face.front, count + 2, tipped)):
         begin = process_time()
         estimator.take_pose(index / 30.0, T)
         estimator.update(index / 30.0)

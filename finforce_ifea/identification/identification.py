@@ -50,15 +50,16 @@ _PRIOR_STDDEV = np.r_[1.0, 0.1, 0.1, 0.1, 0.4, BRANCH_STDDEV]
 _LOW = np.r_[-3.0, 0.6, 0.6, 0.6, 0.0, BRANCH_LOW]
 _HIGH = np.r_[3.0, 1.5, 1.5, 1.5, 2.0, BRANCH_HIGH]
 _DIFFERENCE = np.array([1e-3, 2e-3, 2e-3, 4e-3, 2e-2, 1e-3, 1e-2, 1e-3, 1e-2])
-_GEOMETRY = slice(1, 5)
+_GEOMETRY, _BRANCHES, _SHARES = slice(1, 5), slice(5, 9), (5, 7)
 # Presses at one place say little of others: the least relative error that is stated, over the number of recordings.
 _PLACES_DIFFER = 0.05
 _FORCE_ERROR, _FORCE_FLOOR = 0.015, 0.01
 _SHAPE_ERROR = 0.05e-3
 _ITERATIONS = 12
 _PER_CASE = 14
-# Of half a millimetre at most to the depth of a steady load: strips bend by centimetres.
-_STEPS = 200
+# Iterations that find the shape of a steady load, half a millimetre deeper at most in each: strips bend by centimetres.
+# Depth and equilibrium are sought together at first, later one after the other.
+_STEPS, _TOGETHER, _NEAR = 300, 60, 1e-5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,6 +116,12 @@ def fit_calibration(
     )
     covariance = np.linalg.inv(result.jac.T @ result.jac)
     rough = fit.report(result.x, np.sqrt(np.diag(covariance)))
+    if fit.stills:  # without a course of time there is nothing to relax
+        error = float(np.clip(max(rough.calibration.force_error, _PLACES_DIFFER / len(cases)), 0.005, 0.5))
+        known = {name: value for name, value in rough.uncertainty.items() if name not in _NAMES[5:]}
+        return replace(
+            rough, calibration=replace(rough.calibration, relaxation=(), force_error=error), uncertainty=known
+        )
     # magnitudes are compared; friction is looked for once they are known
     smooth = replace(settings, smooth_share=1.0)
     history = fit_force_history(jaw, cases, smooth, rough.calibration, progress)
@@ -151,6 +158,12 @@ class _Fit:
         self.low = np.r_[_LOW, [item.low for item in bounds]]
         self.high = np.r_[_HIGH, [item.high for item in bounds]]
         self.difference = np.r_[_DIFFERENCE, [item.largest_change / 15 for item in bounds]]
+        self.stills = all(_starts_loaded(case) for case in cases)
+        # only a drawing can be thickened, and only what has a course of time relaxes
+        self.frozen = set() if jaw.drawing is not None else set(range(*_GEOMETRY.indices(len(_NAMES))))
+        if self.stills:
+            self.frozen |= set(range(*_BRANCHES.indices(len(_NAMES))))
+            self.mean[list(_SHARES)], self.high[list(_SHARES)] = 0.0, 1e-9
         self.start = self.mean.copy()
         self.forces = [np.linalg.norm(case.forces_true, axis=1) for case in cases]
         self._shapes: dict[bytes, tuple[NDArray, NDArray]] = {}
@@ -226,7 +239,7 @@ class _Fit:
         centre = self.residuals(x)
         columns = []
         for i, step in enumerate(self.difference):
-            if self.jaw.drawing is None and i in range(*_GEOMETRY.indices(len(x))):  # only a drawing can be changed
+            if i in self.frozen:
                 columns.append(np.zeros(len(centre)))
                 columns[-1][len(centre) - len(x) + i] = 1.0 / self.stddev[i]
                 continue
@@ -290,7 +303,7 @@ class _PlateauSolver:
         place[DEPTH] = touch + 0.5e-3 if start is None else start.depth
         seen = np.isfinite(plateau.keypoints[:, 0])
         stddev = np.sqrt(plateau.variance[seen, None] + _SHAPE_ERROR**2)
-        for _ in range(_STEPS):
+        for step in range(_STEPS):
             state = self._contact.linearize(q, place)
             if not state.touches:
                 q = q + self._contact.approach(q, state.correction, place)
@@ -301,6 +314,8 @@ class _PlateauSolver:
             residual = (plateau.keypoints[seen] - moved[seen][:, [0, 2]]) / stddev
             change = float(np.clip((mode * residual).sum() / (mode**2).sum(), -0.5e-3, 0.5e-3))
             change = max(change, touch + 3e-5 - place[DEPTH])
+            if step > _TOGETHER:  # they chase each other: the depth waits for the equilibrium
+                change *= 0.5 if np.abs(state.correction).max() < _NEAR else 0.0
             place[DEPTH] += change
             q = q + limit_step(self._model, state.modes[:, DEPTH] * change)
             if abs(change) < 1e-6 and np.abs(state.correction).max() < 1e-6:
@@ -375,6 +390,11 @@ def find_plateaus(
         chosen = np.unique(np.linspace(0, len(found) - 1, per_case).round().astype(int))
         plateaus += [found[i] for i in chosen]
     return plateaus
+
+
+def _starts_loaded(case: CalibrationCase) -> bool:
+    """Whether a case begins with a load, as stills do."""
+    return bool(len(case.forces_true) and np.linalg.norm(case.forces_true[0]) > _UNLOADED)
 
 
 def _plateaus_of_case(number: int, case: CalibrationCase, jaw: Jaw, settings: EstimatorSettings) -> list[Plateau]:

@@ -8,6 +8,7 @@ import numpy as np
 import yaml
 
 from finforce_ifea.errors import CalibrationError
+from finforce_ifea.jaw.drawing import Band, Drawing
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.relaxation import RelaxationTerm
 
@@ -111,8 +112,8 @@ class Calibration:
             return replace(jaw, material=material)
         drawing = replace(
             jaw.drawing,
-            inner=_thicken(jaw.drawing.inner, self.inner_thickness_factor),
-            outer=_thicken(jaw.drawing.outer, self.outer_thickness_factor),
+            inner=_thicken(jaw.drawing.inner, self.inner_thickness_factor, jaw.drawing),
+            outer=_thicken(jaw.drawing.outer, self.outer_thickness_factor, jaw.drawing),
             ribs=tuple(replace(rib, thickness=rib.thickness * self.rib_thickness_factor) for rib in jaw.drawing.ribs),
             clamped_z=max(jaw.drawing.clamped_z, self.clamped_z),
         )
@@ -142,8 +143,11 @@ def name_mechanics(jaw: Jaw, solver: str) -> str:
     return solver if solver in _MECHANICS else jaw.model
 
 
-def _thicken(band, factor: float):
-    return replace(band, thickness=band.thickness * factor)
+def _thicken(band: Band, factor: float, drawing: Drawing) -> Band:
+    """Returns a thicker band with its outer face where it was; where a rigid tip joins centre lines, those stay."""
+    shift = 0.5 * band.inward * band.thickness * (1.0 - factor) if drawing.tip_z is None else 0.0
+    base, tip = (band.base[0] + shift, band.base[1]), (band.tip[0] + shift, band.tip[1])
+    return replace(band, base=base, tip=tip, thickness=band.thickness * factor)
 
 
 def load_calibration(name_or_path: str | Path) -> Calibration:

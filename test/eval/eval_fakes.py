@@ -9,6 +9,7 @@ import numpy as np
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, PoseTrack, Recording, WrenchTrack, parse_phases
 from finforce_eval.stress.stress import Family, Trial, attempt
 from finforce_ifea.errors import ContactError
+from finforce_ifea.jaw.face import FaceLine
 from finforce_ifea.observation import Contact
 
 PERIOD = 33_333_333
@@ -74,6 +75,7 @@ class FakeJaw:
     keypoints: np.ndarray = None
     inner_face_x: float = 0.014
     side: str = "left"
+    face: FaceLine = FaceLine.flat(0.014)
 
 
 BOX = np.array([[x, y, z] for z in (0.0, 0.08) for y in (-0.01, 0.01) for x in (-0.014, 0.014)])

@@ -9,6 +9,7 @@ from mechanics_fakes import BENCH, MODULUS
 
 from finforce_ifea.errors import CalibrationError
 from finforce_ifea.identification.identification import CalibrationCase, find_plateaus, fit_calibration
+from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
 from finforce_ifea.settings import EstimatorSettings
@@ -165,17 +166,46 @@ def test_no_recordings_are_refused():
         fit_calibration(load_jaw("bench"), [])
 
 
-def test_recording_that_starts_loaded_is_refused_by_name():
-    case = make_case(40)
-    late = slice(150, None)
-    cut = replace(
+def begin_later(case, frames):
+    late = slice(frames, None)
+    return replace(
         case,
         observations=case.observations[late],
         stamps_true=case.stamps_true[late],
         forces_true=case.forces_true[late],
     )
-    with pytest.raises(CalibrationError, match="pressed_at_40.*without load"):
-        fit_calibration(load_jaw("bench"), [cut], FRAME)
+
+
+def test_recording_with_too_short_a_rest_is_refused_by_name():
+    case = begin_later(make_case(40), 50)
+    with pytest.raises(CalibrationError, match="pressed_at_40: 10 frames without load at the start; expected"):
+        fit_calibration(load_jaw("bench"), [case], FRAME)
+
+
+def test_stills_need_no_rest():
+    """Loaded from the first frame on: key points are where the jaw file has them, and nothing is said of relaxation."""
+    fit = fit_calibration(load_jaw("bench"), [begin_later(make_case(40), 150)], FRAME)
+    assert fit.calibration.relaxation == ()
+    assert fit.calibration.force_error >= 0.05
+    assert set(fit.uncertainty) == {
+        "young_modulus",
+        "inner_thickness_factor",
+        "outer_thickness_factor",
+        "rib_thickness_factor",
+        "clamped_z",
+    }
+    # what has relaxed by then counts as modulus
+    relaxed = MODULUS * (1.0 + sum(term.share for term in TERMS))
+    assert 0.85 * MODULUS < fit.calibration.young_modulus < 1.15 * relaxed
+    assert abs(fit.calibration.young_modulus - MODULUS) < 2.5 * fit.uncertainty["young_modulus"]
+
+
+def test_strips_with_a_rigid_tip_keep_their_centre_lines():
+    steel = load_jaw("steel")
+    thicker = Calibration(young_modulus=2e11, inner_thickness_factor=1.3, outer_thickness_factor=1.2).apply(steel)
+    for before, after in ((steel.drawing.inner, thicker.drawing.inner), (steel.drawing.outer, thicker.drawing.outer)):
+        assert after.thickness > 1.1 * before.thickness
+        np.testing.assert_allclose(after.centre_x(np.array([0.0, 0.1])), before.centre_x(np.array([0.0, 0.1])))
 
 
 def test_recording_without_a_held_load_is_refused_by_name():
