@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -114,7 +115,7 @@ class RollingContact:
     def find_touch(self, place: NDArray) -> float:
         """Returns the depth [m] at which the object at a place (3,) first touches the undeformed jaw."""
         if self.face.is_flat:
-            return self.indenter.find_touch(place, *self.surface.heights[[0, -1]])
+            return self.indenter.find_touch(place, *self.surface.ends)
         return self.indenter.find_touch_at(self.surface.points[:: self.surface.across, [0, 2]], self.face_x, place)
 
     def rub(self, points: NDArray, place: NDArray) -> RubbedContact:
@@ -249,6 +250,11 @@ class ContactSurface:
     probe: Any
     low: NDArray
     high: NDArray
+
+    @cached_property
+    def ends(self) -> tuple[float, float]:
+        """The lowest and the highest of the heights [m]."""
+        return float(self.heights[0]), float(self.heights[-1])
 
 
 def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across: Across) -> ContactSurface:
