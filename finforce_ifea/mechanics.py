@@ -67,6 +67,8 @@ def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) ->
     """
     from finforce_ifea.fem.plane import PlaneModel
 
+    if jaw.section is None:
+        raise JawFileError(f"the jaw {jaw.name!r} is no section, which solver plane needs; expected solver {jaw.model}")
     key = (jaw.digest, jaw.material.poisson_ratio, jaw.section.size)
     if key not in _WIDTH_SHARES:
         coarse = jaw.build_mesh("coarse")

@@ -17,6 +17,9 @@ from finforce_ifea.settings import SOLVERS, EstimatorSettings
 
 _WARM_UP_FRAMES = 150
 
+# Solvers that do not describe the bench finger, which is a drawing.
+_OF_OTHER_JAWS = ("plane",)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Tier:
@@ -62,7 +65,7 @@ TIERS = (
 def list_tiers(*, slow: bool = True) -> tuple[Tier, ...]:
     """Returns the tiers, with one for each solver that has been registered since the list was written."""
     listed = {tier.solver for tier in TIERS} | {"default"}
-    others = tuple(Tier(name=name, solver=name) for name in SOLVERS if name not in listed)
+    others = tuple(Tier(name=name, solver=name) for name in SOLVERS if name not in (*listed, *_OF_OTHER_JAWS))
     return tuple(tier for tier in TIERS + others if slow or not tier.slow)
 
 

@@ -151,6 +151,11 @@ def test_plane_model_has_the_solid_finger_s_force(jaw):
         np.testing.assert_allclose(forces[0], forces[1], atol=0.02 * np.linalg.norm(forces[1]))
 
 
+def test_plane_model_of_a_drawing_is_refused():
+    with pytest.raises(JawFileError, match="the jaw 'bench' is no section, which solver plane needs; expected solver"):
+        build_mechanics(load_jaw("bench"), EstimatorSettings(solver="plane"))
+
+
 def test_both_sides_share_their_equilibria(jaw):
     settings = EstimatorSettings(solver="plane", mesh="coarse")
     sides = [item for item in (jaw, jaw.mirrored())]
