@@ -16,6 +16,8 @@ NOISES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 SHARES = (0.1, 0.2, 0.3, 0.4)
 USUAL = 0.2
 WORKSPACE = 0.03
+# Young's modulus of the softest finger that a calibration may have [Pa].
+SOFTEST = 1e3
 FARTHEST_SHIFT = 0.01
 
 
@@ -113,7 +115,8 @@ def run_forces(plan: Plan) -> Iterator[Trial]:
             depth = DEPTH * force / full
             history = replace(bench.history(height=height, radius=RADIUS, depth=max(depth, LEAST_DEPTH)), depth=depth)
         else:
-            bench, level = Bench(plan, modulus=force / full), f"{force:g} N, a jaw to match"
+            softer = max(force / full, SOFTEST / usual.jaw.material.young_modulus)
+            bench, level = Bench(plan, modulus=softer), f"{force:g} N, a jaw to match"
             history = bench.history(height=height, radius=RADIUS, depth=DEPTH)
         session = open_session(bench, random, history=history, level=level)
         yield from session.play(seed, session.press())
