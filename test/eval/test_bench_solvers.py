@@ -44,7 +44,8 @@ def figures_of(name, time, error, lost=0.0):
 
 
 def test_every_registered_solver_is_a_tier_and_the_slow_one_can_be_left_out():
-    assert {tier.solver for tier in list_tiers()} >= set(SOLVERS) - {"default"}
+    # the bench finger is a drawing, which solver plane does not describe
+    assert {tier.solver for tier in list_tiers()} == set(SOLVERS) - {"default", "plane"}
     assert {tier.name for tier in list_tiers()} - {tier.name for tier in list_tiers(slow=False)} == {"solid, fine mesh"}
 
 
