@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from time import monotonic
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES, jaw_in_gripper
-from finforce.stamps import Synchronizer
+from finforce.stamps import SECOND, Synchronizer
 
 Side = Literal["left", "right"]
 
 R_GRIPPER_JAW = {side: jaw_in_gripper(side, 0.0)[:3, :3] for side in SIDES}
+
+
+class Wrench(NamedTuple):
+    """What the object does to a jaw: force (3,) [N] and torque (3,) [N m] about the jaw's origin, in the jaw frame."""
+
+    force: NDArray[np.float64]
+    torque: NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,44 +31,79 @@ class Grasp:
     Attributes:
         grasp: (3,) [N], along x: how hard the object is held.
         manipulation: (3,) [N], the net force on the gripper.
+        torque: (3,) [N m] of the net force about the origin, of one jaw alone about that jaw's; None where the jaws are
+            is not known.
     """
 
     grasp: NDArray[np.float64]
     manipulation: NDArray[np.float64]
+    torque: NDArray[np.float64] | None
 
 
-def combine_forces(left: NDArray[np.float64], right: NDArray[np.float64]) -> Grasp:
+def combine_wrenches(left: Wrench, right: Wrench, distance: float | None) -> Grasp:
     """Return grasp force min(|F_left|, |F_right|) and manipulation force R_left F_left + R_right F_right.
 
     Seen in the gripper's frame the jaws' forces oppose each other, so that the sum is the difference
-    F_left - F_right of the paper.
+    F_left - F_right of the paper. With p = -+distance / 2 along x its torque is the sum of R T + p x R F.
 
     Args:
-        left: (3,) [N], force the object applies to the left jaw, in `left_jaw`.
-        right: (3,) [N], likewise for the right jaw, in `right_jaw`.
+        left: of the left jaw.
+        right: of the right jaw.
+        distance: between the jaws' origins, half way between which the gripper's is [m]; None unknown.
     """
-    held = min(float(np.linalg.norm(left)), float(np.linalg.norm(right)))
-    net = R_GRIPPER_JAW["left"] @ left + R_GRIPPER_JAW["right"] @ right
-    return Grasp(grasp=np.array([held, 0.0, 0.0]), manipulation=net)
+    held = min(float(np.linalg.norm(left.force)), float(np.linalg.norm(right.force)))
+    forces = [R_GRIPPER_JAW["left"] @ left.force, R_GRIPPER_JAW["right"] @ right.force]
+    torque = None
+    if distance is not None:
+        # x cross F = (0, -F_z, F_y)
+        couple = (0.5 * distance * (forces[1] - forces[0]))[[0, 2, 1]] * [0.0, -1.0, 1.0]
+        torque = R_GRIPPER_JAW["left"] @ left.torque + R_GRIPPER_JAW["right"] @ right.torque + couple
+    return Grasp(grasp=np.array([held, 0.0, 0.0]), manipulation=forces[0] + forces[1], torque=torque)
 
 
-def single_jaw_grasp(force: NDArray[np.float64], side: Side) -> Grasp:
-    """Return what one jaw alone says: its force is the grasp force and the net force."""
-    held = float(np.linalg.norm(force))
-    return Grasp(grasp=np.array([held, 0.0, 0.0]), manipulation=R_GRIPPER_JAW[side] @ force)
+def single_jaw_grasp(wrench: Wrench, side: Side) -> Grasp:
+    """Return what one jaw alone says: its force is the grasp force, its wrench the net wrench."""
+    held, R = float(np.linalg.norm(wrench.force)), R_GRIPPER_JAW[side]
+    return Grasp(grasp=np.array([held, 0.0, 0.0]), manipulation=R @ wrench.force, torque=R @ wrench.torque)
+
+
+class JawDistance:
+    """How far the jaws' origins are from each other, by their poses in the camera's frame."""
+
+    def __init__(self, max_age: float) -> None:
+        """Keeps the greatest distance in time of a pose from what it is used for [s]."""
+        self._max_age = round(max_age / SECOND)
+        self._poses: dict[str, tuple[int, NDArray]] = {}
+
+    def take(self, side: str, stamp: int, T_camera_jaw: NDArray) -> None:
+        """Take the pose (4, 4) of a jaw in an image [ns]."""
+        self._poses[side] = stamp, T_camera_jaw
+
+    def at(self, stamp: int) -> float | None:
+        """Return the distance in an image [ns] along the closing axis [m]; None where one of them is not known."""
+        poses = [T for taken, T in self._poses.values() if abs(taken - stamp) <= self._max_age]
+        if len(poses) < len(SIDES):
+            return None
+        left, right = self._poses["left"][1], self._poses["right"][1]
+        return float((right[:3, 3] - left[:3, 3]) @ left[:3, 0])
 
 
 class ForcePairing:
-    """Brings together the forces of both jaws that belong to one image, whichever comes first.
+    """Brings together the wrenches of both jaws that belong to one image, whichever comes first.
 
     Args:
-        side: the jaw whose forces come first-hand.
+        side: the jaw whose wrenches come first-hand.
         depth: images that may wait for the other jaw.
+        max_age: of the jaws' poses in the image of a force [s].
+
+    Attributes:
+        distance: between the jaws.
     """
 
-    def __init__(self, side: Side, depth: int = 16) -> None:
+    def __init__(self, side: Side, depth: int = 16, max_age: float = 0.5) -> None:
+        self.distance = JawDistance(max_age)
         self._own, self._other = side, "right" if side == "left" else "left"
-        self._forces = Synchronizer({self._own: depth, self._other: depth})
+        self._wrenches = Synchronizer({self._own: depth, self._other: depth})
         self._heard = -float("inf")
 
     @property
@@ -69,14 +111,14 @@ class ForcePairing:
         """Time since the other jaw was heard of [s], infinite before."""
         return monotonic() - self._heard
 
-    def add(self, stamp: int, force: NDArray[np.float64], *, own: bool) -> Grasp | None:
-        """Take a force (3,) [N] in its jaw's frame; return the grasp once the stamp has both forces."""
+    def add(self, stamp: int, wrench: Wrench, *, own: bool) -> Grasp | None:
+        """Take the wrench on a jaw; return the grasp once the stamp [ns] has both."""
         if not own:
             self._heard = monotonic()
         mine, peer = (self._own, self._other) if own else (self._other, self._own)
-        found = self._forces.take(peer, stamp)
+        found = self._wrenches.take(peer, stamp)
         if found is None:
-            self._forces.add(mine, stamp, force)
+            self._wrenches.add(mine, stamp, wrench)
             return None
-        forces = {mine: force, peer: found.value}
-        return combine_forces(forces["left"], forces["right"])
+        wrenches = {mine: wrench, peer: found.value}
+        return combine_wrenches(wrenches["left"], wrenches["right"], self.distance.at(stamp))

@@ -1,4 +1,4 @@
-"""Messages into observations, contacts and forces; outlines to and from the columns of a point cloud."""
+"""Messages into observations and contacts; outlines to and from the columns of a point cloud."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.errors import ObservationError
-from finforce.messages import check_cloud, check_frame, decode_columns, decode_keypoints
+from finforce.messages import check_cloud, decode_columns, decode_keypoints
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, are_same_polygons
 
@@ -64,20 +63,6 @@ def outline_from_cloud(cloud: Any, frame: str, previous: ObjectOutline | None) -
     """
     check_cloud(cloud, frame, "the outline")
     return outline_from_columns(decode_columns(cloud, COLUMNS, ACROSS), previous)
-
-
-def force_from_wrench(message: Any, frame: str, what: str) -> NDArray[np.float64]:
-    """Return the force (3,) [N] of a geometry_msgs/WrenchStamped.
-
-    Raises:
-        ObservationError: the frame is not `frame`, or the force is not finite.
-    """
-    check_frame(message, frame, what)
-    force = message.wrench.force
-    values = np.array([force.x, force.y, force.z])
-    if not np.isfinite(values).all():
-        raise ObservationError(f"{what} is not finite: {values}")
-    return values
 
 
 STDDEVS = ("stddev_x", "stddev_z", "stddev_tilt")

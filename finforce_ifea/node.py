@@ -5,23 +5,25 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from threading import Timer
 from time import perf_counter
 from typing import Any
 
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from finforce.errors import FinforceError
+from finforce.gripper_frames import SIDES
 from finforce.health import Health, Outcome, Report
-from finforce.messages import read_stamp, stamp_of
+from finforce.messages import pose_from_message, read_stamp, stamp_of, wrench_from_message
 from finforce.ros import node as ros
 from finforce.skipping import AWAY, IDLE, LATE, SOLVER, Skips
 from finforce.stamps import Idling, StampGate
-from finforce_ifea.grasp_force import ForcePairing, single_jaw_grasp
-from finforce_ifea.messages import force_from_wrench, observation_from_cloud
+from finforce_ifea.grasp_force import ForcePairing, Wrench, single_jaw_grasp
+from finforce_ifea.messages import observation_from_cloud
 from finforce_ifea.observation import Solution
 from finforce_ifea.parameters import NodeParameters, build_contact_feed, build_estimator, load_parameter_jaw
 from finforce_ifea.publishers import (
@@ -59,7 +61,8 @@ class IfeaSolverNode(Node):
             self.estimator = build(jaw, parameters, settings, self.skips.allows(AWAY))
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
         self.health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
-        self.pairing, self.idling = ForcePairing(parameters.jaw_name), Idling()
+        self.pairing = ForcePairing(parameters.jaw_name)
+        self.idling = Idling()
         self.last: Solution | None = None
         self.qos = ros.QosWatch(self)
         self.out = SolverOutputs(self.qos, parameters, self.skips)
@@ -93,6 +96,8 @@ class IfeaSolverNode(Node):
             self.qos.subscription(PointCloud2, f"{side}/object_outline", self._on_outline, ros.SENSOR)
         if peer := self.parameters.peer:
             self.qos.subscription(WrenchStamped, f"{peer}/wrench", self._on_peer, ros.RESULT)
+            for jaw in SIDES:
+                self.qos.subscription(PoseStamped, f"{jaw}/jaw_pose", partial(self._on_jaw_pose, jaw), ros.SENSOR)
         topic = f"{side}/keypoints"
         # as bytes: of an image that is passed over no more than the stamp is read
         self.keypoints = self.qos.subscription(PointCloud2, topic, self._on_keypoints, ros.SENSOR, raw=True)
@@ -121,10 +126,11 @@ class IfeaSolverNode(Node):
                 self._refuse(outcome_of_solution(solution))
                 return
             self.out.send_wrench(header, solution)
+            wrench = Wrench(solution.force, solution.torque)
             if self.parameters.peer:
-                self.out.send_grasp(header, self.pairing.add(stamp, solution.force, own=True))
+                self.out.send_grasp(header, self.pairing.add(stamp, wrench, own=True))
             elif self.parameters.completes_grasp:
-                self.out.send_grasp(header, single_jaw_grasp(solution.force, self.parameters.jaw_name))
+                self.out.send_grasp(header, single_jaw_grasp(wrench, self.parameters.jaw_name))
             self.out.send_stddev(header, solution)
             age = (self._now() - stamp) / ros.NANOSECONDS
             self.health.publish(outcome_of_solution(solution), latency=perf_counter() - began, age=age)
@@ -155,9 +161,15 @@ class IfeaSolverNode(Node):
         """Complete the grasp with the other jaw's force."""
         stamp, peer = stamp_of(wrench), self.parameters.peer
         with self._refusals():
-            force = force_from_wrench(wrench, f"{peer}_jaw", f"the wrench of the {peer} jaw")
+            found = Wrench(*wrench_from_message(wrench, f"{peer}_jaw"))
             self.gate.check_age(stamp, self._now())
-            self.out.send_grasp(wrench.header, self.pairing.add(stamp, force, own=False))
+            self.out.send_grasp(wrench.header, self.pairing.add(stamp, found, own=False))
+
+    def _on_jaw_pose(self, side: str, pose: PoseStamped) -> None:
+        """Keep where a jaw is, for the torque on the gripper."""
+        with self._refusals():
+            T = pose_from_message(pose, pose.header.frame_id, f"the pose of the {side} jaw")
+            self.pairing.distance.take(side, stamp_of(pose), T)
 
     def _restart(self, reason: str) -> str:
         self.estimator.reset()

@@ -58,14 +58,15 @@ class SolverOutputs:
             self.stddev.publish(ros.wrench_message(header, solution.force_stddev, solution.torque_stddev))
 
     def send_grasp(self, header: Any, grasp: Grasp | None) -> None:
-        """Send what the object does to the gripper, once it is known."""
+        """Send what the object does to the gripper, once it is known; a torque that is not known is left at zero."""
         if grasp is None:
             return
         header = ros.Header(stamp=header.stamp, frame_id=self._parameters.gripper_frame)
         if ros.is_wanted(self.grasp, self._skips):
             self.grasp.publish(ros.wrench_message(header, grasp.grasp))
         if ros.is_wanted(self.manipulation, self._skips):
-            self.manipulation.publish(ros.wrench_message(header, grasp.manipulation))
+            torque = (0.0, 0.0, 0.0) if grasp.torque is None else grasp.torque
+            self.manipulation.publish(ros.wrench_message(header, grasp.manipulation, torque))
 
     def send_shape(self, header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> None:
         """Send the deformed surface, and markers at their own rate; markers only to listeners, whatever the rules."""

@@ -16,8 +16,8 @@ from finforce_eval.evaluation.contact_source import ContactSource
 from finforce_eval.evaluation.manipulation import ManipulationStats, score_manipulation
 from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_detection
-from finforce_eval.evaluation.scoring import CaseScore, force_range, match_truth, score_case
-from finforce_eval.recordings.tracks import Recording
+from finforce_eval.evaluation.scoring import CaseScore, force_range, match_samples, match_truth, score_case
+from finforce_eval.recordings.tracks import Recording, WrenchTrack
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.observation import Contact, Observation
 
@@ -59,7 +59,7 @@ def evaluate_recording(
         ObservationError: the estimator refuses a frame.
     """
     track = recording.jaw(side).keypoints
-    truth = match_truth(recording.truth(side), track.stamps)
+    truth = recording.truth(side)
     check_keypoint_count(recording, side, jaw)
     estimator = factory() if factory else JawEstimator(jaw)
     log = StepLog(recording, side, jaw, estimator, source)
@@ -134,7 +134,7 @@ def score_results(results: Sequence[CaseResult], recordings: Sequence[Recording]
         scores={result.name: score_case(result, span) for result in results},
         total=score_case(results, span),
         span=span,
-        manipulation=score_manipulation({result.name: result for result in results}),
+        manipulation=score_manipulation(results, recordings),
     )
 
 
@@ -169,6 +169,7 @@ class StepLog:
         self.phases = recording.phases_at(track.stamps)
         frames = len(track.stamps)
         self.force = np.full((frames, 3), np.nan)
+        self.torque = np.full((frames, 3), np.nan)
         self.place = np.full((frames, 3), np.nan)
         self.stddev = np.full(frames, np.nan)
         self.axis_stddev = np.full((frames, 3), np.nan)
@@ -201,6 +202,7 @@ class StepLog:
     def _keep(self, index: int, solution: Any, contact: Contact | None) -> None:
         """Keep a trusted estimate."""
         self.force[index] = solution.force
+        self.torque[index] = solution.torque
         self.place[index] = solution.contact_place
         self.stddev[index] = solution.magnitude_stddev
         self.axis_stddev[index] = solution.force_stddev
@@ -226,14 +228,17 @@ class StepLog:
             outline=contact.outline.placed() if known else (),
         )
 
-    def result(self, truth: NDArray[np.float64]) -> CaseResult:
-        """Return the time series, with the true forces (n, 3) [N]."""
+    def result(self, truth: WrenchTrack) -> CaseResult:
+        """Return the time series, with the true wrenches."""
+        stamps = self.track.stamps
         return CaseResult(
             name=self.name,
             side=self.side,
-            stamps=self.track.stamps,
-            truth=truth,
+            stamps=stamps,
+            truth=match_truth(truth, stamps),
+            true_torque=match_samples(truth.stamps, truth.torque, stamps),
             force=self.force,
+            torque=self.torque,
             place=self.place,
             stddev=self.stddev,
             axis_stddev=self.axis_stddev,

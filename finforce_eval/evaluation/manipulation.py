@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.gripper_frames import SIDES
+from finforce.transforms import pose_from_quaternion
 from finforce_eval.evaluation.results import CaseResult
-from finforce_eval.evaluation.scoring import compare_vectors
-from finforce_ifea.grasp_force import combine_forces
+from finforce_eval.evaluation.scoring import compare_torques, compare_vectors
+from finforce_eval.recordings.tracks import Recording
+from finforce_ifea.grasp_force import JawDistance, Wrench, combine_wrenches
+
+_SAME = 0.2  # [s] within which a jaw's pose is still that of an image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +29,8 @@ class ManipulationStats:
         within_3_sigma_pct: share of the images in which the difference along x, y and z is within three of the stated
             standard deviations of both jaws together, or 1 mN [%].
         answered_pct: share of the images with both truths in which both jaws were answered [%].
+        torque_rmse_Nm: root mean square length of the difference of the torques about the gripper's origin [N m], None
+            where they, or the jaws' places, are not known.
     """
 
     n: int
@@ -31,39 +38,88 @@ class ManipulationStats:
     axis_rmse_N: tuple[float, float, float] | None = None
     within_3_sigma_pct: tuple[float, float, float] | None = None
     answered_pct: float | None = None
+    torque_rmse_Nm: float | None = None
 
 
-def score_manipulation(results: Mapping[str, CaseResult]) -> dict[str, ManipulationStats]:
+def score_manipulation(
+    results: Iterable[CaseResult], recordings: Iterable[Recording] = ()
+) -> dict[str, ManipulationStats]:
     """Return the score of every recording of which both jaws were evaluated, by its name."""
     pairs: dict[str, dict[str, CaseResult]] = {}
-    for name, result in results.items():
-        pairs.setdefault(name.removesuffix(f"/{result.side}"), {})[result.side] = result
-    return {name: score_pair(pair["left"], pair["right"]) for name, pair in pairs.items() if len(pair) == 2}
+    for result in results:
+        pairs.setdefault(result.name.removesuffix(f"/{result.side}"), {})[result.side] = result
+    known = {recording.name: recording for recording in recordings}
+    return {
+        name: score_pair(pair["left"], pair["right"], known.get(name)) for name, pair in pairs.items() if len(pair) == 2
+    }
 
 
-def score_pair(left: CaseResult, right: CaseResult) -> ManipulationStats:
-    """Return the score of two jaws of one recording, image by image with equal stamps."""
-    _, mine, theirs = np.intersect1d(left.stamps, right.stamps, return_indices=True)
+def score_pair(left: CaseResult, right: CaseResult, recording: Recording | None = None) -> ManipulationStats:
+    """Return the score of two jaws of one recording, image by image with equal stamps.
+
+    Args:
+        left: of the left jaw.
+        right: of the right jaw.
+        recording: with the jaws' poses, without which no torque is known.
+    """
+    stamps, mine, theirs = np.intersect1d(left.stamps, right.stamps, return_indices=True)
     counted = left.scored[mine] & right.scored[theirs]
     counted &= np.isfinite(left.truth[mine, 0]) & np.isfinite(right.truth[theirs, 0])
-    mine, theirs = mine[counted], theirs[counted]
+    stamps, mine, theirs = stamps[counted], mine[counted], theirs[counted]
     both = np.isfinite(left.force[mine, 0]) & np.isfinite(right.force[theirs, 0])
     answered = 100.0 * float(both.mean()) if len(both) else None
-    mine, theirs = mine[both], theirs[both]
+    stamps, mine, theirs = stamps[both], mine[both], theirs[both]
     if not len(mine):
         return ManipulationStats(n=0, answered_pct=answered)
-    found = _combine(left.force[mine], right.force[theirs])
-    difference = found - _combine(left.truth[mine], right.truth[theirs])
+    jaws = ((left, mine), (right, theirs))
+    found = _combine(*((jaw.force[rows], _rows_of(jaw.torque, rows)) for jaw, rows in jaws), _ways(recording, stamps))
+    ways = _ways(recording, stamps, true=True)
+    true = _combine(*((jaw.truth[rows], _rows_of(jaw.true_torque, rows)) for jaw, rows in jaws), ways)
     stated = None
     if left.axis_stddev is not None and right.axis_stddev is not None:
         # the jaws' frames are turned about z by half a turn: their axes are those of the gripper
         stated = np.hypot(left.axis_stddev[mine], right.axis_stddev[theirs])
-    return ManipulationStats(n=len(mine), answered_pct=answered, **compare_vectors(difference, stated))
+    known = np.isfinite(found.torque - true.torque).all(axis=1)
+    torque = compare_torques(found.torque[known], true.torque[known]) if known.any() and true.torque.any() else {}
+    return ManipulationStats(
+        n=len(mine),
+        answered_pct=answered,
+        torque_rmse_Nm=torque.get("torque_rmse_Nm"),
+        **compare_vectors(found.force - true.force, stated),
+    )
 
 
-def _combine(left: NDArray, right: NDArray) -> NDArray:
-    """Return the net forces (n, 3) [N] in the gripper's frame."""
-    return np.array([combine_forces(mine, theirs).manipulation for mine, theirs in zip(left, right, strict=True)])
+def _rows_of(torque: NDArray | None, rows: NDArray) -> NDArray:
+    """Return the torques in some images (n, 3) [N m], NaN where none were kept."""
+    return np.full((len(rows), 3), np.nan) if torque is None else torque[rows]
+
+
+def _ways(recording: Recording | None, stamps: NDArray, *, true: bool = False) -> list[float | None]:
+    """Return the distance between the jaws in images (n,) [ns], as it was seen or as it was; None where unknown."""
+    distance, tracks = JawDistance(_SAME), {}
+    for side in SIDES if recording is not None else ():
+        jaw = recording.jaw(side)
+        track = (jaw.true_pose or jaw.pose) if true else (jaw.pose or jaw.true_pose)
+        if track is None:
+            break
+        poses = zip(track.position, track.quaternion, strict=True)
+        tracks[side] = dict(zip(track.stamps.tolist(), (pose_from_quaternion(*pose) for pose in poses), strict=True))
+    found: list[float | None] = []
+    for stamp in stamps.tolist():
+        for side, poses in tracks.items():
+            if stamp in poses:
+                distance.take(side, stamp, poses[stamp])
+        found.append(distance.at(stamp))
+    return found
+
+
+def _combine(left: tuple[NDArray, NDArray], right: tuple[NDArray, NDArray], ways: Iterable[float | None]) -> Wrench:
+    """Return the net wrenches (n, 3) in the gripper's frame; a torque that is not known is NaN."""
+    rows = zip(*left, *right, ways, strict=True)
+    grasps = [combine_wrenches(Wrench(f, t), Wrench(g, u), way) for f, t, g, u, way in rows]
+    nothing = np.full(3, np.nan)
+    torques = [nothing if grasp.torque is None else grasp.torque for grasp in grasps]
+    return Wrench(np.array([grasp.manipulation for grasp in grasps]), np.array(torques))
 
 
 def format_manipulation(scores: Mapping[str, ManipulationStats]) -> list[str]:
@@ -74,8 +130,9 @@ def format_manipulation(scores: Mapping[str, ManipulationStats]) -> list[str]:
             lines.append(f"{name}: no net force: never were both jaws answered")
             continue
         axes = " ".join(f"{value:.2f}" for value in score.axis_rmse_N)
+        turn = "" if score.torque_rmse_Nm is None else f", torque by {1e3 * score.torque_rmse_Nm:.1f} N mm"
         lines.append(
-            f"{name}: net force on the gripper off by {score.vector_rmse_N:.3f} N (x, y, z: {axes}), "
+            f"{name}: net force on the gripper off by {score.vector_rmse_N:.3f} N (x, y, z: {axes}){turn}, "
             f"{score.answered_pct:.1f} % answered"
         )
     return lines

@@ -284,6 +284,8 @@ class CaseResult:
         stamps: (n,) image time [ns].
         truth: (n, 3) true force on the jaw [N], NaN where it was not measured.
         force: (n, 3) estimate [N], NaN where the estimator did not trust it.
+        torque: (n, 3) of it about the jaw's origin [N m]; None where it was not kept.
+        true_torque: (n, 3) of the true force [N m]; None where it was not kept.
         stddev: (n,) standard deviation of the magnitude [N].
         place: (n, 3) contact place on the undeformed surface [m].
         residual: (n,) weighted rms of the key points used [m].
@@ -323,6 +325,8 @@ class CaseResult:
     detector_ms: NDArray[np.float64] | None = None
     axis_stddev: NDArray[np.float64] | None = None
     latency_ms: NDArray[np.float64] | None = None
+    torque: NDArray[np.float64] | None = None
+    true_torque: NDArray[np.float64] | None = None
 
     @property
     def seconds(self) -> NDArray[np.float64]:

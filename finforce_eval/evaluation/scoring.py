@@ -154,6 +154,8 @@ class Stats:
         within_3_sigma_pct: share of the frames in which the difference along x, y and z is within three of the stated
             standard deviations, or 1 mN [%].
         answered_pct: share of the frames that were to be answered [%].
+        torque_rmse_Nm: root mean square length of the difference of the torques about the jaw's origin [N m].
+        torque_pct: the same over the root mean square of the true torque [%].
     """
 
     n: int
@@ -165,6 +167,8 @@ class Stats:
     axis_rmse_N: tuple[float, float, float] | None = None
     within_3_sigma_pct: tuple[float, float, float] | None = None
     answered_pct: float | None = None
+    torque_rmse_Nm: float | None = None
+    torque_pct: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,7 +327,23 @@ def _vector_stats(cases: Sequence[CaseResult], phase: str) -> dict[str, Any]:
     stated = None
     if all(case.axis_stddev is not None for case in cases):
         stated = np.concatenate([case.axis_stddev[rows] for case, rows in zip(cases, chosen, strict=True)])
-    return found | compare_vectors(differences, stated)
+    return found | compare_vectors(differences, stated) | _torque_stats(cases, chosen)
+
+
+def _torque_stats(cases: Sequence[CaseResult], chosen: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
+    """Return what `Stats` says of the torque; nothing where a case has none, or its truth is zero throughout."""
+    pairs = [(case.torque, case.true_torque) for case in cases]
+    if any(found is None or true is None or not np.nan_to_num(true).any() for found, true in pairs):
+        return {}
+    parts = [(found[rows], true[rows]) for (found, true), rows in zip(pairs, chosen, strict=True)]
+    found, true = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return compare_torques(found, true)
+
+
+def compare_torques(found: NDArray[np.float64], true: NDArray[np.float64]) -> dict[str, float]:
+    """Return `torque_rmse_Nm` and, unless the true ones are zero, `torque_pct` of torques (n, 3) [N m]."""
+    error, size = (float(np.sqrt((values**2).sum(axis=1).mean())) for values in (found - true, true))
+    return {"torque_rmse_Nm": error} | ({"torque_pct": 100.0 * error / size} if size > 0.0 else {})
 
 
 def compare_vectors(differences: NDArray[np.float64], stated: NDArray[np.float64] | None) -> dict[str, Any]:

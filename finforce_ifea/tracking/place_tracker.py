@@ -19,6 +19,7 @@ from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import PointNoise, Tare
 from finforce_ifea.tracking.friction_estimate import SMOOTH, Coefficient, FrictionEstimate, FrictionFrame
+from finforce_ifea.tracking.held_weight import HeldFrame, HeldWeight
 from finforce_ifea.tracking.influence import measure_influence
 from finforce_ifea.tracking.place_update import (
     Average,
@@ -57,11 +58,13 @@ _WIDEST_FORECAST = 1e-3
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
 # object has gone back to this share of its depth.
 _STRANGE, _BACK = 1.0, 0.8
-# What is held by the jaws alone does not slide out: no force along the finger is left, as far as friction can. From
-# image to image the lean goes this share of its way there.
+# What is held by the jaws alone does not slide out: of the force along the finger its weight is left, as far as
+# friction can. From image to image the lean goes this share of its way there.
 _LARGEST_LEAN, _HELD_GAIN = 0.9, 0.5
 # What of the friction the mechanics does not follow, and a lean of the force that is never excluded [-].
 _UNFOLLOWED, _LEAN = 0.25, 0.08
+# Of a weight that nobody knows, as a share of the normal force, and the least normal force that counts [N].
+_WEIGHT, _LEAST_NORMAL = 0.15, 0.1
 
 
 class _Level(NamedTuple):
@@ -111,6 +114,7 @@ class PlaceTracker:
         self._outline: OutlineIndenter | None = None
         self.slips = SlipHistory(contact.with_friction())
         self.roughness = FrictionEstimate(settings, smooth)
+        self._held = HeldWeight()
         self._width = WidthTracker(torsion, len(keypoints), UNSEEN_LEAN * settings.friction)
         self._face = contact.surface.heights[[0, -1]]
         self.reset()
@@ -172,6 +176,7 @@ class PlaceTracker:
         self._motion_covariance = np.diag([0.1e-3, 1e-3]) ** 2
         self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
         self.slips.reset()
+        self._held.reset()
         self._width.reset()
         self._released, self._jumped = 0, False
         self._forget_place()
@@ -275,16 +280,19 @@ class PlaceTracker:
         """Follows how the object slides, and learns its coefficient where something presses."""
         if self._reached[DEPTH] - self._find_touch(self._reached) < _LOADED_DEPTH or self._jumped:
             return
+        normal, moved = float(np.hypot(*state.force[::2])), update.place - forecast.place
         if self.settings.held == "yes":
-            upright = find_upright_lean(state.force, self.contact.rubbing.lean)
-            self.contact.rubbing.lean += _HELD_GAIN * (upright - self.contact.rubbing.lean)
+            rubbing = self.contact.rubbing
+            upright = find_upright_lean(state.force, rubbing.lean)
+            frame = HeldFrame(data, self._motions[:, ::2], normal, rubbing.lean - upright, moved, update.place)
+            wanted = upright + self._held.update(frame, self._prior_variance) / normal
+            rubbing.lean += _HELD_GAIN * (min(max(wanted, -_LARGEST_LEAN), _LARGEST_LEAN) - rubbing.lean)
             return
         expected = np.array([self._reached[DEPTH], self._prior[0], self._prior[1]])
         before, known = self.slips.mobilised, self.roughness.coefficient.mean
         self.slips.set_indenter(self.contact.indenter)
         mobilised = self.slips.follow(self.give_shape(), expected, float(np.sqrt(update.depth_variance)), known)
-        normal = float(np.hypot(*state.force[::2]))
-        moved, away = update.place - forecast.place, update.place[1:] - self._prior
+        away = update.place[1:] - self._prior
         frame = FrictionFrame(data, self._motions[:, ::2], normal, before, self.contact.rubbing.lean, moved, away)
         found = self.roughness.update(frame, self._prior_variance)
         self.contact.rubbing.lean = found.mean * mobilised
@@ -429,7 +437,7 @@ class PlaceTracker:
             converged=settled,
             bearable=self._levels[0].contact.bearable,
             across=self._width.across if self._is_known else None,
-            lean_stddev=self._describe_lean() if self._is_known else None,
+            lean_stddev=self._describe_lean(float(np.hypot(*force[::2]))) if self._is_known else None,
             ambiguity=0.0 if settled else float(np.linalg.norm(state.force_modes[:, :3] @ moved)),
             sound=bool(finite and state.smallest_det > 0),
             quiet=bool(pressed < _TOUCH_DEPTH),
@@ -442,10 +450,10 @@ class PlaceTracker:
             place_stddev=float(np.sqrt(max(update.covariance[HEIGHT, HEIGHT], 0.0))),
         )
 
-    def _describe_lean(self) -> float:
-        """Returns the standard deviation of the lean of the force along the finger that friction leaves [-]."""
+    def _describe_lean(self, normal: float) -> float:
+        """Returns the standard deviation of the lean of a force [N] along the finger that friction leaves [-]."""
         if self.settings.held == "yes":
-            return _LEAN
+            return sqrt(min(self._held.stddev / max(normal, _LEAST_NORMAL), _WEIGHT) ** 2 + _LEAN**2)
         found = self.roughness.coefficient
         return sqrt((found.stddev * self.slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _LEAN**2)
 

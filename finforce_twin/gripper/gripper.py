@@ -1,7 +1,7 @@
 """The synthetic gripper at work: jaws, object and true wrenches image by image."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,10 +76,13 @@ class TwinGripper(Assembly):
         weights[~script.weight.any(axis=1)] = 0.0
         held = self.hold_object()
         wrenches = {side: RelaxedWrench(self.material.terms) for side in self._jaws}
-        posture, weight, shapes = None, None, self.rest_shapes()
+        posture, weight, shapes, slid = None, None, self.rest_shapes(), 0.0
         for index, stamp in enumerate(script.stamps):
-            is_same = script.postures[index] == posture and np.array_equal(weights[index], weight)
-            posture, weight = script.postures[index], weights[index]
+            slid += held.creep / RATE if held is not None else 0.0
+            planned = script.postures[index]
+            planned = replace(planned, slide=planned.slide + slid)
+            is_same = planned == posture and np.array_equal(weights[index], weight)
+            posture, weight = planned, weights[index]
             if held is not None and not is_same:
                 shapes = held.follow(self.setting_of(posture, weight))
             x = held.x if held is not None else 0.0

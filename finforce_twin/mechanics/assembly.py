@@ -85,7 +85,14 @@ class Assembly:
         """Returns the object between jaws at rest; None without one."""
         if self._object is None:
             return None
-        return HeldObject(self._jaws, self.scenario.offset, guided=self.scenario.is_guided)
+        scenario = self.scenario
+        return HeldObject(
+            self._jaws,
+            scenario.offset,
+            guided=scenario.is_guided,
+            friction=scenario.friction,
+            drag=scenario.drag,
+        )
 
     def setting_of(self, posture: Posture, weight: NDArray | None = None) -> GraspSetting:
         """Returns what a posture, and a weight (3,) [N] in `gripper_base`, mean to the jaws."""

@@ -18,7 +18,6 @@ _SHORTEST = 1.0 / 128.0  # of the way from one image to the next
 _LARGEST_SHIFT = 1e-3  # [m] of the object in one Newton step
 _SOFTEST = 1e-3  # [N/m] of both jaws together, below which a balance tells nothing of the object's place
 _STRONGEST = 50.0  # [N]; fingers that bend give way far below
-FRICTION = 0.9  # of soft plastic on a dry object; more pull than this share of the pressure slips
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,11 +56,23 @@ class HeldObject:
 
     The pressure follows from the shapes and has no friction. What it and the weight leave along y and z is taken up by
     the jaws' surfaces as a pull, each in proportion to its pressure, unless a hand guides the object.
+
+    Attributes:
+        creep: speed at which the object slides along z [m/s]: what the pulls have beyond the friction, over the drag.
     """
 
-    def __init__(self, jaws: Mapping[str, PressedJaw], x: float, *, guided: bool) -> None:
-        """Starts with jaws at rest and the object at x [m]."""
+    def __init__(self, jaws: Mapping[str, PressedJaw], x: float, *, guided: bool, friction: float, drag: float) -> None:
+        """Starts with jaws at rest.
+
+        Args:
+            jaws: by side.
+            x: of the object [m].
+            guided: whether a hand holds the object.
+            friction: share of a pressure that the pull may have before the object slides.
+            drag: of a sliding object [N s/m]; 0: it would fall, which is an error.
+        """
         self._jaws, self._guided, self._is_free = jaws, guided, len(jaws) > 1
+        self._friction, self._drag, self.creep = friction, drag, 0.0
         rest = {side: np.zeros(jaw.model.size) for side, jaw in jaws.items()}
         self._balance = _Balance(q=rest, loads=dict.fromkeys(jaws), x=x if self._is_free else 0.0)
         self._setting: GraspSetting | None = None
@@ -156,6 +167,7 @@ class HeldObject:
         """Returns jaws at rest, and the object where it was unless a jaw has pushed it."""
         if np.abs(setting.weight).max() > 0.0:
             raise BalanceError(f"the jaws let go of {np.linalg.norm(setting.weight):.2f} N; set the object down first")
+        self.creep = 0.0
         rest = {side: np.zeros(jaw.model.size) for side, jaw in self._jaws.items()}
         x = float(np.clip(self.x, -gaps["left"], gaps["right"])) if self._is_free else 0.0
         return _Balance(q=rest, loads=dict.fromkeys(self._jaws), x=x)
@@ -169,6 +181,7 @@ class HeldObject:
         return float(np.clip((setting.weight[0] - push) / slope, -_LARGEST_SHIFT, _LARGEST_SHIFT))
 
     def _check_grip(self, steps: Mapping[str, JawStep], loads: Mapping[str, Load]) -> None:
+        self.creep = 0.0
         for side, load in loads.items():
             pressure, needed = np.linalg.norm(steps[side].force), np.linalg.norm(load.pull)
             if pressure > _STRONGEST:
@@ -176,12 +189,15 @@ class HeldObject:
                     f"the {side} jaw is pressed with {pressure:.0f} N, more than such a finger bears: the object meets "
                     "its clamped base; close less far or raise the object's height"
                 )
-            held = FRICTION * pressure
-            if needed > held + _LEAST_PULL:
+            held = self._friction * pressure
+            if needed <= held + _LEAST_PULL:
+                continue
+            if self._drag == 0.0:
                 raise BalanceError(
                     f"the object slips: the {side} jaw must pull with {needed:.2f} N and holds at most {held:.2f} N; "
                     "close further, or lift less"
                 )
+            self.creep += (needed - held) * float(load.pull[2]) / needed / self._drag
 
 
 def _along(side: str) -> float:

@@ -47,6 +47,8 @@ class Scenario:
     settle: float = setting(0.5, "of rest at each level before it is recorded", "s", 0.0, 60.0)
     record: float = setting(0.7, "of record at each level", "s", 0.1, 60.0)
     mass: float = setting(0.0, "of the object that is lifted", "kg", 0.0, 2.0)
+    friction: float = setting(0.9, "share of the pressure that the jaws hold without a slip", "", 0.05, 2.0)
+    drag: float = setting(0.0, "of an object that slides all the same; 0: an error", "N s/m", 0.0, 1e4)
     turn_angle: float = setting(0.0, "by which the wrist turns with the object", "rad", -2.0 * np.pi, 2.0 * np.pi)
     turn_rate: float = setting(0.8, "at which it does", "rad/s", 0.05, 10.0)
     turn_heading: float = setting(0.0, "of the wrist's axis in the x-y plane, from x to y", "rad", -np.pi, np.pi)
@@ -84,6 +86,7 @@ class Scenario:
 
 _BENCH = {"camera": "bench", "closing_speed": 0.002, "clearance": 0.001, "levels": 3, "height": 0.040}
 _TURN = {"object": "rod25", "displacement": 0.007, "mass": 0.08, "turn_angle": 0.5 * np.pi, "turn_heading": 0.6}
+_SLIP = {"height": 0.036, "mass": 0.25, "friction": 0.3, "drag": 150.0, "record": 1.0}
 _ALL = (
     Scenario(name="bench_cylinder", object="rod25", **_BENCH),
     Scenario(name="bench_cylinder_upper", object="rod15", **{**_BENCH, "height": 0.058}),
@@ -96,6 +99,7 @@ _ALL = (
     Scenario(name="weight_turn", **_TURN),
     Scenario(name="weight_turn_dim", light="dim", **_TURN),
     Scenario(name="shifting", object="rod15", slide=0.012, height=0.038),
+    Scenario(name="slipping", object="block", displacement=0.005, **_SLIP),
     Scenario(name="rocking", object="block", rock=0.12, displacement=0.005),
     Scenario(name="fast_close", object="rod25", closing_speed=0.06, clearance=0.015, cycles=3, record=0.4, settle=0.2),
     Scenario(name="empty_close", object="", clearance=0.028, displacement=0.0, cycles=2),

@@ -1,12 +1,16 @@
 """The net force on the gripper is scored against the truth of both jaws."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from test_scoring import make_result
 
+from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
+from finforce.transforms import quaternion_from_pose
 from finforce_eval.evaluation.manipulation import format_manipulation, score_manipulation, score_pair
+from finforce_eval.recordings.tracks import PoseTrack
 
 
 def jaws(count=10):
@@ -46,7 +50,30 @@ def test_images_without_one_of_the_jaws_count_as_unanswered():
 
 def test_recordings_of_one_jaw_have_no_score():
     left, right = jaws()
-    assert score_manipulation({"a": replace(left, name="a")}) == {}
-    both = score_manipulation({left.name: left, right.name: right})
+    assert score_manipulation([replace(left, name="a")]) == {}
+    both = score_manipulation([left, right])
     assert list(both) == ["turn"]
     assert "0.000 N" in format_manipulation(both)[0]
+
+
+def test_the_torque_is_scored_where_the_jaws_places_are_known():
+    left, right = jaws()
+    torque = np.tile([0.0, -0.12, 0.01], (len(left.stamps), 1))
+    left, right = (replace(jaw, torque=torque.copy(), true_torque=torque.copy()) for jaw in (left, right))
+    assert score_pair(left, right).torque_rmse_Nm is None
+    recording = SimpleNamespace(jaw=lambda side: SimpleNamespace(pose=poses[side], true_pose=None))
+    poses = {side: track(left.stamps, x) for side, x in (("left", -0.03), ("right", 0.03))}
+    assert score_pair(left, right, recording).torque_rmse_Nm == pytest.approx(0.0, abs=1e-12)
+    left.torque[:, 1] += 0.006
+    assert score_pair(left, right, recording).torque_rmse_Nm == pytest.approx(0.006)
+    # another force of the right jaw along z turns about y by its lever
+    right.force[:, 2] += 0.1
+    assert score_pair(left, right, recording).torque_rmse_Nm == pytest.approx(abs(0.006 - 0.003))
+
+
+def track(stamps, x):
+    """Poses of a jaw that does not move before the robot's camera."""
+    pose = jaw_in_camera(ROBOT_CAMERA, "left" if x < 0 else "right", x)
+    rows = len(stamps)
+    position, quaternion = (np.tile(part, (rows, 1)) for part in (pose[:3, 3], quaternion_from_pose(pose)))
+    return PoseTrack(stamps=stamps, position=position, quaternion=quaternion, frame_id="camera")

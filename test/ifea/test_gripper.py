@@ -6,10 +6,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from finforce_ifea.grasp_force import ForcePairing, combine_forces, single_jaw_grasp
+from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_gripper
+from finforce.stamps import NANOSECONDS
+from finforce_ifea.grasp_force import (
+    R_GRIPPER_JAW,
+    ForcePairing,
+    JawDistance,
+    Wrench,
+    combine_wrenches,
+    single_jaw_grasp,
+)
 
 forces = hnp.arrays(np.float64, 3, elements=st.floats(-50, 50))
-LEFT, RIGHT = np.array([-2.0, 0.3, 0.5]), np.array([-3.0, 0.1, 0.4])
+LEFT = Wrench(np.array([-2.0, 0.3, 0.5]), np.array([0.0, -0.08, 0.01]))
+RIGHT = Wrench(np.array([-3.0, 0.1, 0.4]), np.array([0.0, -0.12, 0.0]))
+
+
+def combine_forces(left, right):
+    return combine_wrenches(Wrench(left, np.zeros(3)), Wrench(right, np.zeros(3)), None)
 
 
 def test_an_object_squeezed_evenly_is_held_and_not_moved():
@@ -44,9 +58,32 @@ def test_turning_the_gripper_round_swaps_the_jaws_and_turns_the_net_force(left, 
 
 
 def test_one_jaw_alone_holds_with_its_own_force():
-    grasp = single_jaw_grasp(np.array([-3.0, 0.0, 4.0]), "right")
+    grasp = single_jaw_grasp(Wrench(np.array([-3.0, 0.0, 4.0]), np.array([0.1, 0.2, 0.3])), "right")
     np.testing.assert_allclose(grasp.grasp, [5.0, 0.0, 0.0])
     np.testing.assert_allclose(grasp.manipulation, [3.0, 0.0, 4.0])
+    np.testing.assert_allclose(grasp.torque, [-0.1, -0.2, 0.3])
+
+
+def test_the_torque_is_that_of_both_forces_about_the_middle_between_the_jaws():
+    places = {"left": np.array([-0.03, 0.0, 0.0]), "right": np.array([0.03, 0.0, 0.0])}
+    touched = {"left": np.array([0.014, 0.002, 0.05]), "right": np.array([0.013, -0.001, 0.04])}
+    forces = {"left": np.array([-3.0, 0.2, 0.7]), "right": np.array([-2.0, 0.4, -0.3])}
+    wrenches = {side: Wrench(forces[side], np.cross(touched[side], forces[side])) for side in forces}
+    R = R_GRIPPER_JAW
+    torque = sum(np.cross(places[side] + R[side] @ touched[side], R[side] @ forces[side]) for side in forces)
+    grasp = combine_wrenches(wrenches["left"], wrenches["right"], 0.06)
+    np.testing.assert_allclose(grasp.torque, torque, atol=1e-12)
+    assert combine_wrenches(wrenches["left"], wrenches["right"], None).torque is None
+
+
+def test_the_distance_of_the_jaws_is_known_while_both_are_seen():
+    camera = np.linalg.inv(ROBOT_CAMERA)
+    distance = JawDistance(max_age=0.5)
+    distance.take("left", 10 * NANOSECONDS, camera @ jaw_in_gripper("left", -0.031))
+    assert distance.at(10 * NANOSECONDS) is None
+    distance.take("right", 10 * NANOSECONDS, camera @ jaw_in_gripper("right", 0.029))
+    assert distance.at(10 * NANOSECONDS) == pytest.approx(0.060)
+    assert distance.at(11 * NANOSECONDS) is None
 
 
 @pytest.mark.parametrize("own_first", [True, False])
@@ -56,7 +93,8 @@ def test_a_pair_is_complete_with_its_second_force(side, own, peer, own_first):
     first, second = (own, peer) if own_first else (peer, own)
     assert pairing.add(1, first, own=own_first) is None
     grasp = pairing.add(1, second, own=not own_first)
-    np.testing.assert_allclose(grasp.manipulation, combine_forces(LEFT, RIGHT).manipulation)
+    np.testing.assert_allclose(grasp.manipulation, combine_wrenches(LEFT, RIGHT, None).manipulation)
+    assert grasp.torque is None
     assert pairing.add(1, second, own=not own_first) is None
 
 

@@ -8,7 +8,7 @@ import pytest
 from finforce.errors import ObservationError
 from finforce.messages import encode_cloud
 from finforce_ifea.errors import ContactError
-from finforce_ifea.messages import contact_from_cloud, force_from_wrench, observation_from_cloud
+from finforce_ifea.messages import contact_from_cloud, observation_from_cloud
 
 FRAME = "left_jaw"
 
@@ -79,16 +79,3 @@ def test_no_rows_are_no_contact_and_no_error():
 def test_a_contact_that_is_not_finite_is_refused(rows):
     with pytest.raises(ContactError, match="not finite"):
         contact_from_cloud(cloud_of(**rows), FRAME, free=False)
-
-
-def wrench_of(x, frame="right_jaw"):
-    force = SimpleNamespace(x=x, y=0.0, z=1.0)
-    return SimpleNamespace(header=SimpleNamespace(frame_id=frame), wrench=SimpleNamespace(force=force))
-
-
-def test_a_force_is_read_in_its_frame_only_and_only_finite():
-    np.testing.assert_array_equal(force_from_wrench(wrench_of(-2.0), "right_jaw", "it"), [-2, 0, 1])
-    with pytest.raises(ObservationError, match="'left_jaw'"):
-        force_from_wrench(wrench_of(-2.0), "left_jaw", "it")
-    with pytest.raises(ObservationError, match="not finite"):
-        force_from_wrench(wrench_of(np.nan), "right_jaw", "it")

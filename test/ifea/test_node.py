@@ -5,7 +5,7 @@ from time import time_ns
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 from node_fakes import KEYPOINTS, FakeEstimator, keypoint_cloud, start_solver
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
@@ -13,9 +13,11 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
+from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.health import Level
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
+from finforce.transforms import pose_numbers
 
 SECOND = 1_000_000_000
 
@@ -234,6 +236,26 @@ def test_the_peer_completes_the_grasp_whoever_comes_first(probe, order):
     for message in (grasp, net):
         assert message.header.frame_id == "gripper_base"
         assert stamp_of(message) == stamp
+
+
+def test_the_net_torque_is_about_the_middle_between_the_jaws(probe):
+    outs = two_jaws(probe, right_force=(-3.0, 0.0, 0.1))
+    poses = {side: probe.speak(f"{side}/jaw_pose", PoseStamped) for side in outs}
+    for out in poses.values():
+        probe.connected(out)
+    stamp = time_ns()
+    for side, x in (("left", -0.03), ("right", 0.03)):
+        numbers = pose_numbers(jaw_in_camera(ROBOT_CAMERA, side, x))
+        poses[side].publish(ros.pose_message(ros.Header(stamp=ros.stamp_message(stamp), frame_id="camera"), numbers))
+    probe.spin(0.3)
+    stamp = time_ns()
+    for side, out in outs.items():
+        out.publish(keypoint_cloud(stamp, frame=f"{side}_jaw"))
+    probe.wait_for(lambda: probe.got["manipulation_wrench"])
+    torque = probe.got["manipulation_wrench"][0].wrench.torque
+    # the right jaw's own torque, turned by half a turn about z, cancels the left one's
+    assert torque.y == pytest.approx(0.03 * (0.5 - 0.1))
+    assert torque.x == torque.z == 0.0
 
 
 def test_forces_of_different_images_make_no_grasp(probe):

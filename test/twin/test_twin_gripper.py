@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from finforce.gripper_frames import SIDES
 from finforce_eval.recordings.tracks import parse_phases
-from finforce_ifea.grasp_force import R_GRIPPER_JAW, combine_forces
+from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench, combine_wrenches
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
 from finforce_twin.errors import BalanceError, ScenarioError
@@ -39,7 +40,9 @@ def forces_of(states, side):
 
 
 def net_of(state):
-    return combine_forces(state.jaws["left"].force, state.jaws["right"].force).manipulation
+    return combine_wrenches(
+        *(Wrench(state.jaws[side].force, state.jaws[side].torque) for side in SIDES), None
+    ).manipulation
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -186,6 +189,20 @@ def test_grasp_without_weight_has_opposite_forces_even_off_the_middle():
 def test_too_heavy_an_object_slips():
     with pytest.raises(BalanceError, match="slips"):
         play("weight_turn", mass=0.8, turn_angle=0.0)
+
+
+def test_too_heavy_an_object_with_drag_slides_towards_the_tips_and_rests_where_it_is_set_down():
+    _, states = play("slipping")
+    height = np.array([state.T_gripper_object[2, 3] for state in states])
+    speed = RATE * np.diff(height)
+    assert speed.min() > -1e-9
+    assert 3e-3 < speed.max() < 0.03
+    slides = np.flatnonzero(speed > 1e-4)
+    # the weight is more than the friction of both jaws bears, and the drag the rest
+    held = [0.3 * sum(np.linalg.norm(jaw.force[[0, 1]]) for jaw in states[i].jaws.values()) for i in slides[5:-5]]
+    net = [net_of(states[i])[2] for i in slides[5:-5]]
+    assert np.min(np.subtract(net, held)) > 0.0
+    assert height[slides[-1] + 1 :].max() == height[-1] > height[0] + 3e-3
 
 
 def test_object_on_the_clamped_base_is_refused():

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from finforce.gripper_frames import BENCH_ORIGIN_X
+from finforce.gripper_frames import BENCH_ORIGIN_X, SIDES
 from finforce_driver.emulator.firmware import EmulatedGripper
-from finforce_ifea.grasp_force import R_GRIPPER_JAW, combine_forces
+from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench, combine_wrenches
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.relaxation import apply_relaxation
 from finforce_twin.errors import BalanceError
@@ -83,7 +83,7 @@ def test_between_two_solved_grasps_the_interpolated_one_is_the_solved_one(grasp)
 
 def test_forces_of_both_jaws_cancel_and_pass_through_the_object(grasp):
     jaws = grasp.state(HELD).jaws
-    net = combine_forces(jaws["left"].force, jaws["right"].force).manipulation
+    net = combine_wrenches(*(Wrench(jaws[side].force, jaws[side].torque) for side in SIDES), None).manipulation
     np.testing.assert_allclose(net, 0.0, atol=5e-3)
     for jaw in jaws.values():
         assert jaw.force[0] < -1.0

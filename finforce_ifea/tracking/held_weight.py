@@ -1,0 +1,146 @@
+"""What a held object weighs along the finger, told by what changes once it is held.
+
+A force along the finger moves the key points by tenths of a millimetre, as errors of the place, of the mechanics and
+of the key points do; those stay as they are while an object is held, what is lifted does not. So every key point's
+residual is remembered from when the hold began, and the change since then is explained by
+
+    depth of the object, free,
+    shape and height, by which a lifted object settles a little,
+    a force T along the finger.
+
+Where the jaws move on, or the object slides, the memory begins anew, and T is what it was.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from finforce_ifea.contact_mechanics.indenter import DEPTH
+from finforce_ifea.tracking.place_update import Residuals
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+# Frames that make a memory, and over which its changes are averaged.
+_REMEMBERED, _AVERAGED = 15, 10.0
+# A hold has ended once the object is so much deeper or higher [m].
+_DEEPER, _HIGHER = 0.15e-3, 0.6e-3
+# Standard deviations of how a lifted object settles, as a share of what shape and height were expected to be off, and
+# of the weight [N].
+_SETTLES, _WEIGHT = 0.05, 0.7
+# Fewer points than these say nothing.
+_FEWEST = 6
+
+
+class HeldFrame(NamedTuple):
+    """One frame of a hold.
+
+    Attributes:
+        data: residuals about the reference place.
+        modes: of the key points by the place and a lean of the force (K, 2, 4).
+        normal: force [N].
+        lean: of the force, with which the residuals were found, beyond that with which it has nothing along [-].
+        moved: the place that was found minus the reference (3,).
+        place: that was found (3,).
+    """
+
+    data: Residuals
+    modes: NDArray
+    normal: float
+    lean: float
+    moved: NDArray
+    place: NDArray
+
+
+class HeldWeight:
+    """Follows one object.
+
+    Attributes:
+        force: along the finger [N].
+        stddev: of it [N]; infinite before there is a memory.
+    """
+
+    def __init__(self) -> None:
+        """Starts with an object that is not held yet."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the object."""
+        self.force, self.stddev, self._before = 0.0, np.inf, 0.0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Starts to remember."""
+        self._frames, self._place = 0, np.zeros(3)
+        self._information, self._vector = np.zeros((3, 3)), np.zeros(3)
+        self._before = self.force
+
+    def update(self, frame: HeldFrame, prior: NDArray) -> float:
+        """Takes one frame of something that presses and returns the force along the finger [N].
+
+        Args:
+            frame: see `HeldFrame`.
+            prior: variance of shape and height (2,).
+        """
+        away = frame.place - self._place
+        if self._frames and (abs(away[DEPTH]) > _DEEPER or abs(away[2]) > _HIGHER):
+            self._begin()
+        if not self._frames:
+            self._place, away = frame.place.copy(), np.zeros(3)
+            self._memory, self._counts = np.zeros((len(frame.data.weights), 2)), np.zeros(len(frame.data.weights))
+        left = _find_left(frame, away, self._before)
+        if self._frames < _REMEMBERED:
+            self._frames += 1
+            seen = frame.data.weights > 0.0
+            self._counts += seen
+            self._memory += np.where(seen[:, None], left - self._memory, 0.0) / np.maximum(self._counts, 1.0)[:, None]
+            return self.force
+        known = np.where(self._counts > 0.5 * _REMEMBERED, frame.data.weights, 0.0)
+        if np.count_nonzero(known) >= _FEWEST:
+            _accumulate(frame, left - self._memory, known, self._information, self._vector)
+            settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2])
+            spread = np.linalg.inv(self._information + np.diag(1.0 / settles))
+            self.force = self._before + float(spread[2] @ self._vector)
+            self.stddev = float(np.sqrt(spread[2, 2]))
+        return self.force
+
+
+@njit(**_OPTIONS)
+def _find_left(frame, away, before):
+    """Returns the residuals (K, 2) [m] at the place of the memory with the force along the finger that there was.
+
+    Their depth is the one that was found.
+    """
+    left = frame.data.r.copy()
+    for k in range(len(left)):
+        for a in range(2):
+            left[k, a] += frame.modes[k, a, 3] * (frame.lean - before / frame.normal)
+            left[k, a] -= frame.modes[k, a, 0] * frame.moved[0]
+            for i in range(1, 3):
+                left[k, a] += frame.modes[k, a, i] * (away[i] - frame.moved[i])
+    return left
+
+
+@njit(**_OPTIONS)
+def _accumulate(frame, left, weights, information, vector):
+    """Adds one frame, its depth eliminated, to information (3, 3) and vector (3,) on shape, height and T."""
+    A, g = np.zeros((4, 4)), np.zeros(4)
+    rows = np.zeros((4, 2))
+    for k in range(len(weights)):
+        if weights[k] <= 0.0:
+            continue
+        noise = frame.data.noise[k]
+        det = noise[0, 0] * noise[1, 1] - noise[0, 1] ** 2
+        w00, w11, w01 = weights[k] * noise[1, 1] / det, weights[k] * noise[0, 0] / det, -weights[k] * noise[0, 1] / det
+        for a in range(2):
+            rows[0, a], rows[1, a], rows[2, a] = frame.modes[k, a, 0], frame.modes[k, a, 1], frame.modes[k, a, 2]
+            rows[3, a] = frame.modes[k, a, 3] / frame.normal
+        for i in range(4):
+            q0, q1 = w00 * rows[i, 0] + w01 * rows[i, 1], w01 * rows[i, 0] + w11 * rows[i, 1]
+            g[i] += q0 * left[k, 0] + q1 * left[k, 1]
+            for j in range(4):
+                A[i, j] += q0 * rows[j, 0] + q1 * rows[j, 1]
+    for i in range(3):
+        vector[i] += (g[i + 1] - A[i + 1, 0] * g[0] / A[0, 0]) - vector[i] / _AVERAGED
+        for j in range(3):
+            information[i, j] += (A[i + 1, j + 1] - A[i + 1, 0] * A[0, j + 1] / A[0, 0]) - information[i, j] / _AVERAGED

@@ -1,0 +1,68 @@
+"""A weight that is lifted after the hold began shows in the force along the finger, and nothing else does."""
+
+import numpy as np
+import pytest
+
+from finforce_ifea.tracking.held_weight import HeldFrame, HeldWeight
+from finforce_ifea.tracking.place_update import Residuals
+
+POINTS, NORMAL = 12, 3.0
+PRIOR = np.array([0.02, 0.7e-3]) ** 2
+MODES = np.random.default_rng(4).normal(0.0, [[[0.5, 5e-3, 0.3, 3e-3]]], (POINTS, 2, 4))
+
+
+def frame(weight=0.0, place=(3e-3, 0.0, 0.04), bias=0.0, noise=0.0, hidden=(), lean=0.0):
+    """A frame with a weight [N], in which a lean of the force is already counted."""
+    left = MODES[:, :, 3] * (weight / NORMAL - lean) + bias + noise
+    weights = np.ones(POINTS)
+    weights[list(hidden)] = 0.0
+    spread = np.tile((0.1e-3) ** 2 * np.eye(2), (POINTS, 1, 1))
+    data = Residuals(left, MODES[:, :, :3].copy(), weights, spread, np.zeros(POINTS), POINTS, POINTS, 0.0, POINTS)
+    return HeldFrame(data, MODES.copy(), NORMAL, lean, np.zeros(3), np.array(place))
+
+
+def follow(held, frames):
+    return [held.update(one, PRIOR) for one in frames]
+
+
+def test_what_is_lifted_shows_and_what_was_wrong_before_does_not():
+    held, random = HeldWeight(), np.random.default_rng(0)
+    bias = random.normal(0.0, 0.2e-3, (POINTS, 2))
+    noise = random.normal(0.0, 0.05e-3, (200, POINTS, 2))
+    before = follow(held, [frame(bias=bias, noise=noise[i]) for i in range(60)])
+    assert np.abs(before).max() < 0.1
+    lifted = follow(held, [frame(0.8, bias=bias, noise=noise[60 + i]) for i in range(60)])
+    assert lifted[-1] == pytest.approx(0.8, abs=0.1)
+    assert 0.0 < held.stddev < 0.2
+
+
+def test_a_lean_that_is_counted_already_is_not_counted_twice():
+    held = HeldWeight()
+    follow(held, [frame() for _ in range(20)])
+    assert follow(held, [frame(0.6, lean=0.15) for _ in range(60)])[-1] == pytest.approx(0.6, abs=0.03)
+
+
+def test_jaws_that_move_on_keep_the_weight():
+    held = HeldWeight()
+    follow(held, [frame() for _ in range(20)])
+    follow(held, [frame(0.6) for _ in range(60)])
+    deeper = follow(held, [frame(0.6, place=(4e-3, 0.0, 0.04), bias=0.3e-3) for _ in range(60)])
+    assert deeper[-1] == pytest.approx(0.6, abs=0.05)
+    set_down = follow(held, [frame(0.0, place=(4e-3, 0.0, 0.04), bias=0.3e-3) for _ in range(60)])
+    assert set_down[-1] == pytest.approx(0.0, abs=0.05)
+
+
+def test_points_that_come_into_view_later_say_nothing():
+    held = HeldWeight()
+    new = np.zeros((POINTS, 2))
+    new[:3] = 1e-3
+    follow(held, [frame(hidden=(0, 1, 2)) for _ in range(20)])
+    assert np.abs(follow(held, [frame(noise=new) for _ in range(30)])).max() < 1e-6
+
+
+def test_too_few_points_leave_the_weight_as_it_was():
+    held = HeldWeight()
+    follow(held, [frame() for _ in range(15)])
+    few = follow(held, [frame(0.9, hidden=range(7)) for _ in range(30)])
+    assert few[-1] == 0.0
+    assert held.stddev == np.inf
