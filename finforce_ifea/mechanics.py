@@ -73,14 +73,14 @@ def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) ->
     if key not in _WIDTH_SHARES:
         coarse = jaw.build_mesh("coarse")
         solid = SolidModel(coarse, jaw.material)
-        held = PlaneModel(coarse, jaw.build_plane("coarse"), jaw.section.width, jaw.material)
+        held = PlaneModel(coarse, jaw.build_plane("coarse"), jaw.section, jaw.material)
         stiffness = [
             measure_stiffness(model, build_contact_surface(jaw, coarse, model, across=model.across))
             for model in (solid, held)
         ]
         _WIDTH_SHARES[key] = stiffness[0] / stiffness[1]
     material = replace(jaw.material, young_modulus=jaw.material.young_modulus * _WIDTH_SHARES[key])
-    return PlaneModel(mesh, jaw.build_plane(density), jaw.section.width, material)
+    return PlaneModel(mesh, jaw.build_plane(density), jaw.section, material)
 
 
 def choose_solver(settings: EstimatorSettings) -> EstimatorSettings:

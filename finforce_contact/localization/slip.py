@@ -19,7 +19,7 @@ _CHANCE, _MOST, _ALARM = 1.0, 3.0, 4.5
 # Samples over which the place of rest is averaged, time over which a speed is fitted [s], and fewest samples of it.
 _REST_MEMORY, _WINDOW, _FEWEST = 45.0, 0.2, 3
 # Noise is learnt over so many samples; what is expected of it counts for some; before it is learnt, nothing slides.
-_NOISE_MEMORY, _NOISE_PRIOR, _TOO_FEW = 60.0, 4.0, 16.0
+_NOISE_MEMORY, _NOISE_PRIOR, _TOO_FEW = 60.0, 1.0, 16.0
 # Slow samples in a row, after which an object that slid has come to rest.
 _RESTING = 6
 # A jaw that moves along its normal faster than this [m/s] closes or opens: what slides there is no slip of a hold.

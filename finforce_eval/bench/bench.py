@@ -39,6 +39,7 @@ class BenchPart:
         title: above its table.
         usual: whether it is measured when no parts are named.
         takes_folder: whether it measures recordings, too.
+        takes_jaw: whether it measures other fingers than that of the bench.
     """
 
     name: str
@@ -46,6 +47,7 @@ class BenchPart:
     title: str
     usual: bool = True
     takes_folder: bool = False
+    takes_jaw: bool = False
 
 
 PARTS = (
@@ -54,6 +56,7 @@ PARTS = (
         module="finforce_eval.bench.solvers",
         title="Run time against force error of the solver tiers",
         takes_folder=True,
+        takes_jaw=True,
     ),
     BenchPart(name="peer", module="finforce_eval.bench.peer", title="Noise, and targets that no force reaches"),
     BenchPart(name="growth", module="finforce_eval.bench.growth", title="How cost grows"),
@@ -104,17 +107,21 @@ def format_rows(rows: Sequence[Row]) -> str:
     return "\n".join([head, "-" * len(head), *lines])
 
 
-def select_parts(names: str | None) -> tuple[BenchPart, ...]:
-    """Return the parts of a comma-separated list; without one those that `make bench` measures.
+def select_parts(names: str | None, jaw: str = "bench") -> tuple[BenchPart, ...]:
+    """Return the parts of a comma-separated list; without one those that `make bench` measures, of another finger too.
 
     Raises:
-        OptionError: a name is none of a part.
+        OptionError: a name is none of a part, or of one that measures the finger of the bench alone.
     """
+    other = jaw != "bench"
     if not names:
-        return tuple(part for part in PARTS if part.usual)
+        return tuple(part for part in PARTS if part.usual and (part.takes_jaw or not other))
     known = {part.name: part for part in PARTS}
     wanted = [name.strip() for name in names.split(",") if name.strip()]
     for name in wanted:
         if name not in known:
             raise OptionError(f"--parts: there is no part {name!r}, expected some of {', '.join(known)}")
+        if other and not known[name].takes_jaw:
+            able = ", ".join(part.name for part in PARTS if part.takes_jaw)
+            raise OptionError(f"--jaw {jaw}: the part {name} measures the bench finger alone, expected --parts {able}")
     return tuple(known[name] for name in dict.fromkeys(wanted))

@@ -8,14 +8,17 @@ errors, holes and points behind the object are those of the bench recordings' me
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_ifea.errors import ContactError
+from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw, load_jaw
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
+from finforce_ifea.settings import EstimatorSettings
 
 TRUTH = Path(__file__).parents[1] / "data" / "pressed_bench.npz"
 YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45
@@ -24,6 +27,7 @@ LEVELS = (0.002, 0.004, 0.006, 0.008, 0.010)
 PERIOD = 1.0 / 30.0
 REST_FRAMES, HOLD_FRAMES, SCORED_FRAMES = 60, 45, 30
 SPEED = 2e-3
+_DIAMETERS, _FEWEST_DEPTHS = (0.015, 0.025, 0.035), 2
 # Corners of the polygon that stands for a cylinder.
 _CORNERS = 96
 # Constant errors of a tracked object's origin [m] and turn [rad], as the contact estimator expects them.
@@ -36,7 +40,7 @@ class BenchCase:
 
     Attributes:
         name: for tables.
-        height_name: "lower", "middle" or "upper".
+        height_name: a key of `HEIGHTS`.
         height: of the cylinder's axis [m].
         radius: of the cylinder [m].
         depth: (n,) [m], rising.
@@ -106,6 +110,48 @@ def bench_finger() -> Jaw:
     return replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
 
 
+def press_cases(jaw: Jaw) -> tuple[BenchCase, ...]:
+    """Returns nine presses of any finger by its own solid model, on its default mesh.
+
+    The cylinders of the bench meet the same shares of the finger's candidates as there, and a shorter finger is
+    pressed as much less; one that buckles before is pressed as deep as it bears.
+
+    Raises:
+        FinforceError: No solid describes the jaw.
+    """
+    from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
+    from finforce_ifea.mechanics import build_mechanics
+
+    mechanics = build_mechanics(jaw, EstimatorSettings(solver="solid"))
+    model, surface = mechanics.model, mechanics.contact.surface
+    heights, bench = jaw.candidates[:, 2], load_jaw("bench").candidates[:, 2]
+    size = float(np.ptp(heights) / np.ptp(bench))
+    depths = min(size, 1.0) * np.array(LEVELS)
+    probe = model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
+    rest, cases = model.positions(probe, np.zeros(model.size)), []
+    for name, height in HEIGHTS.items():
+        there = float(heights.min() + size * (height - bench.min()))
+        for diameter in _DIAMETERS:
+            rigid, states = RigidCylinder(radius=0.5 * diameter), []
+            with suppress(ContactError):
+                for deepest in range(1, len(depths) + 1):
+                    states = press_jaw(model, surface, jaw.inner_face_x, rigid, there, depths[:deepest])
+            if len(states) < _FEWEST_DEPTHS:
+                continue
+            cases.append(
+                BenchCase(
+                    name=f"Ø{1e3 * diameter:.0f} {name}",
+                    height_name=name,
+                    height=there,
+                    radius=rigid.radius,
+                    depth=depths[: len(states)],
+                    moved=np.stack([model.positions(probe, state.q) - rest for state in states]),
+                    force=np.stack([state.force for state in states]),
+                )
+            )
+    return tuple(cases)
+
+
 def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, seed: int = 0) -> ReplayedPress:
     """Returns a press to all levels at 2 mm/s, each held for 1.5 s, after two seconds at rest.
 
@@ -119,7 +165,7 @@ def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, s
     """
     from scipy.interpolate import PchipInterpolator  # megabytes that a process measuring its memory need not have
 
-    motion = _build_motion()
+    motion = _build_motion(case.depth)
     depth = motion.depth
     grid = np.r_[0.0, case.depth]
     shapes = np.concatenate([np.zeros((1, *jaw.keypoints.shape)), case.moved])
@@ -151,11 +197,13 @@ class _PressMotion:
     ends: NDArray
 
 
-def _build_motion() -> _PressMotion:
-    """Returns rest, then ramps and holds."""
+def _build_motion(depths: NDArray) -> _PressMotion:
+    """Returns rest, then ramps to those of the levels that were pressed, to the last depths of others, and holds."""
+    known = np.isin(np.round(LEVELS, 9), np.round(depths, 9))
+    levels = np.array(LEVELS)[known] if known.all() else depths[-len(LEVELS) :]
     parts, ends = [np.zeros(REST_FRAMES)], []
-    for level in LEVELS:
-        steps = round((level - parts[-1][-1]) / SPEED / PERIOD)
+    for level in levels:
+        steps = max(round((level - parts[-1][-1]) / SPEED / PERIOD), 1)
         parts += [np.linspace(parts[-1][-1], level, steps + 1)[1:], np.full(HOLD_FRAMES, level)]
         ends.append(sum(map(len, parts)) - 1)
     depth = np.concatenate(parts)

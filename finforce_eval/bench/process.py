@@ -1,6 +1,6 @@
 """Memory and start of a solver in a process of its own, with empty and with filled caches.
 
-python -m finforce_eval.bench.process SOLVER MESH
+python -m finforce_eval.bench.process SOLVER MESH JAW
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Start:
     cache: float
 
 
-def measure_start(solver: str, mesh: str) -> Start:
+def measure_start(solver: str, mesh: str, jaw: str = "bench") -> Start:
     """Returns what a fresh process with one estimator needs.
 
     The user's cache folder is replaced by an empty one; where the first process leaves something there, a second one
@@ -49,9 +49,9 @@ def measure_start(solver: str, mesh: str) -> Start:
         ProcessError: The process failed.
     """
     with tempfile.TemporaryDirectory() as folder:
-        first = _probe(solver, mesh, folder)
+        first = _probe(solver, mesh, jaw, folder)
         size = sum(file.stat().st_size for file in Path(folder).rglob("*") if file.is_file())
-        second = _probe(solver, mesh, folder) if size else first
+        second = _probe(solver, mesh, jaw, folder) if size else first
     return Start(
         memory=second["memory"],
         imports=second["imports"],
@@ -61,9 +61,9 @@ def measure_start(solver: str, mesh: str) -> Start:
     )
 
 
-def _probe(solver: str, mesh: str, cache: str) -> dict[str, float]:
+def _probe(solver: str, mesh: str, jaw: str, cache: str) -> dict[str, float]:
     """Returns the figures of one fresh process."""
-    command = [sys.executable, "-m", "finforce_eval.bench.process", solver, mesh]
+    command = [sys.executable, "-m", "finforce_eval.bench.process", solver, mesh, jaw]
     surroundings = {**os.environ, "XDG_CACHE_HOME": cache, "FINFORCE_CACHE": ""}
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=surroundings)
     if done.returncode:
@@ -71,7 +71,7 @@ def _probe(solver: str, mesh: str, cache: str) -> dict[str, float]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def main(solver: str, mesh: str) -> None:
+def main(solver: str, mesh: str, jaw: str) -> None:
     """Builds and runs an estimator and prints what that took as JSON."""
     begin = perf_counter()
     from finforce_eval.replay.processes import resident_bytes
@@ -80,7 +80,7 @@ def main(solver: str, mesh: str) -> None:
     from finforce_ifea.settings import EstimatorSettings
 
     ready = perf_counter()
-    estimator = JawEstimator(load_jaw("bench"), settings=EstimatorSettings(solver=solver, mesh=mesh))
+    estimator = JawEstimator(load_jaw(jaw), settings=EstimatorSettings(solver=solver, mesh=mesh))
     estimator.warm_up()
     built = perf_counter()
     _press(estimator)
@@ -88,17 +88,19 @@ def main(solver: str, mesh: str) -> None:
 
 
 def _press(estimator: Any) -> None:
-    """Gives an estimator a slow press to 2 mm; made here, since what makes better ones takes memory itself."""
+    """Gives an estimator a slow push against its middle; made here, as what makes better ones takes memory itself."""
     import numpy as np
 
-    from finforce_eval.bench.cases import load_cases
     from finforce_ifea.observation import Contact, Observation
 
-    case, rest = load_cases()[0], estimator.jaw.keypoints
-    contact = Contact.fixed(estimator.jaw, case.height)
+    jaw = estimator.jaw
+    rest, height = jaw.keypoints, float(np.median(jaw.candidates[:, 2]))
+    contact, low = Contact.fixed(jaw, height), float(rest[:, 2].min())
+    # bent like a beam that is clamped below: 2 mm at the height of the contact
+    share = np.maximum(rest[:, 2] - low, 0.0) / max(height - low, 1e-3)
+    bent = np.outer(2e-3 * share**1.5, [-1.0, 0.0, 0.0])
     for index in range(_REST_FRAMES + _PRESSED_FRAMES):
-        share = max(0, index - _REST_FRAMES) / _PRESSED_FRAMES
-        points = rest + share * case.moved[1]
+        points = rest + max(0, index - _REST_FRAMES) / _PRESSED_FRAMES * bent
         estimator.update(Observation(stamp=index / 30.0, points=points, likelihood=np.ones(len(points))), contact)
 
 

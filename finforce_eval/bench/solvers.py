@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
 from finforce_eval.bench.bench import Row, row_from_times, time_calls
-from finforce_eval.bench.cases import NoisyCamera, ReplayedPress, bench_finger, load_cases, record_press
+from finforce_eval.bench.cases import (
+    BenchCase,
+    NoisyCamera,
+    ReplayedPress,
+    bench_finger,
+    load_cases,
+    press_cases,
+    record_press,
+)
 from finforce_eval.bench.process import Start, measure_start
 from finforce_eval.bench.recordings import RecordedFigures, find_recordings, measure_recordings
 from finforce_eval.bench.tiers import Accuracy, ShapeErrors, Tier, list_tiers, run_tier, score_runs, score_shapes
@@ -21,7 +29,7 @@ from finforce_eval.evaluation.tables import align_rows
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, GREY, ORANGE, new_figure, style_axes
 from finforce_eval.figures.time_error import ErrorPoint, find_front
 from finforce_ifea.fem.solid import SolidModel
-from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
 
 SEED = 1
 FACTORISATIONS = 20
@@ -75,21 +83,22 @@ class SolverFigures:
     notes: Sequence[str] = field(default_factory=tuple)
 
 
-def measure(quick: bool, folder: Path | str | None = None) -> SolverFigures:
+def measure(quick: bool, folder: Path | str | None = None, jaw: str = "bench") -> SolverFigures:
     """Measures every tier, under a progress bar.
 
     Args:
         quick: three cases instead of nine, and no slow tier.
         folder: recordings to be taken, too; None for none.
+        jaw: the finger; another one than that of the bench is pressed by its own solid model.
 
     Raises:
-        FinforceError: The folder holds no recordings, or one that cannot be used.
+        FinforceError: The jaw cannot be used, the folder holds no recordings, or one that cannot be used.
     """
     from tqdm import tqdm
 
-    tiers, cases = list_tiers(slow=not quick), load_cases()
+    name, jaw = jaw, bench_finger() if jaw == "bench" else load_jaw(jaw)
+    tiers, cases = list_tiers(slow=not quick, section=jaw.section is not None), _find_cases(name, jaw)
     cases = [case for case in cases if case.name.startswith("Ø25")] if quick else cases
-    jaw = bench_finger()
     exact = [record_press(case, jaw) for case in cases]
     noisy = [record_press(case, jaw, NoisyCamera(), SEED) for case in cases]
     recordings = len(find_recordings(folder)) if folder else 0
@@ -98,17 +107,37 @@ def measure(quick: bool, folder: Path | str | None = None) -> SolverFigures:
         for tier in tiers:
             bar.set_description(tier.name)
             try:
-                figures.append(_measure_tier(tier, exact, noisy, bar.update))
+                figures.append(_measure_tier(tier, (name, jaw), exact, noisy, bar.update))
             except FinforceError as error:
                 notes.append(f"{tier.name}: not measured: {error}")
         recorded = measure_recordings(folder, tiers, lambda _: bar.update()) if folder else ()
     return SolverFigures(tiers=figures, recorded=recorded, notes=notes)
 
 
+def _find_cases(name: str, jaw: Jaw) -> Sequence[BenchCase]:
+    """Returns the presses of a jaw: of the bench's those of an independent program, else of its own solid model.
+
+    Raises:
+        FinforceError: No solid describes the jaw, or it bears no press.
+    """
+    if name == "bench":
+        return load_cases()
+    if jaw.drawing is not None and not jaw.drawing.is_solid:
+        raise FinforceError(f"--jaw {name}: only the frame describes it, expected a finger with a solid model")
+    cases = press_cases(jaw)
+    if not cases:
+        raise FinforceError(f"--jaw {name}: none of the presses finds an equilibrium")
+    return cases
+
+
 def _measure_tier(
-    tier: Tier, exact: Sequence[ReplayedPress], noisy: Sequence[ReplayedPress], progress: Callable[[], object]
+    tier: Tier,
+    named: tuple[str, Jaw],
+    exact: Sequence[ReplayedPress],
+    noisy: Sequence[ReplayedPress],
+    progress: Callable[[], object],
 ) -> TierFigures:
-    jaw = bench_finger()
+    name, jaw = named
     yardstick = measure_factorisation()
     without = run_tier(tier, jaw, exact, progress)
     with_noise = run_tier(tier, jaw, noisy, progress)
@@ -122,7 +151,7 @@ def _measure_tier(
         step=_row(tier, [run.seconds for run in with_noise]),
         cpu=_row(tier, [run.cpu for run in with_noise]),
         yardstick=row_from_times(tier.name, yardstick),
-        start=measure_start(tier.solver, tier.mesh) if tier.contact == "height" else None,
+        start=measure_start(tier.solver, tier.mesh, name) if tier.contact == "height" else None,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from gc import collect, disable, enable
 from time import perf_counter, thread_time
 
@@ -17,8 +17,8 @@ from finforce_ifea.settings import SOLVERS, EstimatorSettings
 
 _WARM_UP_FRAMES = 150
 
-# Solvers that do not describe the bench finger, which is a drawing.
-_OF_OTHER_JAWS = ("plane",)
+# Solvers of sections alone, and of drawings alone.
+_OF_SECTIONS, _OF_DRAWINGS = ("plane",), ("frame", "paper")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,11 +62,20 @@ TIERS = (
 )
 
 
-def list_tiers(*, slow: bool = True) -> tuple[Tier, ...]:
-    """Returns the tiers, with one for each solver that has been registered since the list was written."""
-    listed = {tier.solver for tier in TIERS} | {"default"}
-    others = tuple(Tier(name=name, solver=name) for name in SOLVERS if name not in (*listed, *_OF_OTHER_JAWS))
-    return tuple(tier for tier in TIERS + others if slow or not tier.slow)
+def list_tiers(*, slow: bool = True, section: bool = False) -> tuple[Tier, ...]:
+    """Returns the tiers, with one for each solver that has been registered since the list was written.
+
+    Args:
+        slow: with those that take long.
+        section: of a finger that is given by its section, no drawing.
+    """
+    listed, foreign = {tier.solver for tier in TIERS} | {"default"}, _OF_DRAWINGS if section else _OF_SECTIONS
+    others = tuple(Tier(name=name, solver=name) for name in SOLVERS if name not in listed)
+    every = [tier for tier in TIERS + others if tier.solver not in foreign]
+    if section:  # of ten thousand and more unknowns, a second for a step: of the solids the smallest alone
+        every = [tier for tier in every if tier.solver != "solid" or tier.mesh == "coarse"]
+        every = [replace(tier, slow=tier.solver in ("solid", "plane")) for tier in every]
+    return tuple(tier for tier in every if slow or not tier.slow)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

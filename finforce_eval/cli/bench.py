@@ -19,6 +19,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "recordings of the bench finger to be solved, too; without it shapes of an independent program alone"
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
     text = "solvers, peer, growth, localization, detection, chain, skipping; without it those of `make bench`"
+    text = "shipped jaw or jaw file whose solvers are measured, pressed by its own solid model (bench)"
+    parser.add_argument("--jaw", default="bench", metavar="NAME", help=text)
     parser.add_argument("--parts", metavar="A,B", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     text = "draw the first part, and every other beside it with its name added"
@@ -28,7 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Measure the parts, print each one's table, write the JSON and the pictures."""
-    parts, machine = select_parts(options.parts), describe_machine()
+    parts, machine = select_parts(options.parts, options.jaw), describe_machine()
     if options.folder and not any(part.takes_folder for part in parts):
         raise OptionError(f"{options.folder}: none of the parts {', '.join(p.name for p in parts)} takes recordings")
     content: dict[str, Any] = {}
@@ -52,6 +54,7 @@ def _run_part(part: BenchPart, options: argparse.Namespace, picture: Path | None
     module = import_module(part.module)
     print(f"\n{part.title}\n")
     taken = {"folder": options.folder} if part.takes_folder else {}
+    taken |= {"jaw": options.jaw} if part.takes_jaw else {}
     figures = module.measure(options.quick, **taken)
     table = module.format_table(figures)
     print(table)

@@ -21,6 +21,9 @@ _METRES, _INCHES = 0.5, 15.0
 _MOST_TRIANGLES, _LARGEST_FILE = 2_000_000, 200_000_000
 # A surface is prismatic when so much of it stands upright on, or lies across, the direction of extrusion.
 _UPRIGHT, _PRISMATIC = 0.02, 0.97
+# Of a tapered one the normals of walls have less than this along its direction, those of sides more; a side is plane
+# within so much [m].
+_ASIDE, _SIDE, _RULINGS = 0.5, 1e-4, 4
 # Cuts across it at these shares of the width may differ in area by so much.
 _CUTS, _ALIKE = (0.3, 0.5, 0.7), 0.03
 # Ends of cut triangles are joined on a grid of this size [m].
@@ -35,15 +38,15 @@ class RawSection:
 
     Attributes:
         polygon: in metres, in a plane of the file's.
-        width: along the extrusion [m]; None where the file is flat.
+        width: along the extrusion [m], of a tapered finger at the section's origin; None where the file is flat.
+        taper: (2,) [-], change of the width along the section's axes.
         notes: what was found and guessed, a line each.
-        tapered: the body [m] of a finger that is not prismatic, whose middle cut the section is; else None.
     """
 
     polygon: shapely.Polygon
     width: float | None
     notes: list[str] = field(default_factory=list)
-    tapered: trimesh.Trimesh | None = None
+    taper: NDArray = field(default_factory=lambda: np.zeros(2))
 
 
 def read_section(path: Path, *, unit: str | None = None, body: int | None = None) -> RawSection:
@@ -149,17 +152,18 @@ def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> R
         mesh.invert()
         notes.append("its surface was inside out and has been turned")
     axis, share = _find_axis(mesh)
+    if share < _PRISMATIC:
+        return _cut_tapered(mesh, axis, notes)
     low, high = np.sort(mesh.vertices @ axis)[[0, -1]]
     cuts = [_cut(mesh, axis, low + at * (high - low)) for at in _CUTS]
     areas = np.array([cut.area for cut in cuts])
     middle = cuts[int(np.argsort(areas)[len(areas) // 2])]
     letters = np.round(axis, 3).tolist()
-    if share < _PRISMATIC or np.ptp(areas) > _ALIKE * areas.max():
-        notes.append(
-            f"not prismatic: of its surface {share:.0%} goes with the direction {letters}, and cuts across it have "
-            f"{1e6 * areas.min():.4g} to {1e6 * areas.max():.4g} mm^2"
+    if np.ptp(areas) > _ALIKE * areas.max():
+        raise JawFileError(
+            f"is not prismatic: cuts across {letters} have {1e6 * areas.min():.4g} to {1e6 * areas.max():.4g} mm^2, "
+            "expected a finger whose walls all run in one direction"
         )
-        return RawSection(polygon=middle, width=high - low, notes=notes, tapered=_stand(mesh, axis))
     notes.append(f"prismatic along {letters} of the file, {1e3 * (high - low):.4g} mm wide")
     return RawSection(polygon=middle, width=float(high - low), notes=notes)
 
@@ -203,14 +207,77 @@ def _find_axis(mesh: trimesh.Trimesh) -> tuple[NDArray, float]:
     return best, most
 
 
-def _stand(mesh: trimesh.Trimesh, axis: NDArray) -> trimesh.Trimesh:
-    """Return the body with its extrusion along the third axis, its middle at 0, and its section as `_cut` has it."""
-    frame = np.eye(4)
-    frame[:3, :3] = np.stack([*_span(axis), axis])
-    standing = mesh.copy()
-    standing.apply_transform(frame)
-    standing.apply_translation([0.0, 0.0, -standing.bounds[:, 2].mean()])
-    return standing
+def _cut_tapered(mesh: trimesh.Trimesh, axis: NDArray, notes: list[str]) -> RawSection:
+    """Return the section of a body whose walls all run in one direction between two sides that are any planes.
+
+    Args:
+        mesh: the body [m].
+        axis: nearly that direction (3,).
+        notes: what was found, a line each.
+
+    Raises:
+        JawFileError: Walls run in several directions, or a side is no plane.
+    """
+    normals, areas = mesh.face_normals, mesh.area_faces
+    axis = max((_find_ruling(mesh, start) for start in (axis, *np.eye(3))), key=lambda found: _weigh_walls(mesh, found))
+    slope = normals @ axis
+    walls = np.abs(slope) < _UPRIGHT
+    sides = [np.flatnonzero(slope < -_ASIDE), np.flatnonzero(slope > _ASIDE)]
+    share = float((areas * walls).sum() + sum(areas[side].sum() for side in sides)) / float(areas.sum())
+    letters = np.round(axis, 3).tolist()
+    if share < _PRISMATIC or not all(map(len, sides)):
+        raise JawFileError(
+            f"is not prismatic: {share:.0%} of its surface are sides, or walls along {letters}, expected "
+            f"{_PRISMATIC:.0%}: a finger whose walls all run in one direction, from one plane side to another"
+        )
+    across = np.stack(_span(axis))
+    low, high = (_fit_side(mesh, side, axis, across) for side in sides)
+    taper, width = (high - low)[:2], float((high - low)[2])
+    corners = mesh.vertices[np.unique(mesh.faces[walls])] @ across.T
+    widths = corners @ taper + width
+    # where both sides are there everywhere
+    bottom, top = (corners @ plane[:2] + plane[2] for plane in (low, high))
+    if not bottom.max() < top.min():
+        raise JawFileError(f"tapers so much that no cut across {letters} meets all of it")
+    polygon = _cut(mesh, axis, 0.5 * float(bottom.max() + top.min()))
+    notes.append(
+        f"tapered: walls along {letters} of the file, {1e3 * widths.min():.3g} to {1e3 * widths.max():.3g} mm wide; "
+        "taken as symmetric about its middle"
+    )
+    return RawSection(polygon=polygon, width=width, notes=notes, taper=taper)
+
+
+def _find_ruling(mesh: trimesh.Trimesh, axis: NDArray) -> NDArray:
+    """Return the direction (3,) nearest to an axis that as many walls as possible run along."""
+    for _ in range(_RULINGS):
+        walls = np.abs(mesh.face_normals @ axis) < _ASIDE
+        normals, areas = mesh.face_normals[walls], mesh.area_faces[walls, None]
+        # what all walls are across to
+        found = np.linalg.eigh((normals * areas).T @ normals)[1][:, 0]
+        axis = found if found @ axis > 0.0 else -found
+    return axis
+
+
+def _weigh_walls(mesh: trimesh.Trimesh, axis: NDArray) -> float:
+    """Return the area [m^2] of what runs along an axis."""
+    return float(mesh.area_faces[np.abs(mesh.face_normals @ axis) < _UPRIGHT].sum())
+
+
+def _fit_side(mesh: trimesh.Trimesh, faces: NDArray, axis: NDArray, across: NDArray) -> NDArray:
+    """Return how high a side is along an axis: by both directions across, and at their origin [m] (3,).
+
+    Raises:
+        JawFileError: It is no plane.
+    """
+    points = mesh.vertices[np.unique(mesh.faces[faces])]
+    design = np.column_stack([points @ across.T, np.ones(len(points))])
+    plane, *_ = np.linalg.lstsq(design, points @ axis, rcond=None)
+    off = float(np.abs(design @ plane - points @ axis).max())
+    if off > _SIDE:
+        raise JawFileError(
+            f"is not prismatic: a side leaves its plane by {1e3 * off:.2g} mm, expected at most {1e3 * _SIDE:g} mm"
+        )
+    return plane
 
 
 def _span(axis: NDArray) -> tuple[NDArray, NDArray]:

@@ -58,11 +58,9 @@ def make_jaw(
     if width is None:
         raise JawFileError(f"{file.name}: a drawing has no width; give it in metres: --width 0.025")
     try:
-        finger = recognize(raw.polygon, width, wishes)
+        finger = recognize(raw.polygon, width, wishes, raw.taper)
     except JawFileError as error:
         raise JawFileError(f"{file.name}: {error}") from error
-    if raw.tapered is not None:
-        raise JawFileError(f"{file.name}: {raw.notes[-1]}; expected a finger whose section is the same all along")
     proposal = propose(finger, name, material)
     output.parent.mkdir(parents=True, exist_ok=True)
     section = write_jaw(finger, proposal, output, file.name)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_eval.fingers.proposal import Proposal
-from finforce_eval.fingers.recognition import RecognizedFinger
+from finforce_eval.fingers.recognition import RecognizedFinger, find_reach
 from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.jaw.section import order_rings
 
@@ -33,7 +33,8 @@ def draw_finger(finger: RecognizedFinger, proposal: Proposal, mesh: VolumeMesh, 
     _draw_walls(flat, finger)
     _draw_points(flat, finger, proposal, size)
     flat.set(xlabel="x / mm, towards the object", ylabel="z / mm, base to tip", aspect="equal")
-    flat.set_title(f"{proposal.name}: {1e3 * size[0]:.1f} x {1e3 * finger.width:.1f} x {1e3 * size[1]:.1f} mm")
+    widths = finger.read_width(np.array(finger.polygon.exterior.coords))
+    flat.set_title(f"{proposal.name}: {1e3 * size[0]:.1f} x {_say(widths)} x {1e3 * size[1]:.1f} mm")
     flat.legend(loc="upper left", fontsize=8, framealpha=0.9)
     _draw_solid(solid, mesh)
     figure.savefig(path, dpi=110)
@@ -98,7 +99,7 @@ def _draw_points(axes, finger: RecognizedFinger, proposal: Proposal, size: NDArr
     first, step, count = proposal.candidates
     heights = 1e3 * (first + step * np.arange(count))
     axes.plot(
-        np.full(count, 1e3 * finger.face_x),
+        [1e3 * find_reach(finger.polygon, 1e-3 * height) for height in heights],
         heights,
         "<",
         color=_INNER,

@@ -47,15 +47,14 @@ def propose(finger: RecognizedFinger, name: str, material: str) -> Proposal:
     Key points are where the ribs meet the bands, on the side face towards the camera, inner band first, base to tip,
     and the tip; what the clamp holds is left out, since it does not move.
     """
-    side = 0.5 * finger.width
     points = {}
     for band in ("inner", "outer"):
         for number, rib in enumerate(finger.ribs, start=1):
             x, z = getattr(rib, band)
             if z > finger.clamped_z + _ABOVE and not _is_held(finger, x, z):
-                points[f"{band}_{number}"] = np.array([x, side, z])
+                points[f"{band}_{number}"] = _put_on_side(finger, x, z)
     top = finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)).centroid
-    points["tip"] = np.array([top.x, side, top.y])
+    points["tip"] = _put_on_side(finger, top.x, top.y)
     low, high = finger.clamped_z + _AWAY, _find_face_end(finger) - _AWAY
     count = int(np.clip(round((high - low) / _STEP) + 1, _FEWEST, _MOST))
     reference, note = _choose_reference(finger)
@@ -64,9 +63,14 @@ def propose(finger: RecognizedFinger, name: str, material: str) -> Proposal:
         material=material,
         keypoints=points,
         candidates=(low, (high - low) / (count - 1), count),
-        reference=np.array([reference[0], side, reference[1]]),
+        reference=_put_on_side(finger, *reference),
         reference_note=note,
     )
+
+
+def _put_on_side(finger: RecognizedFinger, x: float, z: float) -> NDArray:
+    """Return a place of the section on the side that the camera sees (3,) [m]."""
+    return np.array([x, 0.5 * float(finger.read_width(np.array([x, z]))), z])
 
 
 def _is_held(finger: RecognizedFinger, x: float, z: float) -> bool:
@@ -119,13 +123,15 @@ def describe_jaw(finger: RecognizedFinger, proposal: Proposal, section: str, sou
     material = MATERIALS[proposal.material]
     first, step, count = proposal.candidates
     circles = ", ".join(f"[{x:.5f}, {z:.5f}, {radius:.5f}]" for x, z, radius in finger.clamped_circles)
+    tapers = bool(finger.taper.any())
     clamped = f"z_below: {finger.clamped_z:.5g}" + (f", circles: [{circles}]" if circles else "")
     lines = [
         f"# {proposal.name}, from {source}. Lengths in metres, jaw frame (x closing, y width, z base to tip).",
         f"name: {proposal.name}",
         "section:",
         f"  file: {section}  # polygons in the x-z plane",
-        f"  width: {finger.width:.5g}",
+        f"  width: {finger.width:.5g}" + ("  # at x = z = 0" if tapers else ""),
+        *([f"  taper: [{finger.taper[0]:.5f}, {finger.taper[1]:.5f}]  # of the width, by x and z"] if tapers else []),
         f"  clamped: {{{clamped}}}  # what the holder keeps from moving; circles: [x, z, radius] about bolts",
         f"inner_face_x: {finger.face_x:.5g}",
         f"material: {proposal.material}  # {1e-6 * material.young_modulus:.3g} MPa +- {material.spread:.0%}, until "

@@ -69,7 +69,8 @@ class RecognizedFinger:
 
     Attributes:
         polygon: x towards the object, z from base to tip [m]; its lowest point is at z = 0.
-        width: along y [m].
+        width: along y [m], at x = z = 0.
+        taper: (2,) [-], change of the width along x and z.
         cells: the rooms between bands and ribs (n, 2) each, base to tip.
         bolts: bolt holes (b, 3): x, z, radius [m].
         inner: the band that touches objects.
@@ -84,6 +85,7 @@ class RecognizedFinger:
 
     polygon: shapely.Polygon
     width: float
+    taper: NDArray
     cells: list[NDArray]
     bolts: NDArray
     inner: Wall
@@ -94,6 +96,10 @@ class RecognizedFinger:
     face_x: float
     face_deviation: float
     notes: list[str] = field(default_factory=list)
+
+    def read_width(self, points: NDArray) -> NDArray:
+        """Return the width (...) [m] at points (..., 2) [m] of the section."""
+        return self.width + points @ self.taper
 
     @property
     def length(self) -> float:
@@ -118,13 +124,14 @@ class Wishes:
     face_x: float | None = None
 
 
-def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes) -> RecognizedFinger:
+def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes, taper: NDArray | None = None) -> RecognizedFinger:
     """Find the parts of a fin-ray finger in its section.
 
     Args:
         polygon: the section [m], anyhow turned.
-        width: of the finger [m].
+        width: of the finger [m], where its sides are no parallel planes that at the origin of the section.
         wishes: what is given.
+        taper: (2,) [-], change of the width along the section's axes; None for none.
 
     Raises:
         JawFileError: The section shows no fin-ray finger; the message says what it shows and what to do.
@@ -139,7 +146,8 @@ def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes) -> Recogni
             "drawing"
         )
     notes: list[str] = []
-    turned = _turn_upright(polygon, cells, wishes, notes).simplify(_CHORD)
+    turned, frame = _turn_upright(polygon, cells, wishes, notes)
+    turned = turned.simplify(_CHORD)
     holes = [np.array(ring.coords)[:-1] for ring in turned.interiors]
     bolts = _fit_bolts([hole for hole in holes if _is_round(hole)])
     cells = _order_cells([hole for hole in holes if not _is_round(hole)])
@@ -151,6 +159,8 @@ def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes) -> Recogni
         notes.append(f"inner face curved: it leaves its plane by {1e3 * deviation:.2g} mm")
     shift = _choose_origin(turned, clamped_z, wishes, face_x)
     move = np.array([shift, 0.0])
+    taper = np.zeros(2) if taper is None else frame[:, :2] @ taper
+    width -= float(taper @ (frame[:, 2] + move))
     free = [band.thickness[band.line[:, 1] > clamped_z] for band in (inner, outer)]
     notes.append(
         f"{len(cells)} cells, {len(ribs)} ribs of {_say_range([rib.wall.usual for rib in ribs])} mm, inner band "
@@ -160,6 +170,7 @@ def recognize(polygon: shapely.Polygon, width: float, wishes: Wishes) -> Recogni
     return RecognizedFinger(
         polygon=affinity.translate(turned, shift, 0.0),
         width=width,
+        taper=taper,
         cells=[cell + move for cell in cells],
         bolts=bolts + [shift, 0.0, 0.0],
         inner=Wall(line=inner.line + move, thickness=inner.thickness),
@@ -204,8 +215,13 @@ def _order_cells(cells: list[NDArray]) -> list[NDArray]:
     return sorted(cells, key=lambda cell: shapely.Polygon(cell).centroid.y)
 
 
-def _turn_upright(polygon: shapely.Polygon, cells: list[NDArray], wishes: Wishes, notes: list[str]) -> shapely.Polygon:
-    """Return the section with its inner face upright at the largest x, and its lowest point at z = 0."""
+def _turn_upright(
+    polygon: shapely.Polygon, cells: list[NDArray], wishes: Wishes, notes: list[str]
+) -> tuple[shapely.Polygon, NDArray]:
+    """Return the section with its inner face upright at the largest x, and its lowest point at z = 0.
+
+    And how it got there: a rotation, perhaps mirrored, and a shift (2, 3).
+    """
     middles = np.array([shapely.Polygon(cell).centroid.coords[0] for cell in cells])
     around = middles.mean(axis=0)
     direction = np.linalg.svd(middles - around)[2][0]
@@ -245,7 +261,8 @@ def _turn_upright(polygon: shapely.Polygon, cells: list[NDArray], wishes: Wishes
         "its far end (--flip, --other-face)"
     )
     turned = affinity.affine_transform(polygon, [outward[0], outward[1], up[0], up[1], 0.0, 0.0])
-    return affinity.translate(turned, -turned.bounds[2], -turned.bounds[1])
+    shift = np.array([-turned.bounds[2], -turned.bounds[1]])
+    return affinity.translate(turned, *shift), np.column_stack([np.stack([outward, up]), shift])
 
 
 def _measure_widths(polygon: shapely.Polygon, direction: NDArray) -> tuple[float, float]:
@@ -337,14 +354,14 @@ def _measure_face(polygon: shapely.Polygon, cells: list[NDArray], clamped_z: flo
     """Return the plane x [m] of the inner face and how far it leaves that, between the clamp and the last cell [m]."""
     low = max(clamped_z, min(float(cell[:, 1].min()) for cell in cells))
     high = max(float(cell[:, 1].max()) for cell in cells)
-    reach = np.array([_reach(polygon, z) for z in np.linspace(low, high, 80)[1:-1]])
+    reach = np.array([find_reach(polygon, z) for z in np.linspace(low, high, 80)[1:-1]])
     face = float(np.median(reach))
     deviation = float(np.abs(reach - face).max())
     # of a curved face the place that is farthest in front
     return (face if deviation <= _FLAT else float(reach.max())), deviation
 
 
-def _reach(polygon: shapely.Polygon, z: float) -> float:
+def find_reach(polygon: shapely.Polygon, z: float) -> float:
     """Return the largest x of a section at a height [m]."""
     low_x, _, high_x, _ = polygon.bounds
     cut = polygon.intersection(shapely.LineString([(low_x - 1.0, z), (high_x + 1.0, z)]))

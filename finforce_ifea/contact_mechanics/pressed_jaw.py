@@ -283,6 +283,8 @@ def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across
     sides = {"middle": np.zeros(1), "half": right, "both": np.r_[left, right]}[across]
     z, y = np.meshgrid(heights, sides, indexing="ij")
     points = np.stack([jaw.face.read(z.ravel()), y.ravel(), z.ravel()], axis=1)
+    if jaw.section is not None and jaw.section.taper.any():
+        points[:, 1] *= jaw.section.read_width(points[:, [0, 2]]) / (high[0] - low[0])
     stiffness = np.full(len(points), _STIFFNESS * _SPACING / len(sides))
     probe = model.attach(points, 1e-3)
     return ContactSurface(

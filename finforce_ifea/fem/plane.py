@@ -17,6 +17,7 @@ from finforce_ifea.fem.model import LARGEST_MOVE, Across, Linearization
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import VolumeMesh
+from finforce_ifea.jaw.section import Section
 from finforce_ifea.jaw.section_mesh import PlaneMesh
 
 _SAME = 1e-8
@@ -33,13 +34,13 @@ class PlaneModel(SolidModel):
     _banded_limit = 0.0
     across: Across = "middle"
 
-    def __init__(self, mesh: VolumeMesh, plane: PlaneMesh, width: float, material: Material) -> None:
+    def __init__(self, mesh: VolumeMesh, plane: PlaneMesh, section: Section, material: Material) -> None:
         """Numbers the unknowns and prepares the triangles.
 
         Args:
             mesh: the extruded section, jaw frame [m].
             plane: its triangles.
-            width: along y [m].
+            section: whose width counts.
             material: Young's modulus [Pa] and Poisson's ratio.
 
         Raises:
@@ -55,7 +56,7 @@ class PlaneModel(SolidModel):
             raise MeshError("the mesh is not the section extruded along y")
         self._elements = np.ascontiguousarray(standing[plane.triangles])
         self._gradients, volumes = _differentiate(plane.points[plane.triangles])
-        self._volumes = width * volumes
+        self._volumes = section.read_width(_place_points(plane.points[plane.triangles])) * volumes
         nu = material.poisson_ratio
         self._shear = 0.5 * material.young_modulus / (1.0 + nu)
         self._lame = 2.0 * self._shear * nu / (1.0 - 2.0 * nu)
@@ -83,6 +84,12 @@ class PlaneModel(SolidModel):
         return Linearization(
             force=force, energy=energy, smallest_det=smallest, tangent=self._assemble() if tangent else None
         )
+
+
+def _place_points(corners: NDArray) -> NDArray:
+    """Returns the three points (t, 3, 2) [m] of triangles (t, 6, 2) with straight sides."""
+    shares = np.column_stack([1.0 - _POINTS.sum(axis=1), _POINTS])
+    return np.einsum("pn,tni->tpi", shares, corners[:, :3])
 
 
 def _differentiate(corners: NDArray) -> tuple[NDArray, NDArray]:

@@ -258,7 +258,7 @@ def _check_candidates(jaw: Jaw) -> None:
             )
         shape = jaw.drawing or jaw.section
         if shape is not None:
-            half, length = 0.5 * shape.width, shape.length
+            half, length = 0.5 * (shape.width if jaw.section is None else shape.widest), shape.length
             if abs(point[1]) > half or not 0.0 <= point[2] <= length:
                 raise JawFileError(
                     f"candidates[{number}] at {_millimetres(point)} lies off the inner surface; "

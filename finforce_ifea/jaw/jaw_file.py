@@ -409,7 +409,7 @@ def parse_section(table: Table, folder: Path) -> Section:
     Raises:
         JawFileError: It does not describe a section.
     """
-    table.expect_keys(("file", "clamped"), ("width", "size"))
+    table.expect_keys(("file", "clamped"), ("width", "taper", "size"))
     path = folder / table.text("file", "")
     loops, width = read_loops(path)
     try:
@@ -419,6 +419,9 @@ def parse_section(table: Table, folder: Path) -> Section:
     width = table.length("width") if "width" in table else width
     if not (width and width > 0.0):
         raise JawFileError(f"{table.name('width')}: got {width}, expected a positive length in metres")
+    taper = np.array(table.values.get("taper", [0.0, 0.0]), dtype=object)
+    if taper.shape != (2,) or not all(isinstance(value, int | float) and abs(value) < 1.0 for value in taper):
+        raise JawFileError(f"{table.name('taper')}: got {taper.tolist()}, expected [by x, by z], each -1 to 1")
     size = table.length("size", largest=_LARGEST_THICKNESS) if "size" in table else None
     if size is not None and size <= 0.0:
         raise JawFileError(f"{table.name('size')}: got {size:g}, expected a positive length in metres")
@@ -428,13 +431,18 @@ def parse_section(table: Table, folder: Path) -> Section:
     if not isinstance(circles, list) or not ("z_below" in clamp or circles):
         raise JawFileError(f"{clamp.prefix}: expected z_below, or circles, a list of [x, z, radius]")
     circles = np.array([parse_point(circle, f"{clamp.name('circles')}[{i}]") for i, circle in enumerate(circles)])
-    return Section(
+    section = Section(
         rings=rings,
         width=width,
+        taper=taper.astype(float),
         clamped_z=clamp.length("z_below") if "z_below" in clamp else None,
         clamped_circles=circles.reshape(-1, 3),
         size=size,
     )
+    least = float(section.read_width(rings[0]).min())
+    if not least > 0.0:
+        raise JawFileError(f"{table.name('taper')}: leaves a width of {1e3 * least:.3g} mm somewhere, expected any")
+    return section
 
 
 def _parse_clamp(table: Table) -> ClampRule:

@@ -1,7 +1,7 @@
-"""The section of a prismatic finger, extruded along its width: polygons, where they are held, and the file of both."""
+"""The section of a finger, extruded along its width: polygons, where they are held, and the file of both."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -21,7 +21,8 @@ class Section:
 
     Attributes:
         rings: (n, 2) each, x and z [m, jaw frame]: the outline counterclockwise, then the holes clockwise.
-        width: [m], along y; the finger is symmetric about y = 0.
+        width: [m], along y, at x = z = 0; the finger is symmetric about y = 0.
+        taper: (2,) [-], change of the width along x and z; its sides are planes.
         clamped_z: [m], everything up to this height is clamped; None where circles alone do.
         clamped_circles: (c, 3), x, z and radius [m] about bolts: everything within is clamped.
         size: [m], of the elements in the section; None for what the thinnest parts ask for.
@@ -32,6 +33,16 @@ class Section:
     clamped_z: float | None = 0.0
     clamped_circles: NDArray
     size: float | None = None
+    taper: NDArray = field(default_factory=lambda: np.zeros(2))
+
+    def read_width(self, points: NDArray) -> NDArray:
+        """Return the width (...) [m] at points (..., 2) [m] of the section."""
+        return self.width + points @ self.taper
+
+    @cached_property
+    def widest(self) -> float:
+        """The largest width [m]."""
+        return float(self.read_width(self.rings[0]).max())
 
     @cached_property
     def polygon(self) -> shapely.Polygon:
@@ -42,6 +53,7 @@ class Section:
     def content(self) -> bytes:
         """All that makes the finger's shape and clamp, to a micrometre."""
         numbers = [self.width, np.nan if self.clamped_z is None else self.clamped_z, *self.clamped_circles.ravel()]
+        numbers += self.taper.tolist() if self.taper.any() else []
         rings = [np.round(1e6 * ring).astype(np.int64).tobytes() for ring in self.rings]
         return b"|".join([np.round(1e6 * np.array(numbers)).tobytes(), *rings])
 
@@ -80,7 +92,7 @@ class Section:
 
     def distance_to(self, points: NDArray) -> NDArray:
         """Compute the distances (n,) [m] of points (n, 3) [m, jaw frame] from the finger, 0 inside."""
-        beside = np.maximum(np.abs(points[:, 1]) - 0.5 * self.width, 0.0)
+        beside = np.maximum(np.abs(points[:, 1]) - 0.5 * self.read_width(points[:, [0, 2]]), 0.0)
         in_plane = shapely.distance(self.polygon, shapely.points(points[:, [0, 2]]))
         return np.hypot(beside, in_plane)
 

@@ -217,8 +217,8 @@ def extrude_section(section: Section, share: float = 1.0) -> VolumeMesh:
     plane = mesh_section(section, share)
     corners, triangles = plane.points[: plane.corners], np.sort(plane.triangles[:, :3], axis=1)
     count = len(corners)
-    levels = 0.5 * section.width * np.array([-1.0, 0.0, 1.0])
-    nodes = np.concatenate([np.insert(corners, 1, y, axis=1) for y in levels])
+    half = 0.5 * section.read_width(corners)
+    nodes = np.concatenate([np.insert(corners, 1, level * half, axis=1) for level in (-1.0, 0.0, 1.0)])
     middle, tets = triangles + count, []
     for end in (triangles, triangles + 2 * count):
         # the diagonals of all sides start at the smallest number in the middle plane: both halves mirror each other

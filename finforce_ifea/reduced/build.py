@@ -53,10 +53,11 @@ class Face:
 
     def __init__(self, mechanics: Mechanics, heights: NDArray) -> None:
         """Keeps the rows at heights (n,) [m]."""
-        surface, self._model = mechanics.contact.surface, mechanics.model
-        across = surface.points[: surface.across, 1]
-        points = np.array([[mechanics.contact.face.read(z), y, z] for z in heights for y in across])
-        self._probe, self._across, self._count = self._model.attach(points, 1e-3), len(across), len(heights)
+        surface, face, self._model = mechanics.contact.surface, mechanics.contact.face, mechanics.model
+        columns = surface.points[:, 1].reshape(-1, surface.across).T
+        sides = np.stack([np.interp(heights, surface.heights, y) for y in columns], axis=1)
+        points = np.array([[face.read(z), y, z] for z, row in zip(heights, sides, strict=True) for y in row])
+        self._probe, self._across, self._count = self._model.attach(points, 1e-3), surface.across, len(heights)
         self.basis = np.zeros((self._model.size, 0))
 
     def describe(self, q: NDArray) -> FaceTangent:

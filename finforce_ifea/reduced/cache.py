@@ -152,6 +152,7 @@ def name_manifold(full: Mechanics, jaw: Jaw) -> str:
         parts.append(full.contact.face.x)
     if isinstance(model, PlaneModel):  # one for both sides
         parts[:2] = [model.plane.points, model.plane.triangles, jaw.section.width]
+        parts += [jaw.section.taper] if jaw.section.taper.any() else []
     if isinstance(full.model, FrameModel):
         parts.append(repr(jaw.drawing))
     return hash_parts(type(full.model).__name__, *map(str, manifold_build.GRID), *parts)

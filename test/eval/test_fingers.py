@@ -58,9 +58,56 @@ def test_a_finger_is_found_in_any_unit_and_any_way_round(tmp_path, surface, unit
     path = tmp_path / "finger.stl"
     mesh.export(path)
     raw = read_section(path)
-    assert raw.tapered is None
+    assert not raw.taper.any()
     assert f"unit: {unit}" in raw.notes[0]
     check_found(recognize(raw.polygon, raw.width, Wishes()))
+
+
+def taper_surface(surface, slope, lean):
+    """A finger whose one side is slanted along its length, and whose walls lean as it gets wider."""
+    mesh = surface.copy()
+    points = np.array(mesh.vertices)
+    share = (points[:, 1] + 0.5 * WIDTH) / WIDTH
+    points[:, 1] = share * (WIDTH - slope * points[:, 2])
+    points[:, 0] += lean * points[:, 1]
+    return trimesh.Trimesh(points, mesh.faces, process=True)
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.1])
+@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [90.0, 0.0, 0.0], [90.0, 40.0, 0.0]])
+def test_a_tapered_finger_is_taken_as_symmetric_about_its_middle(tmp_path, surface, turn, lean):
+    mesh = taper_surface(surface, 0.12, lean)
+    volume = mesh.volume
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    mesh.apply_transform(frame)
+    mesh.export(tmp_path / "finger.stl")
+    raw = read_section(tmp_path / "finger.stl")
+    assert any("tapered" in note for note in raw.notes)
+    finger = recognize(raw.polygon, raw.width, Wishes(), raw.taper)
+    stretch = np.hypot(1.0, lean)  # along the walls
+    assert finger.taper == pytest.approx([0.0, -0.12 * stretch], abs=2e-3)
+    assert finger.width == pytest.approx(WIDTH * MILLIMETRE * stretch, abs=5e-5)
+    assert len(finger.ribs) == RIBS
+    main(["jaw", str(tmp_path / "finger.stl"), "-o", str(tmp_path / "finger.yaml")])
+    jaw = load_jaw(tmp_path / "finger.yaml")
+    made = jaw.build_mesh("coarse")
+    assert trimesh.Trimesh(made.nodes, made.surface).volume == pytest.approx(volume * MILLIMETRE**3, rel=3e-3)
+    tip = jaw.keypoints[list(jaw.keypoint_names).index("tip")]
+    assert tip[1] == pytest.approx(0.5 * stretch * (WIDTH * MILLIMETRE - 0.12 * tip[2]), abs=5e-5)
+
+
+def test_a_side_that_is_no_plane_and_walls_that_run_apart_are_refused(tmp_path, surface):
+    mesh = taper_surface(surface, 0.12, 0.0)
+    mesh.vertices[:, 1] *= 1.0 + 0.02 * mesh.vertices[:, 0]
+    mesh.export(tmp_path / "round.stl")
+    with pytest.raises(JawFileError, match="a side leaves its plane"):
+        read_section(tmp_path / "round.stl")
+    mesh = surface.copy()
+    mesh.vertices[:, 0] *= 1.0 + 0.03 * mesh.vertices[:, 1]
+    mesh.export(tmp_path / "cone.stl")
+    with pytest.raises(JawFileError, match="walls all run in one direction"):
+        read_section(tmp_path / "cone.stl")
 
 
 def test_a_surface_that_is_inside_out_is_turned(tmp_path, surface):

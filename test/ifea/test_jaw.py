@@ -58,7 +58,7 @@ def test_steel_hinges_are_where_they_were_measured():
 
 
 def test_shipped_jaws_load_by_name_and_by_path():
-    assert list_shipped_jaws() == ("bench", "ssg48_fin_ray_1", "ssg48_fin_ray_3", "steel", "umi")
+    assert list_shipped_jaws() == ("bench", "ssg48_fin_ray_1", "ssg48_fin_ray_3", "steel", "umi", "xlerobot")
     for name in list_shipped_jaws():
         jaw = load_jaw(name)
         np.testing.assert_array_equal(load_jaw(jaw.path).keypoints, jaw.keypoints)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, draw_polygon, make_section, write_section_jaw
+from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, draw_keypoints, draw_polygon, make_section, write_section_jaw
 
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
@@ -86,7 +86,7 @@ def strip(length=40.0, thickness=2.0):
 
 
 def plane_model(section, material=TPU, share=1.0):
-    return PlaneModel(extrude_section(section, share), mesh_section(section, share), section.width, material)
+    return PlaneModel(extrude_section(section, share), mesh_section(section, share), section, material)
 
 
 def test_strip_bends_as_in_plane_strain():
@@ -149,6 +149,25 @@ def test_plane_model_has_the_solid_finger_s_force(jaw):
     for height in (0.03, 0.05):
         forces = [press(mechanics, jaw, height).force for mechanics in (plane, solid)]
         np.testing.assert_allclose(forces[0], forces[1], atol=0.02 * np.linalg.norm(forces[1]))
+
+
+TAPER = [0.0, -0.2]
+
+
+def test_tapered_finger_has_its_volume_and_its_plane_model_the_solid_s_force(tmp_path):
+    table = {"file": "finger.section.json", "width": 0.02, "taper": TAPER, "clamped": {"z_below": 0.012}}
+    points = {name: [x, 0.5 * (0.02 - 0.2 * z), z] for name, (x, _, z) in draw_keypoints().items()}
+    jaw = load_jaw(write_section_jaw(tmp_path, section=table, keypoints=points))
+    middle = np.array(jaw.section.polygon.centroid.coords[0])
+    volume = jaw.section.polygon.area * float(jaw.section.read_width(middle))
+    assert compute_volume(jaw.build_mesh("coarse")) == pytest.approx(volume, rel=2e-3)
+    settings = EstimatorSettings(mesh="coarse")
+    plane, solid = (build_mechanics(jaw, replace(settings, solver=name)) for name in ("plane", "solid"))
+    assert plane.model._volumes.sum() == pytest.approx(volume, rel=2e-3)
+    assert solid.model.symmetric
+    for height in (0.03, 0.05):
+        forces = [press(mechanics, jaw, height).force for mechanics in (plane, solid)]
+        np.testing.assert_allclose(forces[0], forces[1], atol=0.025 * np.linalg.norm(forces[1]))
 
 
 def test_plane_model_of_a_drawing_is_refused():
@@ -268,7 +287,7 @@ def test_truth_of_the_ssg48_finger_is_met():
 def test_shipped_sections_can_be_built(name):
     jaw = load_jaw(name)
     mesh = jaw.build_mesh("coarse")
-    model = PlaneModel(mesh, jaw.build_plane("coarse"), jaw.section.width, jaw.material)
+    model = PlaneModel(mesh, jaw.build_plane("coarse"), jaw.section, jaw.material)
     assert model.size > 500
     model.attach(jaw.keypoints, 3e-3)
     assert len(jaw.keypoints) >= 7 and jaw.material.spread > 0.0
@@ -281,6 +300,14 @@ BAD_SECTIONS = [
     ({"section": {"file": "finger.section.json", "width": -0.02, "clamped": {"z_below": 0.01}}}, "section.width: got"),
     ({"section": {"file": "finger.section.json", "width": 20.0, "clamped": {"z_below": 0.01}}}, "like millimetres"),
     ({"section": {"file": "finger.section.json", "width": 0.02, "clamped": {}}}, "expected z_below, or circles"),
+    (
+        {"section": {"file": "finger.section.json", "width": 0.02, "taper": 0.1, "clamped": {"z_below": 0.012}}},
+        "section.taper: got 0.1, expected",
+    ),
+    (
+        {"section": {"file": "finger.section.json", "width": 0.01, "taper": [0, -0.2], "clamped": {"z_below": 0.012}}},
+        "section.taper: leaves a width of -4",
+    ),
     ({"material": "cheese"}, "material: got 'cheese', expected one of tpu85a"),
     ({"model": "frame"}, "model: got the text 'frame', expected plane or solid"),
     ({"candidates": [[0.0, 0.0, 0.03]]}, "lies off the inner surface"),
