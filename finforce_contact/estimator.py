@@ -220,8 +220,8 @@ class ContactEstimator:
         if watched and surrounds(self._mesh, (invert_pose(T) @ np.append(camera, 1.0))[:3]):
             raise PoseError("this pose puts the object around the camera: check its pose, mesh and unit")
         outcome = self._poses.update(stamp, T, covariance)
-        if outcome == "used" and self._face is not None:
-            self._slips.update(stamp, T, self._face)
+        if outcome in ("used", "aside") and self._face is not None:
+            self._slips.update(stamp, T, self._face, odd=outcome == "aside")
         self._counts["late pose"] += outcome == "late"
         self._counts["odd pose"] += outcome == "aside"
 

@@ -152,10 +152,25 @@ class TwinCameraNode(Node):
         for side, jaw in frame.jaws.items():
             cloud = ros.cloud_message(Header(frame_id=f"{side}_jaw"), detection_truth_columns(jaw))
             yield self._output(PointCloud2, f"{side}/ground_truth_keypoints"), cloud
+        if self.parameters.detects:
+            yield from self._detected(frame)
         header, depth = Header(frame_id=self.parameters.camera_frame), encode_depth(frame.depth, self.scene.depth_step)
         yield self._output(CameraInfo, INFO_TOPIC), camera_info(header, self.scene.camera)
         yield self._output(Image, DEPTH_TOPIC), ros.image_message(header, depth, "16UC1")
         yield self._output(Image, COLOR_TOPIC), ros.image_message(header, frame.color)
+
+    def _detected(self, frame: TwinFrame) -> Iterable[Output]:
+        """Yield publishers and messages of what a detector without errors finds."""
+        for side, jaw in frame.jaws.items():
+            header = Header(frame_id=self.parameters.camera_frame)
+            yield (
+                self._output(PoseStamped, f"{side}/jaw_pose"),
+                ros.pose_message(header, pose_numbers(jaw.T_camera_jaw)),
+            )
+            seen = np.where(jaw.visible[:, None], jaw.points, np.nan).astype(np.float32)
+            columns = {**ros.xyz_columns(seen), "likelihood": jaw.visible.astype(np.float32)}
+            cloud = ros.cloud_message(Header(frame_id=f"{side}_jaw"), columns)
+            yield self._output(PointCloud2, f"{side}/keypoints"), cloud
 
     def _output(self, kind: type, topic: str) -> Any:
         """Return the publisher of a topic."""

@@ -28,6 +28,9 @@ class TwinParameters:
         "", "where an emulated gripper shall wait for its driver: the scene is what it grasps; empty: as scripted"
     )
     gripper_firmware: str = setting("new", "of the emulated gripper", choices=("new", "old"))
+    detects: bool = setting(
+        False, "publish the true key points and poses of the jaws as a detector would, for jaws that no network knows"
+    )
     camera_frame: str = setting("camera_color_optical_frame", "frame of the images")
 
     @property

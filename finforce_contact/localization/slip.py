@@ -24,6 +24,8 @@ _NOISE_MEMORY, _NOISE_PRIOR, _TOO_FEW = 60.0, 1.0, 16.0
 _RESTING = 6
 # A jaw that moves along its normal faster than this [m/s] closes or opens: what slides there is no slip of a hold.
 _CLOSING = 1.5e-3
+# An odd pose that is farther than this [m] from the last one is wrong.
+_FAR = 2e-3
 # A gap between samples that begins anew [s].
 _LONGEST_GAP = 0.5
 
@@ -93,18 +95,25 @@ class SlipWatch:
             self._height, self._on_object = height, None
         return self._height
 
-    def update(self, stamp: float, T: NDArray, face: TouchedFace) -> Slip:
+    def update(self, stamp: float, T: NDArray, face: TouchedFace, *, odd: bool = False) -> Slip | None:
         """Takes a pose and the face where the object touches.
+
+        The first poses of a slip are odd to who has seen the object rest: they count, unless they are far away.
 
         Args:
             stamp: of the pose [s].
             T: T_jaw_object (4, 4), as measured.
             face: at the followed height.
+            odd: whether the pose is not that of an object that goes on as it did.
         """
+        if odd and not self._samples:
+            return self.slip
         if self._on_object is None or not self._samples or not 0.0 < stamp - self._samples[-1][0] < _LONGEST_GAP:
             self._begin(T, face)
         away = T[:3, :3] @ self._on_object + T[:3, 3] - face.point
         offset = np.array([away @ face.tangent, away[1]])
+        if odd and self._samples and np.abs(offset - self._samples[-1][1]).max() > _FAR:
+            return self.slip
         if self._samples:
             change = (offset - self._samples[-1][1]) / np.sqrt(2.0)
             square = min(float(change @ change) / 2.0, (_MOST * self._noise) ** 2)

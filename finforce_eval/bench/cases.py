@@ -27,7 +27,8 @@ LEVELS = (0.002, 0.004, 0.006, 0.008, 0.010)
 PERIOD = 1.0 / 30.0
 REST_FRAMES, HOLD_FRAMES, SCORED_FRAMES = 60, 45, 30
 SPEED = 2e-3
-_DIAMETERS, _FEWEST_DEPTHS = (0.015, 0.025, 0.035), 2
+DIAMETERS, _FEWEST_DEPTHS = (0.015, 0.025, 0.035), 2
+_HARDEST = 12.0  # [N]
 # Corners of the polygon that stands for a cylinder.
 _CORNERS = 96
 # Constant errors of a tracked object's origin [m] and turn [rad], as the contact estimator expects them.
@@ -110,11 +111,15 @@ def bench_finger() -> Jaw:
     return replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
 
 
-def press_cases(jaw: Jaw) -> tuple[BenchCase, ...]:
-    """Returns nine presses of any finger by its own solid model, on its default mesh.
+def press_cases(jaw: Jaw, diameters: Sequence[float] = DIAMETERS) -> tuple[BenchCase, ...]:
+    """Returns presses of any finger by its own solid model, of a section on the coarse mesh.
 
     The cylinders of the bench meet the same shares of the finger's candidates as there, and a shorter finger is
-    pressed as much less; one that buckles before is pressed as deep as it bears.
+    pressed as much less, a stiff one to about twelve newtons, and one that buckles before as deep as it bears.
+
+    Args:
+        jaw: the finger.
+        diameters: of the cylinders [m].
 
     Raises:
         FinforceError: No solid describes the jaw.
@@ -122,21 +127,25 @@ def press_cases(jaw: Jaw) -> tuple[BenchCase, ...]:
     from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
     from finforce_ifea.mechanics import build_mechanics
 
-    mechanics = build_mechanics(jaw, EstimatorSettings(solver="solid"))
+    mesh = "default" if jaw.section is None else "coarse"
+    mechanics = build_mechanics(jaw, EstimatorSettings(solver="solid", mesh=mesh))
     model, surface = mechanics.model, mechanics.contact.surface
     heights, bench = jaw.candidates[:, 2], load_jaw("bench").candidates[:, 2]
     size = float(np.ptp(heights) / np.ptp(bench))
-    depths = min(size, 1.0) * np.array(LEVELS)
+    levels = min(size, 1.0) * np.array(LEVELS)
     probe = model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
     rest, cases = model.positions(probe, np.zeros(model.size)), []
     for name, height in HEIGHTS.items():
         there = float(heights.min() + size * (height - bench.min()))
-        for diameter in _DIAMETERS:
+        for diameter in diameters:
             rigid, states = RigidCylinder(radius=0.5 * diameter), []
-            with suppress(ContactError):
-                for deepest in range(1, len(depths) + 1):
-                    states = press_jaw(model, surface, jaw.inner_face_x, rigid, there, depths[:deepest])
-            if len(states) < _FEWEST_DEPTHS:
+            first = press_jaw(model, surface, jaw.inner_face_x, rigid, there, levels[:1])[0]
+            depths = levels * min(1.0, _HARDEST / float(np.linalg.norm(first.force)) * levels[0] / levels[-1])
+            for count in range(len(depths), _FEWEST_DEPTHS - 1, -1):
+                with suppress(ContactError):
+                    states = press_jaw(model, surface, jaw.inner_face_x, rigid, there, depths[:count])
+                    break
+            if not states:
                 continue
             cases.append(
                 BenchCase(

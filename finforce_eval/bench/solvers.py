@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from finforce.errors import FinforceError
 from finforce_eval.bench.bench import Row, row_from_times, time_calls
 from finforce_eval.bench.cases import (
+    DIAMETERS,
     BenchCase,
     NoisyCamera,
     ReplayedPress,
@@ -97,8 +98,7 @@ def measure(quick: bool, folder: Path | str | None = None, jaw: str = "bench") -
     from tqdm import tqdm
 
     name, jaw = jaw, bench_finger() if jaw == "bench" else load_jaw(jaw)
-    tiers, cases = list_tiers(slow=not quick, section=jaw.section is not None), _find_cases(name, jaw)
-    cases = [case for case in cases if case.name.startswith("Ø25")] if quick else cases
+    tiers, cases = list_tiers(slow=not quick, section=jaw.section is not None), _find_cases(name, jaw, quick)
     exact = [record_press(case, jaw) for case in cases]
     noisy = [record_press(case, jaw, NoisyCamera(), SEED) for case in cases]
     recordings = len(find_recordings(folder)) if folder else 0
@@ -114,17 +114,17 @@ def measure(quick: bool, folder: Path | str | None = None, jaw: str = "bench") -
     return SolverFigures(tiers=figures, recorded=recorded, notes=notes)
 
 
-def _find_cases(name: str, jaw: Jaw) -> Sequence[BenchCase]:
+def _find_cases(name: str, jaw: Jaw, quick: bool) -> Sequence[BenchCase]:
     """Returns the presses of a jaw: of the bench's those of an independent program, else of its own solid model.
 
     Raises:
         FinforceError: No solid describes the jaw, or it bears no press.
     """
     if name == "bench":
-        return load_cases()
+        return [case for case in load_cases() if case.name.startswith("Ø25") or not quick]
     if jaw.drawing is not None and not jaw.drawing.is_solid:
         raise FinforceError(f"--jaw {name}: only the frame describes it, expected a finger with a solid model")
-    cases = press_cases(jaw)
+    cases = press_cases(jaw, DIAMETERS[1:2] if quick else DIAMETERS)
     if not cases:
         raise FinforceError(f"--jaw {name}: none of the presses finds an equilibrium")
     return cases

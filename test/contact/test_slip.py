@@ -95,3 +95,17 @@ def test_contact_follows_its_height_until_it_has_gone_elsewhere():
     assert eyes.place(0.040) == 0.040
     assert eyes.place(0.044) == 0.040
     assert eyes.place(0.050) == 0.050
+
+
+def test_odd_poses_count_unless_they_are_far_away():
+    eyes, T = SlipWatch(SETTINGS), np.eye(4)
+    eyes.place(0.040)
+    for number in range(60):
+        T[:3, 3] = [0.03, 0.0, 0.04 + 1e-5 * (number % 3)]
+        eyes.update(number / 30.0, T.copy(), FACE)
+    T[2, 3] = 0.06
+    assert not eyes.update(2.0, T.copy(), FACE, odd=True).sliding
+    for number in range(1, 6):
+        T[2, 3] = 0.04 + 5e-3 * number / 30.0
+        slip = eyes.update(2.0 + number / 30.0, T.copy(), FACE, odd=True)
+    assert slip.sliding
