@@ -49,6 +49,14 @@ class Torsion:
         return moment, force, float(roll)
 
 
+def _find_narrowest(jaw: Jaw, heights: NDArray, half: float) -> float:
+    """Returns the least half width [m] of the inner face at heights (n,) [m], `half` where it is the same all along."""
+    if jaw.section is None or not jaw.section.taper.any():
+        return half
+    places = np.stack([[jaw.face.read(z), z] for z in heights])
+    return 0.5 * float(jaw.section.read_width(places).min())
+
+
 def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
     """Returns how a jaw twists and gives way sideways; None where it is no solid, or its mesh too large.
 
@@ -64,7 +72,7 @@ def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
     face = mesh.nodes[jaw.face.holds(mesh.nodes)]
     half, (low, high) = float(face[:, 1].max()), (face[:, 2].min(), face[:, 2].max())
     heights = np.linspace(low + 0.1 * (high - low), high - 0.05 * (high - low), _HEIGHTS)
-    arm, rest = _ARM * half, np.zeros(model.size)
+    arm, rest = _ARM * _find_narrowest(jaw, heights, half), np.zeros(model.size)
     places = np.array([[jaw.face.read(z), y, z] for z in heights for y in (-arm, 0.0, arm)])
     probes = [model.attach(places[3 * row : 3 * row + 3], 1e-3) for row in range(_HEIGHTS)]
     twist, across = np.zeros((3, 3)), np.zeros((3, 3))

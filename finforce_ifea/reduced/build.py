@@ -58,7 +58,29 @@ class Face:
         sides = np.stack([np.interp(heights, surface.heights, y) for y in columns], axis=1)
         points = np.array([[face.read(z), y, z] for z, row in zip(heights, sides, strict=True) for y in row])
         self._probe, self._across, self._count = self._model.attach(points, 1e-3), surface.across, len(heights)
+        self._share = None if has_own_rows(mechanics) else self._share_nodes(mechanics, heights)
         self.basis = np.zeros((self._model.size, 0))
+
+    def _share_nodes(self, mechanics: Mechanics, heights: NDArray) -> sparse.csr_matrix:
+        """Returns what each unknown's force is on the rows (2 n, size): rows and nodes of the face stand apart.
+
+        A force between two rows is shared by both as by the ends of a beam; one below the first row goes to the clamp,
+        too.
+        """
+        nodes, dof = mechanics.mesh.nodes, mechanics.model.dof
+        face = np.flatnonzero(mechanics.contact.face.holds(nodes))
+        base = 2.0 * heights[0] - heights[1]
+        place = np.interp(nodes[face, 2], np.r_[base, heights], np.arange(-1.0, len(heights)))
+        low = np.clip(np.floor(place), -1, len(heights) - 2).astype(int)
+        table = sparse.lil_matrix((2 * len(heights), mechanics.model.size))
+        for number, axis in enumerate((0, 2)):
+            for node, row, share in zip(face, low, place - low, strict=True):
+                column = dof[node, axis]
+                if column < mechanics.model.size:
+                    if row >= 0:
+                        table[2 * row + number, column] = 1.0 - share
+                    table[2 * row + 2 + number, column] = share
+        return table.tocsr()
 
     def describe(self, q: NDArray) -> FaceTangent:
         """Returns the equilibrium of unknowns q (size,) and what unit loads at the rows do to it."""
@@ -92,6 +114,8 @@ class Face:
 
     def _find_load(self, q: NDArray, force: NDArray) -> NDArray:
         """Returns the load on the rows (2 n,) [N] that balances an internal force (size,), as far as it can."""
+        if self._share is not None:
+            return self._share @ force
         loads = sparse.csc_matrix(self._unit_loads(q))
         normal = (loads.T @ loads).tocsc()
         normal += _RIDGE * normal.diagonal().max() * sparse.eye(normal.shape[0], format="csc")
@@ -230,21 +254,32 @@ def _choose_rows(mechanics: Mechanics) -> NDArray:
     A solid moves linearly between its nodes: their own heights are best, divided where they are few. Where they are too
     many or too close together, as in unstructured meshes, and of frames the rows divide the face evenly.
     """
-    mesh, surface = mechanics.mesh, mechanics.contact.surface
-    on_face = mechanics.contact.face.holds(mesh.nodes)
-    held = np.isin(np.arange(len(mesh.nodes)), mesh.clamped)
-    own = np.unique(np.round(mesh.nodes[on_face & ~held, 2], 7))
-    base = mesh.nodes[on_face & held, 2].max(initial=-np.inf)
+    surface, own, base = mechanics.contact.surface, *_find_own_rows(mechanics)
     if base >= own[0] > -np.inf and np.isfinite(base):
         raise ContactError("the inner face is held above its lower end, expected one that is held at its base or not")
     if not np.isfinite(base):  # nothing holds the face: its lower end is a row of its own
         base = surface.low[1] - (surface.high[1] - surface.low[1]) / ROWS
-    gaps = np.diff(np.r_[base, own])
-    even = gaps.min() > _CLOSEST * gaps.mean()
-    if not (isinstance(mechanics.model, SolidModel) and even and len(own) <= _MOST_ROWS):
+    if not (isinstance(mechanics.model, SolidModel) and has_own_rows(mechanics)):
         return np.linspace(base, surface.high[1], ROWS + 1)
     parts = 1 if len(own) >= _FEWEST_ROWS else -(-ROWS // len(own))
     return np.interp(np.arange(parts * len(own) + 1) / parts, np.arange(len(own) + 1), np.r_[base, own])
+
+
+def _find_own_rows(mechanics: Mechanics) -> tuple[NDArray, float]:
+    """Returns the heights of the face's free nodes (n,) [m], and the highest of its clamped ones, -inf without any."""
+    mesh, on_face = mechanics.mesh, mechanics.contact.face.holds(mechanics.mesh.nodes)
+    held = np.isin(np.arange(len(mesh.nodes)), mesh.clamped)
+    own = np.unique(np.round(mesh.nodes[on_face & ~held, 2], 7))
+    return own, float(mesh.nodes[on_face & held, 2].max(initial=-np.inf))
+
+
+def has_own_rows(mechanics: Mechanics) -> bool:
+    """Whether the rows can be those of the mesh's nodes: of a frame always, which has no mesh of its own."""
+    if not isinstance(mechanics.model, SolidModel):
+        return True
+    own, base = _find_own_rows(mechanics)
+    gaps = np.diff(np.r_[base if np.isfinite(base) else own[0] - (own[-1] - own[0]) / ROWS, own])
+    return bool(gaps.min() > _CLOSEST * gaps.mean() and len(own) <= _MOST_ROWS)
 
 
 class _Rod:

@@ -155,6 +155,8 @@ def name_manifold(full: Mechanics, jaw: Jaw) -> str:
         parts += [jaw.section.taper] if jaw.section.taper.any() else []
     if isinstance(full.model, FrameModel):
         parts.append(repr(jaw.drawing))
+    if not manifold_build.has_own_rows(full):
+        parts.append("shared")
     return hash_parts(type(full.model).__name__, *map(str, manifold_build.GRID), *parts)
 
 
