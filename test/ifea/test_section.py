@@ -21,6 +21,7 @@ from finforce_ifea.jaw.mesh import compute_volume
 from finforce_ifea.jaw.section_mesh import extrude_section, mesh_section
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation
+from finforce_ifea.reduced.build import Face, has_own_rows
 from finforce_ifea.reduced.cache import name_manifold
 from finforce_ifea.settings import EstimatorSettings
 
@@ -149,6 +150,22 @@ def test_plane_model_has_the_solid_finger_s_force(jaw):
     for height in (0.03, 0.05):
         forces = [press(mechanics, jaw, height).force for mechanics in (plane, solid)]
         np.testing.assert_allclose(forces[0], forces[1], atol=0.02 * np.linalg.norm(forces[1]))
+
+
+@pytest.mark.parametrize("name", ["plane", "solid"])
+def test_no_load_is_lost_between_two_rows(tmp_path, name):
+    """Rows are farther apart than nodes: what presses between two of them stands on both."""
+    table = {"file": "finger.section.json", "width": 0.02, "size": 0.6e-3, "clamped": {"z_below": 0.012}}
+    jaw = load_jaw(write_section_jaw(tmp_path, section=table))
+    mechanics = build_mechanics(jaw, EstimatorSettings(solver=name, mesh="coarse"))
+    assert not has_own_rows(mechanics)
+    heights = np.linspace(0.012, 0.068, 30)
+    face = Face(mechanics, heights[1:])
+    for height in (0.0303, 0.0391, 0.0507):
+        pressed = press(mechanics, jaw, height)
+        load = face.describe(pressed.q).load.reshape(-1, 2)
+        np.testing.assert_allclose(load.sum(0), pressed.force[[0, 2]], atol=2e-3 * np.linalg.norm(pressed.force))
+        assert load[:, 0] @ heights[1:] / load[:, 0].sum() == pytest.approx(pressed.pressure_place[2], abs=2e-4)
 
 
 TAPER = [0.0, -0.2]
