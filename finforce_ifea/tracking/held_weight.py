@@ -8,7 +8,8 @@ residual is remembered from when the hold began, and the change since then is ex
     shape and height, by which a lifted object settles a little,
     a force T along the finger.
 
-Where the jaws move on, or the object slides, the memory begins anew, and T is what it was.
+A change counts once it is beyond chance. Where the jaws move on, or the object slides, the memory begins anew, and T is
+what it was.
 """
 
 from typing import NamedTuple
@@ -28,6 +29,9 @@ _DEEPER, _HIGHER = 0.15e-3, 0.6e-3
 # Standard deviations of how a lifted object settles, as a share of what shape and height were expected to be off, and
 # of the weight [N].
 _SETTLES, _WEIGHT = 0.05, 0.7
+# The errors of so many successive frames count for one. A change counts from the first of these numbers of standard
+# deviations on, and until it is below the second.
+_ALIKE, _SURE, _DOUBTED = 3.0, 3.0, 1.5
 # Fewer points than these say nothing.
 _FEWEST = 6
 
@@ -73,7 +77,7 @@ class HeldWeight:
         """Starts to remember."""
         self._frames, self._place = 0, np.zeros(3)
         self._information, self._vector = np.zeros((3, 3)), np.zeros(3)
-        self._before = self.force
+        self._before, self._changed = self.force, False
 
     def update(self, frame: HeldFrame, prior: NDArray) -> float:
         """Takes one frame of something that presses and returns the force along the finger [N].
@@ -99,9 +103,10 @@ class HeldWeight:
         if np.count_nonzero(known) >= _FEWEST:
             _accumulate(frame, left - self._memory, known, self._information, self._vector)
             settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2])
-            spread = np.linalg.inv(self._information + np.diag(1.0 / settles))
-            self.force = self._before + float(spread[2] @ self._vector)
-            self.stddev = float(np.sqrt(spread[2, 2]))
+            spread = np.linalg.inv(self._information / _ALIKE + np.diag(1.0 / settles))
+            change, self.stddev = float(spread[2] @ self._vector) / _ALIKE, float(np.sqrt(spread[2, 2]))
+            self._changed = abs(change) > (_DOUBTED if self._changed else _SURE) * self.stddev
+            self.force = self._before + (change if self._changed else 0.0)
         return self.force
 
 

@@ -137,7 +137,7 @@ def test_table_json_and_picture_hold_every_tier(tmp_path):
 
 def test_tier_that_does_not_exist_is_noted_and_the_others_are_measured(monkeypatch):
     tiers = (Tier(name="nothing", solver="nothing"), Tier(name="frame", solver="frame", contact="outline"))
-    monkeypatch.setattr(bench_solvers, "list_tiers", lambda slow: tiers)
+    monkeypatch.setattr(bench_solvers, "list_tiers", lambda slow, section: tiers)
     monkeypatch.setattr(bench_solvers, "load_cases", lambda: (CASES["Ø25 middle"],))
     figures = bench_solvers.measure(True)
     assert [tier.tier.name for tier in figures.tiers] == ["frame"]
@@ -154,7 +154,7 @@ def test_fresh_process_tells_memory_and_set_up():
 def test_set_up_is_measured_again_where_the_first_process_left_a_cache(monkeypatch):
     probes = []
 
-    def probe(solver, mesh, folder):
+    def probe(solver, mesh, jaw, folder):
         probes.append(folder)
         if solver == "caching":
             with open(f"{folder}/tables", "wb") as file:

@@ -181,6 +181,8 @@ STATS = {
     "axis_rmse_N",
     "within_3_sigma_pct",
     "answered_pct",
+    "torque_rmse_Nm",
+    "torque_pct",
 }
 CASE = {"frames", "solved", "skipped", "all", "load", "unload", "step_ms"}
 

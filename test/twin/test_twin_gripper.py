@@ -199,9 +199,9 @@ def test_too_heavy_an_object_with_drag_slides_towards_the_tips_and_rests_where_i
     assert 3e-3 < speed.max() < 0.03
     slides = np.flatnonzero(speed > 1e-4)
     # the weight is more than the friction of both jaws bears, and the drag the rest
-    held = [0.3 * sum(np.linalg.norm(jaw.force[[0, 1]]) for jaw in states[i].jaws.values()) for i in slides[5:-5]]
-    net = [net_of(states[i])[2] for i in slides[5:-5]]
-    assert np.min(np.subtract(net, held)) > 0.0
+    fastest = states[int(speed.argmax())]
+    held = 0.3 * sum(np.linalg.norm(jaw.force[[0, 1]]) for jaw in fastest.jaws.values())
+    assert 0.3 < net_of(fastest)[2] - held < 1.0
     assert height[slides[-1] + 1 :].max() == height[-1] > height[0] + 3e-3
 
 
