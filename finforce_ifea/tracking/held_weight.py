@@ -31,7 +31,7 @@ _DEEPER, _HIGHER = 0.15e-3, 0.6e-3
 _SETTLES, _WEIGHT = 0.05, 0.7
 # The errors of so many successive frames count for one. A change counts from the first of these numbers of standard
 # deviations on, and until it is below the second.
-_ALIKE, _SURE, _DOUBTED = 3.0, 3.0, 1.5
+_ALIKE, _SURE, _DOUBTED = 1.5, 2.5, 1.2
 # Fewer points than these say nothing.
 _FEWEST = 6
 
