@@ -75,7 +75,11 @@ def simulation(tmp_path):
 
 
 def test_the_examples_hold_two_newtons_and_lift_on_the_simulated_robot(simulation):
-    done = run("hold_two_newtons.py", simulation)
+    for _ in range(5):
+        done = run("hold_two_newtons.py", simulation)
+        if "there is no port" not in done.stderr:
+            break
+        sleep(3.0)  # the driver was there before the gripper, and looks for its port now and then
     assert done.returncode == 0, done.stdout + done.stderr
     calibrated, opened, held, force, _ = done.stdout.splitlines()
     assert "calibrated" in calibrated and "open: 48.0 mm" in opened
