@@ -19,9 +19,10 @@ from finforce_driver.emulator.adapter import EmulatedAdapter
 from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.emulator.pty_port import PtyPort
 from finforce_driver.emulator.settings import EmulatorSettings
+from finforce_ifea.grasp_force import Wrench
 from finforce_twin.errors import ScenarioError
 from finforce_twin.gripper.footage import FINGER, TRACKED_EVERY, TwinFrame, disturb_pose, set_stage, true_jaw
-from finforce_twin.gripper.pressing import PressedGrasp, RelaxedGrasp, Wrench
+from finforce_twin.gripper.pressing import PressedGrasp, RelaxedGrasp
 from finforce_twin.rendering.depth_camera import build_d405_vga
 from finforce_twin.rendering.photographer import Photographer
 from finforce_twin.scenes.scenarios import Scenario

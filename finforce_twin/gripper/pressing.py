@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_ifea.grasp_force import Wrench
 from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_twin.errors import BalanceError
 from finforce_twin.gripper.footage import FINGER
@@ -21,14 +22,6 @@ from finforce_twin.scenes.scenarios import Posture, Scenario
 STEP = 1e-4  # [m] of each jaw from one solved grasp to the next
 JAMMED = 5e4  # [N/m] of opening, by which the force grows where jaws find no equilibrium any more
 _DOWN = np.array([0.0, 0.0, 1.0])
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Wrench:
-    """Force (3,) [N] that the object applies to a jaw and torque (3,) [N m] about its origin, jaw frame."""
-
-    force: NDArray
-    torque: NDArray
 
 
 class PressedGrasp:

@@ -86,13 +86,8 @@ class Assembly:
         if self._object is None:
             return None
         scenario = self.scenario
-        return HeldObject(
-            self._jaws,
-            scenario.offset,
-            guided=scenario.is_guided,
-            friction=scenario.friction,
-            drag=scenario.drag,
-        )
+        told = {"guided": scenario.is_guided, "friction": scenario.friction, "drag": scenario.drag}
+        return HeldObject(self._jaws, scenario.offset, **told)
 
     def setting_of(self, posture: Posture, weight: NDArray | None = None) -> GraspSetting:
         """Returns what a posture, and a weight (3,) [N] in `gripper_base`, mean to the jaws."""
