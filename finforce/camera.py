@@ -1,4 +1,4 @@
-"""Pixels, rays and depth of a pinhole camera with plumb-bob distortion."""
+"""Pixels, rays and depth of a camera: a pinhole with the lens models of ROS, and a fisheye."""
 
 from __future__ import annotations
 
@@ -14,6 +14,10 @@ DEPTH_TYPES = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32F
 MILLIMETRE = 1e-3  # the unit of 16-bit depth images (REP 118)
 FARTHEST_CENTRE = 10.0  # of a principal point outside its image, in sizes of that image; a cut-out has one
 SHORTEST_FOCAL, LONGEST_FOCAL = 0.01, 1000.0  # of a focal length, in sizes of the image; a cut-out's is long
+PLUMB_BOB, RATIONAL, EQUIDISTANT = "plumb_bob", "rational_polynomial", "equidistant"
+# how many coefficients each has, filled up with zeros to the last number; the names are those of ROS (REP 104)
+COEFFICIENTS = {PLUMB_BOB: (0, 4, 5), RATIONAL: (0, 5, 8), EQUIDISTANT: (0, 4)}
+WIDEST = np.radians(88.0)  # from the optical axis; farther out a ray has no place on the plane z = 1
 UNDISTORTION_STEPS = 50
 UNDISTORTION_TOLERANCE = 1e-10  # of a ray with z = 1
 
@@ -28,7 +32,13 @@ class IntrinsicsError(FinforceError, ValueError):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraIntrinsics:
-    """A pinhole camera; the centre of the upper left pixel has the coordinates (0, 0), as in OpenCV.
+    """A camera; the centre of the upper left pixel has the coordinates (0, 0), as in OpenCV.
+
+    With r the distance from the axis on the plane z = 1 and a = atan(r), a lens moves a point to
+
+    - plumb_bob: (1 + k1 r^2 + k2 r^4 + k3 r^6) (x, y) and tangential terms with p1 and p2,
+    - rational_polynomial: the same with the factor divided by 1 + k4 r^2 + k5 r^4 + k6 r^6,
+    - equidistant, a fisheye: (a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9) / r (x, y).
 
     Attributes:
         width: of the image [px].
@@ -37,11 +47,15 @@ class CameraIntrinsics:
         fy: focal length along the columns [px].
         cx: column of the principal point [px].
         cy: row of the principal point [px].
-        distortion: (5,) plumb-bob coefficients k1, k2, p1, p2, k3.
+        distortion: k1, k2, p1, p2, k3 (5,); k1, k2, p1, p2, k3 to k6 (8,); or k1 to k4 (4,) of a fisheye.
+        model: "plumb_bob", "rational_polynomial" or "equidistant".
 
     Raises:
         IntrinsicsError: a size or a focal length is not positive, a number is not finite, the principal point is far
-            outside the image, or a focal length is out of proportion to it.
+            outside the image, a focal length is out of proportion to it, the model is another one, or its coefficients
+            are too many or too few.
+
+    Source: OpenCV, calib3d and its fisheye module.
     """
 
     width: int
@@ -50,7 +64,8 @@ class CameraIntrinsics:
     fy: float
     cx: float
     cy: float
-    distortion: NDArray = field(default_factory=lambda: np.zeros(5))
+    distortion: NDArray = field(default_factory=lambda: np.zeros(0))
+    model: str = PLUMB_BOB
 
     def __post_init__(self) -> None:
         numbers = np.array([self.fx, self.fy, self.cx, self.cy], dtype=float)
@@ -70,13 +85,25 @@ class CameraIntrinsics:
                 f"intrinsics {self.width}x{self.height}, fx fy = {numbers[:2].tolist()}: expected focal lengths in "
                 f"proportion to the image, {SHORTEST_FOCAL:g} to {LONGEST_FOCAL:g} of its size [px]"
             )
-        distortion = np.asarray(self.distortion, dtype=float).ravel()
-        if len(distortion) not in (0, 4, 5) or not np.isfinite(distortion).all():
+        if self.model not in COEFFICIENTS:
             raise IntrinsicsError(
-                f"distortion {distortion.tolist()}: expected the plumb-bob coefficients k1 k2 p1 p2 [k3]; "
-                "rectify the images of a camera with another model"
+                f"distortion model {self.model!r}: expected one of {', '.join(COEFFICIENTS)}; rectify the images of a "
+                "camera with another model"
             )
-        object.__setattr__(self, "distortion", np.pad(distortion, (0, 5 - len(distortion))))
+        distortion, counts = np.asarray(self.distortion, dtype=float).ravel(), COEFFICIENTS[self.model]
+        if len(distortion) > counts[-1] and not np.any(distortion[counts[-1] :]):
+            distortion = distortion[: counts[-1]]
+        if len(distortion) not in counts or not np.isfinite(distortion).all():
+            raise IntrinsicsError(
+                f"distortion {distortion.tolist()}: expected {' or '.join(map(str, counts))} finite coefficients of "
+                f"the model {self.model}; rectify the images of a camera with another model"
+            )
+        object.__setattr__(self, "distortion", np.pad(distortion, (0, counts[-1] - len(distortion))))
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether the lens does anything that a pinhole does not."""
+        return self.model == EQUIDISTANT or bool(self.distortion.any())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,15 +133,18 @@ def compute_rays(camera: CameraIntrinsics) -> NDArray:
 def rays_from_pixels(pixels: NDArray, camera: CameraIntrinsics) -> NDArray:
     """Return the viewing rays (n, 3), z = 1, of pixels (n, 2) given as column and row [px].
 
-    The distortion is inverted by a fixed-point iteration, x = (x_d - tangential(x)) / radial(x).
+    The distortion is inverted by a fixed-point iteration, x = (x_d - tangential(x)) / radial(x), that of a fisheye by
+    Newton's; where a fisheye sees farther than `WIDEST` from its axis there is no such ray, NaN.
 
     Raises:
         IntrinsicsError: the distortion cannot be inverted at one of the pixels.
     """
     pixels = np.asarray(pixels, dtype=float)
     distorted = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    if camera.model == EQUIDISTANT:
+        return np.column_stack((_unbend_fisheye(distorted, camera.distortion), np.ones(len(distorted))))
     plane = distorted.copy()
-    if camera.distortion.any():
+    if camera.is_distorted:
         for _ in range(UNDISTORTION_STEPS):
             radial, tangential = _distortion_at(plane, camera.distortion)
             previous, plane = plane, (distorted - tangential) / radial[:, None]
@@ -127,24 +157,58 @@ def rays_from_pixels(pixels: NDArray, camera: CameraIntrinsics) -> NDArray:
 
 def _distortion_at(plane: NDArray, coefficients: NDArray) -> tuple[NDArray, NDArray]:
     """Return the radial factors (n,) and tangential shifts (n, 2) at points (n, 2) of the plane z = 1."""
-    k1, k2, p1, p2, k3 = coefficients
+    k1, k2, p1, p2, k3 = coefficients[:5]
     x, y = plane.T
     square = x * x + y * y
     radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+    if len(coefficients) > 5:
+        k4, k5, k6 = coefficients[5:]
+        radial /= 1.0 + square * (k4 + square * (k5 + square * k6))
     shift_x = 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
     shift_y = p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
     return radial, np.column_stack((shift_x, shift_y))
 
 
+def _bend_fisheye(angle: NDArray, coefficients: NDArray) -> tuple[NDArray, NDArray]:
+    """Return what angles (n,) [rad] from the axis become (n,), and the slopes of that (n,)."""
+    square = angle * angle
+    k1, k2, k3, k4 = coefficients
+    bent = angle * (1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+    slope = 1.0 + square * (3.0 * k1 + square * (5.0 * k2 + square * (7.0 * k3 + square * 9.0 * k4)))
+    return bent, slope
+
+
+def _unbend_fisheye(distorted: NDArray, coefficients: NDArray) -> NDArray:
+    """Return the points (n, 2) of the plane z = 1 that a fisheye shows at (n, 2); NaN beyond `WIDEST`."""
+    bent = np.hypot(*distorted.T)
+    angle = np.minimum(bent, 0.5 * np.pi)
+    for _ in range(UNDISTORTION_STEPS):
+        value, slope = _bend_fisheye(angle, coefficients)
+        previous, angle = angle, np.clip(angle - (value - bent) / np.where(slope > 0.05, slope, 0.05), 0.0, 0.5 * np.pi)
+        if np.nanmax(np.abs(angle - previous), initial=0.0) < UNDISTORTION_TOLERANCE:
+            break
+    missed = np.abs(_bend_fisheye(angle, coefficients)[0] - bent) > 1e-6
+    angle = np.where(missed | (angle > WIDEST), np.nan, angle)
+    share = np.where(bent > 1e-12, np.tan(angle) / np.maximum(bent, 1e-12), 1.0)
+    return distorted * share[:, None]
+
+
 def project(points: NDArray, camera: CameraIntrinsics) -> NDArray:
     """Return the pixels (n, 2), column and row, of points (n, 3) [m] in the camera frame.
 
-    Points at or behind the camera's plane have no pixel and come back as NaN.
+    Points at or behind the camera's plane have no pixel and come back as NaN; so do those beyond `WIDEST` of a fisheye.
     """
     points = np.asarray(points, dtype=float)
     depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
     plane = points[:, :2] / depth[:, None]
-    if camera.distortion.any():
+    if camera.model == EQUIDISTANT:
+        distance = np.hypot(*plane.T)
+        angle = np.arctan(distance)
+        bent, slope = _bend_fisheye(angle, camera.distortion)
+        # beyond the angle where its circles begin to shrink again, a lens shows nothing
+        share = np.where(distance > 1e-12, bent / np.maximum(distance, 1e-12), 1.0)
+        plane = plane * np.where((angle <= WIDEST) & (slope > 0.0), share, np.nan)[:, None]
+    elif camera.is_distorted:
         radial, tangential = _distortion_at(plane, camera.distortion)
         plane = plane * radial[:, None] + tangential
     return plane * (camera.fx, camera.fy) + (camera.cx, camera.cy)

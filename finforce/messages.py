@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from finforce.camera import (
+    EQUIDISTANT,
+    PLUMB_BOB,
     CameraIntrinsics,
     ImageError,
     ImageLayout,
@@ -274,6 +276,7 @@ def _stack(columns: Mapping[str, NDArray], names: Sequence[str]) -> NDArray[np.f
 
 
 MASKS = ("mono8", "8UC1")
+FISHEYES = {"fisheye": EQUIDISTANT, "kannala_brandt4": EQUIDISTANT}  # what some drivers call it
 
 
 def stamp_of(message: Any) -> int:
@@ -332,18 +335,24 @@ def camera_from_info(info: Any, frame: str) -> CameraIntrinsics:
 
     Raises:
         ObservationError: the frame is another one.
-        IntrinsicsError: the numbers are no camera's, its axes are skew, or the distortion is not plumb-bob.
+        IntrinsicsError: the numbers are no camera's, its axes are skew, or its distortion model is not known.
     """
     check_frame(info, frame, "the camera info")
-    if info.distortion_model not in ("plumb_bob", ""):
-        raise IntrinsicsError(f"distortion model '{info.distortion_model}'; expected plumb_bob, or rectified images")
+    model = FISHEYES.get(info.distortion_model, info.distortion_model) or PLUMB_BOB
     k = info.k
     if any(k[index] != 0.0 for index in (1, 3, 6, 7)):
         raise IntrinsicsError(
             f"camera matrix K {[float(number) for number in k]}: expected no skew, [fx 0 cx 0 fy cy 0 0 1]"
         )
     return CameraIntrinsics(
-        width=info.width, height=info.height, fx=k[0], fy=k[4], cx=k[2], cy=k[5], distortion=np.array(info.d)
+        width=info.width,
+        height=info.height,
+        fx=k[0],
+        fy=k[4],
+        cx=k[2],
+        cy=k[5],
+        distortion=np.array(info.d),
+        model=model,
     )
 
 

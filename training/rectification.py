@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics
+from finforce.camera import PLUMB_BOB, CameraIntrinsics
 from finforce.gripper_frames import jaw_in_camera, jaw_in_gripper
 from finforce.transforms import pose_from_quaternion
 from finforce_ifea.jaw.jaw import Jaw
@@ -62,7 +62,11 @@ def parse_camera(content: Mapping[str, Any]) -> CameraView:
     if pose.shape != (7,):
         raise LabelFileError(f"T_gripper_camera: got {pose.tolist()}, expected x y z [m] qx qy qz qw")
     return CameraView(
-        camera=CameraIntrinsics(**numbers, distortion=np.array(content.get("distortion", ()), dtype=float)),
+        camera=CameraIntrinsics(
+            **numbers,
+            distortion=np.array(content.get("distortion", ()), dtype=float),
+            model=str(content.get("distortion_model", PLUMB_BOB)),
+        ),
         T_gripper_camera=pose_from_quaternion(pose[:3], pose[3:]),
     )
 

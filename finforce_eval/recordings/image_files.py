@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics, decode_depth
+from finforce.camera import PLUMB_BOB, CameraIntrinsics, decode_depth
 from finforce.errors import MissingDependencyError, PoseError
 from finforce_contact.reconstruction.paper_alignment import affine_from_generator
 from finforce_eval.errors import OptionError
@@ -102,9 +102,10 @@ def read_intrinsics(words: Sequence[str], shape: tuple[int, int]) -> CameraIntri
     try:
         values = {name: float(named[name]) for name in ("fx", "fy", "cx", "cy")}
         distortion = np.array(named.get("distortion", []), dtype=float)
+        model = str(named.get("distortion_model") or PLUMB_BOB)
     except (KeyError, TypeError, ValueError) as error:
         raise OptionError(f"intrinsics: {error!r} is missing or no number; expected {INTRINSICS_FORMS}") from None
-    return CameraIntrinsics(width=shape[1], height=shape[0], **values, distortion=distortion)
+    return CameraIntrinsics(width=shape[1], height=shape[0], **values, distortion=distortion, model=model)
 
 
 def _name_numbers(words: Sequence[str]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from finforce_keypoints.errors import DetectionError, ModelError
 from finforce_keypoints.networks.metadata import LARGEST_SIDE, METADATA_FILE, ModelMetadata, read_metadata
-from finforce_keypoints.networks.network import COLOURS, CPU, Network, OutputLayout, find_outputs
+from finforce_keypoints.networks.network import COLOURS, CPU, Network, OutputLayout, find_network, find_outputs
 
 # Likelihood and standard deviation [px of the network's input] of a network that was never calibrated: DeepLabCut's
 # networks err by 2 to 3 px above its cut-off of 0.6, and by tens of pixels where they see nothing.
@@ -473,27 +473,6 @@ class KeypointModel:
         if _first(self._overrides.normalize, self.metadata.normalize):
             scale, shift = scale / _STD, -_MEAN / _STD
         return scale.reshape(axes), shift.reshape(axes)
-
-
-def find_network(path: str | Path) -> Path:
-    """Return the only .onnx file of a folder, or the file itself.
-
-    Raises:
-        ModelError: there is none, or there are several.
-    """
-    path = Path(path)
-    try:
-        if path.is_file():
-            return path
-        found = sorted(path.glob("*.onnx"))
-    except OSError as error:
-        raise ModelError(
-            f"model: cannot be looked for ({error.strerror}); expected a folder with one .onnx file"
-        ) from error
-    if len(found) != 1:
-        names = ", ".join(file.name for file in found) or "none"
-        raise ModelError(f"{path}: expected a folder with one .onnx file and {METADATA_FILE}, found {names}")
-    return found[0]
 
 
 def _first(*values):

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.optional import import_onnxruntime
 from finforce_keypoints.errors import DetectionError, ModelError
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
 
 CPU = "CPUExecutionProvider"
 COLOURS = 3
@@ -84,6 +88,54 @@ class OutputLayout:
         return np.moveaxis(maps, self.channel_axis, 1).astype(np.float32, copy=False)
 
 
+def open_session(path: Path, threads: int, providers: Sequence[str]) -> InferenceSession:
+    """Return an onnxruntime session of a network file.
+
+    Raises:
+        ModelError: there is no such provider, no thread, or the file cannot be loaded.
+        MissingDependencyError: onnxruntime is not installed.
+    """
+    runtime = import_onnxruntime()
+    unknown = [name for name in providers if name not in runtime.get_available_providers()]
+    if unknown or threads < 1:
+        raise ModelError(
+            f"got providers {list(providers)} and {threads} threads, expected at least one thread and providers "
+            f"among {runtime.get_available_providers()}"
+        )
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = 3  # errors, which are raised anyway
+    # Threads that spin while they wait double the time where the solver's process needs the cores, too.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return runtime.InferenceSession(str(path), options, providers=list(providers))
+    except Exception as error:  # onnxruntime has no base class of its errors
+        raise ModelError(
+            f"{path}: onnxruntime cannot load it ({_on_one_line(error)}); expected an ONNX network"
+        ) from error
+
+
+def find_network(path: str | Path) -> Path:
+    """Return the only .onnx file of a folder, or the file itself.
+
+    Raises:
+        ModelError: there is none, or there are several.
+    """
+    path = Path(path)
+    try:
+        if path.is_file():
+            return path
+        found = sorted(path.glob("*.onnx"))
+    except OSError as error:
+        raise ModelError(
+            f"model: cannot be looked for ({error.strerror}); expected a folder with one .onnx file"
+        ) from error
+    if len(found) != 1:
+        names = ", ".join(file.name for file in found) or "none"
+        raise ModelError(f"{path}: expected a folder with one .onnx file and its metadata, found {names}")
+    return found[0]
+
+
 class Network:
     """An ONNX network of one image input; not for several threads at once."""
 
@@ -99,24 +151,7 @@ class Network:
             ModelError: the file cannot be loaded, or its input is no colour image.
             MissingDependencyError: onnxruntime is not installed.
         """
-        runtime = import_onnxruntime()
-        unknown = [name for name in providers if name not in runtime.get_available_providers()]
-        if unknown or threads < 1:
-            raise ModelError(
-                f"got providers {list(providers)} and {threads} threads, expected at least one thread and providers "
-                f"among {runtime.get_available_providers()}"
-            )
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-        options.log_severity_level = 3  # errors, which are raised anyway
-        # Threads that spin while they wait double the time where the solver's process needs the cores, too.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        try:
-            self._session = runtime.InferenceSession(str(path), options, providers=list(providers))
-        except Exception as error:  # onnxruntime has no base class of its errors
-            raise ModelError(
-                f"{path}: onnxruntime cannot load it ({_on_one_line(error)}); expected an ONNX network"
-            ) from error
+        self._session = open_session(path, threads, providers)
         self.input = find_input([(item.name, item.shape, item.type) for item in self._session.get_inputs()])
         self.output_names = tuple(item.name for item in self._session.get_outputs())
 

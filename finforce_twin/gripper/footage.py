@@ -235,7 +235,7 @@ def info_fields(camera: CameraIntrinsics) -> dict[str, Any]:
     return {
         "height": camera.height,
         "width": camera.width,
-        "distortion_model": "plumb_bob",
+        "distortion_model": camera.model,
         "d": np.array(camera.distortion, dtype=np.float64),
         "k": k,
         "r": np.eye(3).ravel(),

@@ -43,6 +43,54 @@ def test_distortion_is_that_of_opencv():
     np.testing.assert_allclose(project(points, camera), expected[:, 0], atol=1e-9)
 
 
+RATIONAL_LENS = np.array([0.28, -0.12, 0.0008, -0.0005, 0.011, 0.55, -0.09, 0.004])
+FISHEYE_LENS = np.array([-0.012, 0.006, -0.004, 0.0007])
+
+
+def make_fisheye():
+    size = {"width": 640, "height": 480, "fx": 236.0, "fy": 235.0, "cx": 320.5, "cy": 238.0}  # 155 degrees across
+    return CameraIntrinsics(**size, distortion=FISHEYE_LENS, model="equidistant")
+
+
+def spread_points(widest):
+    angles, turns = np.radians(np.linspace(0.0, widest, 9)), np.linspace(0.0, 6.0, 9)
+    rays = np.stack((np.sin(angles) * np.cos(turns), np.sin(angles) * np.sin(turns), np.cos(angles)), axis=1)
+    return 0.3 * rays
+
+
+def test_a_rational_lens_is_that_of_opencv_and_can_be_inverted():
+    cv2 = pytest.importorskip("cv2")
+    camera = replace(make_camera(), distortion=RATIONAL_LENS, model="rational_polynomial")
+    points = spread_points(35.0)
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, RATIONAL_LENS)
+    np.testing.assert_allclose(project(points, camera), expected[:, 0], atol=1e-9)
+    np.testing.assert_allclose(rays_from_pixels(expected[:, 0], camera), points / points[:, 2:], atol=1e-8)
+
+
+def test_a_fisheye_is_that_of_opencv_and_can_be_inverted():
+    cv2 = pytest.importorskip("cv2")
+    camera, points = make_fisheye(), spread_points(77.5)
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    expected, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, FISHEYE_LENS)
+    np.testing.assert_allclose(project(points, camera), expected[:, 0], atol=1e-9)
+    np.testing.assert_allclose(rays_from_pixels(expected[:, 0], camera), points / points[:, 2:], rtol=1e-7, atol=1e-9)
+
+
+def test_a_fisheye_has_no_ray_beyond_its_side():
+    camera = replace(make_fisheye(), fx=130.0, fy=130.0, distortion=np.zeros(4))
+    rays = compute_rays(camera)
+    assert np.isnan(rays[0, 0, 0]) and np.isfinite(rays[240, 320]).all()
+    assert np.isnan(project(np.array([[1.0, 0.0, 0.001]]), camera)).all()
+
+
+def test_a_lens_with_coefficients_of_another_model_is_refused():
+    with pytest.raises(IntrinsicsError, match=r"expected 0 or 4 finite coefficients of the model equidistant"):
+        replace(make_fisheye(), distortion=np.ones(5))
+    with pytest.raises(IntrinsicsError, match=r"'mirror': expected one of plumb_bob, rational_polynomial, equidistant"):
+        replace(make_camera(), model="mirror")
+
+
 def test_distortion_follows_its_published_formula():
     # x y of the ray 0.4 0.2: r2 = 0.2, written out by hand
     x, y, r2 = 0.4, 0.2, 0.2
@@ -137,7 +185,7 @@ def test_mask_is_refused_when_empty_of_another_size_or_without_depth():
 
 
 @pytest.mark.parametrize(
-    "change", [{"fx": 0.0}, {"cy": np.nan}, {"width": 0}, {"distortion": np.zeros(8)}, {"cx": 1e9}, {"cy": -50.0}]
+    "change", [{"fx": 0.0}, {"cy": np.nan}, {"width": 0}, {"distortion": np.ones(8)}, {"cx": 1e9}, {"cy": -50.0}]
 )
 def test_impossible_intrinsics_are_refused(change):
     good = {"width": 4, "height": 3, "fx": 2.0, "fy": 2.0, "cx": 2.0, "cy": 1.5}

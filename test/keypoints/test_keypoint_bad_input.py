@@ -76,7 +76,7 @@ def test_camera_info_of_another_size_is_refused(probe):
 @pytest.mark.parametrize(
     ("changes", "word"),
     [
-        ({"distortion_model": "equidistant"}, "equidistant"),
+        ({"distortion_model": "mirror ball"}, "mirror ball"),
         ({"k": [0.0] * 9}, "focal"),
         ({"k": [1e300, 0.0, 32.0, 0.0, 1e300, 24.0, 0.0, 0.0, 1.0]}, "focal lengths in proportion"),
         ({"k": [60.0, 2.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0]}, "skew"),

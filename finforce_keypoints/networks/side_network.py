@@ -1,0 +1,189 @@
+"""The network of any finger: pictures of side planes and the fingers' templates in, places of their points out.
+
+It has two parts, each a file: a coarse one tells roughly where each point of the template has moved to, a fine one
+compares small pieces of picture and template there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.optional import import_cv2
+from finforce_keypoints.errors import DetectionError, ModelError
+from finforce_keypoints.networks.network import CPU, open_session
+
+METADATA = "finforce"  # key of the files' own metadata
+KIND = "side plane"
+COARSE, FINE = "coarse.onnx", "fine.onnx"
+COARSE_LAYOUT = (("pictures", "templates", "points"), ("guesses", "context", "mean", "gain"))
+FINE_LAYOUT = (("pieces", "templates", "context", "mean", "gain"), ("offsets", "likelihood", "spread"))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Template:
+    """One finger as the network is told of it, made by `SideNetwork.prepare`.
+
+    Attributes:
+        half: (h / 2, w / 2, 3) uint8, what it looks like at rest.
+        points: (K, 2) float32 its points in the template at full size [px].
+        pieces: (K, p, p, 3) uint8, the template around them.
+    """
+
+    half: NDArray
+    points: NDArray
+    pieces: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Places:
+    """Where the points of B pictures are.
+
+    Attributes:
+        pixels: (B, K, 2) column and row in the picture [px].
+        likelihood: (B, K) from 0 to 1, that a point can be seen.
+        stddev: (B, K) one standard deviation along a row or a column [px].
+    """
+
+    pixels: NDArray
+    likelihood: NDArray
+    stddev: NDArray
+
+
+class SideNetwork:
+    """A network in two parts that compares pictures with templates; not for several threads at once.
+
+    Attributes:
+        path: the folder.
+        height: of pictures and templates [px].
+        width: of pictures and templates [px].
+    """
+
+    def __init__(self, path: str | Path, threads: int = 2, providers: Sequence[str] = (CPU,)) -> None:
+        """Load a network.
+
+        Args:
+            path: the folder with `coarse.onnx` and `fine.onnx`.
+            threads: that one batch is computed with.
+            providers: onnxruntime's execution providers, best first.
+
+        Raises:
+            ModelError: a file is missing, cannot be loaded, or is of another kind of network.
+            MissingDependencyError: onnxruntime is not installed.
+        """
+        self.path = Path(path)
+        missing = [name for name in (COARSE, FINE) if not (self.path / name).is_file()]
+        if missing:
+            raise ModelError(
+                f"{path}: there is no {' and no '.join(missing)}; expected the folder of a network for side planes; a "
+                "DeepLabCut network is used with finder frame"
+            )
+        self._coarse = open_session(self.path / COARSE, threads, providers)
+        self._fine = open_session(self.path / FINE, threads, providers)
+        for session, layout, name in ((self._coarse, COARSE_LAYOUT, COARSE), (self._fine, FINE_LAYOUT, FINE)):
+            self._check_layout(session, layout, name)
+        self.height, self.width = self._read_size(self._coarse, COARSE)
+        self._piece, _ = self._read_size(self._fine, FINE)
+        self._factor = self._read_factor()
+        steps = np.arange(self._piece, dtype=np.float32) - np.float32(0.5 * (self._piece - 1))
+        self._window = np.stack(np.meshgrid(steps, steps), axis=-1)
+
+    def _check_layout(self, session, layout: tuple[tuple[str, ...], ...], name: str) -> None:
+        """Refuse a file with other inputs or outputs."""
+        found = tuple(tuple(item.name for item in items) for items in (session.get_inputs(), session.get_outputs()))
+        if found != layout:
+            raise ModelError(
+                f"{self.path / name}: a network of {', '.join(found[0])} to {', '.join(found[1])}; expected "
+                f"{', '.join(layout[0])} to {', '.join(layout[1])}"
+            )
+
+    def _read_size(self, session, name: str) -> tuple[int, int]:
+        """Return height and width of a part's pictures (batch, height, width, 3)."""
+        shape = list(session.get_inputs()[0].shape)
+        if (
+            len(shape) != 4
+            or not all(isinstance(size, int) and 8 <= size <= 2048 for size in shape[1:3])
+            or shape[3] != 3
+        ):
+            raise ModelError(f"{self.path / name}: pictures {shape}; expected (batch, height, width, 3), of fixed size")
+        return shape[1], shape[2]
+
+    def _read_factor(self) -> float:
+        """Return what the network's own deviations are multiplied with to be standard deviations."""
+        text = self._coarse.get_modelmeta().custom_metadata_map.get(METADATA, "")
+        try:
+            content = json.loads(text)
+            factor = float(content["stddev_factor"]) if content["kind"] == KIND else np.nan
+        except (ValueError, TypeError, KeyError, RecursionError):
+            factor = np.nan
+        if not 0.0 < factor < 100.0:
+            raise ModelError(
+                f"{self.path / COARSE}: metadata {text[:200]!r}; expected JSON with kind '{KIND}' and stddev_factor "
+                f"under '{METADATA}'"
+            )
+        return factor
+
+    @cached_property
+    def sha256(self) -> str:
+        """The SHA-256 of both files, by which recordings tell what they were made with."""
+        return hashlib.sha256(b"".join((self.path / name).read_bytes() for name in (COARSE, FINE))).hexdigest()
+
+    def prepare(self, template: NDArray, points: NDArray) -> Template:
+        """Return what is told of a finger.
+
+        Args:
+            template: (height, width, 3) uint8, see `draw_template`.
+            points: (K, 2) column and row of its points there [px].
+        """
+        cv2, points = import_cv2(), np.asarray(points, dtype=np.float32)
+        half = cv2.resize(template, (self.width // 2, self.height // 2), interpolation=cv2.INTER_AREA)
+        return Template(half=half, points=points, pieces=self._cut(template, points))
+
+    def locate(self, pictures: NDArray, templates: Sequence[Template]) -> Places:
+        """Find points in pictures.
+
+        Args:
+            pictures: (B, height, width, 3) uint8 RGB.
+            templates: B, of fingers with the same number of points.
+
+        Raises:
+            DetectionError: the network cannot be computed for these.
+        """
+        points = np.stack([template.points for template in templates])
+        batch, count = points.shape[:2]
+        half = np.stack([template.half for template in templates])
+        guesses, context, mean, gain = self._run(self._coarse, COARSE_LAYOUT[0], (pictures, half, points))
+        pieces = np.concatenate([self._cut(*pair) for pair in zip(pictures, guesses, strict=True)])
+        known = np.concatenate([template.pieces for template in templates])
+        inputs = (pieces, known, context.reshape(batch * count, -1), mean.repeat(count, 0), gain.repeat(count, 0))
+        offsets, likelihood, spread = self._run(self._fine, FINE_LAYOUT[0], inputs)
+        places = guesses + offsets.reshape(batch, count, 2)
+        likelihood, spread = likelihood.reshape(batch, count), spread.reshape(batch, count)
+        good = np.isfinite(places).all(axis=2) & np.isfinite(likelihood) & np.isfinite(spread)
+        return Places(
+            pixels=np.where(good[..., None], places, np.nan).astype(float),
+            likelihood=np.where(good, np.clip(likelihood, 0.0, 1.0), 0.0).astype(float),
+            stddev=np.where(good, self._factor * spread, np.inf).astype(float),
+        )
+
+    def _run(self, session, names: tuple[str, ...], inputs: tuple[NDArray, ...]) -> list[NDArray]:
+        try:
+            return session.run(None, dict(zip(names, inputs, strict=True)))
+        except Exception as error:  # onnxruntime has no base class of its errors
+            shapes, text = [part.shape for part in inputs], " ".join(str(error).split())
+            raise DetectionError(f"the network cannot be computed for {shapes}: {text}") from error
+
+    def _cut(self, picture: NDArray, centres: NDArray) -> NDArray[np.uint8]:
+        """Return the pieces (K, p, p, 3) of a picture (h, w, 3) around places (K, 2) [px]."""
+        cv2 = import_cv2()
+        centres = np.nan_to_num(centres, nan=-1e3, posinf=-1e3, neginf=-1e3).clip(-1e3, 4e3)
+        maps = (centres[:, None, None] + self._window).reshape(-1, self._piece, 2).astype(np.float32)
+        pieces = cv2.remap(picture, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return pieces.reshape(-1, self._piece, self._piece, 3)
