@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
+from finforce.optional import import_cv2
 
 DEPTH_TYPES = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}
 MILLIMETRE = 1e-3  # the unit of 16-bit depth images (REP 118)
@@ -359,3 +360,47 @@ def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | Non
     if encoding != "rgb8":
         image = image[:, :, COLOR_CHANNELS[encoding]]
     return np.ascontiguousarray(image)
+
+
+LARGEST_PICTURE = 50_000_000  # px, of a picture that is unpacked: no camera here makes more
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of a jpeg after which its size stands
+
+
+def decode_picture(data: NDArray | bytes, what: str) -> NDArray[np.uint8]:
+    """Return the colours (h, w, 3), red green blue, of a jpeg or png.
+
+    Raises:
+        ImageError: the bytes are neither, are damaged, or unpack to more than 50 million pixels; `what` names them.
+        MissingDependencyError: OpenCV is not installed.
+    """
+    cv2, content = import_cv2(), bytes(data)
+    size = read_picture_size(content)
+    if size is None:
+        raise ImageError(f"{what}: {len(content)} bytes that are neither jpeg nor png")
+    if size[0] * size[1] > LARGEST_PICTURE:
+        raise ImageError(f"{what}: {size[1]} x {size[0]}; expected at most {LARGEST_PICTURE} pixels")
+    try:
+        # as it lies in the file: a camera does not turn its pictures
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error:
+        picture = None
+    if picture is None or picture.shape[:2] != size:
+        raise ImageError(f"{what}: damaged: {len(content)} bytes that cannot be decoded")
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def read_picture_size(content: bytes) -> tuple[int, int] | None:
+    """Return height and width [px] as a jpeg or a png says them in its head; None of anything else."""
+    if content.startswith(_PNG) and len(content) >= 24:
+        width, height = (int.from_bytes(content[at : at + 4], "big") for at in (16, 20))
+        return height, width
+    at = len(_JPEG)
+    while content.startswith(_JPEG) and at + 9 <= len(content) and content[at] == 0xFF:
+        marker, length = content[at + 1], int.from_bytes(content[at + 2 : at + 4], "big")
+        if marker in _FRAMES:
+            height, width = (int.from_bytes(content[at + k : at + k + 2], "big") for k in (5, 7))
+            return height, width
+        at += 1 if marker == 0xFF else 2 + max(length, 2)
+    return None

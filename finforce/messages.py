@@ -21,6 +21,7 @@ from finforce.camera import (
     IntrinsicsError,
     decode_color,
     decode_depth,
+    decode_picture,
     unpack_rows,
 )
 from finforce.errors import ObservationError, PoseError
@@ -427,7 +428,11 @@ def check_cloud(cloud: Any, frame: str, what: str) -> None:
 def color_from_image(message: Any) -> NDArray[np.uint8]:
     """Return the colours (h, w, 3), red green blue, of a sensor_msgs/Image, without a copy where its bytes lie so.
 
+    Of a sensor_msgs/CompressedImage the jpeg or png is decoded.
+
     Raises:
-        ImageError: the encoding is not known, or the data do not fill the image.
+        ImageError: the encoding is not known, the data do not fill the image, or the picture is damaged.
     """
+    if hasattr(message, "format"):
+        return decode_picture(message.data, f"colour image {message.format!r}")
     return decode_color(np.frombuffer(message.data, dtype=np.uint8), message.encoding, layout_of(message))

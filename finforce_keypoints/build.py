@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -58,10 +58,13 @@ def build_detector(
         MissingDependencyError: a library that the finder needs is not installed.
     """
     from finforce_keypoints.detector import KeypointDetector
+    from finforce_keypoints.parameters import ALIGNED
     from finforce_keypoints.settings import DetectorSettings
 
     T_gripper_camera = parameters.camera_pose
     settings = settings or DetectorSettings()
+    if parameters.depth != ALIGNED:
+        settings = replace(settings, plane_depth=True)
     finder, card = build_finder(jaws, parameters, settings, dots)
     return BuiltDetector(KeypointDetector(finder, jaws, T_gripper_camera, settings, skips), card)
 

@@ -14,7 +14,7 @@ from finforce.messages import camera_from_info, check_frame, color_from_image, d
 from finforce.stamps import SECOND, Synchronizer
 from finforce_keypoints.errors import SyncError
 from finforce_keypoints.images import ImagePair, ImageWatch, RgbdImage, check_image
-from finforce_keypoints.parameters import DetectorParameters
+from finforce_keypoints.parameters import ALIGNED, AUTO, NO_DEPTH, DetectorParameters
 
 SILENCE = 1.0  # s without an image, after which another colour topic may be the camera's
 COLOR, DEPTH = "color", "depth"
@@ -24,8 +24,9 @@ WAITING = 3  # colour images that may wait for their depth: a tenth of a second 
 class RgbdFeed:
     """Brings the images of a camera together by their stamps, the newest first, and refuses what no camera sees.
 
-    A colour image waits for its depth image; one that a newer whole image overtook is passed over. Of several colour
-    topics the first that brings an image is listened to, until it is silent.
+    A colour image waits for its depth image; one that a newer whole image overtook is passed over. Where depth may be
+    missing, the first image that waited in vain is taken alone, and so are those after it, until depth comes again. Of
+    several colour topics the first that brings an image is listened to, until it is silent.
 
     Attributes:
         camera: intrinsics of both images, None until they came.
@@ -54,6 +55,7 @@ class RgbdFeed:
     def reset(self) -> None:
         """Forget all images; intrinsics and topic stay."""
         self._images = Synchronizer({COLOR: None, DEPTH: WAITING + 1}, self._tolerance)
+        self._alone = self._parameters.depth == NO_DEPTH
         self._forget_colors()
 
     def _forget_colors(self) -> None:
@@ -85,18 +87,25 @@ class RgbdFeed:
         """Take a colour image and return it with its depth; None while that has not come, or of another topic.
 
         Raises:
-            SyncError: no depth image came for an earlier image.
+            SyncError: no depth image came for an earlier image, and every one needs its own.
         """
         if not self.listens(topic):
             return None
+        if self._alone:
+            return ImagePair(stamp_of(message), message, None)
         self._images.add(COLOR, stamp_of(message), message)
         found, waiting = self._match(), self._images.entries(COLOR)
-        if found is None and len(waiting) > WAITING:
+        if found is not None or len(waiting) <= WAITING:
+            return found
+        if self._parameters.depth == ALIGNED:
             raise self._missing_depth(waiting.popleft().stamp)
-        return found
+        self._alone = True
+        self.pass_over()
+        return ImagePair(stamp_of(message), message, None)
 
     def take_depth(self, message: Any) -> ImagePair | None:
         """Take a depth image and return it with its colour; None while that has not come."""
+        self._alone = False
         self._images.add(DEPTH, stamp_of(message), message)
         return self._match()
 
@@ -138,12 +147,20 @@ class RgbdFeed:
         image = RgbdImage(
             stamp=SECOND * pair.stamp,
             color=self.read_color(pair.color),
-            depth=depth_from_image(pair.depth, self._parameters.camera_frame, self._parameters.depth_scale),
+            depth=self._read_depth(pair.depth),
             camera=self.camera,
         )
         check_image(image)
         self._watch.check(image)
         return image
+
+    def _read_depth(self, message: Any) -> NDArray | None:
+        """Return the depth (h, w) [m] of a depth image; None without one, or of an empty one that is not needed."""
+        if message is None:
+            return None
+        depth = depth_from_image(message, self._parameters.camera_frame, self._parameters.depth_scale)
+        is_empty = self._parameters.depth == AUTO and not np.isfinite(depth).any()
+        return None if is_empty else depth
 
     def _missing_depth(self, stamp: int) -> SyncError:
         """Return the error of a colour image [ns] that has waited long enough."""
@@ -152,7 +169,7 @@ class RgbdFeed:
         if nearest is None:
             return SyncError(
                 f"colour images come, but no depth image on {self._parameters.depth_topic}; "
-                "start the camera with align_depth.enable:=true"
+                "start the camera with align_depth.enable:=true, or the detector with depth:=none"
             )
         return SyncError(
             f"no depth image within {limit} of the colour image at {SECOND * stamp:.3f} s, the nearest lies "

@@ -37,7 +37,7 @@ class RgbdImage:
 
 
 class ImagePair(NamedTuple):
-    """A colour image and its depth image, both as they came, and the exact stamp of the first [ns]."""
+    """A colour image and its depth image, None without, both as they came, and the exact stamp of the first [ns]."""
 
     stamp: int
     color: Any

@@ -14,13 +14,13 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from finforce.errors import FinforceError
 from finforce.health import Health, Outcome, Report
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
-from finforce.ros.raw_image import read_image
+from finforce.ros.raw_image import read_image, read_picture
 from finforce.skipping import IDLE, LATE, UNHEARD, Skips
 from finforce.stamps import Idling, StampGate
 from finforce_keypoints.build import BuiltDetector, build_detector
@@ -28,7 +28,7 @@ from finforce_keypoints.camera_feed import SECOND, RgbdFeed
 from finforce_keypoints.detectors.dots import DotSettings
 from finforce_keypoints.diagnostics import describe, outcome_of_keypoints, report_of_rest
 from finforce_keypoints.images import ImagePair
-from finforce_keypoints.parameters import DetectorParameters, load_jaws
+from finforce_keypoints.parameters import NO_DEPTH, DetectorParameters, is_compressed, load_jaws
 from finforce_keypoints.publishers import DetectorOutputs
 from finforce_keypoints.settings import RULES, DetectorSettings
 
@@ -105,11 +105,18 @@ class KeypointDetectorNode(Node):
         self.qos.subscription(CameraInfo, parameters.info_topic, self._on_info, ros.SENSOR, raw=True)
         # as bytes: of an image that nobody looks at no more than the header is read
         self.depth_group = DoorGroup()
-        self.depths = ros.LargeSubscription(
-            self.qos, Image, parameters.depth_topic, self._on_depth, raw=True, callback_group=self.depth_group
-        )
+        if parameters.depth != NO_DEPTH:
+            self.depths = ros.LargeSubscription(
+                self.qos, Image, parameters.depth_topic, self._on_depth, raw=True, callback_group=self.depth_group
+            )
         self.colors = {
-            topic: ros.LargeSubscription(self.qos, Image, topic, partial(self._on_color, topic), raw=True)
+            topic: ros.LargeSubscription(
+                self.qos,
+                CompressedImage if is_compressed(topic) else Image,
+                topic,
+                partial(self._on_color, topic),
+                raw=True,
+            )
             for topic in parameters.color_topics
         }
 
@@ -133,7 +140,7 @@ class KeypointDetectorNode(Node):
             health.source = self.feed.source
             health.arrive(superseded)
         with self._refusals():
-            message = read_image(data)
+            message = read_picture(data) if is_compressed(topic) else read_image(data)
             if not (self._rest() or self._confirm(message, began)):
                 self.depth_group.open()  # what came meanwhile is read now
                 self._answer(self.feed.take_color(topic, message), began)

@@ -20,6 +20,7 @@ CAMERA = "/camera/camera"
 COLOR_TOPIC, OLD_COLOR_TOPIC = f"{CAMERA}/color/image_raw", f"{CAMERA}/color/image_rect_raw"
 DEPTH_TOPIC = f"{CAMERA}/aligned_depth_to_color/image_raw"
 INFO_TOPIC = f"{CAMERA}/color/camera_info"
+DEPTHS = ALIGNED, AUTO, NO_DEPTH = ("aligned", "auto", "none")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +35,15 @@ class DetectorParameters(TimeParameters):
     )
     color_topics: tuple[str, ...] = setting(
         (COLOR_TOPIC, OLD_COLOR_TOPIC),
-        "colour images; the first topic that brings one is used, until it is silent",
+        "colour images; the first topic that brings one is used, until it is silent; .../compressed: jpeg or png",
         topic=True,
     )
     depth_topic: str = setting(DEPTH_TOPIC, "depth images, aligned to the colour images", topic=True)
+    depth: str = setting(
+        ALIGNED,
+        "aligned: every colour image needs its depth image; auto: one without is used alone; none: colour alone",
+        choices=DEPTHS,
+    )
     info_topic: str = setting(INFO_TOPIC, "intrinsics of the colour camera", topic=True)
     finder: str = setting(
         "network",
@@ -98,6 +104,11 @@ class DetectorParameters(TimeParameters):
     def camera_pose(self) -> NDArray:
         """T_gripper_camera (4, 4); raises PoseError unless it is seven finite numbers with a unit quaternion."""
         return pose_from_quaternion(self.T_gripper_camera[:3], self.T_gripper_camera[3:])
+
+
+def is_compressed(topic: str) -> bool:
+    """Say whether a colour topic is one of pictures, as image transport calls them."""
+    return topic.endswith("/compressed")
 
 
 def load_jaws(parameters: DetectorParameters) -> dict[str, Jaw]:

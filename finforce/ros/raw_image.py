@@ -45,6 +45,34 @@ class RawImage:
     data: memoryview
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawPicture:
+    """A sensor_msgs/CompressedImage, whose data are a view of the bytes that came."""
+
+    header: RawHeader
+    format: str
+    data: memoryview
+
+
+def read_picture(message: bytes) -> RawPicture:
+    """Return the picture in a serialised sensor_msgs/CompressedImage.
+
+    Raises:
+        ImageError: the bytes are none.
+    """
+    try:
+        reader = _Reader(message)
+        header = _read_header(reader)
+        kind = reader.take_text()
+        (size,) = reader.take("I")
+        data = reader.take_bytes(size)
+    except (KeyError, struct.error, UnicodeDecodeError) as error:
+        raise ImageError(
+            f"{len(message)} bytes are no picture: expected a serialised sensor_msgs/CompressedImage"
+        ) from error
+    return RawPicture(header=header, format=kind, data=data)
+
+
 def read_image(message: bytes) -> RawImage:
     """Return the image in a serialised sensor_msgs/Image.
 
@@ -53,8 +81,7 @@ def read_image(message: bytes) -> RawImage:
     """
     try:
         reader = _Reader(message)
-        seconds, rest = reader.take("iI")
-        header = RawHeader(stamp=RawStamp(sec=seconds, nanosec=rest), frame_id=reader.take_text())
+        header = _read_header(reader)
         height, width = reader.take("II")
         encoding = reader.take_text()
         (is_bigendian,) = reader.take("B")
@@ -71,6 +98,12 @@ def read_image(message: bytes) -> RawImage:
         step=step,
         data=data,
     )
+
+
+def _read_header(reader: _Reader) -> RawHeader:
+    """Return the header with which a message begins."""
+    seconds, rest = reader.take("iI")
+    return RawHeader(stamp=RawStamp(sec=seconds, nanosec=rest), frame_id=reader.take_text())
 
 
 class _Reader:

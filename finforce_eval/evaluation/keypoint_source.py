@@ -19,7 +19,7 @@ from finforce.stamps import NANOSECONDS
 from finforce.transforms import quaternion_from_pose
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.results import parse_changes
-from finforce_eval.recordings.images import PAIRED
+from finforce_eval.recordings.images import DEPTH_ENDS, PAIRED, ImageTrack
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.images import ImageWatch, RgbdImage
@@ -137,9 +137,31 @@ class KeypointSource:
 
         detector, parameters = self.build(recording), build_records(self.node_parameters(recording)).parameters
         watch = ImageWatch(parameters.frozen_after)
-        recording = replace(recording, images=replace(recording.images, depth_scale=parameters.depth_scale))
+        images = _choose_images(recording, parameters.depth)
+        recording = replace(recording, images=replace(images, depth_scale=parameters.depth_scale))
         with tqdm(total=len(recording.images), unit="image", desc=recording.name, disable=None, leave=False) as bar:
             return detect_keypoints(recording, detector, watch=watch, progress=bar.update)
+
+
+def _choose_images(recording: Recording, depth: str) -> ImageTrack:
+    """Return the images that a detector is to see, with depth, without, or where there is some.
+
+    Raises:
+        RecordingError: there is no depth, and it is needed.
+    """
+    from finforce_keypoints.parameters import ALIGNED, NO_DEPTH
+
+    images = recording.images
+    if depth == NO_DEPTH:
+        return images.colors_alone()
+    if depth != ALIGNED:
+        return images.all_colors()
+    if not images.has_depth:
+        raise RecordingError(
+            f"{recording.name}: there are images on {images.topics[0]}, but no depth on {DEPTH_ENDS[0]}; give "
+            "--detector depth=none"
+        )
+    return images
 
 
 def build_records(given: Mapping[str, Any]) -> DetectorRecords:

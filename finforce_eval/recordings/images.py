@@ -6,7 +6,7 @@ import io
 import struct
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +25,7 @@ from finforce_keypoints.images import RgbdImage, check_image
 COLOR_ENDS = tuple(f"color/{name}{end}" for end in ("", "/compressed") for name in ("image_raw", "image_rect_raw"))
 DEPTH_ENDS = tuple(f"aligned_depth_to_color/image_raw{end}" for end in ("", "/compressedDepth", "/compressed"))
 INFO_ENDS = ("color/camera_info",)
+ALONE = -1  # in the place of a depth image's stamp [ns], of a colour image without
 PAIRED = 8_000_000  # as the detector node takes colour and depth for one image: distance of their stamps [ns]
 
 
@@ -42,12 +43,12 @@ class ImageTrack:
     Attributes:
         source: the bag.
         name: of the recording, for messages.
-        topics: of colour and depth.
+        topics: of colour and depth, "" without.
         stamps: (n,) of the colour images [ns], strictly rising.
-        depth_stamps: (n,) of their depth images [ns].
+        depth_stamps: (n,) of their depth images [ns], ALONE of an image without.
         camera: intrinsics.
         frame_id: of the camera.
-        unpaired: colour images left out because no depth image is of their time.
+        unpaired: (m,) stamps of colour images left out because no depth image is of their time [ns].
         depth_scale: one step of a 16-bit depth image [m].
     """
 
@@ -58,7 +59,7 @@ class ImageTrack:
     depth_stamps: NDArray[np.int64]
     camera: CameraIntrinsics
     frame_id: str
-    unpaired: int = 0
+    unpaired: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     depth_scale: float = MILLIMETRE
 
     def __len__(self) -> int:
@@ -74,6 +75,23 @@ class ImageTrack:
         chosen = np.isin(self.stamps, stamps)
         return replace(self, stamps=self.stamps[chosen], depth_stamps=self.depth_stamps[chosen])
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether there are depth images."""
+        return bool(self.topics[1])
+
+    def all_colors(self) -> ImageTrack:
+        """Return all colour images, those alone that have no depth image."""
+        stamps = np.concatenate((self.stamps, self.unpaired))
+        depths = np.concatenate((self.depth_stamps, np.full(len(self.unpaired), ALONE)))
+        order = np.argsort(stamps)
+        return replace(self, stamps=stamps[order], depth_stamps=depths[order], unpaired=self.unpaired[:0])
+
+    def colors_alone(self) -> ImageTrack:
+        """Return all colour images as if there was no depth."""
+        track = self.all_colors()
+        return replace(track, topics=(self.topics[0], ""), depth_stamps=np.full(len(track.stamps), ALONE))
+
     def __iter__(self) -> Iterator[StampedImage]:
         """Read the images in the order of their stamps.
 
@@ -81,17 +99,17 @@ class ImageTrack:
             RecordingError: an image is damaged, of unknown encoding, or of another size than its camera.
         """
         color, depth = self.topics
-        wanted = {color: set(self.stamps.tolist()), depth: set(self.depth_stamps.tolist())}
+        wanted = {color: set(self.stamps.tolist()), depth: set(self.depth_stamps.tolist()) - {ALONE}}
         pairs = zip(self.stamps.tolist(), self.depth_stamps.tolist(), strict=True)
         waiting: dict[tuple[str, int], Any] = {}
         pair = next(pairs, None)
         with open_bag(self.source, self.name) as bag:
-            for raw in bag.raw(self.topics):
+            for raw in bag.raw(tuple(filter(None, self.topics))):
                 stamp = read_stamp(raw.data)
                 if stamp in wanted[raw.topic]:
                     waiting[raw.topic, stamp] = bag.decode(raw)
-                while pair and {(color, pair[0]), (depth, pair[1])} <= waiting.keys():
-                    yield self._image(pair[0], waiting.pop((color, pair[0])), waiting[depth, pair[1]])
+                while pair and (color, pair[0]) in waiting and (pair[1] == ALONE or (depth, pair[1]) in waiting):
+                    yield self._image(pair[0], waiting.pop((color, pair[0])), waiting.get((depth, pair[1])))
                     waiting = {key: kept for key, kept in waiting.items() if key[0] == color or key[1] >= pair[1]}
                     pair = next(pairs, None)
 
@@ -100,7 +118,7 @@ class ImageTrack:
             image = RgbdImage(
                 stamp=stamp * 1e-9,
                 color=color_from_message(color),
-                depth=depth_from_message(depth, self.depth_scale),
+                depth=None if depth is None else depth_from_message(depth, self.depth_scale),
                 camera=self.camera,
             )
             check_image(image)
@@ -118,23 +136,32 @@ def find_images(bag: BagReader, source: Path, pairing: int = PAIRED) -> ImageTra
         pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
 
     Raises:
-        RecordingError: there are colour images, but no depth, no camera_info or nothing that belongs together; a topic
-            is of another type; stamps go back; the camera changes.
+        RecordingError: there are colour images, but no camera_info; there is depth, but nothing that belongs together;
+            a topic is of another type; stamps go back; the camera changes.
     """
     color = _find_topic(bag, COLOR_ENDS)
     if color is None:
         return None
     depth, info = _find_topic(bag, DEPTH_ENDS), _find_topic(bag, INFO_ENDS)
-    missing = [ends[0] for topic, ends in ((depth, DEPTH_ENDS), (info, INFO_ENDS)) if topic is None]
-    if missing:
-        raise RecordingError(f"{bag.name}: there are images on {color}, but nothing on {' and '.join(missing)}")
-    expected = {color: (IMAGE, COMPRESSED), depth: (IMAGE, COMPRESSED), info: (CAMERA_INFO,)}
-    check_types(bag.connections, expected, bag.name)
+    if info is None:
+        raise RecordingError(f"{bag.name}: there are images on {color}, but nothing on {INFO_ENDS[0]}")
+    topics = (color,) if depth is None else (color, depth)
+    check_types(bag.connections, dict.fromkeys(topics, (IMAGE, COMPRESSED)) | {info: (CAMERA_INFO,)}, bag.name)
     camera, frame_id = _read_camera(bag, info)
-    found: dict[str, list[int]] = {color: [], depth: []}
-    for raw in bag.raw((color, depth)):
+    found: dict[str, list[int]] = {topic: [] for topic in topics}
+    for raw in bag.raw(topics):
         found[raw.topic].append(read_stamp(raw.data))
     stamps = {topic: _rising(times, topic, bag.name) for topic, times in found.items()}
+    if depth is None:
+        return ImageTrack(
+            source=source,
+            name=bag.name,
+            topics=(color, ""),
+            stamps=stamps[color],
+            depth_stamps=np.full(len(stamps[color]), ALONE),
+            camera=camera,
+            frame_id=frame_id,
+        )
     nearest = find_nearest(stamps[depth], stamps[color])
     paired = np.abs(stamps[depth][nearest] - stamps[color]) <= pairing
     if not paired.any():
@@ -147,7 +174,7 @@ def find_images(bag: BagReader, source: Path, pairing: int = PAIRED) -> ImageTra
         depth_stamps=stamps[depth][nearest[paired]],
         camera=camera,
         frame_id=frame_id,
-        unpaired=int((~paired).sum()),
+        unpaired=stamps[color][~paired],
     )
 
 

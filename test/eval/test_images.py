@@ -49,7 +49,7 @@ def test_images_come_back_as_they_were_taken(written):
     form, folder = written
     frames = list(make_footage())
     images = read_recording(folder).images
-    assert len(images) == len(frames) and images.unpaired == 0
+    assert len(images) == len(frames) and len(images.unpaired) == 0
     for frame, (stamp, image) in zip(frames, images, strict=True):
         assert stamp == frame.stamp and image.stamp == pytest.approx(1e-9 * stamp, abs=1e-9)
         # a depth of 16 bits is in millimetres: half a step
@@ -126,10 +126,18 @@ def test_a_part_in_time_has_the_images_of_that_time(written):
     assert [stamp for stamp, _ in part] == images.stamps[2:5].tolist()
 
 
-@pytest.mark.parametrize(("topic", "reason"), [(DEPTH_TOPIC, "aligned_depth_to_color"), (INFO_TOPIC, "camera_info")])
-def test_images_without_depth_or_camera_info_are_refused(tmp_path, topic, reason):
-    with pytest.raises(RecordingError, match=reason):
-        read_recording(write_without(tmp_path / "bag", topic))
+def test_images_without_camera_info_are_refused(tmp_path):
+    with pytest.raises(RecordingError, match="camera_info"):
+        read_recording(write_without(tmp_path / "bag", INFO_TOPIC))
+
+
+def test_images_without_depth_are_read_as_colours_alone(tmp_path):
+    images = read_recording(write_without(tmp_path / "bag", DEPTH_TOPIC)).images
+    frames = list(make_footage())
+    assert not images.has_depth and images.stamps.tolist() == [frame.stamp for frame in frames]
+    for frame, (_, image) in zip(frames, images, strict=True):
+        assert image.depth is None
+        np.testing.assert_array_equal(image.color, frame.color)
 
 
 def test_depth_that_is_always_late_is_refused_and_some_lost_depth_leaves_its_images_out(tmp_path):
@@ -147,7 +155,11 @@ def test_depth_that_is_always_late_is_refused_and_some_lost_depth_leaves_its_ima
         read_recording(folder)
     assert len(read_recording(folder, pairing=9_000_000).images) == 12
     images = read_recording(write_without(tmp_path / "lost", edit=lost)).images
-    assert images.unpaired == 1 and len(list(images)) == 11
+    assert len(images.unpaired) == 1 and len(list(images)) == 11
+    everything = [image.depth is not None for _, image in images.all_colors()]
+    assert everything == [number != 5 for number in range(12)]
+    alone = images.colors_alone()
+    assert [stamp for stamp, image in alone if image.depth is None] == [frame.stamp for frame in make_footage()]
 
 
 def test_images_without_any_topic_of_a_jaw_are_refused_with_what_would_do(tmp_path):
@@ -256,4 +268,4 @@ def test_key_points_that_were_recorded_do_not_need_whole_images(tmp_path):
     footage = _footage_entries(make_footage(), ImageFactory(factory, FORMS["raw"]), lambda frame: None)
     colors = [entry for entry in footage if entry.topic == COLOR_TOPIC]
     read = read_recording(write_entries([*entries, *colors], tmp_path / "bag", factory))
-    assert read.images is None and any("aligned_depth" in note for note in read.notes)
+    assert read.images is None and any("camera_info" in note for note in read.notes)

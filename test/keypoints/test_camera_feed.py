@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 import pytest
 from keypoint_node_fakes import COLOR, HEIGHT, OLD_COLOR, WIDTH, camera_info, image_of
 
+from finforce.camera import ImageError
 from finforce_keypoints.camera_feed import SILENCE, RgbdFeed
-from finforce_keypoints.errors import FrozenImageError
+from finforce_keypoints.errors import FrozenImageError, SyncError
 from finforce_keypoints.parameters import DetectorParameters
 
 PERIOD = 0.03  # s
@@ -20,8 +22,10 @@ class Camera:
     now: float = 0.0
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
+    depth: str = "aligned"
+
     def __post_init__(self):
-        self.feed = RgbdFeed(DetectorParameters(), lambda: self.now)
+        self.feed = RgbdFeed(DetectorParameters(depth=self.depth), lambda: self.now)
         self.feed.take_info(camera_info())
 
     def shoot(self, topic, picture=None):
@@ -63,3 +67,82 @@ def test_images_of_the_old_topic_are_not_held_against_the_new_one():
     with pytest.raises(FrozenImageError):
         for _ in range(3):
             camera.shoot(OLD_COLOR, still)
+
+
+def color_of(camera, number):
+    picture = camera.rng.integers(90, 160, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    return image_of(round(1e9 * PERIOD * number), picture, "rgb8")
+
+
+def depth_of(number, value=120):
+    plane = np.full((HEIGHT, WIDTH), value, dtype=np.uint16)
+    plane[0] += number
+    return image_of(round(1e9 * PERIOD * number), plane, "16UC1")
+
+
+def test_without_depth_every_colour_image_is_whole():
+    camera = Camera(depth="none")
+    for number in range(1, 5):
+        image = camera.feed.decode(camera.feed.take_color(COLOR, color_of(camera, number)))
+        assert image.depth is None and image.stamp == pytest.approx(PERIOD * number)
+
+
+def test_depth_that_comes_and_goes_is_used_while_it_comes():
+    camera, had = Camera(depth="auto"), []
+
+    def shoot(number, with_depth):
+        pairs = [camera.feed.take_depth(depth_of(number)) if with_depth else None]
+        pairs.append(camera.feed.take_color(COLOR, color_of(camera, number)))
+        had.extend((number, pair.depth is not None) for pair in pairs if pair is not None)
+
+    for number in range(1, 16):
+        shoot(number, with_depth=number < 4 or number > 11)
+    # three images wait in vain when depth ends, then none does; with the first depth they have it again
+    assert had == [(n, True) for n in (1, 2, 3)] + [(n, False) for n in range(7, 12)] + [
+        (n, True) for n in range(12, 16)
+    ]
+
+
+def test_an_empty_depth_image_counts_as_none_only_where_none_is_needed():
+    for depth, is_taken in (("auto", True), ("aligned", False)):
+        camera = Camera(depth=depth)
+        camera.feed.take_depth(depth_of(0, value=0))
+        pair = camera.feed.take_color(COLOR, color_of(camera, 0))
+        if is_taken:
+            assert camera.feed.decode(pair).depth is None
+        else:
+            with pytest.raises(ImageError, match="empty"):
+                camera.feed.decode(pair)
+
+
+def test_where_every_image_needs_its_depth_one_without_is_refused():
+    camera = Camera()
+    with pytest.raises(SyncError, match="depth:=none"):
+        for number in range(6):
+            camera.feed.take_color(COLOR, color_of(camera, number))
+
+
+class Picture:
+    """A sensor_msgs/CompressedImage."""
+
+    def __init__(self, header, data):
+        self.header, self.format, self.data = header, "rgb8; jpeg compressed bgr8", data
+
+
+def test_a_jpeg_stream_is_decoded_and_a_damaged_one_refused():
+    camera = Camera(depth="none")
+    raw = color_of(camera, 1)
+    picture = cv2.GaussianBlur(np.frombuffer(raw.data, np.uint8).reshape(HEIGHT, WIDTH, 3), (0, 0), 3.0)
+    _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+    topic = f"{COLOR}/compressed"
+    pair = camera.feed.take_color(topic, Picture(raw.header, data.tobytes()))
+    image = camera.feed.decode(pair)
+    assert np.abs(image.color.astype(int) - picture).mean() < 3.0
+    for broken in (b"", b"no picture", data.tobytes()[:40]):
+        later = color_of(camera, 2)
+        with pytest.raises(ImageError, match="neither jpeg nor png|damaged"):
+            camera.feed.read_color(Picture(later.header, broken))
+    huge = data.tobytes().replace(bytes([0xFF, 0xC0, 0, 17, 8, *divmod(HEIGHT, 256)]), b"\xff\xc0\0\x11\x08\xff\xff")
+    huge = huge[: huge.index(b"\xff\xff") + 2] + b"\xff\xff" + huge[huge.index(b"\xff\xff") + 4 :]
+    with pytest.raises(ImageError, match="65535 x 65535; expected at most 50000000 pixels"):
+        camera.feed.read_color(Picture(raw.header, huge))
