@@ -28,6 +28,8 @@ FAR, FAR_SHARE, NEAR = (
     0.25,
     2.5,
 )  # px by which guesses are off: some anywhere up to FAR, others with deviation NEAR
+WRONG = 0.1  # share of the pictures whose template is not theirs, so that nothing of it can be seen ...
+WRONG_FINGER = 0.6  # ... of which so many show another finger; the others are mirrored or upside down
 SHARPNESS = 0.05  # px; smaller errors count by their square
 
 
@@ -45,13 +47,23 @@ class BatchMaker(torch.utils.data.Dataset):
         data = self.pictures
         rows = rng.integers(0, len(data), self.size)
         samples = [augment(data.picture[i], data.place[i], data.visible[i], self.settings, rng) for i in rows]
+        pictures = [sample.picture for sample in samples]
+        places, visible = (np.stack([getattr(sample, name) for sample in samples]) for name in ("points", "visible"))
+        told = rows.copy()
+        for k in np.flatnonzero(rng.random(self.size) < WRONG):
+            places[k], visible[k] = np.nan, False
+            chance = rng.random()
+            if chance < WRONG_FINGER:
+                told[k] = rng.choice(np.flatnonzero(data.finger != data.finger[rows[k]]))
+            else:  # mirrored or upside down
+                pictures[k] = pictures[k][:, ::-1] if chance < 0.5 * (1.0 + WRONG_FINGER) else pictures[k][::-1, ::-1]
         columns = (
-            np.stack([sample.picture for sample in samples]),
-            data.template[data.finger[rows]],
-            data.rest[rows],
-            np.stack([sample.points for sample in samples]),
-            np.stack([sample.visible for sample in samples]),
-            data.keypoints[rows],
+            np.stack(pictures),
+            data.template[data.finger[told]],
+            data.rest[told],
+            places,
+            visible,
+            data.keypoints[told],
         )
         return [torch.from_numpy(np.ascontiguousarray(column)) for column in columns]
 
@@ -65,11 +77,11 @@ def compute_losses(network: FingerNetwork, batch: list[torch.Tensor], device: to
     """Return the parts of the loss of a batch."""
     pictures, templates, rest, places, visible, keypoints = (part.to(device) for part in batch)
     known = torch.isfinite(places).all(dim=2) & (places.abs() < 600.0).all(dim=2)
-    places = torch.where(known[..., None], places, rest)
     with torch.autocast(device.type, torch.bfloat16, enabled=has_bfloat16(device)):
         pictures, templates = standardise(to_layers(pictures)), to_layers(templates)
         moves, features = network.register(pictures, templates)
         guess = rest + network.read(moves, rest)
+        places = torch.where(known[..., None], places, guess.detach())
         away = torch.sqrt((guess - places).square().sum(dim=2) + 0.25)
         weight = known * torch.where(visible, 1.0, 0.4)
         coarse = (weight * away).sum() / weight.sum().clamp(min=1.0)
