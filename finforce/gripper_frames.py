@@ -73,6 +73,8 @@ def look_at(position: ArrayLike, target: ArrayLike, right: ArrayLike) -> NDArray
 
 # On the wrist, above the fingers' side faces, both jaws in view from base to tip.
 ROBOT_CAMERA = look_at((0.0, 0.095, -0.045), (0.0, 0.010, 0.042), (1.0, 0.0, 0.0))
+# Beyond the tips, looking back at the same sides, 30 degrees from square to them.
+FRONT_CAMERA = look_at((0.0, 0.114, 0.102), (0.0, 0.010, 0.042), (1.0, 0.0, 0.0))
 
 # The bench has one jaw, held here on the closing axis [m]; its pose before the camera is that of the bench recordings.
 BENCH_ORIGIN_X = -0.055

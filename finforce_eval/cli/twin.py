@@ -31,7 +31,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     record.add_argument("--light", metavar="WORD", help="bright, dim or any; without it that of the scene")
     record.add_argument("--object", metavar="NAME", help="shape by name, or mesh file; without it that of the scene")
     record.add_argument("--jaw", metavar="NAME", help="shipped jaw or jaw file; without it that of the scene, bench")
-    record.add_argument("--camera", choices=("robot", "bench"), help="two jaws on the wrist, or one on the bench")
+    text = "two jaws on the wrist or from beyond the tips, or one jaw on the bench"
+    record.add_argument("--camera", choices=("robot", "front", "bench"), help=text)
+    record.add_argument("--lens", default="d405", choices=("d405", "webcam", "fisheye"), help="of the camera (d405)")
     record.add_argument("--size", default="640x480", metavar="WxH", help="of the images (640x480)")
     text = "change a number of the scene, may be repeated; an unknown NAME lists them"
     record.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
@@ -74,7 +76,7 @@ def run_record(options: argparse.Namespace) -> None:
     folder = Path(options.output)
     check_new(folder)
     scenario = scenario_from_options(options)
-    camera = parse_size(options.size)
+    camera = parse_size(options.size, options.lens)
     if min(options.seed, options.finger) < 0:
         raise OptionError(f"--seed {options.seed} --finger {options.finger}: expected numbers from 0")
     if not 1 <= options.quality <= 95:

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics
-from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA
+from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, ROBOT_CAMERA
 from finforce.stamps import NANOSECONDS
 from finforce.transforms import invert_pose
 from finforce_twin.errors import ScenarioError
 from finforce_twin.gripper.gripper import TwinGripper, TwinState
 from finforce_twin.mechanics.assembly import Assembly
 from finforce_twin.rendering.bodies import DrawnJaw
-from finforce_twin.rendering.depth_camera import build_d405_vga
+from finforce_twin.rendering.depth_camera import D405, LENSES, build_d405_vga
 from finforce_twin.rendering.photographer import Photographer, SceneSetting, Shot
 from finforce_twin.scenes.scenarios import Scenario
 
@@ -28,7 +28,7 @@ START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
 TRACKED_EVERY = 3  # images: the object is tracked at 10 Hz
 POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
 ANGLE_STDDEV = np.radians(0.3)  # about each axis
-CAMERAS = {"robot": ROBOT_CAMERA, "bench": BENCH_CAMERA}
+CAMERAS = {"robot": ROBOT_CAMERA, "front": FRONT_CAMERA, "bench": BENCH_CAMERA}
 LEAST_SIZE, LARGEST_SIZE = 16, 4096  # [px]
 
 
@@ -171,30 +171,32 @@ def set_stage(assembly: Assembly, camera: CameraIntrinsics, depth_step: float) -
     )
 
 
-def parse_size(text: str) -> CameraIntrinsics:
-    """Return a D405's colour camera with images of a size such as 640x480.
+def parse_size(text: str, lens: str = D405) -> CameraIntrinsics:
+    """Return a colour camera with images of a size such as 640x480.
 
     The lens stays: other sizes are those of the 640 x 480 image scaled to the width and cut, or extended, about its
     principal point.
 
     Raises:
-        ScenarioError: the text is no size.
+        ScenarioError: the text is no size, or there is no such lens.
     """
+    if lens not in LENSES:
+        raise ScenarioError(f"lens {lens!r}: expected one of {', '.join(LENSES)}")
     found = re.fullmatch(r"(\d+)x(\d+)", text)
     width, height = (int(number) for number in found.groups()) if found else (0, 0)
     if not (LEAST_SIZE <= width <= LARGEST_SIZE and LEAST_SIZE <= height <= LARGEST_SIZE):
         raise ScenarioError(f"size {text!r}: expected WIDTHxHEIGHT, each {LEAST_SIZE} to {LARGEST_SIZE} pixels")
-    lens = build_d405_vga()
-    scale = width / lens.width
-    shift = 0.5 * (height - scale * lens.height)
+    plain = LENSES[lens]
+    scale = width / plain.width
+    shift = 0.5 * (height - scale * plain.height)
     return replace(
-        lens,
+        plain,
         width=width,
         height=height,
-        fx=scale * lens.fx,
-        fy=scale * lens.fy,
-        cx=scale * (lens.cx + 0.5) - 0.5,
-        cy=scale * (lens.cy + 0.5) - 0.5 + shift,
+        fx=scale * plain.fx,
+        fy=scale * plain.fy,
+        cx=scale * (plain.cx + 0.5) - 0.5,
+        cy=scale * (plain.cy + 0.5) - 0.5 + shift,
     )
 
 

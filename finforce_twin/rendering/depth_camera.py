@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
-from finforce.camera import CameraIntrinsics
+from finforce.camera import EQUIDISTANT, RATIONAL, CameraIntrinsics
 
 D405_DISTORTION = (-0.0545, 0.0568, 0.0010, 0.00034, -0.0185)
 
@@ -38,6 +38,33 @@ def build_d405(*, distorted: bool = False, step: int = 1) -> CameraIntrinsics:
         cy=241.3 / step,
         distortion=np.array(D405_DISTORTION) if distorted else np.zeros(5),
     )
+
+
+D405, WEBCAM, FISHEYE = "d405", "webcam", "fisheye"
+# by name, at 640 x 480: a webcam calibrated with the rational model, and an action camera of 155 degrees across
+LENSES = {
+    D405: build_d405_vga(),
+    WEBCAM: CameraIntrinsics(
+        width=640,
+        height=480,
+        fx=505.0,
+        fy=504.0,
+        cx=322.8,
+        cy=236.9,
+        distortion=np.array([0.21, -0.35, 0.0009, -0.0006, 0.02, 0.17, -0.27, -0.05]),
+        model=RATIONAL,
+    ),
+    FISHEYE: CameraIntrinsics(
+        width=640,
+        height=480,
+        fx=236.0,
+        fy=235.5,
+        cx=320.9,
+        cy=238.4,
+        distortion=np.array([-0.012, 0.006, -0.004, 0.0007]),
+        model=EQUIDISTANT,
+    ),
+}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -104,14 +104,17 @@ class RenderedScene:
         rays = compute_rays(camera)[rows, columns]
         shape = rays.shape[:2]
         flat = rays.reshape(-1, 3)
+        blind = np.isnan(flat).any(axis=1)  # beyond what a fisheye can show
+        flat = np.where(blind[:, None], [0.0, 0.0, 1.0], flat)
         hits = self._cast(flat)
         color = self._shade(flat, hits)
         rough = _find_edges(hits.depth.reshape(shape), hits.surface.reshape(shape), hits.owner.reshape(shape))
         at = np.flatnonzero(rough)
         row, column = np.divmod(at, shape[1])
         pixels = np.column_stack((column + (columns.start or 0), row + (rows.start or 0)))
-        fine = rays_from_pixels((pixels[:, None] + SUBPIXELS).reshape(-1, 2), camera)
+        fine = np.nan_to_num(rays_from_pixels((pixels[:, None] + SUBPIXELS).reshape(-1, 2), camera), nan=1.0)
         color[at] = self._shade(fine, self._cast(fine)).reshape(-1, len(SUBPIXELS), 3).mean(axis=1)
+        color[blind], hits.depth[blind], hits.owner[blind] = 0.0, FAR, -1
         picture = Picture(
             color=np.zeros((camera.height, camera.width, 3)),
             depth=np.full((camera.height, camera.width), FAR),

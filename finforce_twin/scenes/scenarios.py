@@ -12,7 +12,7 @@ from finforce.settings import check_bounds, setting
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_twin.errors import ScenarioError
 
-CAMERAS = ("robot", "bench")
+CAMERAS = ("robot", "front", "bench")
 LIGHTS = ("bright", "dim", "any")
 HELD = 1e-6  # [kg] of mass from which on an object is lifted
 
@@ -36,7 +36,11 @@ class Scenario:
     height: float = setting(0.042, "z of the object's middle at first", "m", 0.0, 0.2)
     offset: float = setting(0.0, "x of the object's middle at first, between two jaws", "m", -0.05, 0.05)
     shift: float = setting(0.0, "y of the object's middle", "m", -0.05, 0.05)
-    camera: str = setting("robot", "two jaws before the wrist camera, or one before that of the bench", choices=CAMERAS)
+    camera: str = setting(
+        "robot",
+        "two jaws before the wrist camera or one beyond the tips, or one jaw before that of the bench",
+        choices=CAMERAS,
+    )
     light: str = setting("bright", "how the scene is lit", choices=LIGHTS)
     clearance: float = setting(0.008, "from each jaw to first touch while open", "m", 5e-4, 0.06)
     closing_speed: float = setting(0.020, "of each jaw", "m/s", 5e-4, 0.3)
