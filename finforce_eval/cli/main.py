@@ -17,6 +17,7 @@ COMMANDS = {
     "jaw": "make the jaw file of a printed finger from its STL, STEP, DXF or SVG file",
     "calibrate": "identify the material from recordings with ground truth",
     "weigh": "scale the stiffness of a finger by the readings of a kitchen scale, one for each steady hold",
+    "check": "say whether camera, jaw file, extrinsics and picture fit each other, before any force",
     "extrinsics": "find where the camera is in the gripper, from images of jaws that are open, still and unloaded",
     "twin": "make RGB-D recordings of a synthetic gripper, with the truth about everything in them",
     "demo": "play a recording through the real nodes, from images to force, and write a report",
@@ -51,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the `finforce` command.
 
     Returns:
-        0; 2 after one line on stderr when the input cannot be used; 130 after Ctrl-C.
+        0; 1 where `check` found a fault; 2 after one line on stderr when the input cannot be used; 130 after Ctrl-C.
     """
     # one thread: the times are of one thread, and sums come in the same order on every machine
     for name in THREADS:

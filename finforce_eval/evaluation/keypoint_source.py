@@ -137,13 +137,13 @@ class KeypointSource:
 
         detector, parameters = self.build(recording), build_records(self.node_parameters(recording)).parameters
         watch = ImageWatch(parameters.frozen_after)
-        images = _choose_images(recording, parameters.depth)
+        images = choose_images(recording, parameters.depth)
         recording = replace(recording, images=replace(images, depth_scale=parameters.depth_scale))
         with tqdm(total=len(recording.images), unit="image", desc=recording.name, disable=None, leave=False) as bar:
             return detect_keypoints(recording, detector, watch=watch, progress=bar.update)
 
 
-def _choose_images(recording: Recording, depth: str) -> ImageTrack:
+def choose_images(recording: Recording, depth: str) -> ImageTrack:
     """Return the images that a detector is to see, with depth, without, or where there is some.
 
     Raises:

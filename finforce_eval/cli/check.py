@@ -1,0 +1,62 @@
+"""The subcommand `check`: do camera, jaw file, extrinsics and picture fit each other, before any force."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from tqdm import tqdm
+
+from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.at_rest import ROUNDS, first_images
+from finforce_eval.evaluation.check import FAULT, check_recording
+from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.setup import read_recordings
+from finforce_eval.recordings.tracks import JAWS
+
+PICTURE = "check.png"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    parser.add_argument("bags", nargs=1, metavar="BAG", help="rosbag2 folder, .mcap or .db3 file with images")
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
+    parser.add_argument("--jaws", default="both", choices=("left", "right", "both"), help="in the images (both)")
+    text = "the camera in the gripper: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
+    parser.add_argument("--extrinsics", metavar="POSE", help=text)
+    text = "change a parameter of the key point detector, as depth=none; repeatable"
+    parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
+    text = "how many images at the beginning show the jaws open, still and unloaded (30)"
+    parser.add_argument("--images", type=int, default=30, metavar="N", help=text)
+    parser.add_argument("--report", default=".", metavar="DIR", help=f"where {PICTURE} is written (here)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Check the first images of a recording, print what fits and what does not, and draw it.
+
+    Returns:
+        0 if everything fits, 1 if something has to be changed.
+    """
+    from finforce.optional import import_cv2
+
+    options.source = "images"
+    if options.images < 5:
+        raise OptionError(f"--images {options.images}: expected at least 5, the mean of which is taken")
+    source = parse_source(options)
+    sides = JAWS if options.jaws == "both" else (options.jaws,)
+    (recording,) = read_recordings(options.bags, source.pairing, sides=sides)
+    recording = first_images(recording, options.images)
+    recording = replace(recording, jaws={side: recording.jaws[side] for side in sides})
+    if not recording.images.has_depth and "depth" not in source.parameters:
+        source = replace(source, parameters={**source.parameters, "depth": "none"})
+    with tqdm(total=ROUNDS * len(recording.images), unit="image", disable=None, leave=False) as bar:
+        check = check_recording(recording, source, bar.update)
+    for line in check.said:
+        print(f"{line.level:<8}{line.text}")
+    folder = Path(options.report)
+    folder.mkdir(parents=True, exist_ok=True)
+    import_cv2().imwrite(str(folder / PICTURE), check.picture[..., ::-1])
+    verdict = "everything fits" if check.is_good else f"{sum(line.level == FAULT for line in check.said)} to be changed"
+    print(f"{verdict}; {folder / PICTURE}: grey as given, orange as fitted, green key points")
+    return 0 if check.is_good else 1

@@ -1,0 +1,108 @@
+"""Images of jaws at rest: where their key points are in the mean, and where the detector takes the jaws to be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.transforms import pose_numbers
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.keypoint_source import Detector, KeypointSource
+from finforce_eval.recordings.tracks import Recording
+from finforce_ifea.jaw.jaw import Jaw
+from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, find_extrinsics
+
+ROUNDS = 4  # of finding the key points with the place found before
+LOOSE = {"detector.reference_tolerance": 0.02, "detector.lost_images": 1000}  # [m]; a guess is allowed to be far off
+STILL = 0.05e-3  # [m] below which another round changes nothing
+OFTEN = 0.5  # share of the images in which a jaw, and a key point, has to be seen
+
+
+def first_images(recording: Recording, count: int) -> Recording:
+    """Return a recording with its first images alone."""
+    images = recording.images
+    if images is None:
+        raise RecordingError(f"{recording.name}: no images; record colour and camera_info, and aligned depth")
+    if len(images) < count:
+        raise RecordingError(f"{recording.name}: {len(images)} images, expected at least {count} of jaws at rest")
+    return replace(recording, images=images.between(int(images.stamps[0]), int(images.stamps[count - 1]) + 1))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RestLook:
+    """What a detector saw: the jaws, and where it took them to be, T_camera_jaw (4, 4) of every image by side."""
+
+    jaws: Mapping[str, SeenJaw]
+    poses: Mapping[str, Sequence[NDArray]]
+
+
+def look_at_rest(
+    recording: Recording, detector: Detector, jaws: Mapping[str, Jaw], progress: Callable[[int], Any]
+) -> RestLook:
+    """Average the pixels of the key points over the images.
+
+    Raises:
+        RecordingError: a jaw is found in less than half of them.
+    """
+    pixels: dict[str, list[NDArray]] = {side: [] for side in jaws}
+    poses: dict[str, list[NDArray]] = {side: [] for side in jaws}
+    for _, image in recording.images:
+        for side, found in detector.detect(image).items():
+            blind = np.isin(found.reasons, ("image", "likelihood"))[:, None]
+            pixels[side].append(np.where(blind, np.nan, found.pixels))
+            poses[side].append(found.T_camera_jaw)
+        progress(1)
+    for side, seen in pixels.items():
+        if len(seen) < OFTEN * len(recording.images):
+            raise RecordingError(
+                f"{recording.name}: the {side} jaw was found in {len(seen)} of {len(recording.images)} images: are the "
+                "jaws in view and is the guess, --extrinsics, within some 10 mm and 5 degrees?"
+            )
+    averaged = {side: _average(np.array(seen)) for side, seen in pixels.items()}
+    return RestLook(
+        jaws={side: SeenJaw(points=jaws[side].keypoints, pixels=averaged[side]) for side in jaws}, poses=poses
+    )
+
+
+def _average(pixels: NDArray) -> NDArray:
+    """Return the means (K, 2) of pixels (n, K, 2), NaN for a key point that is not seen in most images."""
+    seen = np.isfinite(pixels).all(axis=2)
+    sums = np.where(seen[:, :, None], pixels, 0.0).sum(axis=0)
+    often = seen.mean(axis=0) > OFTEN
+    return np.where(often[:, None], sums / np.maximum(seen.sum(axis=0), 1)[:, None], np.nan)
+
+
+def approach(
+    recording: Recording,
+    source: KeypointSource,
+    jaws: Mapping[str, Jaw],
+    guess: NDArray,
+    progress: Callable[[int], Any] = lambda images: None,
+) -> tuple[Extrinsics, RestLook]:
+    """Find the key points, with these the camera's place, and again with that place, until nothing moves.
+
+    Args:
+        recording: images of jaws at rest.
+        source: the detector's parameters.
+        jaws: by side.
+        guess: T_gripper_camera (4, 4).
+        progress: called with the number of images done since its last call, ROUNDS times as many at most.
+
+    Raises:
+        FinforceError: the jaws are not found, or a parameter cannot be used.
+    """
+    T = guess
+    for _ in range(ROUNDS):
+        here = replace(source, parameters={**LOOSE, **source.parameters, "T_gripper_camera": list(pose_numbers(T))})
+        look = look_at_rest(recording, here.build(recording), jaws, progress)
+        origins = [abs(float((T @ pose)[0, 3])) for poses in look.poses.values() for pose in poses]
+        found = find_extrinsics(look.jaws, recording.images.camera, T, float(np.median(origins)))
+        moved = float(np.linalg.norm(found.T_gripper_camera[:3, 3] - T[:3, 3]))
+        T = found.T_gripper_camera
+        if moved < STILL:
+            break
+    return found, look

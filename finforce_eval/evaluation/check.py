@@ -1,0 +1,360 @@
+"""Whether camera, jaw file, extrinsics and picture fit each other, before any force is believed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from finforce.camera import CameraIntrinsics, ImageError, project
+from finforce.errors import FinforceError
+from finforce.gripper_frames import OpeningRange, jaw_in_camera
+from finforce.optional import import_cv2
+from finforce.transforms import invert_pose, move_pose, pose_numbers, rotation_between
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.at_rest import RestLook, approach
+from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images
+from finforce_eval.recordings.tracks import Recording
+from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
+from finforce_keypoints.errors import KeypointError
+from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw
+from finforce_keypoints.geometry.template import find_shape
+from finforce_keypoints.images import RgbdImage
+from finforce_keypoints.parameters import ALIGNED
+
+OK, WARNING, FAULT = LEVELS = ("ok", "warning", "fault")
+DARK, BRIGHT = 25.0, 235.0  # of 255: mean brightness beyond which a picture shows little
+BLURRED = 0.16  # share of the finest detail in that of the next scale, of a picture out of focus
+COVERED = 0.30  # share of the picture's parts without any detail, from which on something may cover the lens
+FLAT, TILES = 1.5, 12  # of 255: contrast of such a part; parts each way
+GOOD_RESIDUAL = 1.0  # [px] left over when jaws at rest are laid on what is seen
+FAR, TURNED = 3e-3, np.radians(1.5)  # [m], [rad] by which the camera may be elsewhere than it is said to be
+FOCAL_ERROR, SCALE_ERROR = 0.03, 0.03  # of focal length and depth, from which on they are named
+BETTER, ENOUGH = 0.2, 0.5  # by which another reading has to be likelier, and how likely, to be named
+
+
+class Said(NamedTuple):
+    """One thing that a check says: how bad it is, and what it is."""
+
+    level: str
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Check:
+    """What a check found.
+
+    Attributes:
+        said: line by line.
+        picture: (h, w, 3) uint8, the mean image with what was expected (grey) and what was found.
+        extrinsics: where the camera is by the jaws at rest; None where they were not found.
+    """
+
+    said: Sequence[Said]
+    picture: NDArray
+    extrinsics: Extrinsics | None = None
+
+    @property
+    def is_good(self) -> bool:
+        """Whether there is no fault."""
+        return all(line.level != FAULT for line in self.said)
+
+
+def check_recording(
+    recording: Recording, source: KeypointSource, progress: Callable[[int], Any] = lambda images: None
+) -> Check:
+    """Return whether the images of jaws at rest show what camera, jaw file and extrinsics say.
+
+    Args:
+        recording: with images of jaws that are open, still and unloaded.
+        source: the detector's parameters, the jaw file among them.
+        progress: called with the number of images done since its last call.
+
+    Raises:
+        FinforceError: an image is damaged, or the detector cannot be built.
+    """
+    parameters = build_records(source.node_parameters(recording)).parameters
+    recording = replace(recording, images=choose_images(recording, parameters.depth))
+    mean = _mean_image(recording)
+    said = [*_describe_camera(recording, parameters.depth), *judge_picture(mean.color)]
+    jaws = {side: load_jaw(source.jaw_file, side) for side in recording.jaws}
+    try:
+        found, look = approach(recording, source, jaws, parameters.camera_pose, progress)
+    except (RecordingError, KeypointError, ImageError) as error:
+        said.append(Said(FAULT, f"no jaw to rely on: {_trim(error)}"))
+        said += _find_reasons(mean, source, recording, parameters.camera_pose)
+        return Check(said=said, picture=_draw(mean, jaws, parameters.camera_pose, None, None))
+    said += [
+        Said(OK, f"{side} jaw: {_count(jaw)} of {len(jaw.pixels)} key points seen") for side, jaw in look.jaws.items()
+    ]
+    lines = _judge_place(found, look, recording, parameters.camera_pose)
+    said += lines
+    if found.residual > GOOD_RESIDUAL:
+        said += _find_reasons(mean, source, recording, parameters.camera_pose)
+    picture = _draw(mean, jaws, parameters.camera_pose, found, look)
+    return Check(said=said, picture=picture, extrinsics=found)
+
+
+def judge_picture(color: NDArray) -> list[Said]:
+    """Return what speaks against a picture (h, w, 3) uint8, best a mean of many: light, focus, something before it."""
+    cv2 = import_cv2()
+    grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    said, level = [], float(grey.mean())
+    if not DARK <= level <= BRIGHT:
+        said.append(
+            Said(WARNING, f"mean brightness {level:.0f} of 255; expected {DARK:g} to {BRIGHT:g}: more or less light")
+        )
+    sharpness = measure_sharpness(grey)
+    if sharpness < BLURRED:
+        said.append(
+            Said(FAULT, f"out of focus: fine detail {sharpness:.2f} of coarse; expected {BLURRED:g}: focus the lens")
+        )
+    rows, columns = (np.linspace(0, size, TILES + 1).astype(int) for size in grey.shape)
+    flat = [
+        float(grey[r0:r1, c0:c1].std()) < FLAT
+        for r0, r1 in zip(rows[:-1], rows[1:], strict=True)
+        for c0, c1 in zip(columns[:-1], columns[1:], strict=True)
+    ]
+    if np.mean(flat) > COVERED:
+        said.append(
+            Said(
+                WARNING, f"{100 * np.mean(flat):.0f} % of the picture show nothing at all: is the lens partly covered?"
+            )
+        )
+    return said or [Said(OK, f"brightness {level:.0f} of 255, fine detail {sharpness:.2f} of coarse")]
+
+
+def measure_sharpness(grey: NDArray) -> float:
+    """Return the finest detail of a picture (h, w) float32 beside that of the next scale [-], where there is some."""
+    cv2 = import_cv2()
+    first, second = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (0.8, 2.4))
+    fine, coarse = np.abs(grey - first), np.abs(first - second)
+    edges = coarse >= np.quantile(coarse, 0.9)
+    return float(fine[edges].mean() / max(float(coarse[edges].mean()), 1e-6))
+
+
+def _mean_image(recording: Recording) -> RgbdImage:
+    """Return the mean of the images, without depth."""
+    total, count, last = None, 0, None
+    for _, image in recording.images:
+        total = image.color.astype(np.float64) if total is None else total + image.color
+        count, last = count + 1, image
+    return replace(last, color=np.round(total / count).astype(np.uint8), depth=None)
+
+
+def _describe_camera(recording: Recording, depth: str) -> Iterator[Said]:
+    """Yield what the camera is."""
+    camera, images = recording.images.camera, recording.images
+    across = 2.0 * np.degrees(np.arctan(0.5 * camera.width / camera.fx))
+    if camera.model == "equidistant":
+        across = np.degrees(camera.width / camera.fx)
+    rate = (len(images) - 1) / max(1e-9 * float(images.stamps[-1] - images.stamps[0]), 1e-6)
+    kind = "with depth" if images.has_depth and depth == ALIGNED else "colour alone"
+    yield Said(
+        OK, f"camera {camera.width}x{camera.height}, {camera.model}, {across:.0f} degrees, {rate:.0f} Hz, {kind}"
+    )
+    aspect = camera.fx / camera.fy
+    if not 0.97 < aspect < 1.03:
+        yield Said(
+            WARNING, f"fx / fy is {aspect:.3f}; expected 1: are the intrinsics those of a picture of another size?"
+        )
+    aside = np.hypot(camera.cx - 0.5 * (camera.width - 1), camera.cy - 0.5 * (camera.height - 1))
+    if aside > 0.1 * camera.width:
+        yield Said(
+            WARNING, f"principal point {aside:.0f} px off the middle: was the picture cut, and the intrinsics not?"
+        )
+
+
+def _judge_place(found: Extrinsics, look: RestLook, recording: Recording, guess: NDArray) -> list[Said]:
+    """Return what the camera's place by what is seen says of what was given."""
+    said = []
+    moved = float(np.linalg.norm(found.T_gripper_camera[:3, 3] - guess[:3, 3]))
+    turned = rotation_between(guess, found.T_gripper_camera)
+    shown = f"{1e3 * moved:.1f} mm and {np.degrees(turned):.2f} degrees"
+    if found.residual > GOOD_RESIDUAL:
+        said.append(
+            Said(
+                FAULT,
+                f"key points lie {found.residual:.2f} px beside the jaw file, wherever the camera is; expected at most "
+                f"{GOOD_RESIDUAL:g} px: another finger, a bent one, or other intrinsics",
+            )
+        )
+    elif moved > FAR or turned > TURNED:
+        numbers = ", ".join(f"{number:.6f}" for number in pose_numbers(found.T_gripper_camera))
+        said.append(
+            Said(FAULT, f"the camera is {shown} from where T_gripper_camera says; set T_gripper_camera: [{numbers}]")
+        )
+    else:
+        said.append(Said(OK, f"extrinsics within {shown}, {found.residual:.2f} px left over"))
+    focal = fit_focal(look.jaws, recording.images.camera, found)
+    if found.residual > 0.5 * GOOD_RESIDUAL and abs(focal) > FOCAL_ERROR:
+        said.append(
+            Said(FAULT, f"a focal length {100 * focal:+.0f} % from that of camera_info fits better: wrong intrinsics?")
+        )
+    return said
+
+
+def fit_focal(jaws: Mapping[str, SeenJaw], camera: CameraIntrinsics, found: Extrinsics) -> float:
+    """Return by which share another focal length would explain what is seen better; 0 where it hardly does."""
+    half = float(np.mean([abs(x) for x in found.origins.values()]))
+
+    def misses(x: NDArray) -> NDArray:
+        lens = replace(camera, fx=camera.fx * np.exp(x[6]), fy=camera.fy * np.exp(x[6]))
+        T, away = move_pose(found.T_gripper_camera, x[:6]), []
+        for side, jaw in jaws.items():
+            pose = jaw_in_camera(T, side, (half + x[7]) * (-1.0 if side == "left" else 1.0))
+            seen = np.isfinite(jaw.pixels).all(axis=1)
+            places = project(jaw.points[seen] @ pose[:3, :3].T + pose[:3, 3], lens)
+            away.append((places - jaw.pixels[seen]).ravel())
+        return np.nan_to_num(np.concatenate(away), nan=1e3)
+
+    scale = np.r_[np.full(3, 5e-3), np.full(3, 0.05), 0.1, 5e-3]
+    fit = least_squares(misses, np.zeros(8), x_scale=scale, loss="soft_l1", f_scale=2.0)
+    before, after = (float(np.sqrt((misses(x) ** 2).mean())) for x in (np.zeros(8), fit.x))
+    return float(np.expm1(fit.x[6])) if after < 0.6 * before else 0.0
+
+
+def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray) -> list[Said]:
+    """Return which other reading of picture, extrinsics or jaw file shows the jaws better."""
+    own = _score(mean, source, recording, guess)
+    best = max(
+        ((_try(mean, source, recording, guess, change), words) for words, change in _readings(source)),
+        key=lambda entry: entry[0],
+        default=(0.0, ""),
+    )
+    if best[0] > max(own + BETTER, ENOUGH):
+        return [Said(FAULT, f"the jaws show (likelihood {best[0]:.2f} instead of {own:.2f}) if {best[-1]}")]
+    return [
+        Said(
+            WARNING,
+            f"likelihood {own:.2f}, no better upside down, mirrored, with other conventions of the extrinsics or with "
+            "another shipped finger: are the jaws in view, lit, and within some 15 mm of where the extrinsics say?",
+        )
+    ]
+
+
+def _try(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray, change: Callable) -> float:
+    """Return how likely the jaws are in another reading."""
+    try:
+        image, pose, jaw = change(mean, guess)
+        return _score(image, replace(source, jaw_file=jaw or source.jaw_file), recording, pose)
+    except FinforceError:
+        return 0.0
+
+
+def _readings(source: KeypointSource) -> Iterator[tuple[str, Callable]]:
+    """Yield other readings: in words, and as a change of image and extrinsics."""
+    yield (
+        "the picture is turned upside down: rotate it, or turn T_gripper_camera by 180 degrees",
+        lambda i, T: (
+            _flip(i, rows=True, columns=True),
+            T,
+            None,
+        ),
+    )
+    yield (
+        "the picture is mirrored: switch that off in the camera's driver",
+        lambda i, T: (
+            _flip(i, rows=False, columns=True),
+            T,
+            None,
+        ),
+    )
+    yield (
+        "T_gripper_camera is inverted, the gripper in the camera's frame: give its inverse",
+        lambda i, T: (
+            i,
+            invert_pose(T),
+            None,
+        ),
+    )
+    yield (
+        "T_gripper_camera is of the camera's body (x ahead): give that of its optical frame (z ahead)",
+        lambda i, T: (
+            i,
+            T @ _pose_of(Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])),
+            None,
+        ),
+    )
+    yield "the quaternion of T_gripper_camera begins with w: give x y z w", lambda i, T: (i, _reorder(T), None)
+    for name in list_shipped_jaws():
+        if name != source.jaw_file and load_jaw(name).model != "frame":
+            yield f"the finger is {name}: give its jaw file", lambda i, T, name=name: (i, T, name)
+
+
+def _pose_of(rotation: Rotation) -> NDArray:
+    T = np.eye(4)
+    T[:3, :3] = rotation.as_matrix()
+    return T
+
+
+def _reorder(T: NDArray) -> NDArray:
+    """Return a pose whose quaternion was read as x y z w, and meant as w x y z."""
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    turned = _pose_of(Rotation.from_quat([y, z, w, x]))
+    turned[:3, 3] = T[:3, 3]
+    return turned
+
+
+def _flip(image: RgbdImage, *, rows: bool, columns: bool) -> RgbdImage:
+    """Return an image turned over, with the intrinsics that belong to it."""
+    camera = image.camera
+    color = image.color[:: -1 if rows else 1, :: -1 if columns else 1]
+    cx = camera.width - 1 - camera.cx if columns else camera.cx
+    cy = camera.height - 1 - camera.cy if rows else camera.cy
+    return replace(image, color=np.ascontiguousarray(color), camera=replace(camera, cx=cx, cy=cy))
+
+
+def _score(image: RgbdImage, source: KeypointSource, recording: Recording, pose: NDArray) -> float:
+    """Return the mean likelihood of the key points, the jaws looked for all along the closing axis."""
+    from finforce_keypoints.build import build_finder
+    from finforce_keypoints.parameters import load_jaws
+
+    given = {**source.node_parameters(recording), "T_gripper_camera": [float(number) for number in pose_numbers(pose)]}
+    parameters, settings, dots = build_records(given)
+    finder = build_finder(load_jaws(parameters), parameters, settings, dots).finder
+    found = finder.find(image, dict.fromkeys(recording.jaws))
+    return float(np.mean([found[side].likelihood.mean() if side in found else 0.0 for side in recording.jaws]))
+
+
+GIVEN, SEEN, FITTED = (150, 150, 150), (60, 230, 90), (255, 170, 40)
+
+
+def _draw(
+    mean: RgbdImage, jaws: Mapping[str, Jaw], given: NDArray, found: Extrinsics | None, look: RestLook | None
+) -> NDArray:
+    """Return the mean image with the jaws as given in grey, as fitted in orange, and the key points seen in green."""
+    cv2, picture, camera = import_cv2(), mean.color.copy(), mean.camera
+    middle = 0.5 * (OpeningRange().nearest + OpeningRange().farthest)
+    for side, jaw in jaws.items():
+        sign = -1.0 if side == "left" else 1.0
+        places = [(given, sign * abs(found.origins[side]) if found else sign * middle, GIVEN)]
+        if found is not None:
+            places.append((found.T_gripper_camera, found.origins[side], FITTED))
+        for T, origin, color in places:
+            pose, y = jaw_in_camera(T, side, origin), float(jaw.keypoints[:, 1].mean())
+            for ring in find_shape(jaw).rings:
+                points = np.insert(np.vstack((ring, ring[:1])), 1, y, axis=1)
+                line = project(points @ pose[:3, :3].T + pose[:3, 3], camera)
+                for part in np.split(line, np.flatnonzero(~np.isfinite(line).all(axis=1))):
+                    part = part[np.isfinite(part).all(axis=1)]
+                    if len(part) > 1:
+                        shifted = np.round(8.0 * np.clip(part, -4e3, 4e3)).astype(np.int32)
+                        cv2.polylines(picture, [shifted], False, color, 1, cv2.LINE_AA, 3)
+    for jaw in look.jaws.values() if look else ():
+        for x, y in jaw.pixels[np.isfinite(jaw.pixels).all(axis=1)]:
+            cv2.circle(picture, (round(8 * x), round(8 * y)), 24, SEEN, 1, cv2.LINE_AA, 3)
+    return picture
+
+
+def _count(jaw: SeenJaw) -> int:
+    return int(np.isfinite(jaw.pixels).all(axis=1).sum())
+
+
+def _trim(error: Exception) -> str:
+    return " ".join(str(error).split())
