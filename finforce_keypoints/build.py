@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from finforce_keypoints.pixel_finder import PixelFinder
     from finforce_keypoints.settings import DetectorSettings
 
-SHIPPED = Path(__file__).parent / "models" / "plane"
+SHIPPED = Path(__file__).parent / "models" / "side_plane"
 ANSWERS = {"auto": None, "yes": True, "no": False}
 
 
@@ -75,25 +75,27 @@ def build_finder(
     """Return what finds the pixels of key points; see `build_detector`."""
     from finforce.gripper_frames import OpeningRange
     from finforce_keypoints.detectors.side_plane import PlaneFinder
+    from finforce_keypoints.networks.side_network import SideNetwork
 
     opening = OpeningRange(nearest=settings.opening_min, farthest=settings.opening_max)
     if parameters.finder == "dots":
         from finforce_keypoints.detectors.dots import DotFinder
 
         return BuiltFinder(DotFinder(jaws, dots, parameters.camera_pose, opening), FinderCard(name="dots"))
-    model = load_model(parameters)
     if parameters.finder == "frame":
+        model = load_model(parameters)
         finder = _build_frame_finder(model, jaws, parameters)
-    else:
-        finder = PlaneFinder(model, jaws, parameters.camera_pose, opening)
-    return BuiltFinder(finder, FinderCard(name=f"{parameters.finder} {model.path.stem}", sha256=model.sha256))
+        return BuiltFinder(finder, FinderCard(name=f"frame {model.path.stem}", sha256=model.sha256))
+    network = SideNetwork(parameters.model or SHIPPED, threads=parameters.threads)
+    finder = PlaneFinder(network, jaws, parameters.camera_pose, opening)
+    return BuiltFinder(finder, FinderCard(name=f"network {network.path.name}", sha256=network.sha256))
 
 
 def load_model(parameters: DetectorParameters) -> KeypointModel:
-    """Load the network that the parameters name, the shipped one without a name.
+    """Load the DeepLabCut network that the parameters name.
 
     Raises:
-        ModelError: its files are missing, do not agree with the metadata and the parameters, or are not for the finder.
+        ModelError: there is no name, its files are missing, or do not agree with the metadata and the parameters.
         MissingDependencyError: onnxruntime is not installed.
     """
     from finforce_keypoints.errors import ModelError
@@ -107,18 +109,12 @@ def load_model(parameters: DetectorParameters) -> KeypointModel:
         normalize=ANSWERS[parameters.normalize],
         input_size=size if any(size) else None,
     )
-    if parameters.finder == "frame" and not parameters.model:
+    if not parameters.model:
         raise ModelError(
             "finder frame: got no model, and the shipped network sees rectified side planes; expected the folder of a "
             "DeepLabCut network as `model`, or finder network"
         )
-    model = KeypointModel(parameters.model or SHIPPED, overrides, threads=parameters.threads)
-    if parameters.finder == "frame" and "plane" in model.metadata.extra:
-        raise ModelError(
-            f"finder frame: {model.path.parent} holds a network of rectified side planes (finforce: plane in its "
-            "metadata); expected one that sees the image, or finder network"
-        )
-    return model
+    return KeypointModel(parameters.model, overrides, threads=parameters.threads)
 
 
 def _build_frame_finder(model: KeypointModel, jaws: Mapping[str, Jaw], parameters: DetectorParameters) -> PixelFinder:

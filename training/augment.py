@@ -13,9 +13,6 @@ from finforce.settings import check_bounds, setting
 from training.dataset import MARGIN
 from training.errors import RecipeError
 
-MEAN = np.array([0.485, 0.456, 0.406], dtype=np.float32)  # ImageNet's, the contract of DeepLabCut's networks
-STD = np.array([0.229, 0.224, 0.225], dtype=np.float32)
-
 
 @dataclass(frozen=True, kw_only=True)
 class AugmentSettings:
@@ -33,7 +30,7 @@ class AugmentSettings:
     sharpen: float = setting(0.15, "probability of a camera's sharpening", "-", 0.0, 1.0)
     noise: float = setting(0.7, "probability of sensor noise; little light always has it", "-", 0.0, 1.0)
     jpeg: float = setting(0.3, "probability of compression", "-", 0.0, 1.0)
-    occlusion: float = setting(0.35, "probability of things in front", "-", 0.0, 1.0)
+    occlusion: float = setting(0.5, "probability of things in front", "-", 0.0, 1.0)
 
     def __post_init__(self) -> None:
         check_bounds(self, RecipeError)
@@ -52,12 +49,6 @@ class TrainingSample:
     picture: NDArray
     points: NDArray
     visible: NDArray
-
-
-def crop_centre(picture: NDArray, points: NDArray, visible: NDArray) -> TrainingSample:
-    """Return the picture (h, w, 3) without its padding, the points (K, 2) moved along."""
-    cropped = picture[MARGIN:-MARGIN, MARGIN:-MARGIN]
-    return _keep_inside(cropped, points - MARGIN, visible)
 
 
 def augment(

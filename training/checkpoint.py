@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from training.errors import CheckpointError
-from training.network import KeypointNetwork, NetworkShape
+from training.network import FingerNetwork, NetworkShape
 from training.optional import import_torch
 
 torch = import_torch()
@@ -20,7 +20,6 @@ class Checkpoint:
 
     Attributes:
         shape: of the network.
-        names: (K,) of the points, the reference point last.
         averaged: state of the averaged network, the one to use.
         network: state of the network that is trained.
         optimizer: its state.
@@ -29,7 +28,6 @@ class Checkpoint:
     """
 
     shape: NetworkShape
-    names: tuple[str, ...]
     averaged: Mapping[str, Any]
     network: Mapping[str, Any]
     optimizer: Mapping[str, Any]
@@ -41,7 +39,6 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint; the file before it stays whole until the new one is complete."""
     content = {name: getattr(checkpoint, name) for name in checkpoint.__dataclass_fields__}
     content["shape"] = asdict(checkpoint.shape)
-    content["names"] = list(checkpoint.names)
     part = Path(path).with_suffix(".part")
     torch.save(content, part)
     part.replace(path)
@@ -55,15 +52,19 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-        shape = {name: tuple(v) if isinstance(v, list) else v for name, v in content["shape"].items()}
-        return Checkpoint(**content | {"shape": NetworkShape(**shape), "names": tuple(content["names"])})
+        return Checkpoint(**content | {"shape": shape_from(content["shape"])})
     except Exception as error:  # torch raises whatever its unpickler does
         reason = str(error).partition("\n")[0]
         raise CheckpointError(f"{path}: {reason}; expected a checkpoint written by training.train") from error
 
 
-def build_averaged(checkpoint: Checkpoint) -> KeypointNetwork:
+def shape_from(content: Mapping[str, Any]) -> NetworkShape:
+    """Return the sizes of a network from what a file says of them."""
+    return NetworkShape(**{name: tuple(value) if isinstance(value, list) else value for name, value in content.items()})
+
+
+def build_averaged(checkpoint: Checkpoint) -> FingerNetwork:
     """Return the averaged network of a checkpoint, in evaluation mode."""
-    network = KeypointNetwork(checkpoint.shape)
+    network = FingerNetwork(checkpoint.shape)
     network.load_state_dict(checkpoint.averaged)
     return network.eval()

@@ -1,8 +1,8 @@
-"""Shards of padded, rectified pictures with their points, on disk and in memory."""
+"""Shards of rectified pictures of many fingers with their templates, on disk and in memory."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -15,67 +15,104 @@ from training.errors import DatasetError
 
 MARGIN = 28  # px of padding all round, room for shifting and turning a picture
 TRAIN, VALIDATION = "train", "val"  # how the names of shards begin
+_SHAPES = {"picture": 4, "rest": 3, "place": 3, "visible": 2, "template": 4, "finger": 1, "keypoints": 1}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LabelledPictures:
-    """Pictures of one jaw with the places of its points.
+class FingerPictures:
+    """Pictures of the side planes of fingers, and where points of their material are.
 
     Attributes:
-        picture: (n, h, w, 3) uint8 RGB, rectified to the jaw's side plane, with MARGIN pixels of padding all round.
-        xz: (n, K, 2) float32 column and row of the points in the padded picture [px]; NaN where not known.
-        visible: (n, K) bool, whether a point can be seen.
-        names: (K,) names of the points, the reference point last; () where the shards do not tell.
-        light: (n,) str, the name of a picture's light; "" where the shards do not tell.
+        picture: (n, h, w, 3) uint8 RGB, square to the side plane, with MARGIN pixels of padding all round.
+        rest: (n, P, 2) float32 column and row of points of the finger at rest, in the template [px]; the mark first.
+        place: (n, P, 2) float32 column and row of the same points in the padded picture [px]; NaN where not known.
+        visible: (n, P) bool, whether a point can be seen.
+        keypoints: (n,) how many of the points, from the first on, are key points; the others lie anywhere.
+        template: (f, h', w', 3) uint8, the fingers at rest on the unpadded grid.
+        finger: (n,) index of a picture's template.
     """
 
     picture: NDArray
-    xz: NDArray
+    rest: NDArray
+    place: NDArray
     visible: NDArray
-    names: tuple[str, ...] = ()
-    light: NDArray | None = None
+    keypoints: NDArray
+    template: NDArray
+    finger: NDArray
 
     def __post_init__(self) -> None:
-        count, points = self.visible.shape if self.visible.ndim == 2 else (-1, -1)
-        fits = self.picture.ndim == 4 and self.picture.shape[::3] == (count, 3)
-        if not fits or self.xz.shape != (count, points, 2) or len(self.names) not in (0, points):
+        for name, axes in _SHAPES.items():
+            if getattr(self, name).ndim != axes:
+                raise DatasetError(f"{name}: got shape {getattr(self, name).shape}, expected {axes} axes")
+        count, points = self.visible.shape
+        lengths = {len(self.picture), len(self.rest), len(self.place), len(self.finger), len(self.keypoints), count}
+        if lengths != {count} or self.rest.shape[1:] != (points, 2) or self.place.shape[1:] != (points, 2):
             raise DatasetError(
-                f"picture {self.picture.shape}, xz {self.xz.shape}, visible {self.visible.shape}, {len(self.names)} "
-                "names; expected (n, h, w, 3), (n, K, 2), (n, K) and K names"
+                f"picture {self.picture.shape}, rest {self.rest.shape}, place {self.place.shape}, visible "
+                f"{self.visible.shape}; expected (n, h, w, 3), (n, P, 2), (n, P, 2), (n, P)"
             )
-        if self.picture.dtype != np.uint8 or self.visible.dtype != bool:
-            raise DatasetError(
-                f"picture of {self.picture.dtype} and visible of {self.visible.dtype}; expected uint8 and bool"
-            )
-        if not np.isfinite(self.xz[self.visible]).all():
-            raise DatasetError("xz: a visible point has no place; mark it as not visible")
+        if self.picture.dtype != np.uint8 or self.template.dtype != np.uint8 or self.visible.dtype != bool:
+            raise DatasetError("picture and template are to be uint8, visible bool")
+        if not np.isfinite(self.place[self.visible]).all():
+            raise DatasetError("place: a visible point has no place; mark it as not visible")
+        if count and not 0 <= self.finger.min() <= self.finger.max() < len(self.template):
+            raise DatasetError(f"finger: {self.finger.min()} to {self.finger.max()}, of {len(self.template)} templates")
 
     def __len__(self) -> int:
         return len(self.picture)
 
-    def take(self, indices: NDArray) -> LabelledPictures:
-        """Return the pictures of some indices (m,)."""
-        light = None if self.light is None else self.light[indices]
-        return LabelledPictures(
-            picture=self.picture[indices],
-            xz=self.xz[indices],
-            visible=self.visible[indices],
-            names=self.names,
-            light=light,
-        )
+    @property
+    def middle(self) -> NDArray:
+        """The pictures (n, h', w', 3) without their padding."""
+        return self.picture[:, MARGIN:-MARGIN, MARGIN:-MARGIN]
+
+    def take(self, indices: NDArray) -> FingerPictures:
+        """Return the pictures of some indices (m,), or of a mask (n,)."""
+        columns = {name: getattr(self, name)[indices] for name in _SHAPES if name != "template"}
+        return FingerPictures(**columns, template=self.template)
+
+    def widened(self, points: int) -> FingerPictures:
+        """Return the same with as many points a picture: those that are missing are its own once more."""
+        have = self.rest.shape[1]
+        if have > points:
+            raise DatasetError(f"{have} points a picture; expected at most {points}")
+        own = np.arange(points) % have
+        columns = {name: getattr(self, name)[:, own] for name in ("rest", "place", "visible")}
+        others = {name: getattr(self, name) for name in _SHAPES if name not in columns}
+        return FingerPictures(**columns, **others)
+
+    def mixed_with(self, many: FingerPictures) -> FingerPictures:
+        """Return both sets, these pictures repeated until they are about half."""
+        points = max(self.rest.shape[1], many.rest.shape[1])
+        repeated = self.take(np.tile(np.arange(len(self)), max(1, round(len(many) / len(self)))))
+        return FingerPictures.join([repeated.widened(points), many.widened(points)])
+
+    @staticmethod
+    def join(parts: Sequence[FingerPictures]) -> FingerPictures:
+        """Return several sets one after the other, with all their templates.
+
+        Raises:
+            DatasetError: their pictures differ in size or in the number of points.
+        """
+        if len({(part.picture.shape[1:], part.rest.shape[1:]) for part in parts}) != 1:
+            raise DatasetError("shards of several kinds (size, number of points); expected one kind")
+        starts = np.cumsum([0, *(len(part.template) for part in parts[:-1])])
+        columns = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in _SHAPES if name != "finger"
+        }
+        fingers = [part.finger + start for part, start in zip(parts, starts, strict=True)]
+        return FingerPictures(**columns, finger=np.concatenate(fingers))
 
 
-def save_shard(path: str | Path, pictures: LabelledPictures) -> None:
-    """Write one shard, `train_*.npz` or `val_*.npz`."""
-    content = {"picture": pictures.picture, "xz": pictures.xz, "visible": pictures.visible}
-    if pictures.names:
-        content["names"] = np.array(pictures.names)
-    if pictures.light is not None:
-        content["light"] = pictures.light
-    np.savez_compressed(path, **content)
+def save_shard(path: Path, pictures: FingerPictures) -> None:
+    """Write one shard, `train_*.npz` or `val_*.npz`; it appears whole or not at all."""
+    unfinished = path.with_suffix(".part")
+    with unfinished.open("wb") as file:
+        np.savez(file, **{name: getattr(pictures, name) for name in _SHAPES})
+    unfinished.rename(path)
 
 
-def load_shard(path: str | Path) -> LabelledPictures:
+def load_shard(path: Path) -> FingerPictures:
     """Read one shard.
 
     Raises:
@@ -83,58 +120,31 @@ def load_shard(path: str | Path) -> LabelledPictures:
     """
     try:
         with np.load(path, allow_pickle=False) as content:
-            names = tuple(map(str, content["names"])) if "names" in content else ()
-            light = content["light"].astype(str) if "light" in content else None
-            return LabelledPictures(
-                picture=content["picture"],
-                xz=content["xz"].astype(np.float32),
-                visible=content["visible"].astype(bool),
-                names=names,
-                light=light,
-            )
+            return FingerPictures(**{name: content[name] for name in _SHAPES})
     except (OSError, EOFError, ValueError, KeyError, BadZipFile) as error:
-        raise DatasetError(f"{path}: {error}; expected a shard with picture, xz and visible") from error
+        raise DatasetError(f"{path}: {error}; expected a shard with {', '.join(_SHAPES)}") from error
 
 
-def load_pictures(folder: str | Path, part: str, limit: int | None = None) -> LabelledPictures:
-    """Read all shards of one part of a data set into memory, with a progress bar.
+def load_pictures(folder: Path, part: str, limit: int | None = None) -> FingerPictures:
+    """Read the shards of one part of a data set into memory, with a progress bar.
 
     Args:
         folder: of the shards.
-        part: TRAIN or VALIDATION; shards, never pictures of one shard, separate the two.
+        part: TRAIN or VALIDATION; fingers, never pictures of one finger, separate the two.
         limit: the number of pictures that is enough; all when absent.
 
     Raises:
         DatasetError: there is no shard of this part, or one cannot be used.
     """
-    paths = sorted(Path(folder).glob(f"{part}_*.npz"))
+    paths = sorted(folder.glob(f"{part}_*.npz"))
     if not paths:
-        raise DatasetError(f"{folder}: no shard {part}_*.npz; make some with python -m training.make_dataset")
-    shards: list[LabelledPictures] = []
+        raise DatasetError(f"{folder}: no shard {part}_*.npz; make some with python -m training.scenes")
+    shards: list[FingerPictures] = []
     for path in tqdm(paths, desc=f"read {part}", unit="shard", leave=False):
         shards.append(load_shard(path))
         if limit is not None and sum(map(len, shards)) >= limit:
             break
-    return join_pictures(shards)
-
-
-def join_pictures(shards: list[LabelledPictures]) -> LabelledPictures:
-    """Return the pictures of several shards one after the other.
-
-    Raises:
-        DatasetError: they differ in size, in their points or in their names.
-    """
-    kinds = {(shard.picture.shape[1:], shard.visible.shape[1], shard.names) for shard in shards}
-    if len(kinds) != 1:
-        raise DatasetError(f"shards of {len(kinds)} kinds (size, number and names of points); expected one kind")
-    lights = [np.full(len(shard), "") if shard.light is None else shard.light for shard in shards]
-    return LabelledPictures(
-        picture=np.concatenate([shard.picture for shard in shards]),
-        xz=np.concatenate([shard.xz for shard in shards]),
-        visible=np.concatenate([shard.visible for shard in shards]),
-        names=shards[0].names,
-        light=np.concatenate(lights),
-    )
+    return FingerPictures.join(shards)
 
 
 def iterate_batches(count: int, size: int, rng: np.random.Generator) -> Iterator[NDArray]:

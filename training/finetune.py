@@ -1,6 +1,6 @@
 """Trains the shipped network further on a user's labelled images.
 
-`python -m training.finetune CollectedData_X.csv --camera camera.yaml --network FOLDER -o FOLDER`
+`python -m training.finetune CollectedData_X.csv --camera camera.yaml --jaw FILE --network FOLDER -o FOLDER`
 """
 
 from __future__ import annotations
@@ -18,17 +18,19 @@ from finforce.gripper_frames import SIDES
 from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
+from finforce_keypoints.networks.side_network import SideNetwork
 from training.arguments import one_line_errors
-from training.dataset import TRAIN, LabelledPictures, join_pictures, load_pictures
+from training.dataset import TRAIN, FingerPictures, load_pictures
 from training.errors import LabelFileError
-from training.evaluate import build_model, crop_all, detect_samples, format_scores
+from training.evaluate import detect, format_scores
 from training.labels import Labels, read_labels
 from training.rectification import CameraView, LabelledImage, read_camera, rectify
 from training.scoring import score_detections
 
-FEWEST = 10  # labelled pictures; fewer cannot even be judged
-HELD_BACK = 6  # every sixth picture judges, the others teach
-MINUTES, RATE = 10.0, 3e-4
+FEWEST = 3  # labelled pictures
+HELD_BACK = 6  # every sixth picture judges, the others teach; of fewer than twelve every second one
+MINUTES, RATE = 5.0, 3e-4
+MIXED = 2000  # pictures of the data set that are mixed in
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,12 +63,17 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--jaw", default="bench", help="jaw file, or the name of a shipped jaw")
     parser.add_argument("--sides", nargs="+", choices=SIDES, default=SIDES, help="labelled jaws (both)")
     parser.add_argument("--map", nargs="*", default=[], help="BODYPART=NAME for body parts with names of their own")
-    parser.add_argument("--dataset", type=Path, help="shards of the twin, mixed in half and half against forgetting")
+    parser.add_argument("--dataset", type=Path, help="shards of training.scenes, mixed in against forgetting")
+    add_refinement(parser)
+    return parser
+
+
+def add_refinement(parser: argparse.ArgumentParser) -> None:
+    """Add how long and how fast the network learns."""
     parser.add_argument("--minutes", type=float, default=MINUTES, help=f"time for training ({MINUTES:g})")
     parser.add_argument("--rate", type=float, default=RATE, help=f"largest learning rate ({RATE:g})")
     parser.add_argument("--threads", type=int, default=1, help="threads of the network's arithmetic (1)")
     parser.add_argument("--seed", type=int, default=0, help="of order and augmentation (0)")
-    return parser
 
 
 def run(options: argparse.Namespace) -> None:
@@ -75,12 +82,13 @@ def run(options: argparse.Namespace) -> None:
     pictures = load_project(read_project(options))
     from training.refinement import refine
 
-    judging = np.arange(len(pictures)) % HELD_BACK == HELD_BACK - 1
-    train, validation = pictures.take(~judging), pictures.take(judging)
-    if options.dataset:
-        train = mix(train, load_pictures(options.dataset, TRAIN, 2000))
-    before = detect_samples(build_model(options.network), crop_all(validation))
-    after = refine(options, train, validation)
+    every = HELD_BACK if len(pictures) >= 2 * HELD_BACK else 2
+    judging = np.arange(len(pictures)) % every == every - 1
+    teaching, judges = pictures.take(~judging), pictures.take(judging)
+    mixed = load_pictures(options.dataset, TRAIN, MIXED) if options.dataset else None
+    before = detect(SideNetwork(options.network, threads=1), judges)
+    refine(options, teaching, judges, mixed)
+    after = detect(SideNetwork(options.output, threads=1), judges)
     print(format_scores({"before": score_detections(before), "after": score_detections(after)}))
 
 
@@ -96,7 +104,7 @@ def read_project(options: argparse.Namespace) -> Project:
     )
 
 
-def load_project(project: Project) -> LabelledPictures:
+def load_project(project: Project) -> FingerPictures:
     """Return every labelled jaw of a project as a rectified picture, with a progress bar.
 
     Raises:
@@ -118,7 +126,7 @@ def load_project(project: Project) -> LabelledPictures:
             f"{len(usable)} of {len(found)} pictures show a jaw with its reference point or a key point near its base; "
             f"expected at least {FEWEST}, better 50 to 300"
         )
-    return join_pictures(usable)
+    return FingerPictures.join(usable)
 
 
 def read_image(path: Path) -> NDArray:
@@ -132,15 +140,6 @@ def read_image(path: Path) -> NDArray:
     if image is None:
         raise LabelFileError(f"{path}: no image there; expected it below the project's folder (--project)")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def mix(few: LabelledPictures, many: LabelledPictures) -> LabelledPictures:
-    """Return both sets, the smaller one repeated until it is about half."""
-    few = few.take(np.tile(np.arange(len(few)), max(1, round(len(many) / len(few)))))
-    named = LabelledPictures(
-        picture=many.picture, xz=many.xz, visible=many.visible, names=few.names if not many.names else many.names
-    )
-    return join_pictures([few, named])
 
 
 if __name__ == "__main__":

@@ -1,102 +1,134 @@
-"""Targets and losses of heat maps and location refinements."""
+"""What is wanted of the coarse and the fine part, in one number."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from training.network import LOCREF_STD, STRIDE
+from training.network import LARGEST_SPREAD, FingerNetwork, standardise
 from training.optional import import_torch
 
 torch = import_torch()
+POINTS = 8  # of a picture that the fine part looks at in one step
+ANYWHERE = 2  # of them that need not be key points
+FAR, FAR_SHARE, NEAR = (
+    9.0,
+    0.25,
+    2.5,
+)  # px by which guesses are off: some anywhere up to FAR, others with deviation NEAR
+FARTHEST = 600.0  # px; a place that a slanted view has thrown farther is not learnt
+HIDDEN_WEIGHT = 3.0  # of a hidden point beside a visible one: to accept what is not there costs more than to lose one
 SHARPNESS = 0.05  # px; smaller errors count by their square
-cross_entropy = torch.nn.functional.binary_cross_entropy_with_logits
 
 
-@dataclass(frozen=True, kw_only=True)
-class LossWeights:
-    """What counts how much.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Batch:
+    """Pictures with what is told of their fingers, and the truth.
 
     Attributes:
-        sigma: standard deviation of the heat maps' Gaussians [px].
-        reach: cells around a point's own, each way, whose location refinement is trained.
-        heatmap: weight of the heat maps' cross entropy, summed over the cells of a map.
-        peak: weight of the cross entropy of visibility, taken at the point's cell, or at the highest one when hidden.
-        locref: weight of the location error [1/px].
+        pictures: (B, h, w, 3) uint8.
+        templates: (B, h, w, 3) uint8.
+        rest: (B, P, 2) points at rest, in the templates [px]; the mark first.
+        places: (B, P, 2) where they are in the pictures [px]; NaN where nobody knows.
+        visible: (B, P) bool.
+        keypoints: (B,) how many, from the first on, are key points.
     """
 
-    sigma: float = 7.0
-    reach: int = 2
-    heatmap: float = 0.1
-    peak: float = 0.5
-    locref: float = 0.5
+    pictures: torch.Tensor
+    templates: torch.Tensor
+    rest: torch.Tensor
+    places: torch.Tensor
+    visible: torch.Tensor
+    keypoints: torch.Tensor
+
+    def to(self, device: torch.device) -> Batch:
+        """Return the batch on a device."""
+        return Batch(**{name: getattr(self, name).to(device) for name in self.__dataclass_fields__})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Losses:
-    """The parts of the loss of one batch, each weighted, as tensors without dimension."""
+    """The parts of the loss of one batch, each weighted, as tensors without dimension.
 
-    heatmap: torch.Tensor
-    peak: torch.Tensor
-    locref: torch.Tensor
+    Attributes:
+        coarse: mean distance of the guesses from where the points are.
+        fine: the same of the found places, from guesses that are off.
+        likely: minus the logarithm of the errors' probability under the stated deviations.
+        seen: cross entropy of visibility.
+    """
+
+    coarse: torch.Tensor
+    fine: torch.Tensor
+    likely: torch.Tensor
+    seen: torch.Tensor
 
     @property
     def total(self) -> torch.Tensor:
         """The sum that is minimised."""
-        return self.heatmap + self.peak + self.locref
+        return self.coarse + self.fine + self.likely + self.seen
 
 
-def compute_losses(
-    logits: torch.Tensor, locref: torch.Tensor, points: torch.Tensor, visible: torch.Tensor, weights: LossWeights
-) -> Losses:
+def compute_losses(network: FingerNetwork, batch: Batch, *, low: bool) -> Losses:
     """Return the losses of a batch.
 
-    A visible point's heat map is to be exp(-d^2 / 2 sigma^2) at the distance d, a hidden one's zero. Location
-    refinements are compared with (point - centre of the cell) / LOCREF_STD by their distance in pixels, weighted with
-    the same Gaussian within the radius: an absolute error, so that the median counts and not a few mistaken points.
+    The coarse part learns from all points whose place is known, hidden ones less. The fine part sees some of them, from
+    guesses that are off by chance, and says of an error e with its deviation b that its density is exp(-e / b) / b^2.
 
     Args:
-        logits: (B, K, h, w) of the heat maps.
-        locref: (B, 2K, h, w) dx and dy interleaved, in LOCREF_STD.
-        points: (B, K, 2) column and row [px]; any number where not visible.
-        visible: (B, K) bool.
-        weights: of the parts.
+        network: in training mode.
+        batch: on the network's device.
+        low: whether to compute in bfloat16.
     """
-    shown = visible.to(logits.dtype)
-    height, width = logits.shape[2:]
-    known = torch.nan_to_num(points, nan=0.0)
-    across = torch.exp(-(_steps(known[..., 0], width) ** 2) / (2.0 * weights.sigma**2))
-    down = torch.exp(-(_steps(known[..., 1], height) ** 2) / (2.0 * weights.sigma**2))
-    target = (down * shown[..., None])[..., :, None] * across[..., None, :]
-    heatmap = cross_entropy(logits, target, reduction="none").sum(dim=(2, 3)).mean()
-    cells = torch.floor(known / STRIDE).long()
-    columns, rows = cells[..., 0].clamp(0, width - 1), cells[..., 1].clamp(0, height - 1)
-    own = logits.flatten(2).gather(2, (rows * width + columns)[..., None])[..., 0]
-    deciding = torch.where(visible, own, logits.amax(dim=(2, 3)))
+    device = batch.rest.device
+    known = torch.isfinite(batch.places).all(dim=2) & (batch.places.abs() < FARTHEST).all(dim=2)
+    with torch.autocast(device.type, torch.bfloat16, enabled=low):
+        pictures, templates = standardise(to_layers(batch.pictures)), to_layers(batch.templates)
+        moves, features = network.register(pictures, templates)
+        guess = batch.rest + network.read(moves, batch.rest)
+        places = torch.where(known[..., None], batch.places, guess.detach())
+        away = torch.sqrt((guess - places).square().sum(dim=2) + 0.25)
+        weight = known * torch.where(batch.visible, 1.0, 0.4)
+        coarse = (weight * away).sum() / weight.sum().clamp(min=1.0)
+        chosen = _choose(batch)
+        rest, places, visible = (_take(part, chosen) for part in (batch.rest, places, batch.visible))
+        found, judged = network.compare(
+            pictures, templates, rest, places + _draw_miss(rest), network.read(features, rest)
+        )
+    shown = visible.float()
+    count = shown.sum().clamp(min=1.0)
+    logit, spread = judged[..., 0].float(), judged[..., 1].float().clamp(-LARGEST_SPREAD, LARGEST_SPREAD)
+    error = torch.sqrt((found - places).square().sum(dim=2) + SHARPNESS**2)
     return Losses(
-        heatmap=weights.heatmap * heatmap,
-        peak=weights.peak * cross_entropy(deciding, shown),
-        locref=weights.locref * _compute_place_loss(locref, known, visible, weights),
+        coarse=0.3 * coarse,
+        fine=0.5 * (shown * error).sum() / count,
+        likely=0.3 * (shown * (error * torch.exp(-spread) + 2.0 * spread)).sum() / count,
+        seen=torch.nn.functional.binary_cross_entropy_with_logits(
+            logit, shown, weight=torch.where(visible, 1.0, HIDDEN_WEIGHT)
+        ),
     )
 
 
-def _steps(places: torch.Tensor, cells: int) -> torch.Tensor:
-    """Return the steps (B, K, n) [px] from the centres (c + 0.5) STRIDE of n cells to places (B, K) along one axis."""
-    return places[..., None] - (torch.arange(cells, device=places.device) + 0.5) * STRIDE
+def to_layers(images: torch.Tensor) -> torch.Tensor:
+    """Return images (B, h, w, 3) uint8 as (B, 3, h, w) from 0 to 1."""
+    return images.permute(0, 3, 1, 2).float() / 255.0
 
 
-def _compute_place_loss(
-    locref: torch.Tensor, points: torch.Tensor, visible: torch.Tensor, weights: LossWeights
-) -> torch.Tensor:
-    """Return the mean distance [px] between visible points (B, K, 2) and where the cells around them put them."""
-    height, width = locref.shape[2:]
-    window = torch.arange(-weights.reach, weights.reach + 1, device=points.device)
-    steps = torch.stack(torch.meshgrid(window, window, indexing="xy"), dim=-1).reshape(-1, 2)
-    cells = torch.floor(points / STRIDE).long()[:, :, None] + steps
-    inside = ((cells >= 0) & (cells < torch.tensor([width, height], device=points.device))).all(dim=3)
-    index = torch.where(inside, cells[..., 1] * width + cells[..., 0], 0)
-    maps = locref.reshape(*points.shape, height * width)
-    offsets = maps.gather(3, index[:, :, None].expand(-1, -1, 2, -1)).transpose(2, 3)
-    aim = points[:, :, None] - (cells + 0.5) * STRIDE
-    near = torch.exp(-aim.square().sum(dim=3) / (2.0 * weights.sigma**2)) * (inside & visible[..., None])
-    distance = torch.sqrt((LOCREF_STD * offsets - aim).square().sum(dim=3) + SHARPNESS**2)
-    return (near * distance).sum() / near.sum().clamp(min=1.0)
+def _choose(batch: Batch) -> torch.Tensor:
+    """Return the indices (B, POINTS) of points that the fine part looks at: the mark, key points, some anywhere."""
+    count, points = batch.visible.shape
+    device = batch.rest.device
+    chosen = (torch.rand(count, POINTS, device=device) * batch.keypoints[:, None]).long()
+    chosen[:, 0] = 0
+    chosen[:, -ANYWHERE:] = torch.randint(0, points, (count, ANYWHERE), device=device)
+    return chosen
+
+
+def _take(values: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
+    """Return values (B, P, ...) of chosen points (B, k, ...)."""
+    return values[torch.arange(len(values), device=values.device)[:, None], chosen]
+
+
+def _draw_miss(rest: torch.Tensor) -> torch.Tensor:
+    """Return by how much guesses (B, k, 2) are off [px]."""
+    far = torch.rand(rest.shape[:2], device=rest.device) < FAR_SHARE
+    anywhere = FAR * (2.0 * torch.rand(rest.shape, device=rest.device) - 1.0)
+    return torch.where(far[..., None], anywhere, NEAR * torch.randn(rest.shape, device=rest.device))

@@ -15,8 +15,9 @@ from finforce.camera import PLUMB_BOB, CameraIntrinsics
 from finforce.gripper_frames import jaw_in_camera, jaw_in_gripper
 from finforce.transforms import pose_from_quaternion
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, intersect_plane, map_picture, take_picture
-from training.dataset import MARGIN, LabelledPictures
+from finforce_keypoints.geometry.side_picture import find_side, intersect_plane, map_picture, take_picture
+from finforce_keypoints.geometry.template import draw_template, find_shape, fit_grid
+from training.dataset import MARGIN, FingerPictures
 from training.errors import LabelFileError
 
 BASE_PART = 0.3  # of the jaw's length: key points nearer to the base hardly move when the jaw bends
@@ -42,6 +43,8 @@ class LabelledImage:
 def read_camera(path: str | Path) -> CameraView:
     """Read a camera from YAML: width, height, fx, fy, cx, cy [px], distortion, T_gripper_camera [x y z qx qy qz qw].
 
+    The lens is that of `distortion_model`, plumb_bob without it.
+
     Raises:
         LabelFileError: the file cannot be read or lacks one of these.
         IntrinsicsError: no camera has such numbers.
@@ -61,12 +64,10 @@ def parse_camera(content: Mapping[str, Any]) -> CameraView:
     pose = np.array(content["T_gripper_camera"], dtype=float)
     if pose.shape != (7,):
         raise LabelFileError(f"T_gripper_camera: got {pose.tolist()}, expected x y z [m] qx qy qz qw")
+    lens = np.array(content.get("distortion", ()), dtype=float)
+    model = str(content.get("distortion_model", PLUMB_BOB))
     return CameraView(
-        camera=CameraIntrinsics(
-            **numbers,
-            distortion=np.array(content.get("distortion", ()), dtype=float),
-            model=str(content.get("distortion_model", PLUMB_BOB)),
-        ),
+        camera=CameraIntrinsics(**numbers, distortion=lens, model=model),
         T_gripper_camera=pose_from_quaternion(pose[:3], pose[3:]),
     )
 
@@ -99,7 +100,7 @@ def find_origin(points: NDArray, jaw: Jaw, side: str, view: CameraView) -> float
     return along * float(jaw_in_gripper(side, 0.0)[0, 0])
 
 
-def rectify(labelled: LabelledImage, jaw: Jaw, side: str, view: CameraView) -> LabelledPictures | None:
+def rectify(labelled: LabelledImage, jaw: Jaw, side: str, view: CameraView) -> FingerPictures | None:
     """Return the picture of one jaw's side plane with its points, as training takes it; None if the jaw is not found.
 
     Raises:
@@ -113,11 +114,25 @@ def rectify(labelled: LabelledImage, jaw: Jaw, side: str, view: CameraView) -> L
     origin = find_origin(labelled.points, jaw, side, view)
     if origin is None:
         return None
-    T_camera_jaw, side_y = jaw_in_camera(view.T_gripper_camera, side, origin), find_side(jaw)
-    grid = PlaneGrid().padded(MARGIN)
-    visible = np.isfinite(labelled.points).all(axis=1)
-    xz = np.full((len(visible), 2), np.nan, dtype=np.float32)
-    xz[visible] = grid.pixels(intersect_plane(labelled.points[visible], side_y, T_camera_jaw, view.camera))
-    picture = take_picture(labelled.image, map_picture(grid, side_y, T_camera_jaw, view.camera))
-    names = (*jaw.keypoint_names, "reference")
-    return LabelledPictures(picture=picture[None], xz=xz[None], visible=visible[None], names=names)
+    return cut_picture(labelled, jaw, jaw_in_camera(view.T_gripper_camera, side, origin), view.camera)
+
+
+def cut_picture(labelled: LabelledImage, jaw: Jaw, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> FingerPictures:
+    """Return the picture of the side plane of a jaw at T_camera_jaw (4, 4) with its labelled points, the mark first."""
+    shape, side_y = find_shape(jaw), find_side(jaw)
+    grid = fit_grid(shape)
+    padded = grid.padded(MARGIN)
+    rest = np.vstack((jaw.reference_point, jaw.keypoints))[:, [0, 2]]
+    points = np.roll(labelled.points, 1, axis=0)
+    visible = np.isfinite(points).all(axis=1)
+    place = np.full((len(visible), 2), np.nan, dtype=np.float32)
+    place[visible] = padded.pixels(intersect_plane(points[visible], side_y, T_camera_jaw, camera))
+    return FingerPictures(
+        picture=take_picture(labelled.image, map_picture(padded, side_y, T_camera_jaw, camera))[None],
+        rest=grid.pixels(rest).astype(np.float32)[None],
+        place=place[None],
+        visible=visible[None],
+        keypoints=np.array([len(rest)]),
+        template=draw_template(shape, grid)[None],
+        finger=np.zeros(1, dtype=int),
+    )

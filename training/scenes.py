@@ -27,12 +27,13 @@ from finforce_twin.rendering.render import Body, Decal, RenderedScene
 from finforce_twin.rendering.sensor import expose
 from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
 from training.arguments import one_line_errors
-from training.finger_dataset import MARGIN, TRAIN, VALIDATION, FingerPictures, save_shard
+from training.dataset import MARGIN, TRAIN, VALIDATION, FingerPictures, save_shard
 from training.fingers import BentFinger, Finger, draw_finger, outline
 
 SEED = 40_000_000_000  # of training's fingers begin here
 STATES = 8  # pictures of a finger
 KEYPOINTS, ANYWHERE = 24, 72  # points of a picture: key points with the mark, and points anywhere on the material
+BARS = 0.35  # share of the pictures with something between camera and finger
 NO_MARK = 0.08  # share of the fingers whose holder has no dot
 R_CAMERA_JAW = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # square at the side, x right, z down
 TEXTURES = Path(__file__).parent / "textures"
@@ -334,7 +335,7 @@ class FingerScenes:
             face = section[:, 0].max() if thing is None else thing.vertices[:, 0].max()
             middle = 0.5 * (section[:, 0].max() + max(face, section[:, 0].max() + 1e-3)) + rng.uniform(0.0, 0.01)
             bodies += [_mirror(body, middle) for body in bodies[: 2 if holder in bodies else 1]]
-        if rng.random() < 0.12:
+        if rng.random() < BARS:
             bodies.append(self._bar(side_y, low, high))
         return bodies, look, R
 
@@ -342,7 +343,7 @@ class FingerScenes:
         """Return an object that touches the finger, or stands before it."""
         rng, length = self._rng, self._finger.length
         height = rng.uniform(0.15, 1.0) * length
-        half = rng.uniform(0.3, 1.6) * side_y
+        half = rng.uniform(0.3, 2.6) * side_y
         if rng.random() < 0.2:
             mesh = _load_objects()[rng.integers(len(_load_objects()))]
             T = Rotation.random(rng=rng).as_matrix()

@@ -6,12 +6,10 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from finforce_ifea.jaw.jaw import load_jaw
 from training.arguments import add_settings, one_line_errors, settings_from
 from training.augment import AugmentSettings
 from training.checkpoint import load_checkpoint
-from training.dataset import TRAIN, VALIDATION, LabelledPictures, load_pictures
-from training.losses import LossWeights
+from training.dataset import TRAIN, VALIDATION, load_pictures
 from training.recipe import Recipe
 from training.trainer import CHECKPOINT, Trainer, TrainingImages, train
 
@@ -28,7 +26,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m training.train", description=__doc__)
     parser.add_argument("dataset", type=Path, help="folder of shards train_*.npz and val_*.npz")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the run")
-    parser.add_argument("--jaw", default="bench", help="jaw whose key points the shards hold, where they have no names")
     parser.add_argument("--limit", type=int, help="train on the first so many pictures only")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder of the run")
     add_settings(parser, Recipe)
@@ -43,15 +40,10 @@ def run(options: argparse.Namespace) -> None:
         train=load_pictures(options.dataset, TRAIN, options.limit),
         validation=load_pictures(options.dataset, VALIDATION, recipe.validation),
     )
-    trainer = Trainer(find_names(pictures.train, options.jaw), recipe, LossWeights())
+    trainer = Trainer(recipe)
     if options.resume:
         trainer.resume(load_checkpoint(options.output / CHECKPOINT))
     print(train(trainer, pictures, settings_from(options, AugmentSettings), options.output))
-
-
-def find_names(pictures: LabelledPictures, jaw: str) -> tuple[str, ...]:
-    """Return the names (K,) of the points in the shards, or those of a jaw and its reference point."""
-    return pictures.names or (*load_jaw(jaw).keypoint_names, "reference")
 
 
 if __name__ == "__main__":

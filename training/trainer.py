@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from math import cos, pi
 from pathlib import Path
@@ -14,48 +13,43 @@ from tqdm import tqdm
 
 from training.augment import AugmentSettings
 from training.checkpoint import Checkpoint, save_checkpoint
-from training.dataset import LabelledPictures
-from training.detection import detect
+from training.dataset import FingerPictures
 from training.errors import CheckpointError
-from training.loading import Batch, LoadingSettings, load_batches
-from training.losses import Losses, LossWeights, compute_losses
-from training.network import KeypointNetwork, NetworkShape
+from training.loading import LoadingSettings, load_batches
+from training.losses import Batch, Losses, compute_losses, to_layers
+from training.network import FingerNetwork
 from training.optional import import_torch
 from training.recipe import Recipe
-from training.scoring import Score, score_detections
+from training.scoring import Detections, Score, gather_detections, score_detections
 
 torch = import_torch()
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
 SMOOTHING = 0.98  # part of the shown losses that stays in each step
+PARTS = ("coarse", "fine", "likely", "seen")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingImages:
-    """The pictures of one training, which share no shard: those learnt from and those that judge it."""
+    """The pictures of one training, which share no finger: those learnt from and those that judge it."""
 
-    train: LabelledPictures
-    validation: LabelledPictures
+    train: FingerPictures
+    validation: FingerPictures
 
 
 class Trainer:
     """A network, its average and its optimiser, and how far they are.
 
     Args:
-        names: (K,) of the points.
         recipe: how to train.
-        weights: of the loss.
         network: to begin with; random weights when absent.
     """
 
-    def __init__(
-        self, names: tuple[str, ...], recipe: Recipe, weights: LossWeights, network: KeypointNetwork | None = None
-    ) -> None:
+    def __init__(self, recipe: Recipe, network: FingerNetwork | None = None) -> None:
         torch.manual_seed(recipe.seed)
-        self.names, self.recipe, self.weights = names, recipe, weights
+        self.recipe = recipe
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        network = network or KeypointNetwork(NetworkShape(points=len(names)))
-        self.network = network.to(self.device, memory_format=torch.channels_last)
+        self.network = (network or FingerNetwork()).to(self.device, memory_format=torch.channels_last)
         averaging = torch.optim.swa_utils
         self.average = averaging.AveragedModel(self.network, avg_fn=self._average, use_buffers=True)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
@@ -73,10 +67,7 @@ class Trainer:
         self.network.train()
         for group in self.optimizer.param_groups:
             group["lr"] = compute_rate(self.progress, self.recipe)
-        pictures, points, visible = (t.to(self.device) for t in (batch.pictures, batch.points, batch.visible))
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=has_bfloat16(self.device)):
-            logits, locref = self.network(pictures)
-        losses = compute_losses(logits.float(), locref.float(), points, visible, self.weights)
+        losses = compute_losses(self.network, batch.to(self.device), low=has_bfloat16(self.device))
         self.optimizer.zero_grad(set_to_none=True)
         losses.total.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.clip)
@@ -90,15 +81,14 @@ class Trainer:
         stay = min(self.recipe.average, (1.0 + int(count)) / (10.0 + int(count)))
         return torch.lerp(new, kept, stay) if new.is_floating_point() else new
 
-    def score(self, pictures: LabelledPictures) -> Score:
-        """Return how well the averaged network finds the points of pictures."""
+    def score(self, pictures: FingerPictures) -> Score:
+        """Return how well the averaged network finds the key points of pictures."""
         return score_detections(detect(self.average.module.eval(), pictures))
 
     def save(self, folder: Path) -> None:
         """Write the checkpoint of a run."""
         checkpoint = Checkpoint(
             shape=self.network.shape,
-            names=self.names,
             averaged=self.average.module.state_dict(),
             network=self.network.state_dict(),
             optimizer=self.optimizer.state_dict(),
@@ -113,8 +103,8 @@ class Trainer:
         Raises:
             CheckpointError: it is of another network.
         """
-        if (checkpoint.names, checkpoint.shape) != (self.names, self.network.shape):
-            raise CheckpointError(f"got a checkpoint of {len(checkpoint.names)} points, expected one of {self.names}")
+        if checkpoint.shape != self.network.shape:
+            raise CheckpointError(f"got a checkpoint of {checkpoint.shape}, expected one of {self.network.shape}")
         self.network.load_state_dict(checkpoint.network)
         self.average.module.load_state_dict(checkpoint.averaged)
         self.average.n_averaged.fill_(checkpoint.step)
@@ -137,6 +127,22 @@ def has_bfloat16(device: torch.device) -> bool:
     return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
 
 
+@torch.no_grad()
+def detect(network: FingerNetwork, pictures: FingerPictures, batch: int = 32) -> Detections:
+    """Return what a network finds of the key points in the middle of padded pictures."""
+    device, count = next(network.parameters()).device, int(pictures.keypoints.max())
+    found: list[list[np.ndarray]] = []
+    for start in range(0, len(pictures), batch):
+        rows = slice(start, start + batch)
+        templates = torch.from_numpy(pictures.template[pictures.finger[rows]])
+        images = torch.from_numpy(np.ascontiguousarray(pictures.middle[rows]))
+        rest = torch.from_numpy(pictures.rest[rows, :count])
+        parts = network(*(part.to(device) for part in (to_layers(images), to_layers(templates), rest)))
+        found.append([part.float().cpu().numpy() for part in parts])
+    pixels, logits, spread = (np.concatenate(column) for column in zip(*found, strict=True))
+    return gather_detections(pictures, pixels, 1.0 / (1.0 + np.exp(-logits)), np.exp(spread))
+
+
 def train(trainer: Trainer, pictures: TrainingImages, augmentation: AugmentSettings, folder: Path) -> Score:
     """Train until the recipe's end, with a log of losses and scores and a checkpoint beside it.
 
@@ -149,30 +155,23 @@ def train(trainer: Trainer, pictures: TrainingImages, augmentation: AugmentSetti
     loading = LoadingSettings(size=recipe.batch, workers=recipe.workers, seed=recipe.seed, first=trainer.step)
     batches = load_batches(pictures.train, augmentation, loading)
     began, next_evaluation = time.monotonic() - trainer.elapsed, trainer.elapsed + 60.0 * recipe.evaluate_every
-    validation = pictures.validation.take(np.arange(min(recipe.validation, len(pictures.validation))))
+    shown: dict[str, float] = {}
     with tqdm(total=100.0, desc="train", unit="%", bar_format="{l_bar}{bar}|{postfix}") as bar:
-        for shown in _follow(trainer, batches):
+        while trainer.progress < 1.0:
+            losses = trainer.learn(next(batches))
+            for name in PARTS:
+                value = float(getattr(losses, name).detach())
+                shown[name] = SMOOTHING * shown.get(name, value) + (1.0 - SMOOTHING) * value
             trainer.elapsed = time.monotonic() - began
             bar.update(100.0 * trainer.progress - bar.n)
             bar.set_postfix({"step": trainer.step, **{name: f"{value:.3f}" for name, value in shown.items()}})
             if trainer.elapsed >= next_evaluation and trainer.progress < 1.0:
                 next_evaluation += 60.0 * recipe.evaluate_every
-                _report(trainer, validation, shown, folder)
-        return _report(trainer, validation, shown, folder)
+                _report(trainer, pictures.validation, shown, folder)
+        return _report(trainer, pictures.validation, shown, folder)
 
 
-def _follow(trainer: Trainer, batches: Iterator[Batch]) -> Iterator[dict[str, float]]:
-    """Yield the smoothed losses after each step, to the end of the training."""
-    shown: dict[str, float] = {}
-    while trainer.progress < 1.0:
-        losses = trainer.learn(next(batches))
-        for name in ("heatmap", "peak", "locref"):
-            value = getattr(losses, name).item()
-            shown[name] = SMOOTHING * shown.get(name, value) + (1.0 - SMOOTHING) * value
-        yield shown
-
-
-def _report(trainer: Trainer, validation: LabelledPictures, shown: dict[str, float], folder: Path) -> Score:
+def _report(trainer: Trainer, validation: FingerPictures, shown: dict[str, float], folder: Path) -> Score:
     """Score the averaged network, add a line to the log, write the checkpoint."""
     score = trainer.score(validation)
     line = {
