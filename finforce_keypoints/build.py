@@ -12,12 +12,14 @@ if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_keypoints.detector import KeypointDetector
     from finforce_keypoints.detectors.dots import DotSettings
+    from finforce_keypoints.detectors.side_plane import SideLocator
     from finforce_keypoints.networks.model import KeypointModel
     from finforce_keypoints.parameters import DetectorParameters
     from finforce_keypoints.pixel_finder import PixelFinder
     from finforce_keypoints.settings import DetectorSettings
 
-SHIPPED = Path(__file__).parent / "models" / "side_plane"
+MODELS = Path(__file__).parent / "models"
+ANY_FINGER, BENCH = MODELS / "side_plane", MODELS / "plane"
 ANSWERS = {"auto": None, "yes": True, "no": False}
 
 
@@ -74,8 +76,9 @@ def build_finder(
 ) -> BuiltFinder:
     """Return what finds the pixels of key points; see `build_detector`."""
     from finforce.gripper_frames import OpeningRange
+    from finforce_keypoints.detectors.locators import AnyFinger, OneFinger
     from finforce_keypoints.detectors.side_plane import PlaneFinder
-    from finforce_keypoints.networks.side_network import SideNetwork
+    from finforce_keypoints.networks.side_network import COARSE, SideNetwork
 
     opening = OpeningRange(nearest=settings.opening_min, farthest=settings.opening_max)
     if parameters.finder == "dots":
@@ -86,9 +89,24 @@ def build_finder(
         model = load_model(parameters)
         finder = _build_frame_finder(model, jaws, parameters)
         return BuiltFinder(finder, FinderCard(name=f"frame {model.path.stem}", sha256=model.sha256))
-    network = SideNetwork(parameters.model or SHIPPED, threads=parameters.threads)
-    finder = PlaneFinder(network, jaws, parameters.camera_pose, opening)
-    return BuiltFinder(finder, FinderCard(name=f"network {network.path.name}", sha256=network.sha256))
+    folder = Path(parameters.model) if parameters.model else choose_network(jaws)
+    if (folder / COARSE).is_file():
+        network = SideNetwork(folder, threads=parameters.threads)
+        locator: SideLocator = AnyFinger(network, jaws)
+    else:
+        network = load_model(replace(parameters, model=str(folder)))
+        locator = OneFinger(network, jaws)
+    finder = PlaneFinder(locator, jaws, parameters.camera_pose, opening)
+    return BuiltFinder(finder, FinderCard(name=f"network {folder.name}", sha256=network.sha256))
+
+
+def choose_network(jaws: Mapping[str, Jaw]) -> Path:
+    """Return the folder of the shipped network for some jaws: the finger `bench` with its points has one of its own."""
+    from finforce_ifea.jaw.jaw import load_jaw
+
+    bench = load_jaw("bench")
+    own = [(jaw.digest, jaw.keypoint_names) == (bench.digest, bench.keypoint_names) for jaw in jaws.values()]
+    return BENCH if all(own) else ANY_FINGER
 
 
 def load_model(parameters: DetectorParameters) -> KeypointModel:
@@ -109,12 +127,18 @@ def load_model(parameters: DetectorParameters) -> KeypointModel:
         normalize=ANSWERS[parameters.normalize],
         input_size=size if any(size) else None,
     )
-    if not parameters.model:
+    if parameters.finder == "frame" and not parameters.model:
         raise ModelError(
             "finder frame: got no model, and the shipped network sees rectified side planes; expected the folder of a "
             "DeepLabCut network as `model`, or finder network"
         )
-    return KeypointModel(parameters.model, overrides, threads=parameters.threads)
+    model = KeypointModel(parameters.model, overrides, threads=parameters.threads)
+    if parameters.finder == "frame" and "plane" in model.metadata.extra:
+        raise ModelError(
+            f"finder frame: {model.path.parent} holds a network of rectified side planes (finforce: plane in its "
+            "metadata); expected one that sees the image, or finder network"
+        )
+    return model
 
 
 def _build_frame_finder(model: KeypointModel, jaws: Mapping[str, Jaw], parameters: DetectorParameters) -> PixelFinder:

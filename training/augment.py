@@ -18,14 +18,16 @@ from training.errors import RecipeError
 class AugmentSettings:
     """How far pictures are changed; every probability is per picture."""
 
-    shift: float = setting(16.0, "largest shift along a row and a column", "px", 0.0, 100.0)
-    scale: float = setting(0.08, "largest change of size", "-", 0.0, 0.5)
-    rotation: float = setting(6.0, "largest turn", "deg", 0.0, 90.0)
+    shift: float = setting(12.0, "largest shift along a row and a column", "px", 0.0, 100.0)
+    scale: float = setting(0.06, "largest change of size", "-", 0.0, 0.5)
+    rotation: float = setting(4.0, "largest turn", "deg", 0.0, 90.0)
     perspective: float = setting(4.0, "largest shift of each corner on its own", "px", 0.0, 50.0)
-    dim: float = setting(0.3, "probability of little light", "-", 0.0, 1.0)
-    darkest: float = setting(0.04, "least light, as a part of the picture's own", "-", 0.001, 1.0)
+    dim: float = setting(0.2, "probability of little light", "-", 0.0, 1.0)
+    darkest: float = setting(0.08, "least light, as a part of the picture's own", "-", 0.001, 1.0)
     color: float = setting(0.8, "probability of another contrast, gamma and white balance", "-", 0.0, 1.0)
     gradient: float = setting(0.3, "probability of light that falls off across the picture", "-", 0.0, 1.0)
+    resample: float = setting(0.6, "probability of a camera with larger pixels", "-", 0.0, 1.0)
+    coarsest: float = setting(0.4, "its pixels' number beside the picture's along an axis, at least", "-", 0.05, 1.0)
     blur: float = setting(0.35, "probability of defocus or motion", "-", 0.0, 1.0)
     sharpen: float = setting(0.15, "probability of a camera's sharpening", "-", 0.0, 1.0)
     noise: float = setting(0.7, "probability of sensor noise; little light always has it", "-", 0.0, 1.0)
@@ -72,7 +74,23 @@ def augment(
 
 
 def change_light(picture: NDArray, settings: AugmentSettings, rng: np.random.Generator) -> NDArray:
-    """Return the picture (h, w, 3) uint8 as another camera would take it in other light."""
+    """Return the picture (h, w, 3) uint8 as another camera would take it in other light.
+
+    A real camera has pixels of its own, larger ones than the picture's where it looks at the side aslant or from afar:
+    light, noise and compression come at its resolution, and the picture is made of that.
+    """
+    cv2, (height, width) = import_cv2(), picture.shape[:2]
+    if rng.random() < settings.resample:
+        least = settings.coarsest ** rng.uniform(0.0, 1.0, 2)
+        size = (round(width * least[0]), round(height * least[1]))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        taken = _change_light(picture, settings, rng)
+        return cv2.resize(taken, (width, height), interpolation=cv2.INTER_LINEAR)
+    return _change_light(picture, settings, rng)
+
+
+def _change_light(picture: NDArray, settings: AugmentSettings, rng: np.random.Generator) -> NDArray:
+    """Return the picture in other light, with a lens, a sensor and a compression of its own."""
     light = _recolor(picture, rng) if rng.random() < settings.color else picture.astype(np.float32)
     if rng.random() < settings.gradient:
         light = light * _draw_gradient(light.shape[:2], rng)[..., None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,32 +12,31 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import OpeningRange
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
-from finforce_keypoints.geometry.template import draw_template, find_shape, fit_grid
 from finforce_keypoints.pixel_finder import PixelFinding
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_keypoints.images import RgbdImage
-    from finforce_keypoints.networks.side_network import Places, SideNetwork, Template
+    from finforce_keypoints.networks.side_network import Places
 
 SAME_PLACE = 1e-3  # [m] by which a jaw may move before its picture is mapped anew; places are exact all the same
-SEARCH_STEP = 32.0  # [px] between the places where a lost jaw is looked for; the network finds one half as far away
+SEARCH_STEP = 24.0  # [px] between the places where a lost jaw is looked for; the network finds one half as far away
 LEAST_SCORE = 0.35  # mean likelihood of a jaw's points, below which it is not there
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Finger:
-    """One jaw as the network is told of it.
+class SideLocator(Protocol):
+    """A network that finds the points of jaws in pictures of their sides."""
 
-    Attributes:
-        grid: of its pictures.
-        template: what it looks like at rest, with its key points and its reference point.
-        side_y: of the plane of its side [m].
-    """
+    grids: Mapping[str, PlaneGrid]
 
-    grid: PlaneGrid
-    template: Template
-    side_y: float
+    def locate(self, pictures: NDArray, sides: Sequence[str]) -> Places:
+        """Return where the points are: of each picture the jaw's key points, then its reference point.
+
+        Args:
+            pictures: (B, h, w, 3) uint8 RGB, on the grids of the sides.
+            sides: B, the jaw that each shows.
+        """
+        ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,12 +49,12 @@ class _View:
 
 
 class PlaneFinder:
-    """Finds key points with one network for all fingers, in pictures that look the same from every camera.
+    """Finds key points with a network, in pictures that look the same from every camera.
 
     A jaw that was lost is looked for along the closing axis.
 
     Args:
-        network: that compares pictures with templates.
+        locator: of these jaws.
         jaws: by side.
         T_gripper_camera: (4, 4).
         opening: where a jaw can be.
@@ -63,13 +62,14 @@ class PlaneFinder:
 
     def __init__(
         self,
-        network: SideNetwork,
+        locator: SideLocator,
         jaws: Mapping[str, Jaw],
         T_gripper_camera: NDArray,
         opening: OpeningRange | None = None,
     ) -> None:
-        self._network, self._T_gripper_camera, self._opening = network, T_gripper_camera, opening or OpeningRange()
-        self._fingers = {side: _describe_finger(jaw, network) for side, jaw in jaws.items()}
+        self._locator, self._T_gripper_camera, self._opening = locator, T_gripper_camera, opening or OpeningRange()
+        self._side_y = {side: find_side(jaw) for side, jaw in jaws.items()}
+        self._rest = {side: find_rest(jaw) for side, jaw in jaws.items()}
         self._kept: dict[str, _View] = {}
         self._camera: CameraIntrinsics | None = None
 
@@ -98,12 +98,12 @@ class PlaneFinder:
 
     def _locate(self, image: RgbdImage, views: Sequence[_View]) -> Places:
         pictures = np.stack([take_picture(image.color, view.mapping) for view in views])
-        return self._network.locate(pictures, [self._fingers[view.side].template for view in views])
+        return self._locator.locate(pictures, [view.side for view in views])
 
     def _views_of(self, side: str, pose: NDArray | None) -> list[_View]:
         """Return where to look for one jaw: where it is expected, or all along the closing axis."""
         if pose is None:
-            step = SEARCH_STEP * self._fingers[side].grid.scale
+            step = SEARCH_STEP * self._locator.grids[side].scale
             return [self._view(side, place) for place in self._opening.place_jaw(self._T_gripper_camera, side, step)]
         kept = self._kept.get(side)
         if kept is None or np.abs(kept.T_camera_jaw - pose).max() > SAME_PLACE:
@@ -111,15 +111,13 @@ class PlaneFinder:
         return [kept]
 
     def _view(self, side: str, pose: NDArray) -> _View:
-        finger = self._fingers[side]
-        mapping = map_picture(finger.grid, finger.side_y, pose, self._camera)
+        mapping = map_picture(self._locator.grids[side], self._side_y[side], pose, self._camera)
         return _View(side=side, T_camera_jaw=pose, mapping=mapping)
 
     def _centre(self, view: _View, places: Places, number: int) -> NDArray:
         """Return the pose of a jaw whose reference point, or else base, was seen beside its place."""
-        finger, jaw = self._fingers[view.side], view.T_camera_jaw.copy()
-        rest = finger.grid.places(finger.template.points)
-        moved = finger.grid.places(places.pixels[number])
+        jaw, rest = view.T_camera_jaw.copy(), self._rest[view.side]
+        moved = self._locator.grids[view.side].places(places.pixels[number])
         sure = places.likelihood[number] >= 0.5
         weight = np.where(sure, 1.0 / (rest[:, 1] - rest[:, 1].min() + 0.01), 0.0)
         if weight.sum() > 0.0:
@@ -129,12 +127,12 @@ class PlaneFinder:
 
     def _describe(self, view: _View, places: Places, number: int) -> PixelFinding:
         """Return the finding of one picture, in pixels of the image."""
-        finger, camera = self._fingers[view.side], self._camera
-        on_plane = finger.grid.places(places.pixels[number])
-        pixels = project_plane(on_plane, finger.side_y, view.T_camera_jaw, camera)
-        beside = [project_plane(on_plane + step, finger.side_y, view.T_camera_jaw, camera) for step in np.eye(2) * 1e-3]
+        side_y, grid, camera = self._side_y[view.side], self._locator.grids[view.side], self._camera
+        on_plane = grid.places(places.pixels[number])
+        pixels = project_plane(on_plane, side_y, view.T_camera_jaw, camera)
+        beside = [project_plane(on_plane + step, side_y, view.T_camera_jaw, camera) for step in np.eye(2) * 1e-3]
         # pixels of the image per pixel of the picture, both ways
-        across = [np.hypot(*(other - pixels).T) * finger.grid.scale / 1e-3 for other in beside]
+        across = [np.hypot(*(other - pixels).T) * grid.scale / 1e-3 for other in beside]
         stddev = places.stddev[number] * np.sqrt(0.5 * (across[0] ** 2 + across[1] ** 2))
         known = np.isfinite(pixels).all(axis=1)
         return PixelFinding(
@@ -144,10 +142,6 @@ class PlaneFinder:
         )
 
 
-def _describe_finger(jaw: Jaw, network: SideNetwork) -> _Finger:
-    """Return what a network is told of a jaw."""
-    shape = find_shape(jaw)
-    grid = fit_grid(shape, network.width, network.height)
-    points = np.vstack((jaw.keypoints, jaw.reference_point))[:, [0, 2]]
-    template = network.prepare(draw_template(shape, grid), grid.pixels(points))
-    return _Finger(grid=grid, template=template, side_y=find_side(jaw))
+def find_rest(jaw: Jaw) -> NDArray:
+    """Return x and z (K + 1, 2) [m] of a jaw's key points and its reference point at rest."""
+    return np.vstack((jaw.keypoints, jaw.reference_point))[:, [0, 2]]
