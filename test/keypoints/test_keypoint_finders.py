@@ -28,7 +28,14 @@ def test_a_network_of_side_planes_is_used_by_the_plane_finder(tmp_path):
     built = finder_of(model=str(folder))
     assert isinstance(built.finder, PlaneFinder)
     assert built.card.sha256 == sha256((folder / "network.onnx").read_bytes()).hexdigest()
-    assert built.card.name == "network network"
+    assert built.card.name == "network net"
+
+
+def test_the_finger_chooses_among_the_shipped_networks():
+    for name, folder in (("bench", "plane"), ("umi", "side_plane"), ("ssg48_fin_ray_1", "side_plane")):
+        parameters = DetectorParameters(jaw_file=name)
+        built = build_finder(load_jaws(parameters), parameters, DetectorSettings())
+        assert isinstance(built.finder, PlaneFinder) and built.card.name == f"network {folder}"
 
 
 def test_any_network_is_used_by_the_frame_finder(tmp_path):

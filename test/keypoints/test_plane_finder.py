@@ -1,11 +1,17 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from finforce.camera import project
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
+from finforce_keypoints.detectors.locators import AnyFinger, OneFinger, grid_from_metadata
 from finforce_keypoints.detectors.side_plane import PlaneFinder
+from finforce_keypoints.errors import ModelError
+from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.images import RgbdImage
+from finforce_keypoints.networks.model import Peaks
 from finforce_keypoints.networks.side_network import Places, Template
 from finforce_twin.rendering.depth_camera import build_d405_vga
 
@@ -64,7 +70,7 @@ def paint(jaws, places, radius=4.5):
 @pytest.mark.parametrize("off", [0.0, 4e-3, -4e-3])
 def test_pixels_are_those_of_the_image_wherever_the_jaw_was_expected(off):
     jaws, network, places = load_jaws("bench"), ShadeNetwork(), {"left": -0.035, "right": 0.037}
-    finder = PlaneFinder(network, jaws, ROBOT_CAMERA)
+    finder = PlaneFinder(AnyFinger(network, jaws), jaws, ROBOT_CAMERA)
     expected = {side: jaw_in_camera(ROBOT_CAMERA, side, x + off) for side, x in places.items()}
     found = finder.find(paint(jaws, places), expected)
     for side, x in places.items():
@@ -79,7 +85,7 @@ def test_pixels_are_those_of_the_image_wherever_the_jaw_was_expected(off):
 def test_another_finger_is_looked_at_on_a_grid_of_its_own():
     jaws, places = load_jaws("ssg48_fin_ray_1"), {"left": -0.035, "right": 0.035}
     expected = {side: jaw_in_camera(ROBOT_CAMERA, side, x) for side, x in places.items()}
-    found = PlaneFinder(ShadeNetwork(), jaws, ROBOT_CAMERA).find(paint(jaws, places), expected)
+    found = PlaneFinder(AnyFinger(ShadeNetwork(), jaws), jaws, ROBOT_CAMERA).find(paint(jaws, places), expected)
     for side, x in places.items():
         assert found[side].pixels.shape == (len(jaws[side].keypoints) + 1, 2)
         assert np.linalg.norm(found[side].pixels - true_pixels(jaws[side], side, x), axis=1).max() < 0.6
@@ -88,7 +94,9 @@ def test_another_finger_is_looked_at_on_a_grid_of_its_own():
 @pytest.mark.parametrize("x", [-0.020, -0.031, -0.044])
 def test_a_lost_jaw_is_found_along_the_closing_axis(x):
     jaws = load_jaws("bench")
-    found = PlaneFinder(ShadeNetwork(), jaws, ROBOT_CAMERA).find(paint(jaws, {"left": x}), {"left": None})
+    found = PlaneFinder(AnyFinger(ShadeNetwork(), jaws), jaws, ROBOT_CAMERA).find(
+        paint(jaws, {"left": x}), {"left": None}
+    )
     error = np.linalg.norm(found["left"].pixels - true_pixels(jaws["left"], "left", x), axis=1)
     assert np.nanmax(error) < 0.9  # near the edge of the picture it was found in, discs are cut
     assert np.isfinite(error).sum() >= len(error) - 1
@@ -96,14 +104,55 @@ def test_a_lost_jaw_is_found_along_the_closing_axis(x):
 
 def test_a_lost_jaw_that_is_nowhere_is_absent():
     jaws = load_jaws("bench")
-    finder = PlaneFinder(ShadeNetwork(), jaws, ROBOT_CAMERA)
+    finder = PlaneFinder(AnyFinger(ShadeNetwork(), jaws), jaws, ROBOT_CAMERA)
     assert not finder.find(paint(jaws, {}), {"left": None, "right": None})
 
 
 def test_what_is_not_seen_has_no_pixel_and_no_likelihood():
     jaws = load_jaws("bench")
-    found = PlaneFinder(ShadeNetwork(hidden=(3,)), jaws, ROBOT_CAMERA).find(
+    found = PlaneFinder(AnyFinger(ShadeNetwork(hidden=(3,)), jaws), jaws, ROBOT_CAMERA).find(
         paint(jaws, {"left": -0.035}), {"left": jaw_in_camera(ROBOT_CAMERA, "left", -0.035)}
     )["left"]
     assert np.isnan(found.pixels[3]).all() and found.likelihood[3] == 0.0 and found.stddev[3] == np.inf
     assert np.isfinite(np.delete(found.pixels, 3, axis=0)).all()
+
+
+NAMES = (*load_jaw("bench").keypoint_names, "reference")
+PLANE = {"scale": 0.45e-3, "x": -0.036, "z": -0.012, "width": 176, "height": 224}
+
+
+class ShadeModel:
+    """The same as a network of one finger, whose body parts have an order of their own."""
+
+    def __init__(self, names=NAMES, plane=PLANE):
+        self.names, self.path = tuple(names), SimpleNamespace(name="shades.onnx")
+        self.metadata = SimpleNamespace(extra={"plane": plane})
+
+    def locate(self, pictures):
+        template = Template(half=None, points=np.zeros((len(NAMES), 2)), pieces=None)
+        found, order = ShadeNetwork().locate(pictures, [template]), [NAMES.index(name) for name in self.names]
+        pixels, likelihood, stddev = found.pixels[:, order], found.likelihood[:, order], found.stddev[:, order]
+        return Peaks(pixels=pixels, likelihood=likelihood, spread=stddev, stddev=stddev, astray=0.0 * likelihood)
+
+
+def test_the_order_of_the_body_parts_does_not_matter():
+    jaws = load_jaws("bench")
+    finder = PlaneFinder(OneFinger(ShadeModel(tuple(reversed(NAMES))), jaws), jaws, ROBOT_CAMERA)
+    found = finder.find(paint(jaws, {"left": -0.035}), {"left": jaw_in_camera(ROBOT_CAMERA, "left", -0.035)})
+    assert np.linalg.norm(found["left"].pixels - true_pixels(jaws["left"], "left", -0.035), axis=1).max() < 0.6
+
+
+def test_a_network_of_another_jaw_is_refused_by_the_names():
+    names = [name if name != "inner_7" else "thumb" for name in NAMES]
+    with pytest.raises(ModelError, match=r"missing: inner_7; not of the jaw 'bench': thumb"):
+        OneFinger(ShadeModel(names), load_jaws("bench"))
+
+
+@pytest.mark.parametrize("plane", [None, {}, {**PLANE, "scale": "small"}])
+def test_a_network_without_its_plane_is_refused(plane):
+    with pytest.raises(ModelError, match=r"finforce\.plane"):
+        OneFinger(ShadeModel(plane=plane), load_jaws("bench"))
+
+
+def test_the_plane_of_the_metadata_is_the_grid():
+    assert grid_from_metadata({"plane": PLANE}) == PlaneGrid()
