@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +13,12 @@ import training
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.errors import NamingError
-from finforce_keypoints.geometry.side_picture import PlaneGrid, project_plane
+from finforce_keypoints.geometry.side_picture import project_plane
+from finforce_keypoints.geometry.template import find_shape, fit_grid
 from training.dataset import MARGIN
 from training.errors import LabelFileError
 from training.finetune import Project, load_project
 from training.labels import parse_labels, read_labels
-from training.make_dataset import SceneMaker
-from training.pressed_shapes import PressedShape
 from training.rectification import CameraView, LabelledImage, find_origin, parse_camera, read_camera, rectify
 
 CAMERA = {
@@ -146,13 +144,14 @@ def test_labels_land_where_the_points_are_in_the_picture(side, origin_x):
             cv2.circle(image, (round(column * 16), round(row * 16)), 24, (255, 255, 255), -1, shift=4)
     points[hidden] = np.nan
     found = rectify(LabelledImage(image=image, points=points), jaw, side, view)
-    assert found.names == (*jaw.keypoint_names, "reference")
-    np.testing.assert_array_equal(np.flatnonzero(~found.visible[0]), [hidden])
-    rest = np.vstack((jaw.keypoints, jaw.reference_point))[:, [0, 2]]
-    expected = PlaneGrid().padded(MARGIN).pixels(rest)
-    np.testing.assert_allclose(found.xz[0][found.visible[0]], expected[found.visible[0]], atol=1e-4)
-    for column, row in np.round(found.xz[0][found.visible[0]]).astype(int):
-        assert found.picture[0, row, column].min() > 150  # in a white dot of 3 px; black would be 0
+    np.testing.assert_array_equal(np.flatnonzero(~found.visible[0]), [hidden + 1])  # the mark is the first
+    rest = np.vstack((jaw.reference_point, jaw.keypoints))[:, [0, 2]]
+    grid = fit_grid(find_shape(jaw))
+    np.testing.assert_allclose(found.rest[0], grid.pixels(rest), atol=1e-4)
+    expected = grid.padded(MARGIN).pixels(rest)
+    np.testing.assert_allclose(found.place[0][found.visible[0]], expected[found.visible[0]], atol=1e-3)
+    for column, row in np.round(found.place[0][found.visible[0]]).astype(int):
+        assert found.picture[0, row, column].min() > 100  # in a white dot of 3 px; black would be 0
 
 
 def test_a_point_that_is_marked_nowhere_is_refused(tmp_path):
@@ -193,20 +192,3 @@ def test_the_camera_of_the_instructions_is_the_robots():
     page = Path(training.__file__).with_name("README.md").read_text(encoding="utf-8")
     view = parse_camera(yaml.safe_load(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1]))
     np.testing.assert_allclose(view.T_gripper_camera, ROBOT_CAMERA, atol=2e-6)  # six decimals of a quaternion
-
-
-def test_pictures_of_the_twin_show_the_plane_of_the_key_points_wherever_the_reference_point_lies():
-    jaw = load_jaw("bench")
-    jaw = replace(jaw, reference_point=jaw.reference_point * (1.0, 0.85, 1.0))  # 1.5 mm behind the others
-    rest = PressedShape(
-        vertices=jaw.build_mesh("default").nodes,
-        keypoints=jaw.keypoints,
-        size=np.full(2, 0.02),
-        is_round=True,
-        centre=np.array([0.024, 0.04]),
-    )
-    samples = SceneMaker(jaw, [rest]).draw(0)
-    expected = PlaneGrid().padded(MARGIN).pixels(jaw.keypoints[:, [0, 2]])
-    for places in samples.xz[:, :-1]:
-        # single precision; a plane that is 1.5 mm off shifts them by a pixel
-        np.testing.assert_allclose(places, expected, atol=1e-3)

@@ -1,0 +1,88 @@
+"""Claims about the network of any finger as a file: what is refused, and that the shipped one says what it sees."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from finforce_keypoints.build import ANY_FINGER
+from finforce_keypoints.errors import DetectionError, ModelError
+from finforce_keypoints.networks.side_network import COARSE, FINE, METADATA, SideNetwork
+
+RNG = np.random.default_rng(3)
+
+
+@pytest.fixture(scope="module")
+def network():
+    return SideNetwork(ANY_FINGER, threads=1)
+
+
+def draw(count, network):
+    return RNG.integers(0, 255, (count, network.height, network.width, 3), dtype=np.uint8)
+
+
+def prepare(network, count=5, template=None):
+    points = RNG.uniform(20.0, 150.0, (count, 2))
+    return network.prepare(draw(1, network)[0] if template is None else template, points)
+
+
+def test_every_point_of_every_picture_gets_a_place(network):
+    places = network.locate(draw(3, network), [prepare(network, 7) for _ in range(3)])
+    assert places.pixels.shape == (3, 7, 2) and places.likelihood.shape == places.stddev.shape == (3, 7)
+    assert np.isfinite(places.pixels).all() and (places.stddev > 0.0).all()
+    assert ((places.likelihood >= 0.0) & (places.likelihood <= 1.0)).all()
+
+
+def test_pictures_in_one_batch_do_not_disturb_each_other(network):
+    pictures, templates = draw(2, network), [prepare(network) for _ in range(2)]
+    both = network.locate(pictures, templates)
+    for number in range(2):
+        alone = network.locate(pictures[[number]], [templates[number]])
+        np.testing.assert_allclose(alone.pixels[0], both.pixels[number], atol=5e-2)  # float32 in another order
+        np.testing.assert_allclose(alone.likelihood[0], both.likelihood[number], atol=1e-2)
+
+
+def test_black_pictures_and_points_outside_are_no_crash(network):
+    template = network.prepare(np.zeros((network.height, network.width, 3), np.uint8), np.array([[-500.0, 9e3]]))
+    places = network.locate(np.zeros((1, network.height, network.width, 3), np.uint8), [template])
+    assert places.pixels.shape == (1, 1, 2)
+
+
+def test_pictures_of_another_size_are_refused(network):
+    with pytest.raises(DetectionError, match="cannot be computed"):
+        network.locate(draw(1, network)[:, :100], [prepare(network)])
+
+
+def test_both_files_are_needed(tmp_path):
+    with pytest.raises(ModelError, match=r"no coarse\.onnx and no fine\.onnx.*finder frame"):
+        SideNetwork(tmp_path)
+    shutil.copy(ANY_FINGER / COARSE, tmp_path)
+    with pytest.raises(ModelError, match=r"no fine\.onnx"):
+        SideNetwork(tmp_path)
+    (tmp_path / FINE).write_bytes(b"no network")
+    with pytest.raises(ModelError, match="cannot load"):
+        SideNetwork(tmp_path)
+    shutil.copy(ANY_FINGER / COARSE, tmp_path / FINE)
+    with pytest.raises(ModelError, match=r"fine\.onnx: a network of pictures, templates, points.*expected pieces"):
+        SideNetwork(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "said", [None, "no json", {}, {"kind": "other"}, {"kind": "side plane", "stddev_factor": -1.0}]
+)
+def test_a_file_without_its_metadata_is_refused(tmp_path, said):
+    onnx = pytest.importorskip("onnx")
+    shutil.copy(ANY_FINGER / FINE, tmp_path)
+    model = onnx.load(str(ANY_FINGER / COARSE))
+    del model.metadata_props[:]
+    if said is not None:
+        entry = model.metadata_props.add()
+        entry.key, entry.value = METADATA, said if isinstance(said, str) else json.dumps(said)
+    onnx.save(model, str(tmp_path / COARSE))
+    with pytest.raises(ModelError, match="stddev_factor"):
+        SideNetwork(tmp_path)
+
+
+def test_the_files_are_small_enough_to_ship():
+    assert sum((ANY_FINGER / name).stat().st_size for name in (COARSE, FINE)) < 10e6
