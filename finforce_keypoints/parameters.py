@@ -51,7 +51,7 @@ class DetectorParameters(TimeParameters):
         "network that sees the image, or printed dots without a network",
         choices=("network", "frame", "dots"),
     )
-    model: str = setting("", "folder of a network and its pytorch_config.yaml; empty: the shipped network")
+    model: str = setting("", "folder of a network; empty: the shipped one for the finger")
     names: tuple[str, ...] = setting(
         ("",),
         "body parts of a frame network whose names are not those of key points, each as BODYPART=NAME, as in "

@@ -43,7 +43,7 @@ def solver_arguments(*, images: str = "false", parameter_file: str = NONE, use_s
             description="find the key points in images of a camera; else they come by topic",
         ),
         Argument("finder", default_value=NONE, description="key points by network, frame (DeepLabCut) or dots"),
-        Argument("model", default_value=NONE, description="folder of a network and its pytorch_config.yaml"),
+        Argument("model", default_value=NONE, description="folder of a network"),
         Argument(
             "T_gripper_camera", default_value=NONE, description="camera in the gripper's frame: x y z [m] qx qy qz qw"
         ),
