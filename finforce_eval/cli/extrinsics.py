@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from finforce.camera import ImageError, decode_picture
 from finforce.transforms import pose_numbers, rotation_between
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS, approach, first_images
@@ -17,11 +19,17 @@ from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.tracks import JAWS
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.geometry.extrinsics import Extrinsics
+from finforce_keypoints.geometry.hole_grid import GridCamera, find_grid_camera
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("bags", nargs=1, metavar="BAG", help="rosbag2 folder, .mcap or .db3 file with images")
+    text = "rosbag2 folder, .mcap or .db3 file with images; with --grid a picture"
+    parser.add_argument("bags", nargs=1, metavar="BAG", help=text)
+    text = (
+        "the picture shows a table with holes this far apart [m]: find the camera's intrinsics and its place above it"
+    )
+    parser.add_argument("--grid", type=float, metavar="PITCH", help=text)
     parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
     parser.add_argument("--jaws", default="both", choices=("left", "right", "both"), help="in the images (both)")
     text = "where the camera is about: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
@@ -34,6 +42,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Find the camera's place from the first images of a recording, and print it as the nodes take it."""
+    if options.grid is not None:
+        print(format_grid_camera(find_grid_camera(read_picture(Path(options.bags[0])), options.grid)))
+        return
     options.source = "images"
     if options.images < 5:
         raise OptionError(f"--images {options.images}: expected at least 5, the mean of which is taken")
@@ -48,6 +59,32 @@ def run(options: argparse.Namespace) -> None:
     with tqdm(total=ROUNDS * len(recording.images), unit="image", disable=None, leave=False) as bar:
         found, _ = approach(recording, source, jaws, start.camera_pose, bar.update)
     print(format_extrinsics(found, start.camera_pose))
+
+
+def read_picture(path: Path) -> NDArray[np.uint8]:
+    """Return a jpeg or png file as (h, w, 3) red green blue.
+
+    Raises:
+        OptionError: it is no regular file, or no picture.
+    """
+    if not path.is_file():
+        raise OptionError(f"{path}: expected a picture, jpeg or png, of a table with holes")
+    try:
+        return decode_picture(path.read_bytes(), path.name)
+    except ImageError as error:
+        raise OptionError(str(error)) from error
+
+
+def format_grid_camera(found: GridCamera) -> str:
+    """Return a camera above a table, as a file of intrinsics has it, and its place."""
+    camera, pose = found.camera, ", ".join(f"{number:.6f}" for number in pose_numbers(found.T_camera_table))
+    lens = ", ".join(f"{number:.5f}" for number in camera.distortion)
+    return (
+        f"width: {camera.width}\nheight: {camera.height}\nfx: {camera.fx:.2f}\nfy: {camera.fy:.2f}\n"
+        f"cx: {camera.cx:.2f}\ncy: {camera.cy:.2f}\ndistortion: [{lens}]\n"
+        f"T_camera_table: [{pose}]  # m, quaternion x y z w; z away from the camera\n"
+        f"# {len(found.holes)} holes, left over {found.residual:.2f} px"
+    )
 
 
 def format_extrinsics(found: Extrinsics, guess: NDArray) -> str:

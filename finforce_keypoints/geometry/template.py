@@ -93,20 +93,8 @@ def find_shape(jaw: Jaw) -> SideShape:
         clamped_z = lowest if jaw.section.clamped_z is None else jaw.section.clamped_z
         bolts = jaw.section.clamped_circles
     elif jaw.drawing is not None:
-        drawing = jaw.drawing
-        bars = [
-            np.asarray(rib)
-            for rib, kind in zip(drawing.junctions.swapaxes(0, 1), drawing.ribs, strict=True)
-            if not kind.thickness
-        ]
-        parts = [shapely.Polygon(part) for part in drawing.outlines()] + [shapely.LineString(bar) for bar in bars]
-        spread = [0.5 * BAR if part.geom_type == "LineString" else 0.0 for part in parts]
-        grown = [
-            part.buffer(size + 1e-6, cap_style="flat", join_style="mitre")
-            for part, size in zip(parts, spread, strict=True)
-        ]
-        rings, clamped_z = _rings_of(shapely.union_all(grown)), drawing.clamped_z
-        if drawing.joints == "hinged":
+        rings, clamped_z = _rings_of(_draw_bars(jaw)), jaw.drawing.clamped_z
+        if jaw.drawing.joints == "hinged":
             bolts = np.column_stack((jaw.keypoints[:, [0, 2]], np.full(len(jaw.keypoints), SCREW_RADIUS)))
     else:
         mesh = jaw.build_mesh()
@@ -122,6 +110,20 @@ def find_shape(jaw: Jaw) -> SideShape:
         reference=jaw.reference_point[[0, 2]],
         bolts=bolts,
     )
+
+
+def _draw_bars(jaw: Jaw) -> shapely.Geometry:
+    """Return the material of a drawing; a bar without thickness joins the screws of its rib, if they are key points."""
+    import shapely
+
+    drawing, bars = jaw.drawing, []
+    places = dict(zip(jaw.keypoint_names, jaw.keypoints[:, [0, 2]], strict=True))
+    for number, (rib, ends) in enumerate(zip(drawing.ribs, drawing.junctions.swapaxes(0, 1), strict=True), start=1):
+        if rib.thickness == 0.0:
+            screws = [places.get(f"{band}_{number}", end) for band, end in zip(("inner", "outer"), ends, strict=True)]
+            bars.append(shapely.LineString(screws).buffer(0.5 * BAR, cap_style="flat"))
+    parts = [shapely.Polygon(part).buffer(1e-6, join_style="mitre") for part in drawing.outlines()]
+    return shapely.union_all([*parts, *bars])
 
 
 def _rings_of(area: shapely.Geometry) -> list[NDArray]:

@@ -73,3 +73,20 @@ def test_a_picture_without_a_grid_is_refused():
         fit_grid_camera(rng.uniform(0, 500, (60, 2)), (540, 960), PITCH)
     with pytest.raises(GeometryError, match="pitch"):
         fit_grid_camera(rng.uniform(0, 500, (60, 2)), (540, 960), 25.0)
+
+
+def test_the_command_prints_the_camera_of_a_picture(tmp_path, capsys):
+    import yaml
+
+    from finforce_eval.cli.main import main
+
+    camera, T = make_camera(), make_pose()
+    path = tmp_path / "table.png"
+    cv2.imwrite(str(path), draw_table(camera, T)[..., ::-1])
+    assert main(["extrinsics", "--grid", "0.025", str(path)]) == 0
+    said = yaml.safe_load(capsys.readouterr().out)
+    assert (said["width"], said["height"], len(said["T_camera_table"])) == (960, 540, 7)
+    assert main(["extrinsics", "--grid", "25", str(path)]) == 2
+    assert "pitch: got 25 m" in capsys.readouterr().err
+    assert main(["extrinsics", "--grid", "0.025", str(tmp_path)]) == 2
+    assert "expected a picture" in capsys.readouterr().err
