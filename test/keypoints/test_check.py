@@ -1,0 +1,129 @@
+"""Claims about the check before any force: what fits passes, and what does not is named as what it is."""
+
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import cv2
+import numpy as np
+import pytest
+
+from finforce.gripper_frames import ROBOT_CAMERA
+from finforce.transforms import invert_pose, pose_numbers
+from finforce_eval.cli.main import main
+from finforce_eval.evaluation.check import FAULT, OK, WARNING, judge_picture
+from finforce_eval.recordings.twin_writer import write_footage
+from finforce_twin.gripper.footage import build_footage
+from finforce_twin.scenes.scenarios import build_scenario
+
+IMAGES = 6
+
+
+@dataclass(frozen=True)
+class StillFrames:
+    """The first images of a scene, each changed, and no word of a jaw but what they show."""
+
+    footage: object
+    frames: tuple
+    change: object
+
+    def __len__(self):
+        return IMAGES
+
+    def __iter__(self):
+        return (replace(frame, color=np.ascontiguousarray(self.change(frame.color))) for frame in self.frames)
+
+    def __getattr__(self, name):
+        return getattr(self.footage, name)
+
+
+@pytest.fixture(scope="module")
+def footage():
+    found = build_footage(build_scenario("grasp_cylinder"), 3)
+    return found, tuple(replace(frame, jaws={}) for frame in islice(found, IMAGES))
+
+
+@pytest.fixture(scope="module")
+def record(footage, tmp_path_factory):
+    def write(name, change=lambda color: color):
+        return write_footage(StillFrames(*footage, change), tmp_path_factory.mktemp("check") / name)
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def still(record):
+    return record("still")
+
+
+def check(folder, capsys, tmp_path, *options):
+    status = main(["check", str(folder), "--images", str(IMAGES), "--report", str(tmp_path), *options])
+    assert cv2.imread(str(tmp_path / "check.png")).shape == (480, 640, 3)
+    return status, capsys.readouterr().out
+
+
+def as_option(T):
+    return "--extrinsics=" + ",".join(f"{number:.6f}" for number in pose_numbers(T))
+
+
+def test_what_fits_passes_with_depth_and_without(still, capsys, tmp_path):
+    for options in ((), ("--detector", "depth=none")):
+        status, said = check(still, capsys, tmp_path, *options)
+        assert status == 0 and "everything fits" in said and "extrinsics within" in said
+        assert ("colour alone" in said) == bool(options)
+
+
+def test_a_camera_that_is_elsewhere_is_told_where_it_is(still, capsys, tmp_path):
+    T = ROBOT_CAMERA.copy()
+    T[1, 3] += 0.008
+    status, said = check(still, capsys, tmp_path, as_option(T))
+    assert status == 1
+    numbers = said.split("set T_gripper_camera: [")[1].split("]")[0].split(",")
+    np.testing.assert_allclose([float(number) for number in numbers[:3]], ROBOT_CAMERA[:3, 3], atol=1.5e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda color: color[::-1, ::-1], "upside down"),
+        (lambda color: cv2.GaussianBlur(color, (0, 0), 5.0), "out of focus"),
+        (lambda color: color // 30, "mean brightness"),
+    ],
+)
+def test_a_picture_that_is_wrong_is_named(record, capsys, tmp_path, change, words):
+    status, said = check(record("changed", change), capsys, tmp_path)
+    assert words in said and (status == 1 or "brightness" in words)
+
+
+def test_extrinsics_of_another_convention_are_named(still, capsys, tmp_path):
+    x, y, z, qx, qy, qz, qw = pose_numbers(ROBOT_CAMERA)
+    first = "--extrinsics=" + ",".join(f"{number:.6f}" for number in (x, y, z, qw, qx, qy, qz))
+    for option, words in ((as_option(invert_pose(ROBOT_CAMERA)), "inverted"), (first, "begins with w")):
+        status, said = check(still, capsys, tmp_path, option)
+        assert status == 1 and words in said
+
+
+def test_jaws_that_are_nowhere_are_said_to_be_so(record, capsys, tmp_path):
+    rng = np.random.default_rng(0)
+    folder = record("noise", lambda color: cv2.GaussianBlur(rng.integers(0, 255, color.shape, np.uint8), (0, 0), 1.0))
+    status, said = check(folder, capsys, tmp_path)
+    assert status == 1 and "no jaw to rely on" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "words"),
+    [
+        (lambda color: color, OK, "fine detail"),
+        (lambda color: color // 12, WARNING, "brightness"),
+        (lambda color: cv2.GaussianBlur(color, (0, 0), 5.0), FAULT, "out of focus"),
+        (lambda color: np.where(np.arange(640)[None, :, None] < 320, 90, color).astype(np.uint8), WARNING, "covered"),
+    ],
+)
+def test_a_picture_is_judged_by_light_focus_and_what_it_shows(footage, change, level, words):
+    mean = np.mean([frame.color for frame in footage[1]], axis=0).astype(np.uint8)
+    said = judge_picture(change(mean))
+    assert any(line.level == level and words in line.text for line in said)
+
+
+def test_too_few_images_are_refused(still, capsys):
+    assert main(["check", str(still), "--images", "3"]) == 2
+    assert "expected at least 5" in capsys.readouterr().err
