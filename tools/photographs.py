@@ -12,7 +12,7 @@ import argparse
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +33,7 @@ from finforce_keypoints.networks.side_network import SideNetwork
 PITCH = 0.025  # [m] between the table's holes
 HEIGHT = 0.04  # [m] of the finger's middle above the table, to begin with
 FEET = (1057.0, 836.0, 1354.0, 834.0)  # px of the feet of strips A and B in the photograph of 5 mm
+FEET_AT_REST = np.array([[HALF_BASE, 0.0, 0.0], [-HALF_BASE, 0.0, 0.0]]) * 1e-3  # [m] in the jaw frame
 SQUARE = np.column_stack(
     ([-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0])
 )  # jaw axes in the table's: tip up, y at us
@@ -94,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     measurement = json.loads(options.measurement.read_text(encoding="utf-8"))
     photographs = read_photographs(options.folder, measurement)
-    jaw = load_jaw("steel")
+    jaw = with_feet(load_jaw("steel"))
     place = place_by_feet(photographs[0], np.reshape(options.feet, (2, 2)))
     labelled = [one for one in photographs if one.displacement in options.labels]
     found = find_hinges(photographs, jaw, place, options.network)
@@ -106,6 +107,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         network = refine_network(options, jaw, labelled, place)
         found = find_hinges(photographs, jaw, place, network)
         report("fine-tuned", photographs, found, labelled)
+        found = find_hinges(photographs, jaw, place, network, by_feet=True)
+        report("fine-tuned, from the feet in each photograph", photographs, found, labelled)
     draw(options.output / "photographs.png", photographs, found, jaw, place)
     nodes = [to_nodes(found[one.name]) for one in photographs]
     levels = [one.displacement for one in photographs]
@@ -118,6 +121,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     (options.output / "found.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
     print(f"{options.output / 'found.json'}: finforce convert-steel BAG --source it; finforce evaluate BAG --jaw steel")
+
+
+def with_feet(jaw: Jaw) -> Jaw:
+    """Return the steel finger with the feet of its strips as two more key points: there the hand-picked frame begins."""
+    names = (*jaw.keypoint_names, "foot_a", "foot_b")
+    return replace(jaw, keypoint_names=names, keypoints=np.vstack((jaw.keypoints, FEET_AT_REST)))
 
 
 def read_photographs(folder: Path, measurement: dict) -> list[Photograph]:
@@ -141,11 +150,10 @@ def read_photographs(folder: Path, measurement: dict) -> list[Photograph]:
 
 def place_by_feet(photograph: Photograph, feet: NDArray) -> Place:
     """Return the place that shows the feet of both strips at pixels (2, 2), A and then B."""
-    points = np.array([[HALF_BASE, 0.0, 0.0], [-HALF_BASE, 0.0, 0.0]]) * 1e-3
 
     def misses(x: NDArray) -> NDArray:
         T = build_place(x).pose(photograph)
-        return (project(points @ T[:3, :3].T + T[:3, 3], photograph.camera) - feet).ravel()
+        return (project(FEET_AT_REST @ T[:3, :3].T + T[:3, 3], photograph.camera) - feet).ravel()
 
     return build_place(least_squares(misses, [0.0, 0.05, HEIGHT, 0.0], x_scale=[0.01, 0.01, 0.01, 0.05]).x)
 
@@ -157,7 +165,8 @@ def place_by_labels(photographs: list[Photograph], found: list[Finding], place: 
         here, away = build_place(x), []
         for one, seen in zip(photographs, found, strict=True):
             T = here.pose(one)
-            away.append((project(one.truth @ T[:3, :3].T + T[:3, 3], one.camera) - seen.pixels) / seen.stddev[:, None])
+            places = project(one.truth @ T[:3, :3].T + T[:3, 3], one.camera)
+            away.append((places - seen.pixels) / seen.stddev[:, None])
         return np.concatenate(away).ravel()
 
     start = [place.x, place.y, place.height, place.turn]
@@ -172,16 +181,17 @@ def build_place(x: NDArray) -> Place:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Finding:
-    """Hinges in one photograph: points (8, 3) [m, jaw frame], pixels (8, 2), deviations (8,) [px] and likelihoods."""
+    """Hinges in one photograph, as the feet in it lie: points (8, 3) [m, jaw frame], pixels (8, 2), deviations (8,) [px]."""
 
     points: NDArray
     pixels: NDArray
     stddev: NDArray
-    likelihood: NDArray
 
 
-def find_hinges(photographs: list[Photograph], jaw: Jaw, place: Place, network: Path) -> dict[str, Finding]:
-    """Return what the network finds, by photograph."""
+def find_hinges(
+    photographs: list[Photograph], jaw: Jaw, place: Place, network: Path, *, by_feet: bool = False
+) -> dict[str, Finding]:
+    """Return what the network finds, by photograph; `by_feet` beside the feet that it sees, not beside the place's."""
     locator, found = AnyFinger(SideNetwork(network, threads=1), {"left": jaw}), {}
     grid = locator.grids["left"]
     for one in photographs:
@@ -189,11 +199,13 @@ def find_hinges(photographs: list[Photograph], jaw: Jaw, place: Place, network: 
         picture = take_picture(one.image, map_picture(grid, 0.0, T, one.camera))
         seen = locator.locate(picture[None], ["left"])
         places = grid.places(seen.pixels[0, :-1])
+        hinges, feet = places[: -len(FEET_AT_REST)], places[-len(FEET_AT_REST) :]
+        weight = seen.stddev[0, [-3, -2]] ** -2.0
+        shift = weight @ (feet - FEET_AT_REST[:, [0, 2]]) / weight.sum() if by_feet else np.zeros(2)
         found[one.name] = Finding(
-            points=np.insert(places, 1, 0.0, axis=1),
-            pixels=project_plane(places, 0.0, T, one.camera),
-            stddev=seen.stddev[0, :-1],
-            likelihood=seen.likelihood[0, :-1],
+            points=np.insert(hinges - shift, 1, 0.0, axis=1),
+            pixels=project_plane(hinges, 0.0, T, one.camera),
+            stddev=seen.stddev[0, : len(hinges)],
         )
     return found
 
@@ -207,7 +219,7 @@ def refine_network(options: argparse.Namespace, jaw: Jaw, labelled: list[Photogr
     pictures = []
     for one in labelled:
         T = place.pose(one)
-        points = project(one.truth @ T[:3, :3].T + T[:3, 3], one.camera)
+        points = project(np.vstack((one.truth, FEET_AT_REST)) @ T[:3, :3].T + T[:3, 3], one.camera)
         marked = LabelledImage(image=one.image, points=np.vstack((points, np.full((1, 2), np.nan))))
         pictures.append(cut_picture(marked, jaw, T, one.camera))
     teaching = FingerPictures.join(pictures)

@@ -32,6 +32,7 @@ def refine(
         threads=options.threads,
         seed=options.seed,
         batch=16,
+        workers=0,  # a process that is split off after OpenCV or onnxruntime have made threads may wait for ever
         evaluate_every=max(options.minutes / 4.0, 0.02),
         average=0.99,
     )
