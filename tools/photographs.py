@@ -124,7 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def with_feet(jaw: Jaw) -> Jaw:
-    """Return the steel finger with the feet of its strips as two more key points: there the hand-picked frame begins."""
+    """Return the steel finger with the feet of its strips as two more key points: there the picked frame begins."""
     names = (*jaw.keypoint_names, "foot_a", "foot_b")
     return replace(jaw, keypoint_names=names, keypoints=np.vstack((jaw.keypoints, FEET_AT_REST)))
 
@@ -181,7 +181,7 @@ def build_place(x: NDArray) -> Place:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Finding:
-    """Hinges in one photograph, as the feet in it lie: points (8, 3) [m, jaw frame], pixels (8, 2), deviations (8,) [px]."""
+    """Hinges in one photograph: points (8, 3) [m, jaw frame], pixels (8, 2), their deviations (8,) [px]."""
 
     points: NDArray
     pixels: NDArray
