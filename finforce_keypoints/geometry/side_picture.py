@@ -62,6 +62,17 @@ def find_side(jaw: Jaw) -> float:
     return float(jaw.keypoints[:, 1].mean())
 
 
+def read_side(jaw: Jaw, x: float, z: float) -> float:
+    """Return the y [m] of a jaw's side at a place: that of the key points, in the plane through them if it is slanted.
+
+    A tapered finger's side is; the plane is the one of least squares, level across what the key points do not tell.
+    """
+    middle = jaw.keypoints.mean(axis=0)
+    away = jaw.keypoints - middle
+    slope = np.linalg.lstsq(away[:, [0, 2]], away[:, 1], rcond=1e-3)[0]
+    return float(middle[1] + slope @ (x - middle[0], z - middle[2]))
+
+
 def project_plane(places: NDArray, side_y: float, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
     """Return the image pixels (n, 2) of places x, z (n, 2) [m] on the plane y = side_y [m]."""
     points = np.column_stack((places[:, 0], np.full(len(places), side_y), places[:, 1]))
