@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from finforce.errors import MissingDependencyError
-from finforce.systems.processes import SINGLE_THREAD, Include, Process
+from finforce.systems.processes import DEPTHS, SINGLE_THREAD, Include, Process
 
 OptionsT = TypeVar("OptionsT")
 
@@ -44,6 +44,12 @@ def solver_arguments(*, images: str = "false", parameter_file: str = NONE, use_s
         ),
         Argument("finder", default_value=NONE, description="key points by network, frame (DeepLabCut) or dots"),
         Argument("model", default_value=NONE, description="folder of a network"),
+        Argument(
+            "depth",
+            default_value=NONE,
+            choices=(NONE, *DEPTHS),
+            description="aligned: every colour image needs its depth; auto: where there is some; off: colour alone",
+        ),
         Argument(
             "T_gripper_camera", default_value=NONE, description="camera in the gripper's frame: x y z [m] qx qy qz qw"
         ),

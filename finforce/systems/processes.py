@@ -16,6 +16,7 @@ from typing import Any
 SINGLE_THREAD = {
     name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 }
+DEPTHS = {"aligned": "aligned", "auto": "auto", "off": "none"}  # options of a system: the detector's parameter `depth`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,6 +146,7 @@ def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
         "jaw_file": options.jaw_file,
         "finder": options.finder,
         "model": options.model,
+        "depth": DEPTHS.get(options.depth, ""),
         "T_gripper_camera": read_numbers("T_gripper_camera", options.T_gripper_camera, 7),
     }
     return [_jaws_process("keypoint_detector", jaws, asked, options)]
@@ -233,6 +235,7 @@ class SolverOptions:
     images: bool = False
     finder: str = ""
     model: str = ""
+    depth: str = ""
     T_gripper_camera: str = ""
     solver: str = ""
     mesh: str = ""

@@ -89,6 +89,7 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
         "images": True,
         "finder": "frame",
         "model": "d",
+        "depth": "auto",
         "T_gripper_camera": "0 0 0.1, 0 0 0 1",
     }
     known = {
@@ -101,6 +102,16 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
     assert {process.executable for process in processes} == set(known)
     for process in processes:
         assert set(process.parameters) <= known[process.executable]
+
+
+@pytest.mark.parametrize(("asked", "told"), [("", None), ("aligned", "aligned"), ("auto", "auto"), ("off", "none")])
+def test_colour_alone_is_asked_for_by_another_word_than_nothing(asked, told):
+    (detector,) = [
+        process
+        for process in replay_processes(ReplayOptions(images=True, depth=asked, bag="x"), ROOT)
+        if process.executable == "keypoint_detector"
+    ]
+    assert detector.parameters.get("depth") == told
 
 
 def test_an_object_mesh_brings_one_contact_estimator_and_its_contacts_go_to_the_solvers():

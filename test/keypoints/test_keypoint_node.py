@@ -3,10 +3,13 @@
 import json
 from time import time_ns
 
+import cv2
 import numpy as np
 import pytest
 from contact_node_fakes import call
+from geometry_msgs.msg import PoseStamped
 from keypoint_node_fakes import (
+    COLOR,
     COUNT,
     FRAME,
     HEIGHT,
@@ -16,13 +19,15 @@ from keypoint_node_fakes import (
     WIDTH,
     CameraBench,
     FakeKeypoints,
+    camera_info,
+    header,
     info_of,
     start_detector,
     start_real_detector,
 )
 from keypoint_scene_fakes import CAMERA, Bend, FakeScene, draw_dots
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import String
 
 from finforce.health import Level
@@ -30,6 +35,7 @@ from finforce.messages import decode_cloud, pose_from_message, stamp_of
 from finforce.ros import node as ros
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.node import KeypointDetectorNode
+from finforce_keypoints.parameters import INFO_TOPIC
 
 COLUMNS = ("x", "y", "z", "likelihood", "u", "v", "valid", "reason", "stddev_x", "stddev_y", "stddev_z")
 
@@ -326,3 +332,28 @@ def test_what_a_cloud_says_against_each_key_point_is_what_the_detector_said():
     cloud = ros.cloud_message(ros.Header(frame_id="left_jaw"), keypoint_columns(said))
     heard = heard_keypoints(cloud, said.T_camera_jaw)
     assert heard.reasons.tolist() == said.reasons.tolist() and heard.valid.tolist() == said.valid.tolist()
+
+
+def test_a_jpeg_stream_without_depth_is_seen_as_it_was_sent(probe):
+    topic = f"{COLOR}/compressed"
+    node = start_detector(probe, depth="none", color_topics=[topic])
+    probe.hear("left/keypoints", PointCloud2)
+    probe.hear("left/jaw_pose", PoseStamped)
+    color_out, info_out = (
+        probe.speak(topic, CompressedImage, ros.RESULT),
+        probe.speak(INFO_TOPIC, CameraInfo, ros.RESULT),
+    )
+    for publisher in (color_out, info_out):
+        probe.connected(publisher)
+    probe.wait_for(lambda: node.out.keypoints["left"].get_subscription_count() == 1)
+    info_out.publish(camera_info())
+    probe.spin(0.05)
+    picture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8), (0, 0), 3.0)
+    data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    stamp = time_ns()
+    color_out.publish(CompressedImage(header=header(stamp), format="rgb8; jpeg compressed bgr8", data=list(data)))
+    probe.wait_for(lambda: len(probe.got["left/keypoints"]) >= 1)
+    assert stamp_of(probe.got["left/keypoints"][-1]) == stamp
+    (seen,) = node.detector.images
+    assert seen.depth is None and np.abs(seen.color.astype(int) - picture).mean() < 3.0
+    assert node.get_parameter("depth").value == "none"
