@@ -56,7 +56,7 @@ class Photograph:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
+class FingerPlace:
     """Where the finger is on the table when its base is not moved: x, y and height [m], turn [rad], and its way.
 
     The base moves along the table's rows by `sign` times its displacement.
@@ -148,7 +148,7 @@ def read_photographs(folder: Path, measurement: dict) -> list[Photograph]:
     return sorted(found, key=lambda one: one.displacement)
 
 
-def place_by_feet(photograph: Photograph, feet: NDArray) -> Place:
+def place_by_feet(photograph: Photograph, feet: NDArray) -> FingerPlace:
     """Return the place that shows the feet of both strips at pixels (2, 2), A and then B."""
 
     def misses(x: NDArray) -> NDArray:
@@ -158,7 +158,7 @@ def place_by_feet(photograph: Photograph, feet: NDArray) -> Place:
     return build_place(least_squares(misses, [0.0, 0.05, HEIGHT, 0.0], x_scale=[0.01, 0.01, 0.01, 0.05]).x)
 
 
-def place_by_labels(photographs: list[Photograph], found: list[Finding], place: Place) -> Place:
+def place_by_labels(photographs: list[Photograph], found: list[Finding], place: FingerPlace) -> FingerPlace:
     """Return the place at which the hand-picked hinges lie where the network sees them, far ones counting less."""
 
     def misses(x: NDArray) -> NDArray:
@@ -174,9 +174,9 @@ def place_by_labels(photographs: list[Photograph], found: list[Finding], place: 
     return build_place(fit.x)
 
 
-def build_place(x: NDArray) -> Place:
+def build_place(x: NDArray) -> FingerPlace:
     """Return a place of its numbers."""
-    return Place(x=float(x[0]), y=float(x[1]), height=float(x[2]), turn=float(x[3]))
+    return FingerPlace(x=float(x[0]), y=float(x[1]), height=float(x[2]), turn=float(x[3]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -189,7 +189,7 @@ class Finding:
 
 
 def find_hinges(
-    photographs: list[Photograph], jaw: Jaw, place: Place, network: Path, *, by_feet: bool = False
+    photographs: list[Photograph], jaw: Jaw, place: FingerPlace, network: Path, *, by_feet: bool = False
 ) -> dict[str, Finding]:
     """Return what the network finds, by photograph; `by_feet` beside the feet that it sees, not beside the place's."""
     locator, found = AnyFinger(SideNetwork(network, threads=1), {"left": jaw}), {}
@@ -210,7 +210,7 @@ def find_hinges(
     return found
 
 
-def refine_network(options: argparse.Namespace, jaw: Jaw, labelled: list[Photograph], place: Place) -> Path:
+def refine_network(options: argparse.Namespace, jaw: Jaw, labelled: list[Photograph], place: FingerPlace) -> Path:
     """Train the network further on labelled photographs and return its folder."""
     from training.dataset import TRAIN, FingerPictures, load_pictures
     from training.rectification import LabelledImage, cut_picture
@@ -259,7 +259,7 @@ def report(words: str, photographs: list[Photograph], found: dict[str, Finding],
             )
 
 
-def draw(path: Path, photographs: list[Photograph], found: dict[str, Finding], jaw: Jaw, place: Place) -> None:
+def draw(path: Path, photographs: list[Photograph], found: dict[str, Finding], jaw: Jaw, place: FingerPlace) -> None:
     """Write the rectified photographs, hand-picked hinges green and found ones red."""
     cv2, tiles = import_cv2(), []
     grid = AnyFinger(SideNetwork(ANY_FINGER, threads=1), {"left": jaw}).grids["left"]

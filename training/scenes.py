@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
@@ -22,6 +22,7 @@ from finforce.camera import CameraIntrinsics, project
 from finforce.optional import import_cv2
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.geometry.template import MARK_RADIUS, SideShape, draw_template, fit_grid
+from finforce_twin.rendering.bodies import build_box
 from finforce_twin.rendering.lighting import Lighting, Paint, draw_color, draw_jaw_paint, draw_look, draw_paint
 from finforce_twin.rendering.render import Body, Decal, RenderedScene
 from finforce_twin.rendering.sensor import expose
@@ -152,14 +153,9 @@ def extrude(finger: Finger) -> _Solid:
     return _Solid(section=points, triangles=triangles, half=finger.half_width(points[:, 1]))
 
 
-def _box(low: NDArray, high: NDArray, paint: Paint | PicturePaint, decals: tuple[Decal, ...] = ()) -> Body:
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]])
-    triangles = np.array(
-        [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4], [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6]]
-        + [[1, 3, 5], [3, 7, 5]]
-    )
-    rest = np.asarray(low) + corners * (np.asarray(high) - low)
-    return Body(vertices=rest, triangles=triangles, rest=rest, paint=paint, decals=decals)
+def _box(low: ArrayLike, high: ArrayLike, paint: Paint | PicturePaint, decals: tuple[Decal, ...] = ()) -> Body:
+    """Return a box of two corners (3,) [m], jaw frame."""
+    return build_box(np.array([low, high], dtype=float), np.eye(4), paint, decals)
 
 
 def _rod(rng: np.random.Generator, radius: NDArray, half: float, *, round_: bool) -> tuple[NDArray, NDArray, NDArray]:

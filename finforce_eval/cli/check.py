@@ -8,12 +8,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.at_rest import ROUNDS, first_images
+from finforce_eval.cli.extrinsics import read_at_rest
+from finforce_eval.evaluation.at_rest import ROUNDS
 from finforce_eval.evaluation.check import FAULT, check_recording
-from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import read_recordings
-from finforce_eval.recordings.tracks import JAWS
 
 PICTURE = "check.png"
 
@@ -40,14 +37,7 @@ def run(options: argparse.Namespace) -> int:
     """
     from finforce.optional import import_cv2
 
-    options.source = "images"
-    if options.images < 5:
-        raise OptionError(f"--images {options.images}: expected at least 5, the mean of which is taken")
-    source = parse_source(options)
-    sides = JAWS if options.jaws == "both" else (options.jaws,)
-    (recording,) = read_recordings(options.bags, source.pairing, sides=sides)
-    recording = first_images(recording, options.images)
-    recording = replace(recording, jaws={side: recording.jaws[side] for side in sides})
+    source, recording = read_at_rest(options)
     if not recording.images.has_depth and "depth" not in source.parameters:
         source = replace(source, parameters={**source.parameters, "depth": "none"})
     with tqdm(total=ROUNDS * len(recording.images), unit="image", disable=None, leave=False) as bar:

@@ -14,9 +14,9 @@ from finforce.camera import ImageError, decode_picture
 from finforce.transforms import pose_numbers, rotation_between
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS, approach, first_images
-from finforce_eval.evaluation.keypoint_source import build_records, choose_images, parse_source
+from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, parse_source
 from finforce_eval.evaluation.setup import read_recordings
-from finforce_eval.recordings.tracks import JAWS
+from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.geometry.extrinsics import Extrinsics
 from finforce_keypoints.geometry.hole_grid import GridCamera, find_grid_camera
@@ -45,6 +45,21 @@ def run(options: argparse.Namespace) -> None:
     if options.grid is not None:
         print(format_grid_camera(find_grid_camera(read_picture(Path(options.bags[0])), options.grid)))
         return
+    source, recording = read_at_rest(options)
+    start = build_records(source.node_parameters(recording)).parameters
+    recording = replace(recording, images=choose_images(recording, start.depth))
+    jaws = {side: load_jaw(options.jaw, side) for side in recording.jaws}
+    with tqdm(total=ROUNDS * len(recording.images), unit="image", disable=None, leave=False) as bar:
+        found, _ = approach(recording, source, jaws, start.camera_pose, bar.update)
+    print(format_extrinsics(found, start.camera_pose))
+
+
+def read_at_rest(options: argparse.Namespace) -> tuple[KeypointSource, Recording]:
+    """Return the detector's parameters, and the first images of a recording, in which the asked jaws are at rest.
+
+    Raises:
+        FinforceError: an option or the recording cannot be used, or has too few images.
+    """
     options.source = "images"
     if options.images < 5:
         raise OptionError(f"--images {options.images}: expected at least 5, the mean of which is taken")
@@ -52,13 +67,7 @@ def run(options: argparse.Namespace) -> None:
     sides = JAWS if options.jaws == "both" else (options.jaws,)
     (recording,) = read_recordings(options.bags, source.pairing, sides=sides)
     recording = first_images(recording, options.images)
-    recording = replace(recording, jaws={side: recording.jaws[side] for side in sides})
-    start = build_records(source.node_parameters(recording)).parameters
-    recording = replace(recording, images=choose_images(recording, start.depth))
-    jaws = {side: load_jaw(options.jaw, side) for side in sides}
-    with tqdm(total=ROUNDS * len(recording.images), unit="image", disable=None, leave=False) as bar:
-        found, _ = approach(recording, source, jaws, start.camera_pose, bar.update)
-    print(format_extrinsics(found, start.camera_pose))
+    return source, replace(recording, jaws={side: recording.jaws[side] for side in sides})
 
 
 def read_picture(path: Path) -> NDArray[np.uint8]:

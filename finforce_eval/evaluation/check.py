@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from finforce.camera import CameraIntrinsics, ImageError, project
+from finforce.camera import EQUIDISTANT, CameraIntrinsics, ImageError, project
 from finforce.errors import FinforceError
 from finforce.gripper_frames import OpeningRange, jaw_in_camera
 from finforce.optional import import_cv2
@@ -22,19 +22,19 @@ from finforce_eval.evaluation.keypoint_source import KeypointSource, build_recor
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_keypoints.errors import KeypointError
-from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw
+from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, measure_misses
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import ALIGNED
 
-OK, WARNING, FAULT = LEVELS = ("ok", "warning", "fault")
+OK, WARNING, FAULT = "ok", "warning", "fault"
 DARK, BRIGHT = 25.0, 235.0  # of 255: mean brightness beyond which a picture shows little
 BLURRED = 0.16  # share of the finest detail in that of the next scale, of a picture out of focus
 COVERED = 0.30  # share of the picture's parts without any detail, from which on something may cover the lens
 FLAT, TILES = 1.5, 12  # of 255: contrast of such a part; parts each way
 GOOD_RESIDUAL = 1.0  # [px] left over when jaws at rest are laid on what is seen
 FAR, TURNED = 3e-3, np.radians(1.5)  # [m], [rad] by which the camera may be elsewhere than it is said to be
-FOCAL_ERROR, SCALE_ERROR = 0.03, 0.03  # of focal length and depth, from which on they are named
+FOCAL_ERROR = 0.03  # of the focal length, from which on it is named
 BETTER, ENOUGH = 0.2, 0.5  # by which another reading has to be likelier, and how likely, to be named
 
 
@@ -151,7 +151,7 @@ def _describe_camera(recording: Recording, depth: str) -> Iterator[Said]:
     """Yield what the camera is."""
     camera, images = recording.images.camera, recording.images
     across = 2.0 * np.degrees(np.arctan(0.5 * camera.width / camera.fx))
-    if camera.model == "equidistant":
+    if camera.model == EQUIDISTANT:
         across = np.degrees(camera.width / camera.fx)
     rate = (len(images) - 1) / max(1e-9 * float(images.stamps[-1] - images.stamps[0]), 1e-6)
     kind = "with depth" if images.has_depth and depth == ALIGNED else "colour alone"
@@ -205,12 +205,8 @@ def fit_focal(jaws: Mapping[str, SeenJaw], camera: CameraIntrinsics, found: Extr
 
     def misses(x: NDArray) -> NDArray:
         lens = replace(camera, fx=camera.fx * np.exp(x[6]), fy=camera.fy * np.exp(x[6]))
-        T, away = move_pose(found.T_gripper_camera, x[:6]), []
-        for side, jaw in jaws.items():
-            pose = jaw_in_camera(T, side, (half + x[7]) * (-1.0 if side == "left" else 1.0))
-            seen = np.isfinite(jaw.pixels).all(axis=1)
-            places = project(jaw.points[seen] @ pose[:3, :3].T + pose[:3, 3], lens)
-            away.append((places - jaw.pixels[seen]).ravel())
+        T = move_pose(found.T_gripper_camera, x[:6])
+        away = [measure_misses(side, jaw, lens, T, half + x[7]) for side, jaw in jaws.items()]
         return np.nan_to_num(np.concatenate(away), nan=1e3)
 
     scale = np.r_[np.full(3, 5e-3), np.full(3, 0.05), 0.1, 5e-3]

@@ -13,7 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError, IntrinsicsError, decode_color, decode_depth
+from finforce.camera import (
+    LARGEST_PICTURE,
+    MILLIMETRE,
+    CameraIntrinsics,
+    ImageError,
+    IntrinsicsError,
+    decode_color,
+    decode_depth,
+)
 from finforce.errors import MissingDependencyError, ObservationError
 from finforce.messages import camera_from_info, layout_of, read_stamp, same_camera
 from finforce.stamps import find_nearest
@@ -222,7 +230,6 @@ DEPTH_FORMAT = "16UC1; compressedDepth png"
 DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport: an enum and two numbers for 32-bit depth
 PNG = b"\x89PNG"
 STEPPED = ("", "16UC1", "mono16")  # what a png of depth can be said to hold; of 32FC1 it holds inverse depths
-LARGEST_PICTURE = 50_000_000  # px, of a picture that is unpacked: no camera here makes more
 QUALITY = 90  # of a jpeg, the key points' pixels stay within a few hundredths
 LEVEL = 1  # of png: the highest makes a noisy depth image a quarter smaller, and takes eighty times as long
 

@@ -82,7 +82,7 @@ def find_extrinsics(
 
     def misses(x: NDArray) -> NDArray:
         T, half = move_pose(guess, x[:6]), origin + (x[6] if is_pair else 0.0)
-        return np.concatenate([_misses(side, jaw, seen[side], camera, T, half) for side, jaw in jaws.items()])
+        return np.concatenate([measure_misses(side, jaw, camera, T, half) for side, jaw in jaws.items()])
 
     fit = least_squares(
         misses, np.zeros(7 if is_pair else 6), x_scale=_TYPICAL[: 7 if is_pair else 6], loss="soft_l1", f_scale=_OUTLIER
@@ -98,8 +98,9 @@ def find_extrinsics(
     )
 
 
-def _misses(side: str, jaw: SeenJaw, seen: NDArray, camera: CameraIntrinsics, T: NDArray, half: float) -> NDArray:
+def measure_misses(side: str, jaw: SeenJaw, camera: CameraIntrinsics, T: NDArray, half: float) -> NDArray:
     """Return column and row by which the seen points lie beside their places [px], one after the other."""
+    seen = np.isfinite(jaw.pixels).all(axis=1)
     T_camera_jaw = jaw_in_camera(T, side, -half if side == "left" else half)
     places = project(jaw.points[seen] @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3], camera)
     return (places - jaw.pixels[seen]).ravel()

@@ -77,12 +77,12 @@ def dress_jaw(shape: DrawnJaw, vertices: NDArray, T_camera_jaw: NDArray, wardrob
         # the holder is as wide as the finger that stands in it
         low, high = shape.rest.min(axis=0), shape.rest.max(axis=0)
         holder[:, :2] = np.stack((low[:2], high[:2]))
-    return [jaw, _box(holder, T_camera_jaw, wardrobe.holder, () if own else (dot,))]
+    return [jaw, build_box(holder, T_camera_jaw, wardrobe.holder, () if own else (dot,))]
 
 
 def dress_palm(T_camera_gripper: NDArray, wardrobe: Wardrobe) -> Body:
     """Return the palm, behind the holders."""
-    return _box(PALM, T_camera_gripper, wardrobe.palm)
+    return build_box(PALM, T_camera_gripper, wardrobe.palm)
 
 
 def dress_object(mesh: ObjectMesh, T_camera_object: NDArray, wardrobe: Wardrobe) -> Body:
@@ -101,10 +101,11 @@ def draw_occluders(T_camera_gripper: NDArray, wardrobe: Wardrobe, rng: np.random
         return []
     size = rng.uniform((0.004, 0.004, 0.004), (0.05, 0.01, 0.05))
     low = rng.uniform((-0.06, 0.02, 0.0), (0.06, 0.04, 0.08))
-    return [_box(np.stack((low, low + size)), T_camera_gripper, wardrobe.occluder)]
+    return [build_box(np.stack((low, low + size)), T_camera_gripper, wardrobe.occluder)]
 
 
-def _box(bounds: NDArray, T: NDArray, paint: Paint, decals: tuple[Decal, ...] = ()) -> Body:
+def build_box(bounds: NDArray, T: NDArray, paint: Paint, decals: tuple[Decal, ...] = ()) -> Body:
+    """Return a box of bounds (2, 3) [m] in a frame at T (4, 4)."""
     rest = bounds[0] + _BOX * (bounds[1] - bounds[0])
     return Body(vertices=_move(rest, T), triangles=_BOX_TRIANGLES, rest=rest, paint=paint, decals=decals)
 
