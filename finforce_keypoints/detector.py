@@ -17,7 +17,7 @@ from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.errors import DetectionError, GeometryError, ImageOrderError, KeypointError
 from finforce_keypoints.geometry.depth import DepthScale
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints, JawLocalizer
-from finforce_keypoints.geometry.side_picture import read_side
+from finforce_keypoints.geometry.side_picture import find_side
 from finforce_keypoints.geometry.stillness import StillWatch
 from finforce_keypoints.images import RgbdImage, check_image
 from finforce_keypoints.pixel_finder import PixelFinder, PixelFinding
@@ -221,7 +221,7 @@ def check_reference(jaw: Jaw) -> None:
     """
     left = jaw if jaw.side == "left" else jaw.mirrored()  # as the jaw file has it
     (x, y, z) = left.reference_point + 0.0  # no -0 in the message
-    side_y = read_side(left, x, z)
+    side_y = float(find_side(left).at(np.array([x, z])))
     if not abs(y - side_y) <= _SAME_SIDE:
         raise GeometryError(
             f"jaw '{jaw.name}': got the reference point [{x:g}, {y:g}, {z:g}] m, expected it on the side that the "

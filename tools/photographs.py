@@ -27,7 +27,7 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.locators import AnyFinger
 from finforce_keypoints.geometry.hole_grid import GridCamera, find_grid_camera
-from finforce_keypoints.geometry.side_picture import map_picture, project_plane, take_picture
+from finforce_keypoints.geometry.side_picture import find_side, map_picture, project_plane, take_picture
 from finforce_keypoints.networks.side_network import SideNetwork
 
 PITCH = 0.025  # [m] between the table's holes
@@ -193,10 +193,10 @@ def find_hinges(
 ) -> dict[str, Finding]:
     """Return what the network finds, by photograph; `by_feet` beside the feet that it sees, not beside the place's."""
     locator, found = AnyFinger(SideNetwork(network, threads=1), {"left": jaw}), {}
-    grid = locator.grids["left"]
+    grid, side = locator.grids["left"], find_side(jaw)
     for one in photographs:
         T = place.pose(one)
-        picture = take_picture(one.image, map_picture(grid, 0.0, T, one.camera))
+        picture = take_picture(one.image, map_picture(grid, side, T, one.camera))
         seen = locator.locate(picture[None], ["left"])
         places = grid.places(seen.pixels[0, :-1])
         hinges, feet = places[: -len(FEET_AT_REST)], places[-len(FEET_AT_REST) :]
@@ -204,7 +204,7 @@ def find_hinges(
         shift = weight @ (feet - FEET_AT_REST[:, [0, 2]]) / weight.sum() if by_feet else np.zeros(2)
         found[one.name] = Finding(
             points=np.insert(hinges - shift, 1, 0.0, axis=1),
-            pixels=project_plane(hinges, 0.0, T, one.camera),
+            pixels=project_plane(hinges, side, T, one.camera),
             stddev=seen.stddev[0, : len(hinges)],
         )
     return found
@@ -265,7 +265,7 @@ def draw(path: Path, photographs: list[Photograph], found: dict[str, Finding], j
     grid = AnyFinger(SideNetwork(ANY_FINGER, threads=1), {"left": jaw}).grids["left"]
     for one in photographs:
         T = place.pose(one)
-        tile = cv2.resize(take_picture(one.image, map_picture(grid, 0.0, T, one.camera)), None, fx=2, fy=2)
+        tile = cv2.resize(take_picture(one.image, map_picture(grid, find_side(jaw), T, one.camera)), None, fx=2, fy=2)
         for points, color in ((one.truth, (40, 220, 60)), (found[one.name].points, (255, 40, 40))):
             for x, y in grid.pixels(points[:, [0, 2]]) if points is not None else ():
                 cv2.circle(tile, (round(2 * x + 0.5), round(2 * y + 0.5)), 5, color, 1, cv2.LINE_AA)

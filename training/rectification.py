@@ -119,16 +119,16 @@ def rectify(labelled: LabelledImage, jaw: Jaw, side: str, view: CameraView) -> F
 
 def cut_picture(labelled: LabelledImage, jaw: Jaw, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> FingerPictures:
     """Return the picture of the side plane of a jaw at T_camera_jaw (4, 4) with its labelled points, the mark first."""
-    shape, side_y = find_shape(jaw), find_side(jaw)
+    shape, side = find_shape(jaw), find_side(jaw)
     grid = fit_grid(shape)
     padded = grid.padded(MARGIN)
     rest = np.vstack((jaw.reference_point, jaw.keypoints))[:, [0, 2]]
     points = np.roll(labelled.points, 1, axis=0)
     visible = np.isfinite(points).all(axis=1)
     place = np.full((len(visible), 2), np.nan, dtype=np.float32)
-    place[visible] = padded.pixels(intersect_plane(points[visible], side_y, T_camera_jaw, camera))
+    place[visible] = padded.pixels(intersect_plane(points[visible], side, T_camera_jaw, camera))
     return FingerPictures(
-        picture=take_picture(labelled.image, map_picture(padded, side_y, T_camera_jaw, camera))[None],
+        picture=take_picture(labelled.image, map_picture(padded, side, T_camera_jaw, camera))[None],
         rest=grid.pixels(rest).astype(np.float32)[None],
         place=place[None],
         visible=visible[None],

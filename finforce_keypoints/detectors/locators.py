@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from finforce_keypoints.detectors.side_plane import find_rest
 from finforce_keypoints.errors import ModelError
+from finforce_keypoints.geometry.shapes import find_motions, span_shapes
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.geometry.template import draw_template, find_shape, fit_grid
 from finforce_keypoints.networks.side_network import Places
@@ -19,7 +20,7 @@ from finforce_keypoints.pixel_finder import REFERENCE
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_keypoints.networks.model import KeypointModel
-    from finforce_keypoints.networks.side_network import SideNetwork
+    from finforce_keypoints.networks.side_network import SideNetwork, Template
 
 
 class AnyFinger:
@@ -34,10 +35,11 @@ class AnyFinger:
         self._network = network
         shapes = {side: find_shape(jaw) for side, jaw in jaws.items()}
         self.grids = {side: fit_grid(shape, network.width, network.height) for side, shape in shapes.items()}
-        self._templates = {
-            side: network.prepare(draw_template(shapes[side], grid), grid.pixels(find_rest(jaws[side])))
-            for side, grid in self.grids.items()
-        }
+        self._templates: dict[str, Template] = {}
+        for side, grid in self.grids.items():
+            points = grid.pixels(find_rest(jaws[side]))
+            together = span_shapes(find_motions(jaws[side]), points, grid.scale)
+            self._templates[side] = network.prepare(draw_template(shapes[side], grid), points, together)
 
     def locate(self, pictures: NDArray, sides: Sequence[str]) -> Places:
         """Return where the points are; see `SideLocator`."""

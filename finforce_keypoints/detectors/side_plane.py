@@ -68,7 +68,7 @@ class PlaneFinder:
         opening: OpeningRange | None = None,
     ) -> None:
         self._locator, self._T_gripper_camera, self._opening = locator, T_gripper_camera, opening or OpeningRange()
-        self._side_y = {side: find_side(jaw) for side, jaw in jaws.items()}
+        self._planes = {side: find_side(jaw) for side, jaw in jaws.items()}
         self._rest = {side: find_rest(jaw) for side, jaw in jaws.items()}
         self._kept: dict[str, _View] = {}
         self._camera: CameraIntrinsics | None = None
@@ -111,7 +111,7 @@ class PlaneFinder:
         return [kept]
 
     def _view(self, side: str, pose: NDArray) -> _View:
-        mapping = map_picture(self._locator.grids[side], self._side_y[side], pose, self._camera)
+        mapping = map_picture(self._locator.grids[side], self._planes[side], pose, self._camera)
         return _View(side=side, T_camera_jaw=pose, mapping=mapping)
 
     def _centre(self, view: _View, places: Places, number: int) -> NDArray:
@@ -127,10 +127,10 @@ class PlaneFinder:
 
     def _describe(self, view: _View, places: Places, number: int) -> PixelFinding:
         """Return the finding of one picture, in pixels of the image."""
-        side_y, grid, camera = self._side_y[view.side], self._locator.grids[view.side], self._camera
+        plane, grid, camera = self._planes[view.side], self._locator.grids[view.side], self._camera
         on_plane = grid.places(places.pixels[number])
-        pixels = project_plane(on_plane, side_y, view.T_camera_jaw, camera)
-        beside = [project_plane(on_plane + step, side_y, view.T_camera_jaw, camera) for step in np.eye(2) * 1e-3]
+        pixels = project_plane(on_plane, plane, view.T_camera_jaw, camera)
+        beside = [project_plane(on_plane + step, plane, view.T_camera_jaw, camera) for step in np.eye(2) * 1e-3]
         # pixels of the image per pixel of the picture, both ways
         across = [np.hypot(*(other - pixels).T) * grid.scale / 1e-3 for other in beside]
         stddev = places.stddev[number] * np.sqrt(0.5 * (across[0] ** 2 + across[1] ** 2))

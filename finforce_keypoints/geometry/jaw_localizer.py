@@ -35,7 +35,7 @@ from finforce_keypoints.geometry.depth import (
     weigh_depths,
 )
 from finforce_keypoints.geometry.jaw_pose import Origin, OriginFinder, OriginTrack
-from finforce_keypoints.geometry.side_picture import PlaneGrid, map_picture, take_picture
+from finforce_keypoints.geometry.side_picture import PlaneGrid, SidePlane, map_picture, take_picture
 from finforce_keypoints.images import RgbdImage, lie_inside
 from finforce_keypoints.pixel_finder import PixelFinding
 from finforce_keypoints.settings import DetectorSettings
@@ -74,7 +74,8 @@ class ReferencePatch:
     """
 
     def __init__(self, jaw: Jaw) -> None:
-        x, self._side_y, z = jaw.reference_point
+        x, y, z = jaw.reference_point
+        self._side = SidePlane(level=float(y))
         size = 2 * HALF + 1
         self._grid = PlaneGrid(scale=SCALE, x=x - HALF * SCALE, z=z - HALF * SCALE, width=size, height=size)
         self._sign = 1.0 if jaw.side == "left" else -1.0
@@ -142,7 +143,7 @@ class ReferencePatch:
 
     def _take(self, color: NDArray, camera: CameraIntrinsics, T_camera_jaw: NDArray) -> NDArray:
         """Return the patch (h, w) of a jaw at a place, smoothed."""
-        picture = take_picture(color, map_picture(self._grid, float(self._side_y), T_camera_jaw, camera))
+        picture = take_picture(color, map_picture(self._grid, self._side, T_camera_jaw, camera))
         grey = picture.astype(np.float32).mean(axis=2)
         return import_cv2().GaussianBlur(grey, (0, 0), BLUR).astype(np.float64)
 

@@ -1,12 +1,12 @@
 """Pictures of a jaw's side plane, square to it and to scale whatever the camera's place and lens.
 
-The key points lie on the side of the jaw that looks at the camera, the plane y = const of the jaw frame. The column c
-and the row r of the picture are x = x_0 + c s and z = z_0 + r s on it; left and right jaw look alike.
+The key points lie on the side of the jaw that looks at the camera, a plane near y = const of the jaw frame. The column
+c and the row r of the picture are x = x_0 + c s and z = z_0 + r s on it; left and right jaw look alike.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,41 +57,56 @@ class PlaneGrid:
         return (np.asarray(places, dtype=float) - (self.x, self.z)) / self.scale
 
 
-def find_side(jaw: Jaw) -> float:
-    """Return the y [m] of a jaw's side plane: the mean of its key points'."""
-    return float(jaw.keypoints[:, 1].mean())
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SidePlane:
+    """The side of a finger that its key points lie on; a tapered finger's is slanted.
 
-
-def read_side(jaw: Jaw, x: float, z: float) -> float:
-    """Return the y [m] of a jaw's side at a place: that of the key points, in the plane through them if it is slanted.
-
-    A tapered finger's side is; the plane is the one of least squares, level across what the key points do not tell.
+    Attributes:
+        level: y at x = z = 0 of the jaw frame [m].
+        slope: change of y along x and z (2,) [m/m].
     """
+
+    level: float
+    slope: NDArray = field(default_factory=lambda: np.zeros(2))
+
+    def at(self, places: NDArray) -> NDArray:
+        """Return the y (...,) [m] of the side at x and z (..., 2) [m]."""
+        return self.level + np.asarray(places) @ self.slope
+
+    def points(self, places: NDArray) -> NDArray:
+        """Return the points (n, 3) [m] of the side at x and z (n, 2) [m]."""
+        return np.insert(np.asarray(places, dtype=float), 1, self.at(places), axis=1)
+
+
+def find_side(jaw: Jaw) -> SidePlane:
+    """Return the plane of least squares through a jaw's key points, level across what they do not tell."""
     middle = jaw.keypoints.mean(axis=0)
     away = jaw.keypoints - middle
     slope = np.linalg.lstsq(away[:, [0, 2]], away[:, 1], rcond=1e-3)[0]
-    return float(middle[1] + slope @ (x - middle[0], z - middle[2]))
+    return SidePlane(level=float(middle[1] - slope @ middle[[0, 2]]), slope=slope)
 
 
-def project_plane(places: NDArray, side_y: float, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
-    """Return the image pixels (n, 2) of places x, z (n, 2) [m] on the plane y = side_y [m]."""
-    points = np.column_stack((places[:, 0], np.full(len(places), side_y), places[:, 1]))
-    return project(points @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3], camera)
+def project_plane(places: NDArray, side: SidePlane, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
+    """Return the image pixels (n, 2) of places x, z (n, 2) [m] on a jaw's side."""
+    return project(side.points(places) @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3], camera)
 
 
-def intersect_plane(pixels: NDArray, side_y: float, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
-    """Return x and z (n, 2) [m] where the rays of image pixels (n, 2) meet the plane y = side_y [m].
+def intersect_plane(pixels: NDArray, side: SidePlane, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
+    """Return x and z (n, 2) [m] where the rays of image pixels (n, 2) meet a jaw's side.
 
-    With n the plane's normal and o the jaw's origin in the camera frame, t = n . (o + side_y n) / n . ray.
+    With n the plane's normal, whose part along y is 1, and o the jaw's origin, both in the camera frame, and l its
+    level: t = (n . o + l) / n . ray.
     """
     rays = rays_from_pixels(pixels, camera)
     R, origin = T_camera_jaw[:3, :3], T_camera_jaw[:3, 3]
-    normal = R[:, 1]
-    points = rays * ((normal @ origin + side_y) / (rays @ normal))[:, None]
+    normal = R @ np.array([-side.slope[0], 1.0, -side.slope[1]])
+    points = rays * ((normal @ origin + side.level) / (rays @ normal))[:, None]
     return ((points - origin) @ R)[:, [0, 2]]
 
 
-def map_picture(grid: PlaneGrid, side_y: float, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray[np.float32]:
+def map_picture(
+    grid: PlaneGrid, side: SidePlane, T_camera_jaw: NDArray, camera: CameraIntrinsics
+) -> NDArray[np.float32]:
     """Return the image column and row (height, width, 2) at which each pixel of a picture is taken.
 
     Parts of the plane that the camera does not see come from outside the image.
@@ -99,7 +114,7 @@ def map_picture(grid: PlaneGrid, side_y: float, T_camera_jaw: NDArray, camera: C
     columns = np.arange(0, grid.width + COARSE, COARSE)
     rows = np.arange(0, grid.height + COARSE, COARSE)
     knots = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    exact = project_plane(grid.places(knots), side_y, T_camera_jaw, camera)
+    exact = project_plane(grid.places(knots), side, T_camera_jaw, camera)
     exact = np.where(np.isfinite(exact), exact, -1e4).astype(np.float32).reshape(len(rows), len(columns), 2)
     down = _interpolate(exact, grid.height)
     return np.ascontiguousarray(_interpolate(down.swapaxes(0, 1), grid.width).swapaxes(0, 1))

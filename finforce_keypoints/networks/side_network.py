@@ -1,7 +1,8 @@
 """The network of any finger: pictures of side planes and the fingers' templates in, places of their points out.
 
 It has two parts, each a file: a coarse one tells roughly where each point of the template has moved to, a fine one
-compares small pieces of picture and template there.
+compares small pieces of picture and template there. Between them stands what the finger's mechanics allow: the guesses
+of all points are one shape of the finger.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -18,12 +19,15 @@ from numpy.typing import NDArray
 
 from finforce.optional import import_cv2
 from finforce_keypoints.errors import DetectionError, ModelError
+from finforce_keypoints.geometry.shapes import fit_shapes, trust
 from finforce_keypoints.networks.network import CPU, open_session
 
 METADATA = "finforce"  # key of the files' own metadata
 KIND = "side plane"
 COARSE, FINE = "coarse.onnx", "fine.onnx"
 COARSE_LAYOUT = (("pictures", "templates", "points"), ("guesses", "context", "mean", "gain"))
+GUESS, BLUR = 2.5, 1.0  # [px] by which the coarse part is off, and by which a finger differs from its shapes
+NEAR = 1.0  # [px] within which a better guess is none: the fine part finds the same from both
 FINE_LAYOUT = (("pieces", "templates", "context", "mean", "gain"), ("offsets", "likelihood", "spread"))
 
 
@@ -35,11 +39,13 @@ class Template:
         half: (h / 2, w / 2, 3) uint8, what it looks like at rest.
         points: (K, 2) float32 its points in the template at full size [px].
         pieces: (K, p, p, 3) uint8, the template around them.
+        shapes: (2 K, m) how they can move together, see `span_shapes`; None where nobody knows.
     """
 
     half: NDArray
     points: NDArray
     pieces: NDArray
+    shapes: NDArray | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -135,16 +141,17 @@ class SideNetwork:
         """The SHA-256 of both files, by which recordings tell what they were made with."""
         return hashlib.sha256(b"".join((self.path / name).read_bytes() for name in (COARSE, FINE))).hexdigest()
 
-    def prepare(self, template: NDArray, points: NDArray) -> Template:
+    def prepare(self, template: NDArray, points: NDArray, shapes: NDArray | None = None) -> Template:
         """Return what is told of a finger.
 
         Args:
             template: (height, width, 3) uint8, see `draw_template`.
             points: (K, 2) column and row of its points there [px].
+            shapes: (2 K, m) how they can move together [px]; without them each point is found for itself.
         """
         cv2, points = import_cv2(), np.asarray(points, dtype=np.float32)
         half = cv2.resize(template, (self.width // 2, self.height // 2), interpolation=cv2.INTER_AREA)
-        return Template(half=half, points=points, pieces=self._cut(template, points))
+        return Template(half=half, points=points, pieces=self._cut(template, points), shapes=shapes)
 
     def locate(self, pictures: NDArray, templates: Sequence[Template]) -> Places:
         """Find points in pictures.
@@ -157,21 +164,58 @@ class SideNetwork:
             DetectionError: the network cannot be computed for these.
         """
         points = np.stack([template.points for template in templates])
-        batch, count = points.shape[:2]
         half = np.stack([template.half for template in templates])
-        guesses, context, mean, gain = self._run(self._coarse, COARSE_LAYOUT[0], (pictures, half, points))
-        pieces = np.concatenate([self._cut(*pair) for pair in zip(pictures, guesses, strict=True)])
-        known = np.concatenate([template.pieces for template in templates])
-        inputs = (pieces, known, context.reshape(batch * count, -1), mean.repeat(count, 0), gain.repeat(count, 0))
-        offsets, likelihood, spread = self._run(self._fine, FINE_LAYOUT[0], inputs)
-        places = guesses + offsets.reshape(batch, count, 2)
-        likelihood, spread = likelihood.reshape(batch, count), spread.reshape(batch, count)
-        good = np.isfinite(places).all(axis=2) & np.isfinite(likelihood) & np.isfinite(spread)
-        return Places(
-            pixels=np.where(good[..., None], places, np.nan).astype(float),
-            likelihood=np.where(good, np.clip(likelihood, 0.0, 1.0), 0.0).astype(float),
-            stddev=np.where(good, self._factor * spread, np.inf).astype(float),
+        guesses, *seen = self._run(self._coarse, COARSE_LAYOUT[0], (pictures, half, points))
+        everywhere = np.ones(points.shape[:2], dtype=bool)
+        if any(template.shapes is None for template in templates):
+            return self._compare(pictures, templates, seen, guesses, everywhere)
+        shapes = np.stack([template.shapes for template in templates])
+        moves = fit_shapes(shapes, guesses - points, np.full(everywhere.shape, GUESS), np.ones(everywhere.shape))
+        places = self._compare(pictures, templates, seen, points + moves, everywhere)
+        better = _fit(shapes, points, places)
+        wrong = np.linalg.norm(better - moves, axis=2) > NEAR
+        if wrong.any():
+            again = self._compare(pictures, templates, seen, points + better, wrong)
+            places = Places(
+                pixels=np.where(wrong[..., None], again.pixels, places.pixels),
+                likelihood=np.where(wrong, again.likelihood, places.likelihood),
+                stddev=np.where(wrong, again.stddev, places.stddev),
+            )
+            better = _fit(shapes, points, places)
+        believed = trust(places.pixels - points, better)
+        return replace(places, likelihood=places.likelihood * np.nan_to_num(believed))
+
+    def _compare(
+        self,
+        pictures: NDArray,
+        templates: Sequence[Template],
+        seen: Sequence[NDArray],
+        guesses: NDArray,
+        wanted: NDArray,
+    ) -> Places:
+        """Return where points are that lie near guesses (B, K, 2) [px]; of those not wanted (B, K) nothing is known.
+
+        What was seen by the coarse part is context (B, K, C), and mean and gain of the colours (B, 3).
+        """
+        context, mean, gain = seen
+        which = np.nonzero(wanted)
+        pieces, known = [], []
+        for picture, template, guess, chosen in zip(pictures, templates, guesses, wanted, strict=True):
+            pieces.append(self._cut(picture, guess[chosen]))
+            known.append(template.pieces[chosen])
+        inputs = (np.concatenate(pieces), np.concatenate(known), context[which], mean[which[0]], gain[which[0]])
+        offsets, likely, spread = self._run(self._fine, FINE_LAYOUT[0], inputs)
+        places = guesses[which] + offsets
+        good = np.isfinite(places).all(axis=1) & np.isfinite(likely) & np.isfinite(spread)
+        pixels, likelihood, stddev = (
+            np.full(guesses.shape, np.nan),
+            np.zeros(wanted.shape),
+            np.full(wanted.shape, np.inf),
         )
+        pixels[which] = np.where(good[:, None], places, np.nan)
+        likelihood[which] = np.where(good, np.clip(likely, 0.0, 1.0), 0.0)
+        stddev[which] = np.where(good, self._factor * spread, np.inf)
+        return Places(pixels=pixels, likelihood=likelihood, stddev=stddev)
 
     def _run(self, session, names: tuple[str, ...], inputs: tuple[NDArray, ...]) -> list[NDArray]:
         try:
@@ -182,8 +226,15 @@ class SideNetwork:
 
     def _cut(self, picture: NDArray, centres: NDArray) -> NDArray[np.uint8]:
         """Return the pieces (K, p, p, 3) of a picture (h, w, 3) around places (K, 2) [px]."""
+        if not len(centres):
+            return np.empty((0, self._piece, self._piece, 3), np.uint8)
         cv2 = import_cv2()
         centres = np.nan_to_num(centres, nan=-1e3, posinf=-1e3, neginf=-1e3).clip(-1e3, 4e3)
         maps = (centres[:, None, None] + self._window).reshape(-1, self._piece, 2).astype(np.float32)
         pieces = cv2.remap(picture, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return pieces.reshape(-1, self._piece, self._piece, 3)
+
+
+def _fit(shapes: NDArray, points: NDArray, places: Places) -> NDArray:
+    """Return how points (B, K, 2) [px] have moved by what was found of them, as one shape."""
+    return fit_shapes(shapes, places.pixels - points, np.hypot(BLUR, places.stddev), places.likelihood**2)

@@ -245,9 +245,11 @@ def ground():
     pixels = np.column_stack((columns.ravel(), rows.ravel())).astype(float)
     fields = {}
     for side, T in scene.poses().items():
-        y = find_side(scene.jaws[side])
-        x, z = intersect_plane(pixels, y, T, CAMERA).T
-        ends = [np.column_stack((x + step, np.full(len(x), y), z)) @ T[:3, :3].T + T[:3, 3] for step in (0.0, 1e-4)]
+        plane = find_side(scene.jaws[side])
+        places = intersect_plane(pixels, plane, T, CAMERA)
+        z = places[:, 1]
+        beside = [plane.points(places) + [step, 0.0, 0.0] for step in (0.0, 1e-4)]
+        ends = [points @ T[:3, :3].T + T[:3, 3] for points in beside]
         way = (project(ends[1], CAMERA) - project(ends[0], CAMERA)) / 1e-4
         field = np.column_stack((way, np.clip(z, 0.0, 0.085))).reshape(*columns.shape, 3)
         fields[side] = cv2.resize(np.nan_to_num(field).astype(np.float32), (CAMERA.width, CAMERA.height))

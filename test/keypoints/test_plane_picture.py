@@ -6,6 +6,8 @@ from finforce.gripper_frames import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, 
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.geometry.side_picture import (
     PlaneGrid,
+    SidePlane,
+    find_side,
     intersect_plane,
     map_picture,
     project_plane,
@@ -22,7 +24,7 @@ POSES = {
 
 
 def side_of(name):
-    return -0.010 if name == "right" else 0.010
+    return SidePlane(level=-0.010 if name == "right" else 0.010)
 
 
 @pytest.mark.parametrize("name", POSES)
@@ -31,7 +33,21 @@ def test_a_place_on_the_side_plane_comes_back_through_the_lens(name):
     pixels = project_plane(places, side_of(name), POSES[name], CAMERA)
     again = intersect_plane(pixels, side_of(name), POSES[name], CAMERA)
     np.testing.assert_allclose(again, places, atol=1e-8)  # the distortion is inverted to 1e-10 of a ray
-    assert np.abs(intersect_plane(pixels, -side_of(name), POSES[name], CAMERA) - places).max() > 1e-3
+    assert (
+        np.abs(intersect_plane(pixels, SidePlane(level=-side_of(name).level), POSES[name], CAMERA) - places).max()
+        > 1e-3
+    )
+
+
+@pytest.mark.parametrize("name", ["left", "right"])
+def test_the_key_points_of_a_tapered_finger_are_where_its_slanted_side_is(name):
+    jaw = load_jaw("xlerobot", name)
+    side, places = find_side(jaw), jaw.keypoints[:, [0, 2]]
+    np.testing.assert_allclose(side.points(places), jaw.keypoints, atol=0.02e-3)
+    pixels = project(jaw.keypoints @ POSES[name][:3, :3].T + POSES[name][:3, 3], CAMERA)
+    assert np.abs(intersect_plane(pixels, side, POSES[name], CAMERA) - places).max() < 0.02e-3
+    flat = SidePlane(level=float(jaw.keypoints[:, 1].mean()))
+    assert np.abs(intersect_plane(pixels, flat, POSES[name], CAMERA) - places).max() > 1e-3
 
 
 def test_pixels_of_a_grid_invert_its_places():
@@ -81,5 +97,5 @@ def test_left_and_right_jaw_give_the_same_picture_of_the_same_marks():
 def test_what_the_camera_does_not_see_is_black():
     image = np.full((CAMERA.height, CAMERA.width, 3), 200, dtype=np.uint8)
     aside = jaw_in_camera(ROBOT_CAMERA, "left", -0.5)
-    assert not take_picture(image, map_picture(PlaneGrid(), 0.010, aside, CAMERA)).any()
-    assert take_picture(image, map_picture(PlaneGrid(), 0.010, POSES["left"], CAMERA)).mean() > 100
+    assert not take_picture(image, map_picture(PlaneGrid(), side_of("left"), aside, CAMERA)).any()
+    assert take_picture(image, map_picture(PlaneGrid(), side_of("left"), POSES["left"], CAMERA)).mean() > 100

@@ -7,7 +7,7 @@ from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.geometry import jaw_localizer as reference_patch
 from finforce_keypoints.geometry.jaw_localizer import TEMPLATE_IMAGES, ReferencePatch, build_matcher
 from finforce_keypoints.geometry.jaw_pose import Origin
-from finforce_keypoints.geometry.side_picture import intersect_plane
+from finforce_keypoints.geometry.side_picture import find_side, intersect_plane
 from finforce_twin.rendering.depth_camera import build_d405_vga
 
 CAMERA = build_d405_vga()
@@ -25,7 +25,7 @@ def place_of(side):
 def image_of(side, x, *, gain=1.0, offset=0.0, seed=0, covered=False):
     """The textured plane of a jaw's side at an origin [m], as the camera sees it, with noise."""
     jaw = load_jaw("bench", side)
-    places = intersect_plane(PIXELS, float(jaw.reference_point[1]), place_of(side)(Origin(x=x, stddev=0.0)), CAMERA)
+    places = intersect_plane(PIXELS, find_side(jaw), place_of(side)(Origin(x=x, stddev=0.0)), CAMERA)
     index = np.clip(np.round(places / 1e-4).astype(int) + 200, 0, 399)
     grey = TEXTURE[index[:, 1], index[:, 0]].reshape(CAMERA.height, CAMERA.width)
     if covered:

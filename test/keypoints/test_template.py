@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finforce_ifea.jaw.jaw import list_shipped_jaws, load_jaw
-from finforce_keypoints.geometry.side_picture import read_side
+from finforce_keypoints.geometry.side_picture import find_side
 from finforce_keypoints.geometry.template import MARK_RADIUS, draw_template, find_shape, fit_grid
 
 
@@ -82,7 +82,7 @@ def test_a_mesh_is_drawn_by_the_side_of_its_surface():
 def test_the_side_of_a_tapered_finger_is_read_where_the_mark_is():
     jaw = load_jaw("xlerobot")
     for x, y, z in (jaw.reference_point, *jaw.keypoints):
-        assert read_side(jaw, x, z) == pytest.approx(y, abs=0.3e-3)
+        assert find_side(jaw).at(np.array([x, z])) == pytest.approx(y, abs=0.3e-3)
     for name in ("bench", "umi"):
         jaw = load_jaw(name)
-        assert read_side(jaw, *jaw.reference_point[[0, 2]]) == pytest.approx(jaw.keypoints[0, 1], abs=1e-9)
+        assert find_side(jaw).at(jaw.reference_point[[0, 2]]) == pytest.approx(jaw.keypoints[0, 1], abs=1e-9)

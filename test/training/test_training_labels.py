@@ -13,7 +13,7 @@ import training
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.errors import NamingError
-from finforce_keypoints.geometry.side_picture import project_plane
+from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape, fit_grid
 from training.dataset import MARGIN
 from training.errors import LabelFileError
@@ -65,7 +65,7 @@ def mark(jaw, side, origin_x, view):
     """The pixels (K + 1, 2) at which somebody would mark the points of an unloaded jaw."""
     points = np.vstack((jaw.keypoints, jaw.reference_point))
     T = jaw_in_camera(view.T_gripper_camera, side, origin_x)
-    return project_plane(points[:, [0, 2]], jaw.keypoints[0, 1], T, view.camera)
+    return project_plane(points[:, [0, 2]], find_side(jaw), T, view.camera)
 
 
 @pytest.mark.parametrize("text", [OLD, NEW, OLD.replace("/", "\\")], ids=["one column", "three columns", "Windows"])

@@ -1,0 +1,153 @@
+"""The shapes that a finger can take: what its mechanics let the key points do together.
+
+A network that looks at small pieces mistakes one thin rib for the next. The finger's own compliance does not: few
+motions, one for each way of loading its face, describe where all its key points can be at once.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
+    from finforce_ifea.jaw.jaw import Jaw
+
+COUNT, BENDS = 9, 6  # motions of bending, and how many of them are those of small forces
+HEIGHTS = 12  # places along the face that are loaded
+LARGEST = 0.1  # one standard deviation of the largest motion of a key point, in lengths of the finger
+PIXELS = 2.0  # standard deviation of where the whole finger is in its picture [px]
+TURN = 0.01  # standard deviation of how it is turned there [rad]
+STEPS, NEWTON = 3, 4  # in which a jaw is pressed far, and of its equilibrium in each
+ROUNDS = 6  # of reweighting
+TOLERANCE, SHARE = 1.5, 0.1  # [px] and share of a point's motion by which a finger may differ from its shapes
+_known: dict[tuple[str, bytes], NDArray] = {}
+
+
+def find_motions(jaw: Jaw) -> NDArray:
+    """Return motions (COUNT, K, 2) of a jaw's key points in x and z, each times its standard deviation [m].
+
+    They are the main ones of the jaw's answers to forces on its face, at rest; both sides of a jaw have the same.
+
+    Raises:
+        MeshError: the jaw cannot be meshed.
+        JawFileError: the jaw has no mechanics.
+    """
+    key = (jaw.digest, jaw.keypoints[:, [0, 2]].tobytes())
+    if key not in _known:
+        _known[key] = _compute_motions(jaw)
+    return _known[key]
+
+
+def _compute_motions(jaw: Jaw) -> NDArray:
+    from finforce_ifea.mechanics import build_mechanics
+    from finforce_ifea.settings import EstimatorSettings
+
+    mechanics = build_mechanics(jaw, EstimatorSettings(solver=jaw.model, mesh="coarse"))
+    pressed, count = _PressedPoints(mechanics, jaw.keypoints), len(mechanics.contact.surface.heights)
+    rows = np.unique(np.linspace(0, count - 1, HEIGHTS).round().astype(int))
+    small = np.array([pressed.answer(row) for row in rows])
+    linear = _find_main(small, BENDS)
+    largest = LARGEST * float(np.ptp(jaw.keypoints[:, 2]))
+    linear *= largest / np.abs(linear[0]).max()
+    # what large motions have beside: the finger turns, and grows shorter
+    far = [pressed.press(row, largest / np.abs(one).max()) for row, one in list(zip(rows, small, strict=True))[1::3]]
+    ways = np.linalg.svd(linear, full_matrices=False)[2][: len(rows)]
+    left = [one - (one @ ways.T) @ ways for one in far if one is not None]
+    turned = _find_main(np.array(left), COUNT - BENDS) if left else np.zeros((COUNT - BENDS, linear.shape[1]))
+    return np.vstack((linear, 0.5 * turned)).reshape(COUNT, -1, 2)
+
+
+def _find_main(samples: NDArray, count: int) -> NDArray:
+    """Return the main ways (count, n) of samples (m, n), the first as large as the largest sample; zeros if fewer."""
+    _, sizes, ways = np.linalg.svd(samples, full_matrices=False)
+    main = np.zeros((count, samples.shape[1]))
+    main[: len(ways)] = (sizes[:, None] * ways)[:count]
+    return main * np.linalg.norm(samples, axis=1).max() / sizes[0]
+
+
+class _PressedPoints:
+    """The key points of a jaw under forces on single rows of its face."""
+
+    def __init__(self, mechanics: Mechanics, keypoints: NDArray) -> None:
+        from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
+
+        self._model, self._surface, self._keypoints = mechanics.model, mechanics.contact.surface, keypoints
+        self._probe = mechanics.model.attach(keypoints, KEYPOINT_DISTANCE)
+        self._rest = np.zeros(mechanics.model.size)
+        self._factor = mechanics.model.factorise(mechanics.model.linearize(self._rest).tangent)
+
+    def _force(self, row: int) -> NDArray:
+        """Return the forces (p, 3) on the surface's points that press one row with 1 N."""
+        forces = np.zeros_like(self._surface.points)
+        forces[row * self._surface.across : (row + 1) * self._surface.across, 0] = -1.0 / self._surface.across
+        return forces
+
+    def answer(self, row: int) -> NDArray:
+        """Return the motion in x and z (2 K,) by a small force [m/N]."""
+        load = self._model.load(self._surface.probe, self._rest, self._force(row))
+        motion = self._factor.solve(load)
+        return self._model.project(self._probe, self._rest, motion[:, None])[:, [0, 2], 0].ravel()
+
+    def press(self, row: int, force: float) -> NDArray | None:
+        """Return the motion in x and z (2 K,) [m] by a force [N], None where the jaw does not bear it."""
+        from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
+
+        model, q = self._model, self._rest
+        for share in np.linspace(0.0, 1.0, STEPS + 1)[1:]:
+            for _ in range(NEWTON):
+                state = model.linearize(q)
+                if not state.smallest_det > 0.0:
+                    return None
+                load = model.load(self._surface.probe, q, share * force * self._force(row))
+                q = q + limit_step(model, model.factorise(state.tangent).solve(load - state.force))
+        if not np.isfinite(q).all():
+            return None
+        return (model.positions(self._probe, q) - self._keypoints)[:, [0, 2]].ravel()
+
+
+def span_shapes(motions: NDArray, points: NDArray, scale: float) -> NDArray:
+    """Return how the pixels of key points and reference point can move (2 (K + 1), m), by standard deviations [px].
+
+    Args:
+        motions: of the key points (n, K, 2) [m], see `find_motions`.
+        points: where they and the reference point are at rest (K + 1, 2) [px].
+        scale: size of a pixel [m].
+    """
+    bending = np.pad(motions / scale, ((0, 0), (0, 1), (0, 0)))
+    away = points - points[-1]
+    whole = np.zeros((3, len(points), 2))
+    whole[0, :, 0] = whole[1, :, 1] = PIXELS
+    whole[2] = TURN * away[:, ::-1] * (-1.0, 1.0)
+    return np.vstack((bending, whole)).reshape(-1, 2 * len(points)).T
+
+
+def fit_shapes(shapes: NDArray, moves: NDArray, stddev: NDArray, weight: NDArray) -> NDArray:
+    """Return motions (B, K, 2) [px] within the shapes that are nearest to others, whatever single points claim.
+
+    Args:
+        shapes: of `span_shapes` (B, 2 K, m).
+        moves: how far points seem to have moved (B, K, 2) [px]; not finite where nobody knows.
+        stddev: of each along a row or a column (B, K) [px].
+        weight: how much each is believed (B, K), 0 to 1.
+    """
+    known = np.isfinite(moves).all(axis=2) & np.isfinite(stddev)
+    wanted = np.where(known[..., None], moves, 0.0)
+    variance = np.where(known, stddev, 1.0) ** 2
+    believed = np.where(known, weight, 0.0)
+    doubt, prior, turned = np.ones_like(variance), np.eye(shapes.shape[2]), shapes.swapaxes(1, 2)
+    found = wanted
+    for _ in range(ROUNDS):
+        weighted = turned * (believed * doubt / variance).repeat(2, axis=1)[:, None]
+        sizes = np.linalg.solve(weighted @ shapes + prior, weighted @ wanted.reshape(len(shapes), -1, 1))
+        found = (shapes @ sizes).reshape(moves.shape)
+        doubt = 1.0 / (1.0 + 0.5 * ((wanted - found) ** 2).sum(axis=2) / variance)
+    return found
+
+
+def trust(moves: NDArray, shape: NDArray) -> NDArray:
+    """Return factors (B, K), 0 to 1, of the likelihood of points that moved (B, K, 2) [px] unlike their shape."""
+    tolerance = np.hypot(TOLERANCE, SHARE * np.linalg.norm(shape, axis=2))
+    return 1.0 / (1.0 + (np.linalg.norm(moves - shape, axis=2) / (3.0 * tolerance)) ** 4)
