@@ -19,6 +19,7 @@ from training.checkpoint import build_averaged, load_checkpoint
 from training.dataset import VALIDATION, load_pictures
 from training.network import PIECE, ExportedCoarse, ExportedFine, FingerNetwork, NetworkShape, fold_batch_norm
 from training.optional import import_onnx, import_torch
+from training.quantization import quantize_network
 from training.scoring import fit_factor
 from training.trainer import detect
 
@@ -32,12 +33,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the two files")
     parser.add_argument("--dataset", type=Path, required=True, help="folder of shards val_*.npz")
+    parser.add_argument("--floats", action="store_true", help="do not turn the convolutions into bytes")
     options = parser.parse_args(arguments)
     with one_line_errors():
         network = build_averaged(load_checkpoint(options.checkpoint))
-        factor = fit_factor(detect(network, load_pictures(options.dataset, VALIDATION)))
-        write_network(network, options.output, factor)
-    print(f"{options.output}: {COARSE}, {FINE}, deviations times {factor:.3f}")
+        pictures = load_pictures(options.dataset, VALIDATION)
+        write_network(network, options.output, fit_factor(detect(network, pictures)))
+        if not options.floats:
+            quantize_network(options.output, pictures)
+    print(f"{options.output}: {COARSE}, {FINE}")
 
 
 def write_network(network: FingerNetwork, folder: Path, factor: float) -> None:

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from finforce_keypoints.networks.side_network import COARSE, FINE, METADATA
 from training.checkpoint import shape_from
@@ -30,6 +34,7 @@ def read_network(folder: Path) -> tuple[FingerNetwork, float]:
             raise CheckpointError(f"{folder / name}: {error}; expected a network exported by training") from error
         said = {entry.key: entry.value for entry in model.metadata_props}
         arrays = {item.name: onnx.numpy_helper.to_array(item) for item in model.graph.initializer}
+        arrays |= _read_bytes(model, arrays)
         for node in model.graph.node:  # the exporter keeps equal ones once
             if node.op_type == "Identity" and node.input[0] in arrays:
                 arrays[node.output[0]] = arrays[node.input[0]]
@@ -50,3 +55,15 @@ def read_network(folder: Path) -> tuple[FingerNetwork, float]:
         raise CheckpointError(f"{folder}: no weights for {', '.join(missing[:3])}; expected an untouched export")
     network.load_state_dict(own | {name: weights[name] for name, _ in network.named_parameters()})
     return network, factor
+
+
+def _read_bytes(model: Any, arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """Return the weights that an ONNX model keeps in bytes, by their names before, as floats again."""
+    found = {}
+    for node in model.graph.node:
+        if node.op_type == "DequantizeLinear" and all(name in arrays for name in node.input):
+            values, scale, zero = (arrays[name] for name in node.input)
+            across = (-1, *([1] * (values.ndim - 1)))
+            floats = (values.astype("f4") - zero.reshape(across).astype("f4")) * scale.reshape(across)
+            found[node.input[0].removesuffix("_quantized")] = floats
+    return found

@@ -25,6 +25,7 @@ from training.export import write_network
 from training.loading import LoadingSettings, load_batches
 from training.losses import compute_losses
 from training.network import FingerNetwork, NetworkShape, fold_batch_norm
+from training.quantization import quantize_network
 from training.recipe import Recipe
 from training.scoring import Detections, fit_factor, score_detections
 from training.trainer import CHECKPOINT, Trainer, TrainingImages, compute_rate, detect, train
@@ -68,6 +69,22 @@ def test_folded_weights_come_back_from_the_export(tmp_path):
         assert factor == 1.5
         for name, weights in folded.named_parameters():
             torch.testing.assert_close(again.state_dict()[name], weights.data, msg=name)
+
+
+def test_a_network_in_bytes_is_the_same_but_for_their_steps(tmp_path):
+    network, pictures = build_trained_like(), draw_ladders(3, 3, 7)
+    write_network(network, tmp_path, 1.5)
+    before = training.evaluate.detect(SideNetwork(tmp_path, threads=1), pictures)
+    size = sum((tmp_path / name).stat().st_size for name in (COARSE, FINE))
+    quantize_network(tmp_path, pictures)
+    assert sum((tmp_path / name).stat().st_size for name in (COARSE, FINE)) < 0.4 * size
+    after = training.evaluate.detect(SideNetwork(tmp_path, threads=1), pictures)
+    assert np.median(np.abs(after.pixels - before.pixels)) < 0.5  # random weights pass errors on as trained ones do not
+    again, factor = read_network(tmp_path)
+    assert factor == 1.5
+    for name, weights in fold_batch_norm(network).named_parameters():
+        step = weights.detach().abs().max() / 127.0
+        torch.testing.assert_close(again.state_dict()[name], weights.data, atol=float(step), rtol=0.02, msg=name)
 
 
 def test_what_is_no_export_cannot_be_trained_further(tmp_path):
