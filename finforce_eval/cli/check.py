@@ -5,19 +5,27 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from tqdm import tqdm
 
 from finforce_eval.cli.extrinsics import read_at_rest
+from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS
 from finforce_eval.evaluation.check import FAULT, check_recording
+from finforce_eval.recordings.listening import CameraTopics, record_camera
 
 PICTURE = "check.png"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("bags", nargs=1, metavar="BAG", help="rosbag2 folder, .mcap or .db3 file with images")
+    parser.add_argument("bags", nargs="*", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file with images")
+    text = (
+        "listen to a running camera instead: to the usual topics, or to those of colour images, camera_info and, "
+        "if there is any, aligned depth"
+    )
+    parser.add_argument("--topics", nargs="*", metavar="TOPIC", help=text)
     parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
     parser.add_argument("--jaws", default="both", choices=("left", "right", "both"), help="in the images (both)")
     text = "the camera in the gripper: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
@@ -35,6 +43,26 @@ def run(options: argparse.Namespace) -> int:
     Returns:
         0 if everything fits, 1 if something has to be changed.
     """
+    with TemporaryDirectory() as scratch:
+        if options.topics is not None:
+            options.bags += [str(_listen(options, Path(scratch) / "camera"))]
+        if len(options.bags) != 1:
+            raise OptionError(f"got {' '.join(options.bags) or 'nothing'}; expected one BAG, or --topics")
+        return _check(options)
+
+
+def _listen(options: argparse.Namespace, folder: Path) -> Path:
+    """Record what a running camera publishes."""
+    if options.bags or len(options.topics) not in (0, 2, 3):
+        raise OptionError(
+            f"--topics {' '.join(options.topics)}: expected none, or those of colour, camera_info and perhaps depth; "
+            "and no BAG"
+        )
+    topics = CameraTopics(*options.topics, *([""] if len(options.topics) == 2 else []))
+    return record_camera(topics, options.images, folder)
+
+
+def _check(options: argparse.Namespace) -> int:
     from finforce.optional import import_cv2
 
     source, recording = read_at_rest(options)

@@ -1,17 +1,27 @@
 """Claims about the check before any force: what fits passes, and what does not is named as what it is."""
 
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
+from threading import Event, Thread
 
 import cv2
 import numpy as np
 import pytest
+from node_fakes import ros_domain
+from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from finforce.gripper_frames import ROBOT_CAMERA
+from finforce.ros import node as ros
 from finforce.transforms import invert_pose, pose_numbers
 from finforce_eval.cli.main import main
+from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.check import FAULT, OK, WARNING, judge_picture
+from finforce_eval.recordings.bags import open_bag
+from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED
+from finforce_eval.recordings.listening import CameraTopics, record_camera
 from finforce_eval.recordings.twin_writer import write_footage
+from finforce_keypoints.parameters import COLOR_TOPIC
 from finforce_twin.gripper.footage import build_footage
 from finforce_twin.scenes.scenarios import build_scenario
 
@@ -127,3 +137,50 @@ def test_a_picture_is_judged_by_light_focus_and_what_it_shows(footage, change, l
 def test_too_few_images_are_refused(still, capsys):
     assert main(["check", str(still), "--images", "3"]) == 2
     assert "expected at least 5" in capsys.readouterr().err
+
+
+COLOR_ALONE = CameraTopics(color=f"{COLOR_TOPIC}/compressed", depth="")
+
+
+@contextmanager
+def camera_of(folder, left_out=()):
+    """A camera that shows the images of a recording again and again; yields its domain."""
+    kinds = {COMPRESSED: CompressedImage, CAMERA_INFO: CameraInfo}
+    with ros_domain() as probe, open_bag(folder, "camera") as bag:
+        kept = [c for c in bag.connections if c.msgtype in kinds and not c.topic.endswith(left_out)]
+        out = {c.topic: probe.create_publisher(kinds[c.msgtype], c.topic, ros.RESULT) for c in kept}
+        messages = [(raw.topic, raw.data) for raw in bag.raw(tuple(out))]
+        done = Event()
+
+        def publish():
+            while not done.is_set():
+                for topic, data in messages:
+                    out[topic].publish(bytes(data))
+                    done.wait(0.01)
+
+        thread = Thread(target=publish)
+        thread.start()
+        try:
+            yield probe.context.get_domain_id()
+        finally:
+            done.set()
+            thread.join()
+
+
+def test_a_running_camera_is_checked_as_its_recording_is(still, capsys, tmp_path):
+    with camera_of(still) as domain:
+        folder = record_camera(COLOR_ALONE, IMAGES - 3, tmp_path / "heard", domain)
+    status, said = check(folder, capsys, tmp_path, "--images", "5")
+    assert status == 0 and "everything fits" in said
+
+
+def test_topics_without_a_camera_are_said_to_be_so(still, tmp_path):
+    words = pytest.raises(RecordingError, match=r"0 camera_info on .*published on .*color/image_raw/compressed")
+    with camera_of(still, left_out=("camera_info",)) as domain, words:
+        record_camera(COLOR_ALONE, 3, tmp_path / "heard", domain)
+
+
+@pytest.mark.parametrize("given", [(), ("a", "b"), ("--topics", "/one"), ("bag", "--topics")])
+def test_one_source_is_to_be_named(given, capsys):
+    assert main(["check", *given]) == 2
+    assert "expected" in capsys.readouterr().err
