@@ -12,6 +12,7 @@ from finforce.errors import PoseError
 from finforce.transforms import invert_pose, pose_from_quaternion
 
 SIDES = ("left", "right")
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # about z: left and right change places
 
 
 def jaw_in_gripper(side: str, origin_x: float) -> NDArray:
@@ -24,7 +25,7 @@ def jaw_in_gripper(side: str, origin_x: float) -> NDArray:
     """
     if side not in SIDES:
         raise PoseError(f"side: got {side!r}, expected 'left' or 'right'")
-    T = np.eye(4) if side == "left" else np.diag([-1.0, -1.0, 1.0, 1.0])
+    T = np.eye(4) if side == "left" else HALF_TURN.copy()
     T[0, 3] = origin_x
     return T
 

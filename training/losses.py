@@ -8,7 +8,7 @@ from training.network import LARGEST_SPREAD, FingerNetwork, standardise
 from training.optional import import_torch
 
 torch = import_torch()
-POINTS = 14  # of a picture that the fine part looks at in one step
+POINTS = 18  # of a picture that the fine part looks at in one step
 ANYWHERE = 2  # of them that need not be key points
 FAR, FAR_SHARE, NEAR = (
     9.0,

@@ -36,7 +36,7 @@ class NetworkShape:
     height: int = 224
     width: int = 176
     coarse: tuple[int, int, int, int] = (16, 32, 64, 96)
-    fine: tuple[int, int] = (16, 48)
+    fine: tuple[int, int] = (24, 64)
     folded: bool = False
 
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from finforce.camera import EQUIDISTANT, CameraIntrinsics, ImageError, project
+from finforce.camera import EQUIDISTANT, CameraIntrinsics, ImageError
 from finforce.errors import FinforceError
-from finforce.gripper_frames import OpeningRange, jaw_in_camera
+from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
 from finforce.optional import import_cv2
 from finforce.transforms import invert_pose, move_pose, pose_numbers, rotation_between
 from finforce_eval.errors import RecordingError
@@ -23,6 +23,7 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, measure_misses
+from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import ALIGNED
@@ -217,7 +218,7 @@ def fit_focal(jaws: Mapping[str, SeenJaw], camera: CameraIntrinsics, found: Extr
 
 def _find_reasons(mean: RgbdImage, source: KeypointSource, recording: Recording, guess: NDArray) -> list[Said]:
     """Return which other reading of picture, extrinsics or jaw file shows the jaws better."""
-    own = _score(mean, source, recording, guess)
+    own = _try(mean, source, recording, guess, lambda image, T: (image, T, None))
     best = max(
         ((_try(mean, source, recording, guess, change), words) for words, change in _readings(source)),
         key=lambda entry: entry[0],
@@ -277,6 +278,11 @@ def _readings(source: KeypointSource) -> Iterator[tuple[str, Callable]]:
             None,
         ),
     )
+    yield (
+        "the camera is on the other side of the gripper: turn T_gripper_camera by half a turn about the gripper's z, "
+        "left and right change places",
+        lambda i, T: (i, HALF_TURN @ T, None),
+    )
     yield "the quaternion of T_gripper_camera begins with w: give x y z w", lambda i, T: (i, _reorder(T), None)
     for name in list_shipped_jaws():
         if name != source.jaw_file and load_jaw(name).model != "frame":
@@ -333,10 +339,9 @@ def _draw(
         if found is not None:
             places.append((found.T_gripper_camera, found.origins[side], FITTED))
         for T, origin, color in places:
-            pose, y = jaw_in_camera(T, side, origin), float(jaw.keypoints[:, 1].mean())
+            pose, plane = jaw_in_camera(T, side, origin), find_side(jaw)
             for ring in find_shape(jaw).rings:
-                points = np.insert(np.vstack((ring, ring[:1])), 1, y, axis=1)
-                line = project(points @ pose[:3, :3].T + pose[:3, 3], camera)
+                line = project_plane(np.vstack((ring, ring[:1])), plane, pose, camera)
                 for part in np.split(line, np.flatnonzero(~np.isfinite(line).all(axis=1))):
                     part = part[np.isfinite(part).all(axis=1)]
                     if len(part) > 1:

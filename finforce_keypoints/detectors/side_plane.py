@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
-from finforce.gripper_frames import OpeningRange
+from finforce.gripper_frames import HALF_TURN, OpeningRange
+from finforce.transforms import pose_numbers
+from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
 from finforce_keypoints.pixel_finder import PixelFinding
 
@@ -58,6 +60,9 @@ class PlaneFinder:
         jaws: by side.
         T_gripper_camera: (4, 4).
         opening: where a jaw can be.
+
+    Raises:
+        GeometryError: the camera is where it does not see the jaws' sides.
     """
 
     def __init__(
@@ -68,6 +73,8 @@ class PlaneFinder:
         opening: OpeningRange | None = None,
     ) -> None:
         self._locator, self._T_gripper_camera, self._opening = locator, T_gripper_camera, opening or OpeningRange()
+        for jaw in jaws.values():
+            check_camera_side(jaw, T_gripper_camera)
         self._planes = {side: find_side(jaw) for side, jaw in jaws.items()}
         self._rest = {side: find_rest(jaw) for side, jaw in jaws.items()}
         self._kept: dict[str, _View] = {}
@@ -140,6 +147,23 @@ class PlaneFinder:
             likelihood=np.where(known, places.likelihood[number], 0.0),
             stddev=np.where(known, stddev, np.inf),
         )
+
+
+def check_camera_side(jaw: Jaw, T_gripper_camera: NDArray) -> None:
+    """Refuse a camera that is not beyond the side of a jaw on which its key points lie.
+
+    Raises:
+        GeometryError: it is not; the message says what to give where the camera is mounted on the other side.
+    """
+    y, side_y = float(T_gripper_camera[1, 3]), float(np.abs(jaw.keypoints[:, 1]).mean())
+    if y > side_y:
+        return
+    turned = ", ".join(f"{number:.4f}" for number in pose_numbers(HALF_TURN @ T_gripper_camera))
+    raise GeometryError(
+        f"T_gripper_camera: the camera is at y = {y:g} m and does not see the sides of the jaws, y = {side_y:g} m; "
+        f"expected it beyond them. A camera on the other side of the gripper sees it turned about z by half a turn: "
+        f"the left jaw is called right, and T_gripper_camera is [{turned}]"
+    )
 
 
 def find_rest(jaw: Jaw) -> NDArray:

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from finforce.camera import project
-from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
+from finforce.gripper_frames import HALF_TURN, ROBOT_CAMERA, jaw_in_camera
+from finforce.transforms import pose_from_quaternion
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detectors.locators import AnyFinger, OneFinger, grid_from_metadata
 from finforce_keypoints.detectors.side_plane import PlaneFinder
-from finforce_keypoints.errors import ModelError
+from finforce_keypoints.errors import GeometryError, ModelError
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.networks.model import Peaks
@@ -156,3 +157,13 @@ def test_a_network_without_its_plane_is_refused(plane):
 
 def test_the_plane_of_the_metadata_is_the_grid():
     assert grid_from_metadata({"plane": PLANE}) == PlaneGrid()
+
+
+def test_a_camera_that_does_not_see_the_sides_is_refused_with_what_to_give():
+    jaws = load_jaws("bench")
+    other = HALF_TURN @ ROBOT_CAMERA
+    with pytest.raises(GeometryError, match=r"y = -0\.0.*other side of the gripper") as found:
+        PlaneFinder(AnyFinger(ShadeNetwork(), jaws), jaws, other)
+    numbers = str(found.value).split("T_gripper_camera is [")[1].rstrip("]").split(",")
+    turned = pose_from_quaternion([float(n) for n in numbers[:3]], [float(n) for n in numbers[3:]])
+    np.testing.assert_allclose(turned, ROBOT_CAMERA, atol=1e-3)
