@@ -10,6 +10,7 @@ from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.mesh import VolumeMesh, shape_gradients, shape_values
 
 _NEWTON_STEPS = 12
+_TOGETHER = 64  # points that are looked for at once
 # How far a point may lie outside its element's reference domain and still count as inside [-].
 _INSIDE = 1e-9
 
@@ -153,30 +154,45 @@ def _locate(mesh: VolumeMesh, points: NDArray) -> _Location:
     elements = np.zeros(len(points), dtype=np.int64)
     local = np.zeros((len(points), 3))
     excess = np.full(len(points), np.inf)
-    for row, point in enumerate(points):
-        near = np.flatnonzero(((point >= low) & (point <= high)).all(axis=1))
-        if len(near) == 0:
-            continue
-        found = _solve_local(corners[near], point)
+    for start in range(0, len(points), _TOGETHER):
+        part = points[start : start + _TOGETHER, None]
+        rows, near = np.nonzero(((part >= low) & (part <= high)).all(axis=2))
+        found = _solve_local(corners[near], points[start + rows])
         beyond = _excess(found, corners.shape[1])
-        best = beyond.argmin()
-        elements[row], local[row], excess[row] = near[best], found[best], beyond[best]
+        # the first of those that a point leaves least; on a face they differ by rounding alone
+        order = np.lexsort((near, beyond.round(12), rows))
+        best = order[np.unique(rows[order], return_index=True)[1]]
+        at = start + rows[best]
+        elements[at], local[at], excess[at] = near[best], found[best], beyond[best]
     return _Location(elements=elements, local=local, excess=excess)
 
 
-def _solve_local(corners: NDArray, point: NDArray) -> NDArray:
-    """Solve sum_i N_i(xi) X_i = x for xi in each of the elements (e, m, 3), shape (e, 3)."""
+def _solve_local(corners: NDArray, points: NDArray) -> NDArray:
+    """Solve sum_i N_i(xi) X_i = x for xi, for points (n, 3) each in an element (n, m, 3), shape (n, 3)."""
     count = corners.shape[1]
     local = np.full((len(corners), 3), 0.0 if count == 8 else 0.25)
+    going = np.arange(len(corners))
     for _ in range(_NEWTON_STEPS):
-        gap = point - np.einsum("em,emi->ei", shape_values(count, local), corners)
-        jacobians = np.einsum("emi,emj->eij", corners, shape_gradients(count, local))
-        step = np.einsum("eij,ej->ei", np.linalg.pinv(jacobians), gap)
+        nodes, start = corners[going], local[going]
+        gap = points[going] - np.einsum("em,emi->ei", shape_values(count, start), nodes)
+        jacobians = np.einsum("emi,emj->eij", nodes, shape_gradients(count, start))
+        step = np.einsum("eij,ej->ei", _invert(jacobians), gap)
         # far outside, the mapping of a distorted element may fold; a point out there is only ever compared
-        local = np.clip(local + step, -3.0, 3.0)
-        if np.abs(step).max() < 1e-14:
+        local[going] = np.clip(start + step, -3.0, 3.0)
+        going = going[np.abs(step).max(axis=1) >= 1e-14]
+        if not len(going):
             break
     return local
+
+
+def _invert(matrices: NDArray) -> NDArray:
+    """Return the inverses of matrices (n, 3, 3), of singular ones the pseudo-inverses."""
+    size = np.abs(matrices).max(axis=(1, 2), initial=0.0)
+    singular = np.abs(np.linalg.det(matrices)) <= 1e-9 * size**3
+    inverse = np.empty_like(matrices)
+    inverse[singular] = np.linalg.pinv(matrices[singular])
+    inverse[~singular] = np.linalg.inv(matrices[~singular])
+    return inverse
 
 
 def _excess(local: NDArray, node_count: int) -> NDArray:

@@ -15,13 +15,18 @@ if TYPE_CHECKING:
     from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
     from finforce_ifea.jaw.jaw import Jaw
 
-COUNT, BENDS = 9, 6  # motions of bending, and how many of them are those of small forces
+BENDS = 6  # motions of bending by small forces
+PAIRS = ((0, 0), (0, 1), (1, 1))  # of them whose products tell what large motions have beside
+COUNT = BENDS + len(PAIRS)
 HEIGHTS = 12  # places along the face that are loaded
-LARGEST = 0.1  # one standard deviation of the largest motion of a key point, in lengths of the finger
+LARGEST = 0.2  # one standard deviation of the largest motion of a key point, in lengths of the finger
+STRONGEST = 2.0  # force of large presses, in those that move the softest place so far
 PIXELS = 2.0  # standard deviation of where the whole finger is in its picture [px]
 TURN = 0.01  # standard deviation of how it is turned there [rad]
-STEPS, NEWTON = 3, 4  # in which a jaw is pressed far, and of its equilibrium in each
-ROUNDS = 6  # of reweighting
+STEPS, NEWTON = 6, 4  # in which a jaw is pressed far, and of its equilibrium in each
+RIDGE = 1e-4  # of the products' fit, in the mean of its normal matrix
+ROUNDS = 10  # of reweighting
+FARTHEST = 3.0  # standard deviations that a motion can be large
 TOLERANCE, SHARE = 1.5, 0.1  # [px] and share of a point's motion by which a finger may differ from its shapes
 _known: dict[tuple[str, bytes], NDArray] = {}
 
@@ -29,7 +34,9 @@ _known: dict[tuple[str, bytes], NDArray] = {}
 def find_motions(jaw: Jaw) -> NDArray:
     """Return motions (COUNT, K, 2) of a jaw's key points in x and z, each times its standard deviation [m].
 
-    They are the main ones of the jaw's answers to forces on its face, at rest; both sides of a jaw have the same.
+    The first ones are the main ones of the jaw's answers to small forces on its face, at rest. The others belong to the
+    products (`PAIRS`) of the first ones' sizes: a finger that bends far turns, and grows shorter. Both sides of a jaw
+    have the same.
 
     Raises:
         MeshError: the jaw cannot be meshed.
@@ -49,23 +56,34 @@ def _compute_motions(jaw: Jaw) -> NDArray:
     pressed, count = _PressedPoints(mechanics, jaw.keypoints), len(mechanics.contact.surface.heights)
     rows = np.unique(np.linspace(0, count - 1, HEIGHTS).round().astype(int))
     small = np.array([pressed.answer(row) for row in rows])
-    linear = _find_main(small, BENDS)
     largest = LARGEST * float(np.ptp(jaw.keypoints[:, 2]))
-    linear *= largest / np.abs(linear[0]).max()
-    # what large motions have beside: the finger turns, and grows shorter
-    far = [pressed.press(row, largest / np.abs(one).max()) for row, one in list(zip(rows, small, strict=True))[1::3]]
-    ways = np.linalg.svd(linear, full_matrices=False)[2][: len(rows)]
-    left = [one - (one @ ways.T) @ ways for one in far if one is not None]
-    turned = _find_main(np.array(left), COUNT - BENDS) if left else np.zeros((COUNT - BENDS, linear.shape[1]))
-    return np.vstack((linear, 0.5 * turned)).reshape(COUNT, -1, 2)
+    softness = np.abs(small).max(axis=1)
+    forces = largest / np.maximum(softness, softness.max() / STRONGEST)
+    far = [motion for row, force in list(zip(rows, forces, strict=True))[1::3] for motion in pressed.press(row, force)]
+    return find_ways(small, np.array(far), largest)
 
 
-def _find_main(samples: NDArray, count: int) -> NDArray:
-    """Return the main ways (count, n) of samples (m, n), the first as large as the largest sample; zeros if fewer."""
-    _, sizes, ways = np.linalg.svd(samples, full_matrices=False)
-    main = np.zeros((count, samples.shape[1]))
-    main[: len(ways)] = (sizes[:, None] * ways)[:count]
-    return main * np.linalg.norm(samples, axis=1).max() / sizes[0]
+def find_ways(small: NDArray, far: NDArray, largest: float) -> NDArray:
+    """Return motions (COUNT, K, 2), see `find_motions`.
+
+    Args:
+        small: of small forces (n, 2 K), of any size.
+        far: of large ones (n, 2 K) [m]; may be none.
+        largest: standard deviation of the largest motion of a key point [m].
+    """
+    _, sizes, ways = np.linalg.svd(small, full_matrices=False)
+    ways, sizes = ways[:BENDS], sizes[:BENDS]
+    sizes = sizes * largest / (sizes[0] * np.abs(ways[0]).max())
+    linear = np.zeros((BENDS, small.shape[1]))
+    linear[: len(ways)] = sizes[:, None] * ways
+    products = np.zeros((len(PAIRS), small.shape[1]))
+    if len(far) and len(ways) > 1:
+        along = far @ ways.T
+        terms = np.column_stack([along[:, i] * along[:, j] / (sizes[i] * sizes[j]) for i, j in PAIRS])
+        normal = terms.T @ terms
+        damped = normal + RIDGE * np.trace(normal) / len(PAIRS) * np.eye(len(PAIRS))
+        products = np.linalg.solve(damped, terms.T @ (far - along @ ways))
+    return np.vstack((linear, products)).reshape(COUNT, -1, 2)
 
 
 class _PressedPoints:
@@ -91,28 +109,31 @@ class _PressedPoints:
         motion = self._factor.solve(load)
         return self._model.project(self._probe, self._rest, motion[:, None])[:, [0, 2], 0].ravel()
 
-    def press(self, row: int, force: float) -> NDArray | None:
-        """Return the motion in x and z (2 K,) [m] by a force [N], None where the jaw does not bear it."""
+    def press(self, row: int, force: float) -> list[NDArray]:
+        """Return the motions in x and z, each (2 K,) [m], on the way to a force [N], as far as the jaw bears it."""
         from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 
-        model, q = self._model, self._rest
+        model, q, found = self._model, self._rest, []
         for share in np.linspace(0.0, 1.0, STEPS + 1)[1:]:
             for _ in range(NEWTON):
                 state = model.linearize(q)
                 if not state.smallest_det > 0.0:
-                    return None
+                    return found
                 load = model.load(self._surface.probe, q, share * force * self._force(row))
                 q = q + limit_step(model, model.factorise(state.tangent).solve(load - state.force))
-        if not np.isfinite(q).all():
-            return None
-        return (model.positions(self._probe, q) - self._keypoints)[:, [0, 2]].ravel()
+            if not np.isfinite(q).all():
+                return found
+            found.append((model.positions(self._probe, q) - self._keypoints)[:, [0, 2]].ravel())
+        return found
 
 
 def span_shapes(motions: NDArray, points: NDArray, scale: float) -> NDArray:
     """Return how the pixels of key points and reference point can move (2 (K + 1), m), by standard deviations [px].
 
+    The last columns belong to products of the first ones' sizes (`PAIRS`).
+
     Args:
-        motions: of the key points (n, K, 2) [m], see `find_motions`.
+        motions: of the key points (COUNT, K, 2) [m], see `find_motions`.
         points: where they and the reference point are at rest (K + 1, 2) [px].
         scale: size of a pixel [m].
     """
@@ -121,7 +142,7 @@ def span_shapes(motions: NDArray, points: NDArray, scale: float) -> NDArray:
     whole = np.zeros((3, len(points), 2))
     whole[0, :, 0] = whole[1, :, 1] = PIXELS
     whole[2] = TURN * away[:, ::-1] * (-1.0, 1.0)
-    return np.vstack((bending, whole)).reshape(-1, 2 * len(points)).T
+    return np.vstack((bending[:BENDS], whole, bending[BENDS:])).reshape(-1, 2 * len(points)).T
 
 
 def fit_shapes(shapes: NDArray, moves: NDArray, stddev: NDArray, weight: NDArray) -> NDArray:
@@ -137,12 +158,20 @@ def fit_shapes(shapes: NDArray, moves: NDArray, stddev: NDArray, weight: NDArray
     wanted = np.where(known[..., None], moves, 0.0)
     variance = np.where(known, stddev, 1.0) ** 2
     believed = np.where(known, weight, 0.0)
-    doubt, prior, turned = np.ones_like(variance), np.eye(shapes.shape[2]), shapes.swapaxes(1, 2)
-    found = wanted
+    linear, products = shapes[..., : -len(PAIRS)], shapes[..., -len(PAIRS) :]
+    sizes = np.zeros((len(shapes), linear.shape[2]))
+    doubt, prior = np.ones_like(variance), np.eye(linear.shape[2])
+    found = np.zeros_like(wanted)
     for _ in range(ROUNDS):
-        weighted = turned * (believed * doubt / variance).repeat(2, axis=1)[:, None]
-        sizes = np.linalg.solve(weighted @ shapes + prior, weighted @ wanted.reshape(len(shapes), -1, 1))
-        found = (shapes @ sizes).reshape(moves.shape)
+        slopes = linear.copy()
+        for number, (i, j) in enumerate(PAIRS):
+            slopes[..., i] += sizes[:, None, j] * products[..., number]
+            slopes[..., j] += sizes[:, None, i] * products[..., number]
+        weighted = slopes.swapaxes(1, 2) * (believed * doubt / variance).repeat(2, axis=1)[:, None]
+        missing = (wanted - found).reshape(len(shapes), -1, 1) + slopes @ sizes[..., None]
+        sizes = np.linalg.solve(weighted @ slopes + prior, weighted @ missing)[..., 0].clip(-FARTHEST, FARTHEST)
+        together = np.column_stack([sizes[:, i] * sizes[:, j] for i, j in PAIRS])
+        found = (linear @ sizes[..., None] + products @ together[..., None]).reshape(moves.shape)
         doubt = 1.0 / (1.0 + 0.5 * ((wanted - found) ** 2).sum(axis=2) / variance)
     return found
 

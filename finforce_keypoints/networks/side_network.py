@@ -26,7 +26,7 @@ METADATA = "finforce"  # key of the files' own metadata
 KIND = "side plane"
 COARSE, FINE = "coarse.onnx", "fine.onnx"
 COARSE_LAYOUT = (("pictures", "templates", "points"), ("guesses", "context", "mean", "gain"))
-GUESS, BLUR = 2.5, 1.0  # [px] by which the coarse part is off, and by which a finger differs from its shapes
+GUESS, BLUR = 4.0, 1.0  # [px] by which the coarse part is off, and by which a finger differs from its shapes
 NEAR = 1.0  # [px] within which a better guess is none: the fine part finds the same from both
 FINE_LAYOUT = (("pieces", "templates", "context", "mean", "gain"), ("offsets", "likelihood", "spread"))
 
