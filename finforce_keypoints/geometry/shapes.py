@@ -27,7 +27,7 @@ STEPS, NEWTON = 6, 4  # in which a jaw is pressed far, and of its equilibrium in
 RIDGE = 1e-4  # of the products' fit, in the mean of its normal matrix
 ROUNDS = 10  # of reweighting
 FARTHEST = 3.0  # standard deviations that a motion can be large
-TOLERANCE, SHARE = 1.5, 0.1  # [px] and share of a point's motion by which a finger may differ from its shapes
+TOLERANCE, SHARE = 1.0, 0.05  # [px] and share of a point's motion by which a finger may differ from its shapes
 _known: dict[tuple[str, bytes], NDArray] = {}
 
 
