@@ -29,7 +29,7 @@ def describe_machine() -> dict[str, Any]:
 
 def write_figures(path: Path | str, figures: Mapping[str, Any]) -> None:
     """Write figures as JSON with the machine, versions and commit that they are of; what is not finite becomes null."""
-    write_json(path, {"machine": describe_machine(), **_without_nan(figures)})
+    write_json(path, {"machine": describe_machine(), **without_nan(figures)})
 
 
 def _processor() -> str:
@@ -50,12 +50,12 @@ def _commit() -> str:
         return "unknown"
 
 
-def _without_nan(content: Any) -> Any:
+def without_nan(content: Any) -> Any:
     """Return nested mappings and sequences with None for numbers that are not finite."""
     if isinstance(content, Mapping):
-        return {name: _without_nan(value) for name, value in content.items()}
+        return {name: without_nan(value) for name, value in content.items()}
     if isinstance(content, list | tuple):
-        return [_without_nan(value) for value in content]
+        return [without_nan(value) for value in content]
     return None if isinstance(content, float) and not np.isfinite(content) else content
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from finforce_ifea.grasp_force import Wrench
 from finforce_ifea.jaw.drawing import MeshDensity
-from finforce_twin.errors import BalanceError
+from finforce_twin.errors import BalanceError, ScenarioError
 from finforce_twin.gripper.footage import FINGER
 from finforce_twin.gripper.gripper import JawState, TwinState
 from finforce_twin.mechanics.assembly import Assembly, RelaxedWrench
@@ -70,6 +70,17 @@ class PressedGrasp:
             return 0.0
         jammed = JAMMED * max(self.least_opening - opening, 0.0)
         return float(np.interp(self.closing_at(opening), self._closings, self._forces)) + jammed
+
+    def find_closing(self, force: float) -> float:
+        """Returns how far beyond first touch [m] each jaw goes for an elastic grasp force [N].
+
+        Raises:
+            ScenarioError: The jaws meet before they press that hard.
+        """
+        if not force <= self._forces[-1]:
+            name, most = self.assembly.scenario.name, self._forces[-1]
+            raise ScenarioError(f"{name}: {force:g} N, expected at most {most:.1f} N, with which the jaws have met")
+        return float(np.interp(force, np.maximum.accumulate(self._forces), self._closings))
 
     def wrenches(self, opening: float) -> Mapping[str, Wrench]:
         """Returns the elastic wrench on each jaw at an opening [m]."""

@@ -1,0 +1,193 @@
+"""A set of cases that are run one after the other, kept one by one, and put on a page together."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from finforce.errors import FinforceError
+from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.machine import without_nan, write_figures
+from finforce_eval.evaluation.setup import version
+from finforce_eval.evaluation.tables import align_rows
+
+CASES, PAGE = "cases.jsonl", "README.md"
+EDITION = 1  # of what is kept of a case; another one does not go on where an older one ended
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One run of an experiment.
+
+    Attributes:
+        name: unlike the others', and a part of file names.
+        settings: that decide its figures, as JSON has them.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Figures in rows, the first column of which are words.
+
+    Attributes:
+        title: what it shows.
+        head: names of the columns, with units.
+        rows: cells, as many as the head has.
+        note: what there is to say of them.
+    """
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """What an experiment found.
+
+    Attributes:
+        figures: as JSON has them.
+        tables: for the terminal and the page.
+        pictures: file names in the experiment's folder, by what they show.
+    """
+
+    figures: Mapping[str, Any]
+    tables: Sequence[Table]
+    pictures: Mapping[str, str] = field(default_factory=dict)
+
+
+class Experiment(Protocol):
+    """An experiment; its cases are run in their order.
+
+    Attributes:
+        name: of the command line.
+        title: of the page.
+        about: what is done, and how it differs from the letter's own.
+    """
+
+    name: str
+    title: str
+    about: str
+
+    def list_cases(self) -> Sequence[Case]:
+        """Return what is to be run.
+
+        Raises:
+            FinforceError: recordings lack what the experiment needs.
+        """
+        ...
+
+    def run(self, case: Case, folder: Path) -> dict[str, Any]:
+        """Return the figures of a case as JSON has them; files go into a folder of the experiment's own."""
+        ...
+
+    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
+        """Return what the figures of the cases, by name, say together, and draw it into a folder."""
+        ...
+
+
+class CaseLog:
+    """The cases that are done, in a file of one line each; a line that was cut off is none.
+
+    Args:
+        path: of the file; made when the first case is kept.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._known: dict[str, dict[str, Any]] = {}
+        text = path.read_text(encoding="utf-8") if path.exists() else ""
+        whole = text[: text.rfind("\n") + 1]
+        for line in whole.splitlines():
+            try:
+                row = json.loads(line)
+                self._known[row["case"]] = {"key": row["key"], "figures": row["figures"]}
+            except (ValueError, TypeError, KeyError):
+                raise OptionError(f"{path}: got the line {line[:80]!r}, expected one of this program's") from None
+        if whole != text:
+            path.write_text(whole, encoding="utf-8")
+
+    def find(self, case: Case) -> dict[str, Any] | None:
+        """Return the figures of a case; None where it is still to be run."""
+        row = self._known.get(case.name)
+        return row["figures"] if row is not None and row["key"] == hash_case(case) else None
+
+    def keep(self, case: Case, figures: Mapping[str, Any]) -> None:
+        """Keep the figures of a case; they are on the disk when this returns."""
+        row = {"case": case.name, "key": hash_case(case), "figures": without_nan(figures)}
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row, allow_nan=False) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        self._known[case.name] = row
+
+
+def hash_case(case: Case) -> str:
+    """Return what tells a case from one of the same name with other settings, or of another version."""
+    content = json.dumps([EDITION, version(), dict(case.settings)], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def run_experiment(experiment: Experiment, report: Path) -> Findings:
+    """Run what is not done yet of an experiment, and write `NAME.json`, pictures and a page into `report/NAME`.
+
+    A case that fails is told of, costs itself only, and is tried again by the next run.
+
+    Raises:
+        FinforceError: the cases cannot be listed, or none of them gave figures.
+    """
+    from tqdm import tqdm
+
+    folder = report / experiment.name
+    cases = experiment.list_cases()
+    folder.mkdir(parents=True, exist_ok=True)
+    log, failed = CaseLog(folder / CASES), {}
+    with tqdm(total=len(cases), desc=experiment.name, unit="case", disable=None) as bar:
+        for case in cases:
+            if log.find(case) is None:
+                bar.set_postfix_str(case.name)
+                try:
+                    log.keep(case, experiment.run(case, folder))
+                except FinforceError as error:
+                    failed[case.name] = " ".join(str(error).split())
+                    print(f"failed: {case.name}: {failed[case.name]}", file=sys.stderr)
+            bar.update()
+    figures = {case.name: known for case in cases if (known := log.find(case)) is not None}
+    if not figures:
+        raise FinforceError(f"{experiment.name}: not one of {len(cases)} cases gave figures; the first: "
+                            f"{next(iter(failed.values()), 'there are none')}")  # fmt: skip
+    findings = experiment.find(figures, folder)
+    about = {"experiment": experiment.name, "version": version(), "cases": len(cases), "failed": failed}
+    write_figures(folder / f"{experiment.name}.json", {**about, **findings.figures})
+    (folder / PAGE).write_text(_write_page(experiment, findings, len(cases), failed), encoding="utf-8")
+    return findings
+
+
+def format_tables(findings: Findings) -> str:
+    """Return the tables for a terminal, each with its title above and its note below."""
+    blocks = []
+    for table in findings.tables:
+        note = ("", table.note) if table.note else ()
+        blocks.append("\n".join((table.title, "", align_rows(table.head, table.rows), *note)))
+    return "\n\n".join(blocks)
+
+
+def _write_page(experiment: Experiment, findings: Findings, cases: int, failed: Mapping[str, str]) -> str:
+    """Return the page of an experiment."""
+    done = f"{cases - len(failed)} of {cases} cases, finforce {version()}."
+    lines = [f"# {experiment.title}", "", experiment.about, "", done]
+    lines += [f"- **failed:** {name}: {text}" for name, text in failed.items()]
+    lines += ["", format_tables(findings), ""]
+    lines += [f"![{caption}]({name})" for caption, name in findings.pictures.items()]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,35 @@
+"""Pictures of the experiments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE, new_figure, style_axes
+
+COLOURS = {"low": BLUE, "medium": GREEN, "high": ORANGE}
+
+
+def draw_grasps(figures: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return a figure with a panel for each object and place, measured and estimated force over time."""
+    shapes = list(dict.fromkeys(row["object"] for row in figures.values()))
+    places = list(dict.fromkeys(row["place"] for row in figures.values()))
+    figure = new_figure(3.6 * len(places), 2.5 * len(shapes) + 0.4)
+    panels = figure.subplots(len(shapes), len(places), squeeze=False, sharey=True)
+    for row in figures.values():
+        axes = panels[shapes.index(row["object"])][places.index(row["place"])]
+        course = {name: np.array(values, dtype=float) for name, values in row["course"].items()}
+        begin = course["seconds"][np.flatnonzero(course["truth"] > 0.02)[:1]].sum()
+        axes.plot(course["seconds"] - begin, course["found"], color=COLOURS[row["level"]], linewidth=1.2)
+        axes.plot(course["seconds"] - begin, course["truth"], color=BLACK, linewidth=0.9, dashes=(4, 2))
+    for shape, line in zip(shapes, panels, strict=True):
+        line[0].set_ylabel("grasp force [N]")
+        for place, axes in zip(places, line, strict=True):
+            style_axes(axes)
+            axes.set_title(f"{shape}, {place}", loc="left", fontsize=10)
+            axes.set_xlim(left=-1.0)
+    for axes in panels[-1]:
+        axes.set_xlabel("after first touch [s]")
+    return figure

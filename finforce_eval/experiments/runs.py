@@ -1,0 +1,160 @@
+"""What experiments on grasps share: scenes of the twin or recordings of one's own, read with key points and scored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+import numpy as np
+
+from finforce.gripper_frames import SIDES
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.contact_source import ContactChoice
+from finforce_eval.evaluation.evaluate import Evaluation
+from finforce_eval.evaluation.keypoint_source import KeypointSource
+from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
+from finforce_eval.experiments.experiment import Case
+from finforce_eval.recordings.bags import bag_source
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import PoseTrack, Recording
+from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
+from finforce_ifea.jaw.calibration import load_calibration
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.settings import EstimatorSettings
+from finforce_twin.gripper.footage import parse_size
+from finforce_twin.scenes.scenarios import build_scenario
+
+RECORDINGS = "recordings"
+FARTHEST = 0.3  # [m] of depth that is kept; jaws are nearer
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """How recordings are solved.
+
+    Attributes:
+        bags: recordings of one's own; none for scenes of the twin.
+        jaw: shipped name or jaw file.
+        calibration: shipped name or file; empty for the jaw file's own material.
+        source: of the key points, see `KeypointSource`; empty for images of the twin, and for what bags have.
+        seed: of the first scene.
+        size: of the twin's images, WIDTHxHEIGHT.
+        keep: keep the twin's recordings when they have been scored.
+        quick: few and small cases.
+    """
+
+    bags: Sequence[str] = ()
+    jaw: str = "bench"
+    calibration: str = "twin"
+    source: str = ""
+    seed: int = 100
+    size: str = "640x480"
+    keep: bool = False
+    quick: bool = False
+
+    @property
+    def shared(self) -> dict[str, Any]:
+        """The settings that every case has."""
+        return {"jaw": self.jaw, "calibration": self.calibration, "source": self.source}
+
+    def scene_case(self, name: str, scene: str, changes: Mapping[str, Any], number: int, **more: Any) -> Case:
+        """Return a case that is a scene of the twin; `more` is kept in its settings, too."""
+        made = {"scene": scene, "changes": dict(changes), "seed": self.seed + number, "size": self.size}
+        return Case(name=name, settings=self.shared | made | more)
+
+    def bag_cases(self, needed: Sequence[str] = SIDES) -> list[Case]:
+        """Return the recordings of one's own as cases.
+
+        Args:
+            needed: jaws whose measured force, and about which the object's poses, an experiment cannot do without.
+
+        Raises:
+            RecordingError: a recording lacks something, and which it is.
+        """
+        cases = []
+        for bag in self.bags:
+            recording = read_recording(bag)
+            missing = list_missing(recording, needed)
+            if missing:
+                raise RecordingError(f"{bag}: this experiment needs {'; '.join(missing)}, which is not in it")
+            source = bag_source(Path(bag))
+            files = sorted(source.glob("*")) if source.is_dir() else [source]
+            size = sum(path.stat().st_size for path in files)
+            cases.append(Case(name=recording.name, settings=self.shared | {"bag": str(bag), "bytes": size}))
+        return cases
+
+
+def list_missing(recording: Recording, needed: Sequence[str]) -> list[str]:
+    """Return what a recording lacks: measured forces of jaws, or the object's poses."""
+    sides = [side for side in needed if side not in recording.jaws or recording.jaws[side].truth is None]
+    missing = [f"/{side}/ground_truth_wrench" for side in sides]
+    return missing if recording.object_pose is not None else [*missing, "/object_pose"]
+
+
+def build_setup(settings: Mapping[str, Any], contact: ContactChoice | None = None) -> EvaluationSetup:
+    """Return the setup that a case's settings name.
+
+    Raises:
+        FinforceError: jaw or calibration cannot be used.
+    """
+    return EvaluationSetup(
+        jaw=load_jaw(settings["jaw"]),
+        settings=EstimatorSettings(),
+        calibration=load_calibration(settings["calibration"]) if settings["calibration"] else None,
+        contacts=contact or ContactChoice(mode="estimate"),
+        about={},
+    )
+
+
+def read_case(settings: Mapping[str, Any], name: str, folder: Path) -> Recording:
+    """Return the recording of a case with its key points; a scene is rendered first.
+
+    Raises:
+        FinforceError: the scene cannot be rendered, the recording not be read, or no key points are found.
+    """
+    source = settings["source"]
+    if "bag" in settings:
+        bag = Path(settings["bag"])
+    else:
+        bag, source = render_scene(settings, folder / RECORDINGS / name), source or "images"
+    return KeypointSource(source=source, jaw_file=settings["jaw"]).apply(read_recording(bag))
+
+
+def render_scene(settings: Mapping[str, Any], bag: Path) -> Path:
+    """Return the recording of a scene, which is rendered unless it is there."""
+    if (bag / "case.json").exists():
+        return bag
+    rmtree(bag, ignore_errors=True)  # what a killed run has left
+    scenario = build_scenario(settings["scene"], **settings["changes"])
+    form = RecordingForm(farthest=FARTHEST)
+    record_scene(scenario, settings["seed"], bag, camera=parse_size(settings["size"]), form=form)
+    return bag
+
+
+def forget_case(settings: Mapping[str, Any], name: str, folder: Path) -> None:
+    """Remove the recording of a scene; one's own stay."""
+    if "bag" not in settings:
+        rmtree(folder / RECORDINGS / name, ignore_errors=True)
+
+
+def evaluate_case(recording: Recording, setup: EvaluationSetup) -> Evaluation:
+    """Return the evaluation of all jaws of a recording that have ground truth."""
+    return evaluate_all([recording], setup)
+
+
+def hide_object(recording: Recording, since: int) -> Recording:
+    """Return a recording whose object is not seen any more from a stamp [ns] on."""
+    track = recording.object_pose
+    seen = track.stamps < since
+    shown = {name: getattr(track, name)[seen] for name in ("stamps", "position", "quaternion")}
+    return replace(recording, object_pose=PoseTrack(frame_id=track.frame_id, **shown))
+
+
+def rmse(errors: Any) -> float:
+    """Return the root mean square of what is finite; NaN of nothing."""
+    errors = np.asarray(errors, dtype=float)
+    errors = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(errors**2))) if errors.size else float("nan")
