@@ -21,8 +21,15 @@ def _grasp(options: RunOptions) -> Experiment:
     return GraspExperiment(options=options)
 
 
+def _manipulation(options: RunOptions) -> Experiment:
+    from finforce_eval.experiments.manipulation import ManipulationExperiment
+
+    return ManipulationExperiment(options=options)
+
+
 EXPERIMENTS: dict[str, tuple[str, Callable[[RunOptions], Experiment]]] = {
     "grasp": ("27 grasps: three objects, places and forces, both jaws", _grasp),
+    "manipulation": ("a held weight of 100 g that is turned, in two lights", _manipulation),
 }
 
 

@@ -54,8 +54,27 @@ def score_manipulation(
     }
 
 
-def score_pair(left: CaseResult, right: CaseResult, recording: Recording | None = None) -> ManipulationStats:
-    """Return the score of two jaws of one recording, image by image with equal stamps.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NetForces:
+    """The net wrenches of both jaws in the n images of the record phases in which both are answered and measured.
+
+    Attributes:
+        stamps: (n,) [ns].
+        found: force and torque (n, 3) in the gripper's frame, of the estimates; a torque that is not known is NaN.
+        true: the same, as measured.
+        stated: (n, 3) standard deviation of the found force [N]; None where nobody states it.
+        answered_pct: share of the images with both truths in which both jaws were answered [%]; None without any.
+    """
+
+    stamps: NDArray
+    found: Wrench
+    true: Wrench
+    stated: NDArray | None
+    answered_pct: float | None
+
+
+def join_net(left: CaseResult, right: CaseResult, recording: Recording | None = None) -> NetForces:
+    """Return the net wrenches of two jaws of one recording, image by image with equal stamps.
 
     Args:
         left: of the left jaw.
@@ -69,8 +88,6 @@ def score_pair(left: CaseResult, right: CaseResult, recording: Recording | None 
     both = np.isfinite(left.force[mine, 0]) & np.isfinite(right.force[theirs, 0])
     answered = 100.0 * float(both.mean()) if len(both) else None
     stamps, mine, theirs = stamps[both], mine[both], theirs[both]
-    if not len(mine):
-        return ManipulationStats(n=0, answered_pct=answered)
     jaws = ((left, mine), (right, theirs))
     found = _combine(*((jaw.force[rows], _rows_of(jaw.torque, rows)) for jaw, rows in jaws), _ways(recording, stamps))
     ways = _ways(recording, stamps, true=True)
@@ -79,13 +96,22 @@ def score_pair(left: CaseResult, right: CaseResult, recording: Recording | None 
     if left.axis_stddev is not None and right.axis_stddev is not None:
         # the jaws' frames are turned about z by half a turn: their axes are those of the gripper
         stated = np.hypot(left.axis_stddev[mine], right.axis_stddev[theirs])
-    known = np.isfinite(found.torque - true.torque).all(axis=1)
-    torque = compare_torques(found.torque[known], true.torque[known]) if known.any() and true.torque.any() else {}
+    return NetForces(stamps=stamps, found=found, true=true, stated=stated, answered_pct=answered)
+
+
+def score_pair(left: CaseResult, right: CaseResult, recording: Recording | None = None) -> ManipulationStats:
+    """Return the score of two jaws of one recording; see `join_net`."""
+    net = join_net(left, right, recording)
+    if not len(net.stamps):
+        return ManipulationStats(n=0, answered_pct=net.answered_pct)
+    known = np.isfinite(net.found.torque - net.true.torque).all(axis=1)
+    is_measured = known.any() and net.true.torque.any()
+    torque = compare_torques(net.found.torque[known], net.true.torque[known]) if is_measured else {}
     return ManipulationStats(
-        n=len(mine),
-        answered_pct=answered,
+        n=len(net.stamps),
+        answered_pct=net.answered_pct,
         torque_rmse_Nm=torque.get("torque_rmse_Nm"),
-        **compare_vectors(found.force - true.force, stated),
+        **compare_vectors(net.found.force - net.true.force, net.stated),
     )
 
 
@@ -119,7 +145,7 @@ def _combine(left: tuple[NDArray, NDArray], right: tuple[NDArray, NDArray], ways
     grasps = [combine_wrenches(Wrench(f, t), Wrench(g, u), way) for f, t, g, u, way in rows]
     nothing = np.full(3, np.nan)
     torques = [nothing if grasp.torque is None else grasp.torque for grasp in grasps]
-    return Wrench(np.array([grasp.manipulation for grasp in grasps]), np.array(torques))
+    return Wrench(np.array([grasp.manipulation for grasp in grasps]).reshape(-1, 3), np.array(torques).reshape(-1, 3))
 
 
 def format_manipulation(scores: Mapping[str, ManipulationStats]) -> list[str]:

@@ -33,3 +33,19 @@ def draw_grasps(figures: Mapping[str, Mapping[str, Any]]) -> Any:
     for axes in panels[-1]:
         axes.set_xlabel("after first touch [s]")
     return figure
+
+
+def draw_weights(figures: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return a figure of the net force along gravity over gravity's direction in the gripper, a panel for each turn."""
+    columns = min(len(figures), 4)
+    rows = -(-len(figures) // columns)
+    figure = new_figure(3.2 * columns, 3.4 * rows + 0.2)
+    for number, (name, row) in enumerate(figures.items()):
+        axes = figure.add_subplot(rows, columns, number + 1, projection="polar")
+        course = row["course"]
+        axes.plot(course["angle"], course["found"], color=BLUE, linewidth=0.9)
+        axes.plot(course["angle"], course["truth"], color=BLACK, linewidth=1.0, dashes=(4, 2))
+        axes.set_title(name, fontsize=10)
+        axes.set_rlim(0.0, 1.3 * max([*course["truth"], 0.1]))
+        axes.tick_params(labelsize=7)
+    return figure

@@ -23,9 +23,10 @@ from finforce_ifea.tracking.place_update import Residuals
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Frames that make a memory, and over which its changes are averaged.
-_REMEMBERED, _AVERAGED = 15, 10.0
-# A hold has ended once the object is so much deeper or higher [m].
-_DEEPER, _HIGHER = 0.15e-3, 0.6e-3
+_REMEMBERED, _AVERAGED = 15, 5.0
+# A hold has ended once the object is so much deeper or higher [m]: a weight that goes over from one jaw to the other
+# moves the object by a millimetre. Standard deviation of what the mechanics errs by on the way there, as a share of it.
+_DEEPER, _HIGHER, _BEYOND = 2.5e-3, 0.6e-3, 0.05
 # Standard deviations of how a lifted object settles, as a share of what shape and height were expected to be off, and
 # of the weight [N].
 _SETTLES, _WEIGHT = 0.05, 0.7
@@ -101,7 +102,8 @@ class HeldWeight:
             return self.force
         known = np.where(self._counts > 0.5 * _REMEMBERED, frame.data.weights, 0.0)
         if np.count_nonzero(known) >= _FEWEST:
-            _accumulate(frame, left - self._memory, known, self._information, self._vector)
+            beyond = (_BEYOND * away[DEPTH]) ** 2
+            _accumulate(frame, left - self._memory, known, beyond, self._information, self._vector)
             settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2])
             spread = np.linalg.inv(self._information / _ALIKE + np.diag(1.0 / settles))
             change, self.stddev = float(spread[2] @ self._vector) / _ALIKE, float(np.sqrt(spread[2, 2]))
@@ -127,16 +129,20 @@ def _find_left(frame, away, before):
 
 
 @njit(**_OPTIONS)
-def _accumulate(frame, left, weights, information, vector):
-    """Adds one frame, its depth eliminated, to information (3, 3) and vector (3,) on shape, height and T."""
+def _accumulate(frame, left, weights, beyond, information, vector):
+    """Adds one frame, its depth eliminated, to information (3, 3) and vector (3,) on shape, height and T.
+
+    `beyond` is the variance of each coordinate of a key point that comes on top of its noise [m^2].
+    """
     A, g = np.zeros((4, 4)), np.zeros(4)
     rows = np.zeros((4, 2))
     for k in range(len(weights)):
         if weights[k] <= 0.0:
             continue
         noise = frame.data.noise[k]
-        det = noise[0, 0] * noise[1, 1] - noise[0, 1] ** 2
-        w00, w11, w01 = weights[k] * noise[1, 1] / det, weights[k] * noise[0, 0] / det, -weights[k] * noise[0, 1] / det
+        n00, n11 = noise[0, 0] + beyond, noise[1, 1] + beyond
+        det = n00 * n11 - noise[0, 1] ** 2
+        w00, w11, w01 = weights[k] * n11 / det, weights[k] * n00 / det, -weights[k] * noise[0, 1] / det
         for a in range(2):
             rows[0, a], rows[1, a], rows[2, a] = frame.modes[k, a, 0], frame.modes[k, a, 1], frame.modes[k, a, 2]
             rows[3, a] = frame.modes[k, a, 3] / frame.normal

@@ -46,10 +46,27 @@ def test_jaws_that_move_on_keep_the_weight():
     held = HeldWeight()
     follow(held, [frame() for _ in range(20)])
     follow(held, [frame(0.6) for _ in range(60)])
-    deeper = follow(held, [frame(0.6, place=(4e-3, 0.0, 0.04), bias=0.3e-3) for _ in range(60)])
+    deeper = follow(held, [frame(0.6, place=(7e-3, 0.0, 0.04), bias=0.3e-3) for _ in range(60)])
     assert deeper[-1] == pytest.approx(0.6, abs=0.05)
-    set_down = follow(held, [frame(0.0, place=(4e-3, 0.0, 0.04), bias=0.3e-3) for _ in range(60)])
+    set_down = follow(held, [frame(0.0, place=(7e-3, 0.0, 0.04), bias=0.3e-3) for _ in range(60)])
     assert set_down[-1] == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_weight_that_turns_is_followed_though_it_moves_the_object_from_one_jaw_to_the_other():
+    held = HeldWeight()
+    follow(held, [frame() for _ in range(20)])
+    angles = np.linspace(0.0, 4.0 * np.pi, 480)
+    places = 3e-3 + 1e-3 * np.sin(angles)
+    turned = follow(held, [frame(0.5 * np.cos(a), place=(x, 0.0, 0.04)) for a, x in zip(angles, places, strict=True)])
+    assert np.abs(turned - 0.5 * np.cos(angles))[20:].max() < 0.15
+
+
+def test_what_the_mechanics_errs_by_on_the_way_is_no_weight():
+    held = HeldWeight()
+    follow(held, [frame() for _ in range(20)])
+    ways = np.linspace(0.0, 1e-3, 60)
+    pressed = follow(held, [frame(place=(3e-3 + way, 0.0, 0.04), bias=0.04 * way) for way in ways])
+    assert np.abs(pressed).max() < 0.1
 
 
 def test_points_that_come_into_view_later_say_nothing():

@@ -1,0 +1,127 @@
+"""The letter's manipulation force: a held weight is turned, and its pull comes out of the difference of both jaws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from finforce_eval.evaluation.manipulation import NetForces, join_net
+from finforce_eval.experiments.experiment import Case, Findings, Table
+from finforce_eval.experiments.runs import RunOptions, build_setup, evaluate_case, forget_case, read_case, rmse
+
+MASS, SPEED = 0.1, 1.2  # [kg], [rad/s]
+AXES = {"x": 0.0, "y": 0.5 * np.pi}  # [rad] from the gripper's x to its y
+LIGHTS = {"bright": "weight_turn", "dim": "weight_turn_dim"}
+JAWS = {"as they are": 0.0, "swapped": np.pi}  # the weight goes over to the other jaw first
+LEAST = 0.5  # [N] of true net force, from which on it has a direction
+LETTER = {"bright": "0.12 ± 0.00", "dim": "0.28 ± 0.02"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ManipulationExperiment:
+    """A held weight of 100 g that is turned once round and back about two axes, in two lights; or recordings."""
+
+    options: RunOptions
+    name: str = "manipulation"
+    title: str = "A held weight that is turned"
+    about: str = (
+        "The letter grasps a calibration weight of 100 g (0.98 N), turns the gripper once round and back, with a lamp "
+        "and without, five times each, and compares the manipulation force of Eq. 3 with the weight along gravity. "
+        "Here the turn is rendered: about the axis along which the jaws close (x: gravity never presses on a jaw) "
+        "and about the camera's (y: it presses on one and then on the other), in bright and in dim light, and *swapped*: "
+        "begun the other way round, as if left and right had changed places. The object's poses come at 10 Hz with "
+        "noise; its mass is not known to the estimator."
+    )
+
+    def list_cases(self) -> Sequence[Case]:
+        """Return the turns; see `Experiment`."""
+        if self.options.bags:
+            return self.options.bag_cases()
+        cases = []
+        for axis, heading in AXES.items():
+            for light, scene in LIGHTS.items():
+                for jaws, turned in JAWS.items():
+                    words = {"axis": axis, "light": light, "jaws": jaws}
+                    name = f"{axis}_{light}_{'swapped' if turned else 'plain'}"
+                    sense = {"turn_heading": heading, "turn_angle": (-1.0 if turned else 1.0) * 2.0 * np.pi}
+                    changes = {"mass": MASS, "turn_rate": SPEED, **sense}
+                    cases.append(self.options.scene_case(name, scene, changes, len(cases), words=words))
+        return cases[2:5:2] if self.options.quick else cases
+
+    def run(self, case: Case, folder: Path) -> dict[str, Any]:
+        """Return the figures of a turn; see `Experiment`."""
+        recording = read_case(case.settings, case.name, folder)
+        evaluation = evaluate_case(recording, build_setup(case.settings))
+        jaws = (evaluation.results[f"{recording.name}/{side}"] for side in ("left", "right"))
+        net = join_net(*jaws, recording)
+        if not self.options.keep:
+            forget_case(case.settings, case.name, folder)
+        return {**dict(case.settings.get("words", {})), **score_weight(net)}
+
+    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
+        """Return errors along gravity by light; see `Experiment`."""
+        from finforce_eval.experiments.pictures import draw_weights
+
+        draw_weights(figures).savefig(folder / "weights.png")
+        lights = {row.get("light", "") for row in figures.values()}
+        summary = {}
+        for light in sorted(lights):
+            errors = np.array([row["along_rmse_N"] for row in figures.values() if row.get("light", "") == light], float)
+            known = errors[np.isfinite(errors)]
+            summary[light or "all"] = {"n": len(errors), "along_rmse_N": float(known.mean()), "std": float(known.std())}
+        rows = [
+            (light, str(one["n"]), f"{one['along_rmse_N']:.3f} ± {one['std']:.3f}", LETTER.get(light, "-"))
+            for light, one in summary.items()
+        ]
+        note = "RMSE of the net force of both jaws (Eq. 3) along the true one, while that is above 0.5 N."
+        first = Table(
+            title="**By light**", head=("light", "turns", "along gravity/N", "letter/N"), rows=rows, note=note
+        )
+        head = ("turn", "along gravity/N", "bias/N", "across/N", "x/N", "y/N", "z/N", "within 3σ/%", "answered/%")
+        cells = [(name, *(_number(row[key]) for key in KEYS)) for name, row in figures.items()]
+        second = Table(title="**Each turn**", head=head, rows=cells)
+        plain = {name: {k: v for k, v in row.items() if k != "course"} for name, row in figures.items()}
+        return Findings(
+            figures={"lights": summary, "turns": plain},
+            tables=[first, second],
+            pictures={"Net force along gravity over its direction in the gripper": "weights.png"},
+        )
+
+
+KEYS = ("along_rmse_N", "along_bias_N", "across_rmse_N", "x_rmse_N", "y_rmse_N", "z_rmse_N", "within_3_sigma_pct",
+        "answered_pct")  # fmt: skip
+
+
+def score_weight(net: NetForces) -> dict[str, Any]:
+    """Return errors of a net force along the true one and across it, and the course that is drawn."""
+    size = np.linalg.norm(net.true.force, axis=1)
+    held = size > LEAST
+    down = net.true.force[held] / size[held, None]
+    error = (net.found.force - net.true.force)[held]
+    along = np.einsum("ij,ij->i", error, down)
+    sigma = None if net.stated is None else np.sqrt(np.einsum("ij,ij->i", net.stated[held] ** 2, down**2))
+    # the plane in which gravity turns: the two main directions of what it was
+    plane = np.linalg.svd(down, full_matrices=False)[2][:2] if held.any() else np.zeros((2, 3))
+    angle = np.unwrap(np.arctan2(*(down @ plane.T).T[::-1])) if held.any() else np.zeros(0)
+    found = np.einsum("ij,ij->i", net.found.force[held], down)
+    return {
+        "along_rmse_N": rmse(along),
+        "along_bias_N": float(along.mean()) if held.any() else float("nan"),
+        "across_rmse_N": rmse(np.linalg.norm(error - along[:, None] * down, axis=1)),
+        **{f"{axis}_rmse_N": rmse(error[:, row]) for row, axis in enumerate("xyz")},
+        "within_3_sigma_pct": float("nan") if sigma is None else 100.0 * float((np.abs(along) <= 3.0 * sigma).mean()),
+        "answered_pct": net.answered_pct,
+        "course": {
+            "angle": np.round(angle, 4).tolist(),
+            "truth": np.round(size[held], 4).tolist(),
+            "found": np.round(found, 4).tolist(),
+        },
+    }
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None or not np.isfinite(value) else f"{value:.3f}"
