@@ -21,20 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from grasp_world import GraspCase, GraspTrace, NoisySensor, Plant, World, build_spring
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from finforce.messages import magnitude_stddev
-from finforce_contact.estimator import ContactEstimator
 from finforce_driver.grasp.settings import GraspPhase
 from finforce_eval.evaluation.machine import describe_machine, write_figures
+from finforce_eval.experiments.grasp_sensors import EstimatorSensor, build_plant
+from finforce_eval.experiments.grasp_world import GraspCase, GraspTrace, NoisySensor, Plant, World, build_spring
 from finforce_eval.figures.figures import BLACK, BLUE, GREY, ORANGE, new_figure, style_axes
-from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.grasp_force import R_GRIPPER_JAW
-from finforce_ifea.jaw.calibration import load_calibration
-from finforce_ifea.observation import Observation, Solution
 from finforce_twin.gripper.pressing import PressedGrasp
 from finforce_twin.scenes.scenarios import build_scenario
 
@@ -229,8 +222,6 @@ def main() -> int:
     return 0
 
 
-POINT_NOISE = 0.15e-3  # [m] per axis, of a detected key point from image to image
-POSE_PERIOD, POSE_SHIFT, POSE_TURN = 0.1, 0.3e-3, np.deg2rad(0.3)  # [s], [m], [rad] of the object's tracker
 # name: object, and height of its middle [m]
 TWINS = {"twin, rod 35 low": ("rod35", 0.026), "twin, rod 25": ("rod25", 0.042)}
 
@@ -239,85 +230,6 @@ def build_pressed(name: str) -> PressedGrasp:
     """Return the twin's grasp of a name in `TWINS`."""
     body, height = TWINS[name]
     return PressedGrasp(build_scenario("grasp_cylinder", object=body, height=height))
-
-
-def build_plant(name: str, pressed: PressedGrasp) -> Plant:
-    """Return the twin's fingers as a plant."""
-    return Plant(
-        name=name,
-        force_at=pressed.elastic_force,
-        touch_opening=pressed.touch_opening,
-        terms=pressed.assembly.material.terms,
-    )
-
-
-class JawSensor:
-    """Contact estimator and solver of one jaw, fed as their nodes are: with the surface of the image before."""
-
-    def __init__(self, pressed: PressedGrasp, side: str) -> None:
-        self._side = side
-        self._solver = JawEstimator(pressed.assembly.jaws[side], calibration=load_calibration("twin"))
-        self._contacts = ContactEstimator(self._solver.jaw, mesh=pressed.assembly.object_mesh)
-        self._solver.warm_up()
-        self._last: Solution | None = None
-
-    def take_pose(self, stamp: float, T_gripper_object: NDArray, origin_x: float) -> None:
-        """Take a pose of the object in the gripper's frame, where the jaw's origin is at x [m]."""
-        T_jaw_gripper = np.eye(4)
-        T_jaw_gripper[:3, :3] = R_GRIPPER_JAW[self._side].T
-        T_jaw_gripper[:3, 3] = -T_jaw_gripper[:3, 0] * origin_x
-        self._contacts.take_pose(stamp, T_jaw_gripper @ T_gripper_object)
-
-    def solve(self, observation: Observation) -> Solution:
-        """Return what the solver says of key points; `touching` says what it was told."""
-        last = self._last
-        surface = None if last is None or not last.trusted else self._solver.surface()
-        wrench = None if surface is None else (last.force, last.torque)
-        estimate = self._contacts.update(observation.stamp, surface, wrench)
-        self.touching = estimate.touching
-        self._last = self._solver.update(observation, estimate.contact)
-        return self._last
-
-
-class EstimatorSensor:
-    """The force that the whole chain finds from the true key points with noise, of both jaws as the nodes pair them.
-
-    Attributes:
-        touching: whether a jaw was said to touch in the last image.
-        stddev: of the jaw whose force is less certain, as the driver takes it from `wrench_stddev` [N].
-    """
-
-    def __init__(self, pressed: PressedGrasp, seed: int) -> None:
-        self._pressed, self._random = pressed, np.random.default_rng(seed)
-        self._jaws = {side: JawSensor(pressed, side) for side in pressed.assembly.jaws}
-        self._next_pose = 0.0
-        self.touching: bool | None = None
-        self.stddev = 0.0
-
-    def measure(self, stamp: float, force: float, opening: float) -> float | None:
-        """Return min(|F_left|, |F_right|), None unless both are trusted."""
-        state = self._pressed.state(opening, stamp)
-        if stamp >= self._next_pose:
-            self._next_pose = stamp + POSE_PERIOD
-            pose = self._disturb(state.T_gripper_object)
-            for side, jaw in self._jaws.items():
-                jaw.take_pose(stamp, pose, state.jaws[side].origin_x)
-        solutions = [jaw.solve(self._observe(stamp, state.jaws[side].keypoints)) for side, jaw in self._jaws.items()]
-        self.touching = any(jaw.touching for jaw in self._jaws.values())
-        if not all(solution.trusted for solution in solutions):
-            return None
-        self.stddev = max(magnitude_stddev(solution.force_stddev) for solution in solutions)
-        return min(float(np.linalg.norm(solution.force)) for solution in solutions)
-
-    def _observe(self, stamp: float, keypoints: NDArray) -> Observation:
-        noisy = keypoints + POINT_NOISE * self._random.standard_normal(keypoints.shape)
-        return Observation(stamp=stamp, points=noisy, likelihood=np.full(len(noisy), 0.9))
-
-    def _disturb(self, T: NDArray) -> NDArray:
-        noisy = T.copy()
-        noisy[:3, :3] = Rotation.from_rotvec(POSE_TURN * self._random.standard_normal(3)).as_matrix() @ T[:3, :3]
-        noisy[:3, 3] += POSE_SHIFT * self._random.standard_normal(3)
-        return noisy
 
 
 BEFORE, AFTER = -0.4, 6.0  # [s] about first touch that are drawn

@@ -30,7 +30,6 @@ from random import Random
 from typing import Any
 
 import numpy as np
-from grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 from tqdm import tqdm
 
 from finforce_driver.emulator.control import Mode
@@ -41,6 +40,7 @@ from finforce_driver.grasp.session import hold_force
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_eval.evaluation.machine import describe_machine, write_figures
+from finforce_eval.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 
 LIMIT = GraspSettings().force_limit  # [N]
 FAULTS_FROM, PERIOD, MOST = 1.2, 0.5, 6  # [s], [s], faults of the line and the gripper

@@ -15,6 +15,18 @@ TWIN = "twin"
 QUICK_SIZE = "320x240"
 
 
+def _bench(options: RunOptions) -> Experiment:
+    from finforce_eval.experiments.letter_tables import BenchExperiment
+
+    return BenchExperiment(options=options)
+
+
+def _places(options: RunOptions) -> Experiment:
+    from finforce_eval.experiments.letter_tables import PlacesExperiment
+
+    return PlacesExperiment(options=options)
+
+
 def _grasp(options: RunOptions) -> Experiment:
     from finforce_eval.experiments.grasp import GraspExperiment
 
@@ -27,9 +39,18 @@ def _manipulation(options: RunOptions) -> Experiment:
     return ManipulationExperiment(options=options)
 
 
+def _chip(options: RunOptions) -> Experiment:
+    from finforce_eval.experiments.chip import ChipExperiment
+
+    return ChipExperiment(options=options)
+
+
 EXPERIMENTS: dict[str, tuple[str, Callable[[RunOptions], Experiment]]] = {
+    "bench": ("Table I: nine cylinders pressed on one jaw", _bench),
+    "places": ("Table II: what knowing the place is worth", _places),
     "grasp": ("27 grasps: three objects, places and forces, both jaws", _grasp),
     "manipulation": ("a held weight of 100 g that is turned, in two lights", _manipulation),
+    "chip": ("something that breaks at 5.43 N, grasped to 5 N by force, position and current", _chip),
 }
 
 

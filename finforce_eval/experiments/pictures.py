@@ -49,3 +49,23 @@ def draw_weights(figures: Mapping[str, Mapping[str, Any]]) -> Any:
         axes.set_rlim(0.0, 1.3 * max([*course["truth"], 0.1]))
         axes.tick_params(labelsize=7)
     return figure
+
+
+def draw_chips(figures: Mapping[str, Mapping[str, Any]], bears: float, breaks: float) -> Any:
+    """Return a figure of the true forces [N] over time, a panel for each way of grasping."""
+    ways = list(dict.fromkeys(row["way"] for row in figures.values()))
+    figure = new_figure(4.2 * len(ways), 3.2)
+    panels = figure.subplots(1, len(ways), squeeze=False, sharey=True)[0]
+    for axes, way in zip(panels, ways, strict=True):
+        style_axes(axes)
+        members = [row for row in figures.values() if row["way"] == way]
+        for row in members:
+            colour = ORANGE if row["is_broken"] else BLUE
+            axes.plot(row["seconds"], row["force"], color=colour, linewidth=0.9, alpha=0.7)
+        axes.axhline(breaks, color=BLACK, linewidth=0.9, dashes=(4, 2))
+        axes.axhline(bears, color=GREEN, linewidth=0.9, dashes=(4, 2))
+        broken = sum(row["is_broken"] for row in members)
+        axes.set_title(f"by {way}: {broken} of {len(members)} broken", loc="left", fontsize=10)
+        axes.set(xlabel="after first touch [s]", xlim=(-0.5, 8.0))
+    panels[0].set_ylabel("true force [N]")
+    return figure

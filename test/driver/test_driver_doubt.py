@@ -6,11 +6,11 @@ import emulator_fakes  # noqa: F401 - finds the benchmarks
 import pytest
 from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
 from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, spring
-from grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 
 from finforce.errors import ObservationError
 from finforce.ros.messages import force_stddev
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
+from finforce_eval.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 
 
 def build(force=2.0, stddev=0.0, share=1.0, **parts):

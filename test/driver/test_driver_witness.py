@@ -3,9 +3,9 @@
 import emulator_fakes  # noqa: F401 - finds the benchmarks
 import numpy as np
 import pytest
-from grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 
 from finforce_driver.state import Phase
+from finforce_eval.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 
 
 class FrozenSensor:

@@ -6,7 +6,6 @@ from itertools import count
 import emulator_fakes  # noqa: F401 - finds the benchmarks
 import numpy as np
 import pytest
-from grasp_world import TERMS, build_spring
 from joint_fakes import LEROBOT, ROBOTIQ, EmulatedJoint
 
 from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, TargetError
@@ -15,6 +14,7 @@ from finforce_driver.grasp.session import hold_force
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
 from finforce_driver.joint.settings import JointSettings
 from finforce_driver.state import MoveOutcome, Phase
+from finforce_eval.experiments.grasp_world import TERMS, build_spring
 from finforce_ifea.relaxation import Relaxation
 
 MAKERS = pytest.mark.parametrize("maker", [ROBOTIQ, LEROBOT], ids=["robotiq", "lerobot"])

@@ -1,4 +1,4 @@
-"""A gripper, fingers about an object and a camera in stepped time, for the benchmark of grasps by force.
+"""A gripper, fingers about an object and a camera in stepped time, for grasps by force.
 
 The emulated gripper answers on the virtual bus as firmware does; its true opening bends the fingers, whose force
 relaxes; a camera of 30 Hz tells it late. How it is told is a sensor's matter: noise on the truth, or an estimator.
@@ -31,6 +31,7 @@ LOST = 0.02  # share of the images
 WIDTH = 0.025  # [m] of the objects between springs
 CLEARANCE = 0.003  # [m] of the opening before first touch
 HOLDING = 10.0  # [s]
+BLIND = 8.0  # [s] that a grasp without a camera is watched
 # shares and times in the middle of what the twin draws for its fingers
 TERMS = (RelaxationTerm(share=0.065, time_constant=2.2), RelaxationTerm(share=0.065, time_constant=10.0))
 
@@ -162,6 +163,18 @@ class World:
         goal = GraspGoal(force=self._case.force, speed=self._case.speed)
         try:
             hold_force(self.gripper, self, goal, self._settings, until=self._is_over)
+        except Exception as error:  # whatever ends a grasp is a result of the benchmark
+            self.course.error = str(error)
+        self.course.violations = dict(self.emulated.violations)
+        return self.course
+
+    def run_blind(self, opening: float, current: float) -> GraspTrace:
+        """Calibrate, open, and go to an opening [m] with a limit of the motor's current [A], whatever is there."""
+        self._prepare()
+        try:
+            self.gripper.move(opening, self._case.speed, current=current)
+            end = self.clock.now() + BLIND
+            self.gripper.wait(lambda state: self.clock.now() > end, BLIND + 1.0)
         except Exception as error:  # whatever ends a grasp is a result of the benchmark
             self.course.error = str(error)
         self.course.violations = dict(self.emulated.violations)

@@ -1,0 +1,234 @@
+"""Claims about the letter's experiments: resumed after a kill, honest of what failed, and right in what they count."""
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from eval_fakes import make_recording
+
+from finforce.errors import FinforceError
+from finforce_eval.cli.main import main
+from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.manipulation import NetForces
+from finforce_eval.experiments.chip import ChipExperiment
+from finforce_eval.experiments.experiment import Case, Findings, Table, format_tables, run_experiment
+from finforce_eval.experiments.grasp import GraspCourse, GraspExperiment, score_course
+from finforce_eval.experiments.letter_tables import BenchExperiment
+from finforce_eval.experiments.manipulation import ManipulationExperiment, score_weight
+from finforce_eval.experiments.runs import RunOptions, hide_object, list_missing
+from finforce_eval.recordings.writer import write_recording
+from finforce_ifea.grasp_force import Wrench
+
+DATA = Path(__file__).parents[2] / "finforce_eval" / "data"
+
+
+@dataclass
+class Counting:
+    """An experiment that counts its runs; a case called `bad` fails."""
+
+    names: tuple = ("one", "two", "three")
+    settings: dict = field(default_factory=dict)
+    stop_after: int = 99
+    name: str = "count"
+    title: str = "Counting"
+    about: str = "It counts."
+    ran: list = field(default_factory=list)
+
+    def list_cases(self):
+        return [Case(name=name, settings=self.settings) for name in self.names]
+
+    def run(self, case, folder):
+        if len(self.ran) >= self.stop_after:
+            raise KeyboardInterrupt
+        if case.name == "bad":
+            raise FinforceError("it is bad")
+        self.ran.append(case.name)
+        return {"letters": len(case.name), "nothing": float("nan")}
+
+    def find(self, figures, folder):
+        total = sum(row["letters"] for row in figures.values())
+        table = Table(title="**Letters**", head=("case", "n"), rows=[(name, "1") for name in figures])
+        return Findings(figures={"total": total}, tables=[table])
+
+
+def test_a_run_that_was_killed_goes_on_where_it_was(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(Counting(stop_after=2), tmp_path)
+    assert not (tmp_path / "count" / "count.json").exists()
+    again = Counting()
+    run_experiment(again, tmp_path)
+    assert again.ran == ["three"]
+    assert json.loads((tmp_path / "count" / "count.json").read_text())["total"] == 11
+    assert "It counts." in (tmp_path / "count" / "README.md").read_text()
+    nothing = Counting()
+    run_experiment(nothing, tmp_path)
+    assert nothing.ran == []
+
+
+def test_a_line_that_was_cut_off_is_run_again_and_others_stay(tmp_path):
+    run_experiment(Counting(), tmp_path)
+    log = tmp_path / "count" / "cases.jsonl"
+    log.write_text(log.read_text()[:-20])
+    again = Counting()
+    run_experiment(again, tmp_path)
+    assert again.ran == ["three"]
+    assert [json.loads(line)["case"] for line in log.read_text().splitlines()] == ["one", "two", "three"]
+
+
+def test_other_settings_are_another_case(tmp_path):
+    run_experiment(Counting(), tmp_path)
+    other = Counting(settings={"size": 2})
+    run_experiment(other, tmp_path)
+    assert other.ran == ["one", "two", "three"]
+
+
+def test_a_case_that_fails_costs_itself_only_and_is_named(tmp_path, capsys):
+    experiment = Counting(names=("one", "bad", "two"))
+    run_experiment(experiment, tmp_path)
+    assert experiment.ran == ["one", "two"]
+    assert "failed: bad: it is bad" in capsys.readouterr().err
+    assert json.loads((tmp_path / "count" / "count.json").read_text())["failed"] == {"bad": "it is bad"}
+    assert "2 of 3 cases" in (tmp_path / "count" / "README.md").read_text()
+
+
+def test_nothing_but_failures_is_an_error(tmp_path):
+    with pytest.raises(FinforceError, match="not one of 1 cases gave figures.*it is bad"):
+        run_experiment(Counting(names=("bad",)), tmp_path)
+
+
+def test_a_file_of_something_else_is_refused(tmp_path):
+    (tmp_path / "count").mkdir()
+    (tmp_path / "count" / "cases.jsonl").write_text("hello\n")
+    with pytest.raises(OptionError, match="hello"):
+        run_experiment(Counting(), tmp_path)
+
+
+def course(error=0.0, stddev=0.1):
+    """A grasp that rises to 4 N within a second, rests for one and is let go within another; an image each 20 ms."""
+    seconds = np.arange(0.0, 4.0, 0.02)
+    truth = np.interp(seconds, [0.5, 1.5, 2.5, 3.5], [0.0, 4.0, 4.0, 0.0])
+    nothing = np.zeros_like(seconds)
+    return GraspCourse(
+        seconds=seconds, truth=truth, found=truth + error * (truth > 0.0), stddev=nothing + stddev, delay=nothing
+    )
+
+
+def test_phases_follow_from_the_true_force():
+    phases = course().phases
+    seconds = course().seconds
+    assert seconds[phases["load"]].max() == pytest.approx(1.5, abs=0.05)
+    assert seconds[phases["release"]].min() == pytest.approx(2.75, abs=0.05)
+    assert (phases["all"] == (phases["load"] | phases["hold"] | phases["release"])).all()
+
+
+def test_a_grasp_is_scored_by_phase():
+    score = score_course(course(error=0.2))
+    assert score["rmse_N"] == pytest.approx(dict.fromkeys(("all", "load", "hold", "release"), 0.2))
+    assert score["nrmsd_pct"]["all"] == pytest.approx(5.0, rel=0.04)
+    assert score["answered_pct"] == 100.0
+    assert score["within_3_sigma_pct"] == 100.0
+    assert score_course(course(error=0.2, stddev=0.05))["within_3_sigma_pct"] == 0.0
+    assert score["delay_ms"][0] < 10.0
+
+
+def test_images_without_an_answer_are_counted():
+    one = course()
+    found = one.found.copy()
+    found[one.phases["hold"]] = np.nan
+    score = score_course(replace(one, found=found))
+    assert score["answered_pct"] < 75.0
+    assert score["rmse_N"]["load"] == 0.0
+    assert np.isnan(score["rmse_N"]["hold"])
+
+
+def test_a_weight_is_scored_along_gravity():
+    angles = np.linspace(0.0, 2.0 * np.pi, 50)
+    true = np.column_stack((np.sin(angles), np.zeros(50), np.cos(angles)))
+    found = 1.1 * true + (0.0, 0.3, 0.0)
+    blank = np.full((50, 3), np.nan)
+    net = NetForces(
+        stamps=np.arange(50),
+        found=Wrench(found, blank),
+        true=Wrench(true, blank),
+        stated=np.full((50, 3), 0.1),
+        answered_pct=100.0,
+    )
+    score = score_weight(net)
+    assert score["along_rmse_N"] == pytest.approx(0.1)
+    assert score["along_bias_N"] == pytest.approx(0.1)
+    assert score["across_rmse_N"] == pytest.approx(0.3)
+    assert score["within_3_sigma_pct"] == 100.0
+    assert np.ptp(score["course"]["angle"]) == pytest.approx(2.0 * np.pi, rel=0.01)
+
+
+def test_the_twin_has_27_grasps_with_seeds_of_their_own():
+    cases = GraspExperiment(options=RunOptions()).list_cases()
+    assert len({case.name for case in cases}) == 27
+    assert len({case.settings["seed"] for case in cases}) == 27
+    assert len(ManipulationExperiment(options=RunOptions()).list_cases()) == 8
+    assert len(ChipExperiment(options=RunOptions()).list_cases()) == 60
+    assert len(BenchExperiment(options=RunOptions()).list_cases()) == 9
+
+
+def test_quick_cases_are_some_of_the_others():
+    for kind in (GraspExperiment, ManipulationExperiment, ChipExperiment, BenchExperiment):
+        every, few = ([c.name for c in kind(options=RunOptions(quick=q)).list_cases()] for q in (False, True))
+        assert set(few) < set(every)
+
+
+def test_a_recording_that_lacks_something_is_told_what(tmp_path, capsys):
+    one = make_recording("one")
+    assert list_missing(one, ("left", "right")) == ["/right/ground_truth_wrench"]
+    assert list_missing(replace(one, object_pose=None), ("left",)) == ["/object_pose"]
+    bag = write_recording(replace(one, object_pose=None), tmp_path / "one")
+    assert main(["experiment", "grasp", "--on", str(bag), "--report", str(tmp_path / "report")]) == 2
+    words = capsys.readouterr().err
+    assert "/right/ground_truth_wrench; /object_pose" in words
+    assert not (tmp_path / "report").exists()
+
+
+def test_an_object_that_is_hidden_has_no_poses_any_more():
+    one = make_recording("one")
+    since = int(one.object_pose.stamps[5])
+    hidden = hide_object(one, since)
+    assert len(hidden.object_pose.stamps) == 5
+    assert len(hidden.object_pose.position) == 5
+    assert len(one.object_pose.stamps) > 5
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["nothing"], "invalid choice"),
+        (["chip", "--on", "some_bag"], "expected twin"),
+        (["grasp", "--on", "twin", "a_bag"], "not both"),
+        (["grasp", "--seed", "-1"], "from 0"),
+        (["grasp", "--on", "no_such_bag"], "no_such_bag"),
+    ],
+)
+def test_what_cannot_be_run_is_one_line(words, expected, tmp_path, capsys):
+    try:
+        code = main(["experiment", *words, "--report", str(tmp_path)])
+    except SystemExit as end:
+        code = end.code
+    assert code == 2
+    error = capsys.readouterr().err
+    assert expected in error and error.count("\n") == 1
+
+
+def test_the_bench_runs_on_the_recording_in_the_package(tmp_path, capsys):
+    bag = str(DATA / "bench_cyl25_middle")
+    command = ["experiment", "bench", "--on", bag, "--calibration", "bench", "--report", str(tmp_path)]
+    assert main(command) == 0
+    figures = json.loads((tmp_path / "bench" / "bench.json").read_text())
+    assert figures["summary"]["estimate"]["worst_N"] < 0.2
+    assert "(0.28)" in capsys.readouterr().out
+    assert bag not in (tmp_path / "bench" / "README.md").read_text()
+
+
+def test_tables_have_a_title_and_a_note():
+    table = Table(title="**T**", head=("a", "b"), rows=[("x", "1")], note="N.")
+    lines = format_tables(Findings(figures={}, tables=[table])).splitlines()
+    assert lines[0] == "**T**" and lines[-1] == "N."
