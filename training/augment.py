@@ -32,7 +32,7 @@ class AugmentSettings:
     sharpen: float = setting(0.15, "probability of a camera's sharpening", "-", 0.0, 1.0)
     noise: float = setting(0.7, "probability of sensor noise; little light always has it", "-", 0.0, 1.0)
     jpeg: float = setting(0.3, "probability of compression", "-", 0.0, 1.0)
-    occlusion: float = setting(0.5, "probability of things in front", "-", 0.0, 1.0)
+    occlusion: float = setting(0.65, "probability of things in front", "-", 0.0, 1.0)
 
     def __post_init__(self) -> None:
         check_bounds(self, RecipeError)

@@ -13,10 +13,10 @@ ANYWHERE = 2  # of them that need not be key points
 FAR, FAR_SHARE, NEAR = (
     9.0,
     0.25,
-    2.5,
+    1.5,
 )  # px by which guesses are off: some anywhere up to FAR, others with deviation NEAR
 FARTHEST = 600.0  # px; a place that a slanted view has thrown farther is not learnt
-HIDDEN_WEIGHT = 3.0  # of a hidden point beside a visible one: to accept what is not there costs more than to lose one
+HIDDEN_WEIGHT = 6.0  # of a hidden point beside a visible one: to accept what is not there costs more than to lose one
 SHARPNESS = 0.05  # px; smaller errors count by their square
 
 

@@ -31,6 +31,8 @@ TABLE_II = {
     "lower": {"estimate": 0.61, "upper": 4.40, "middle": 3.61, "lower": 0.69},
 }
 ESTIMATE = "estimate"
+LEAST_SOLVED = 1.0  # [%] of the images under load, below which nothing is said of a contact
+OTHERS = {"closest": "closest point", "paper": "Algorithm 1"}
 
 
 def list_cylinders(options: RunOptions, chosen: Sequence[tuple[int, str]]) -> list[Case]:
@@ -88,6 +90,8 @@ def measure_contacts(case: Case, folder: Path, contacts: Mapping[str, ContactCho
             "nrmsd_pct": score.cycles["all"].nrmsd_pct.mean,
             "bias_N": score.all.bias_N,
             "solved_pct": _share_solved(evaluation),
+            "place_median_mm": score.place.median_mm,
+            "place_p95_mm": score.place.p95_mm,
         }
     if not keep:
         forget_case(case.settings, case.name, folder)
@@ -172,7 +176,7 @@ class PlacesExperiment:
     def run(self, case: Case, folder: Path) -> dict[str, Any]:
         """Return the errors at a place; see `Experiment`."""
         heights = BENCH_HEIGHTS if self.options.bags else HEIGHTS
-        contacts = {ESTIMATE: ContactChoice(mode="estimate")}
+        contacts = {mode: ContactChoice(mode=mode) for mode in (ESTIMATE, *OTHERS)}
         contacts |= {place: _fixed(height) for place, height in heights.items()}
         return measure_contacts(case, folder, contacts, keep=self.options.keep)
 
@@ -182,8 +186,10 @@ class PlacesExperiment:
         for place, letter in TABLE_II.items():
             cells = {contact: _find_cell(figures, DIAMETERS[0], place, contact) for contact in letter}
             if any(cells.values()):
-                rows.append((place, *(f"{_format(cells[contact])} ({own:.2f})" for contact, own in letter.items())))
-        head = ("really at", "estimated", *(f"fixed {place}" for place in HEIGHTS))
+                others = (_format(_find_cell(figures, DIAMETERS[0], place, contact)) for contact in OTHERS)
+                ours = (f"{_format(cells[contact])} ({own:.2f})" for contact, own in letter.items())
+                rows.append((place, *ours, *others))
+        head = ("really at", "estimated", *(f"fixed {place}" for place in HEIGHTS), *OTHERS.values())
         note = "RMSE [N] over the record phases, the letter's in brackets; %: share of the images that was answered."
         table = Table(title="**Ø15**", head=head, rows=rows, note=note)
         return Findings(figures={"cylinders": figures}, tables=[table])
@@ -202,6 +208,6 @@ def _find_cell(
 def _format(cell: Mapping[str, Any] | None) -> str:
     if cell is None:
         return "-"
-    if cell["rmse_N"] is None or not np.isfinite(cell["rmse_N"]):
+    if cell["rmse_N"] is None or not np.isfinite(cell["rmse_N"]) or cell["solved_pct"] < LEAST_SOLVED:
         return "refused"
     return f"{cell['rmse_N']:.2f}" + ("" if cell["solved_pct"] > 99.9 else f", {cell['solved_pct']:.0f} %")
