@@ -17,9 +17,10 @@ BEARS, BREAKS = 5.0, 5.43  # [N]
 SPEED = 0.004  # [m/s] of the opening
 LATENCY = 0.06  # [s] of an image
 GRASPS, QUICK_GRASPS = 20, 2
-OBJECT, HEIGHT, WIDTH = "rod35", 0.026, 0.035  # height of its middle [m], width [m]
+OBJECT, HEIGHT, WIDTH = "block", 0.040, 0.024  # height of its middle [m], width [m]
 ANY_HEIGHT, ANY_WIDTH = 0.004, 0.5e-3  # [m] by which it lies elsewhere, evenly spread, and by which its width strays
 CURRENT = 0.15  # [A], the least with which the gripper is stable
+HOLDING = 4.0  # [s]
 STRONG = 0.5  # [A], with which the jaws go to an opening
 WAYS = {
     "force": "force feedback",
@@ -70,7 +71,7 @@ class ChipExperiment:
         if way == "force":
             make = ImageSensor if case.settings["source"] == "images" else EstimatorSensor
             more = {"size": case.settings["size"]} if make is ImageSensor else {}
-            course = World(grasp, make(pressed, seed, **more)).run()
+            course = World(grasp, make(pressed, seed, **more), holding=HOLDING).run()
         else:
             opening = find_taught_opening() if way == "position" else 0.0
             course = World(grasp, NoisySensor(0.0, seed)).run_blind(opening, STRONG if way == "position" else CURRENT)

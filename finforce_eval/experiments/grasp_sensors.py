@@ -15,6 +15,7 @@ from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.observation import Observation, Solution
+from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.detectors.dots import DotSettings
 from finforce_keypoints.images import RgbdImage
@@ -44,7 +45,11 @@ class JawSensor:
 
     def __init__(self, pressed: PressedGrasp, side: str) -> None:
         self._side = side
-        self._solver = JawEstimator(pressed.assembly.jaws[side], calibration=load_calibration("twin"))
+        self._solver = JawEstimator(
+            pressed.assembly.jaws[side],
+            settings=EstimatorSettings(held="yes"),  # as the nodes have it for two jaws
+            calibration=load_calibration("twin"),
+        )
         self._contacts = ContactEstimator(self._solver.jaw, mesh=pressed.assembly.object_mesh)
         self._solver.warm_up()
         self._last: Solution | None = None
@@ -129,7 +134,13 @@ class ImageSensor(EstimatorSensor):
     def _look(self, state: TwinState) -> Mapping[str, Observation]:
         shot = self._photographer.shoot(state)
         image = RgbdImage(stamp=state.stamp, color=shot.color, depth=shot.depth, camera=self._camera)
+        found = self._detector.detect(image)
         return {
-            side: Observation(stamp=state.stamp, points=one.points, likelihood=one.likelihood, stddev=one.stddev)
-            for side, one in self._detector.detect(image).items()
+            side: Observation(
+                stamp=state.stamp,
+                points=np.where(one.valid[:, None], one.points, np.nan),
+                likelihood=one.likelihood,
+                stddev=one.stddev,
+            )
+            for side, one in found.items()
         }

@@ -112,7 +112,10 @@ class GraspTrace:
 
 
 class World:
-    """One emulated gripper with fingers and camera; it is the force source of `hold_force`, too."""
+    """One emulated gripper with fingers and camera; it is the force source of `hold_force`, too.
+
+    A grasp by force is watched until it has held for `holding` seconds.
+    """
 
     def __init__(
         self,
@@ -120,7 +123,9 @@ class World:
         sensor: Sensor,
         settings: GraspSettings | None = None,
         plan: Sequence[PlannedFault] = (),
+        holding: float = HOLDING,
     ) -> None:
+        self._holding = holding
         self._case, self._sensor, self._settings = case, sensor, settings
         self.emulated = EmulatedGripper(case.variant, load=case.plant.force_at)
         self.clock = VirtualClock()
@@ -222,4 +227,4 @@ class World:
         self.course.statuses.append((now, status))
         if math.isnan(self.course.held_at) and status.phase is GraspPhase.HOLDING:
             self.course.held_at = now
-        return now > self.course.held_at + HOLDING
+        return now > self.course.held_at + self._holding
