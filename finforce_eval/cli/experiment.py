@@ -45,12 +45,19 @@ def _chip(options: RunOptions) -> Experiment:
     return ChipExperiment(options=options)
 
 
+def _pose(options: RunOptions) -> Experiment:
+    from finforce_eval.experiments.pose import PoseExperiment
+
+    return PoseExperiment(options=options)
+
+
 EXPERIMENTS: dict[str, tuple[str, Callable[[RunOptions], Experiment]]] = {
     "bench": ("Table I: nine cylinders pressed on one jaw", _bench),
     "places": ("Table II: what knowing the place is worth", _places),
     "grasp": ("27 grasps: three objects, places and forces, both jaws", _grasp),
     "manipulation": ("a held weight of 100 g that is turned, in two lights", _manipulation),
     "chip": ("something that breaks at 5.43 N, grasped to 5 N by force, position and current", _chip),
+    "pose": ("poses of the object that are late, flipped or lost", _pose),
 }
 
 

@@ -70,21 +70,22 @@ class EstimatedContact:
         estimator: a fresh ContactEstimator.
         track: the object's poses in the jaw frame.
         name: for the report.
+        delay: after which a pose arrives [ns].
     """
 
-    def __init__(self, estimator: Any, track: ObjectTrack, name: str) -> None:
+    def __init__(self, estimator: Any, track: ObjectTrack, name: str, delay: int = 0) -> None:
         """Start before the first pose."""
-        self.name = name
+        self.name, self._delay = name, delay
         self.estimate: Any = None
         self._loop, self._track, self._next = ContactLoop(estimator), track, 0
 
     def contact_at(self, stamp: int) -> Contact | None:
-        """Give the poses up to an image to the estimator, and return what it says of the image.
+        """Give the poses that have arrived by an image to the estimator, and return what it says of the image.
 
         Raises:
             RecordingError: the estimator refuses a pose.
         """
-        while self._next < len(self._track.stamps) and self._track.stamps[self._next] <= stamp:
+        while self._next < len(self._track.stamps) and self._track.stamps[self._next] + self._delay <= stamp:
             self._take_pose(self._next)
             self._next += 1
         self._loop.update(stamp)
@@ -128,7 +129,7 @@ def build_source(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: st
         height = choice.height(recording)
         return GivenContact(contact=Contact.fixed(jaw, height), name=f"fixed:{1e3 * height:g}")
     estimator = build_estimator(choice, mode, recording, jaw, mesh)
-    return EstimatedContact(estimator, track_object(recording, jaw.side), name=mode)
+    return EstimatedContact(estimator, track_object(recording, jaw.side), name=mode, delay=choice.pose_delay)
 
 
 def build_estimator(choice: ContactChoice, mode: str, recording: Recording, jaw: Jaw, mesh: str = "default") -> Any:
@@ -213,6 +214,7 @@ class ContactChoice:
         by_name: recording name -> height [mm], before everything else.
         object_file: mesh for every recording; None takes it from each recording's `case.json`.
         object_unit: unit of the mesh.
+        pose_delay: after which a pose arrives [ns].
     """
 
     mode: str = AUTOMATIC
@@ -220,6 +222,7 @@ class ContactChoice:
     by_name: Mapping[str, float] = field(default_factory=dict)
     object_file: str | None = None
     object_unit: str = "m"
+    pose_delay: int = 0
 
     def mode_for(self, recording: Recording, side: str) -> str:
         """Return "estimate", "closest", "paper" or "fixed" for one jaw of a recording."""

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,13 +12,16 @@ from eval_fakes import make_recording
 from finforce.errors import FinforceError
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.contact_source import EstimatedContact
 from finforce_eval.evaluation.manipulation import NetForces
 from finforce_eval.experiments.chip import ChipExperiment
 from finforce_eval.experiments.experiment import Case, Findings, Table, format_tables, run_experiment
 from finforce_eval.experiments.grasp import GraspCourse, GraspExperiment, score_course
 from finforce_eval.experiments.letter_tables import BenchExperiment
 from finforce_eval.experiments.manipulation import ManipulationExperiment, score_weight
+from finforce_eval.experiments.pose import PoseExperiment, drop_poses, flip_poses
 from finforce_eval.experiments.runs import RunOptions, hide_object, list_missing
+from finforce_eval.recordings.objects import ObjectTrack
 from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.grasp_force import Wrench
 
@@ -130,7 +134,7 @@ def test_a_grasp_is_scored_by_phase():
     assert score["answered_pct"] == 100.0
     assert score["within_3_sigma_pct"] == 100.0
     assert score_course(course(error=0.2, stddev=0.05))["within_3_sigma_pct"] == 0.0
-    assert score["delay_ms"][0] < 10.0
+    assert score["delay_ms"][0] < 20.0
 
 
 def test_images_without_an_answer_are_counted():
@@ -173,7 +177,7 @@ def test_the_twin_has_27_grasps_with_seeds_of_their_own():
 
 
 def test_quick_cases_are_some_of_the_others():
-    for kind in (GraspExperiment, ManipulationExperiment, ChipExperiment, BenchExperiment):
+    for kind in (GraspExperiment, ManipulationExperiment, ChipExperiment, BenchExperiment, PoseExperiment):
         every, few = ([c.name for c in kind(options=RunOptions(quick=q)).list_cases()] for q in (False, True))
         assert set(few) < set(every)
 
@@ -196,6 +200,44 @@ def test_an_object_that_is_hidden_has_no_poses_any_more():
     assert len(hidden.object_pose.stamps) == 5
     assert len(hidden.object_pose.position) == 5
     assert len(one.object_pose.stamps) > 5
+
+
+def test_some_poses_are_turned_by_half_a_turn_and_others_stay():
+    one = make_recording("one", frames=900)
+    before, after = one.object_pose, flip_poses(one, 3).object_pose
+    dots = np.abs((before.quaternion * after.quaternion).sum(axis=1))
+    turned = dots < 1e-9
+    assert 0.03 < turned.mean() < 0.2
+    assert dots[~turned] == pytest.approx(1.0)
+    assert (before.position == after.position).all()
+
+
+def test_gaps_leave_no_pose_for_a_while():
+    one = make_recording("one", frames=900)
+    stamps = drop_poses(one).object_pose.stamps
+    gaps = np.diff(stamps)
+    assert (gaps > 0.75e9).sum() > 5
+    assert len(stamps) < 0.7 * len(one.object_pose.stamps)
+
+
+def test_poses_that_are_late_come_late():
+    track = ObjectTrack(stamps=np.array([0, 100, 200]), poses=np.tile(np.eye(4), (3, 1, 1)))
+    taken = []
+
+    class Loop:
+        last = None
+
+        def take_pose(self, stamp, T_jaw_object, covariance=None, camera=None):
+            taken.append(stamp)
+
+        def update(self, stamp):
+            self.last = SimpleNamespace(estimate=SimpleNamespace(contact=None))
+
+    source = EstimatedContact(None, track, "estimate", delay=150)
+    source._loop = Loop()
+    for stamp in (100, 150, 249, 350):
+        source.contact_at(stamp)
+        assert taken == [when for when in (0, 100, 200) if when + 150 <= stamp]
 
 
 @pytest.mark.parametrize(
