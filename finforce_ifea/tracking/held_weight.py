@@ -1,15 +1,16 @@
-"""What a held object weighs along the finger, told by what changes once it is held.
+"""What a held object weighs along the finger and across it, told by what changes once it is held.
 
 A force along the finger moves the key points by tenths of a millimetre, as errors of the place, of the mechanics and
-of the key points do; those stay as they are while an object is held, what is lifted does not. So every key point's
+of the key points do; those stay as they are while an object is held, what is lifted does not. So does a force across
+it: the finger bends sideways, and the side on which the key points are turns in its own plane. So every key point's
 residual is remembered from when the hold began, and the change since then is explained by
 
     depth of the object, free,
     shape and height, by which a lifted object settles a little,
-    a force T along the finger.
+    a force T along the finger and a force S across it.
 
-A change counts once it is beyond chance. Where the jaws move on, or the object slides, the memory begins anew, and T is
-what it was.
+Once a change is beyond chance the object is lifted, and every change counts until the hold ends. Where the jaws move on
+far, or the object slides, the memory begins anew, and T is what it was.
 """
 
 from typing import NamedTuple
@@ -30,9 +31,9 @@ _DEEPER, _HIGHER, _BEYOND = 2.5e-3, 0.6e-3, 0.05
 # Standard deviations of how a lifted object settles, as a share of what shape and height were expected to be off, and
 # of the weight [N].
 _SETTLES, _WEIGHT = 0.05, 0.7
-# The errors of so many successive frames count for one. A change counts from the first of these numbers of standard
-# deviations on, and until it is below the second.
-_ALIKE, _SURE, _DOUBTED = 1.5, 2.5, 1.2
+# The errors of so many successive frames count for one. An object is lifted from a change of so many standard
+# deviations on.
+_ALIKE, _SURE = 1.5, 2.5
 # Fewer points than these say nothing.
 _FEWEST = 6
 
@@ -47,6 +48,8 @@ class HeldFrame(NamedTuple):
         lean: of the force, with which the residuals were found, beyond that with which it has nothing along [-].
         moved: the place that was found minus the reference (3,).
         place: that was found (3,).
+        aside: motion of the key points in x and z by a force across the finger (K, 2) [m/N].
+        across: force with which the residuals were found [N].
     """
 
     data: Residuals
@@ -55,6 +58,8 @@ class HeldFrame(NamedTuple):
     lean: float
     moved: NDArray
     place: NDArray
+    aside: NDArray
+    across: float
 
 
 class HeldWeight:
@@ -63,6 +68,8 @@ class HeldWeight:
     Attributes:
         force: along the finger [N].
         stddev: of it [N]; infinite before there is a memory.
+        across: force across the finger [N].
+        across_stddev: of it [N]; infinite before anything is lifted.
     """
 
     def __init__(self) -> None:
@@ -72,12 +79,13 @@ class HeldWeight:
     def reset(self) -> None:
         """Forgets the object."""
         self.force, self.stddev, self._before = 0.0, np.inf, 0.0
+        self.across, self.across_stddev = 0.0, np.inf
         self._begin()
 
     def _begin(self) -> None:
         """Starts to remember."""
         self._frames, self._place = 0, np.zeros(3)
-        self._information, self._vector = np.zeros((3, 3)), np.zeros(3)
+        self._information, self._vector = np.zeros((4, 4)), np.zeros(4)
         self._before, self._changed = self.force, False
 
     def update(self, frame: HeldFrame, prior: NDArray) -> float:
@@ -104,11 +112,13 @@ class HeldWeight:
         if np.count_nonzero(known) >= _FEWEST:
             beyond = (_BEYOND * away[DEPTH]) ** 2
             _accumulate(frame, left - self._memory, known, beyond, self._information, self._vector)
-            settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2])
+            settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2, _WEIGHT**2])
             spread = np.linalg.inv(self._information / _ALIKE + np.diag(1.0 / settles))
-            change, self.stddev = float(spread[2] @ self._vector) / _ALIKE, float(np.sqrt(spread[2, 2]))
-            self._changed = abs(change) > (_DOUBTED if self._changed else _SURE) * self.stddev
-            self.force = self._before + (change if self._changed else 0.0)
+            changes, self.stddev = spread[2:] @ self._vector / _ALIKE, float(np.sqrt(spread[2, 2]))
+            aside = float(np.sqrt(spread[3, 3]))
+            self._changed |= abs(changes[0]) > _SURE * self.stddev or abs(changes[1]) > _SURE * aside
+            if self._changed:
+                self.force, self.across, self.across_stddev = self._before + changes[0], float(changes[1]), aside
         return self.force
 
 
@@ -122,6 +132,7 @@ def _find_left(frame, away, before):
     for k in range(len(left)):
         for a in range(2):
             left[k, a] += frame.modes[k, a, 3] * (frame.lean - before / frame.normal)
+            left[k, a] += frame.aside[k, a] * frame.across
             left[k, a] -= frame.modes[k, a, 0] * frame.moved[0]
             for i in range(1, 3):
                 left[k, a] += frame.modes[k, a, i] * (away[i] - frame.moved[i])
@@ -130,12 +141,12 @@ def _find_left(frame, away, before):
 
 @njit(**_OPTIONS)
 def _accumulate(frame, left, weights, beyond, information, vector):
-    """Adds one frame, its depth eliminated, to information (3, 3) and vector (3,) on shape, height and T.
+    """Adds one frame, its depth eliminated, to information (4, 4) and vector (4,) on shape, height, T and S.
 
     `beyond` is the variance of each coordinate of a key point that comes on top of its noise [m^2].
     """
-    A, g = np.zeros((4, 4)), np.zeros(4)
-    rows = np.zeros((4, 2))
+    A, g = np.zeros((5, 5)), np.zeros(5)
+    rows = np.zeros((5, 2))
     for k in range(len(weights)):
         if weights[k] <= 0.0:
             continue
@@ -145,13 +156,13 @@ def _accumulate(frame, left, weights, beyond, information, vector):
         w00, w11, w01 = weights[k] * n11 / det, weights[k] * n00 / det, -weights[k] * noise[0, 1] / det
         for a in range(2):
             rows[0, a], rows[1, a], rows[2, a] = frame.modes[k, a, 0], frame.modes[k, a, 1], frame.modes[k, a, 2]
-            rows[3, a] = frame.modes[k, a, 3] / frame.normal
-        for i in range(4):
+            rows[3, a], rows[4, a] = frame.modes[k, a, 3] / frame.normal, frame.aside[k, a]
+        for i in range(5):
             q0, q1 = w00 * rows[i, 0] + w01 * rows[i, 1], w01 * rows[i, 0] + w11 * rows[i, 1]
             g[i] += q0 * left[k, 0] + q1 * left[k, 1]
-            for j in range(4):
+            for j in range(5):
                 A[i, j] += q0 * rows[j, 0] + q1 * rows[j, 1]
-    for i in range(3):
+    for i in range(4):
         vector[i] += (g[i + 1] - A[i + 1, 0] * g[0] / A[0, 0]) - vector[i] / _AVERAGED
-        for j in range(3):
+        for j in range(4):
             information[i, j] += (A[i + 1, j + 1] - A[i + 1, 0] * A[0, j + 1] / A[0, 0]) - information[i, j] / _AVERAGED

@@ -32,7 +32,7 @@ from finforce_ifea.tracking.place_update import (
     weigh_residuals,
 )
 from finforce_ifea.tracking.slip_history import SlipHistory
-from finforce_ifea.tracking.track import UNSEEN_LEAN, Track, explain_offsets
+from finforce_ifea.tracking.track import UNSEEN_LEAN, AcrossFinger, Track, explain_offsets
 from finforce_ifea.tracking.width_tracker import WidthTracker
 
 # The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
@@ -284,7 +284,17 @@ class PlaceTracker:
         if self.settings.held == "yes":
             rubbing = self.contact.rubbing
             upright = find_upright_lean(state.force, rubbing.lean)
-            frame = HeldFrame(data, self._motions[:, ::2], normal, rubbing.lean - upright, moved, update.place)
+            width = self._width
+            frame = HeldFrame(
+                data=data,
+                modes=self._motions[:, ::2],
+                normal=normal,
+                lean=rubbing.lean - upright,
+                moved=moved,
+                place=update.place,
+                aside=width.sideways[:, ::2],
+                across=width.total,
+            )
             wanted = upright + self._held.update(frame, self._prior_variance) / normal
             rubbing.lean += _HELD_GAIN * (min(max(wanted, -_LARGEST_LEAN), _LARGEST_LEAN) - rubbing.lean)
             return
@@ -436,7 +446,7 @@ class PlaceTracker:
             iterations=iterations,
             converged=settled,
             bearable=self._levels[0].contact.bearable,
-            across=self._width.across if self._is_known else None,
+            across=self._describe_across(float(np.hypot(*force[::2]))) if self._is_known else None,
             lean_stddev=self._describe_lean(float(np.hypot(*force[::2]))) if self._is_known else None,
             ambiguity=0.0 if settled else float(np.linalg.norm(state.force_modes[:, :3] @ moved)),
             sound=bool(finite and state.smallest_det > 0),
@@ -449,6 +459,14 @@ class PlaceTracker:
             condition=update.condition,
             place_stddev=float(np.sqrt(max(update.covariance[HEIGHT, HEIGHT], 0.0))),
         )
+
+    def _describe_across(self, normal: float) -> AcrossFinger:
+        """Returns what acts across the finger; of what two jaws hold the key points' motion in x and z tells more."""
+        seen, held = self._width.across, self._held
+        if self.settings.held != "yes" or not held.across_stddev < np.inf:
+            return seen
+        stddev = sqrt((held.across_stddev / max(normal, _LEAST_NORMAL)) ** 2 + _LEAN**2)
+        return AcrossFinger(seen.place, seen.place_stddev, held.across, stddev)
 
     def _describe_lean(self, normal: float) -> float:
         """Returns the standard deviation of the lean of a force [N] along the finger that friction leaves [-]."""

@@ -47,6 +47,7 @@ class WidthTracker:
 
     Attributes:
         motions: of the key points by what acts across (K, 3) [m]; zero where nothing does.
+        sideways: of the key points by a force across (K, 3) [m/N], where the last one pressed; zero before.
         across: what acts.
     """
 
@@ -63,8 +64,8 @@ class WidthTracker:
         """Forgets what was seen; where the object is expected stays."""
         count = self._count
         self._means = _Means(np.zeros(count), np.zeros((count, 2)), np.zeros(count))
-        self.motions = np.zeros((count, 3))
-        self.across = AcrossFinger(*self._expected, 0.0, self._lean)
+        self.motions, self.sideways = np.zeros((count, 3)), np.zeros((count, 3))
+        self.across, self.total = AcrossFinger(*self._expected, 0.0, self._lean), 0.0
 
     def expect(self, place: float, stddev: float) -> None:
         """Takes where along y the object stands nearest [m], and how wide it does so."""
@@ -88,9 +89,11 @@ class WidthTracker:
             return
         frame = (points, data.weights, variances[0], variances[1], force)
         answers = torsion.at(height)
+        self.sideways = answers[1]
         self.across, self.motions = _update(
             self._means, frame, answers, self.across, self._expected, torsion.half_width
         )
+        self.total = self.across.force
 
 
 @njit(**_OPTIONS)

@@ -11,14 +11,17 @@ PRIOR = np.array([0.02, 0.7e-3]) ** 2
 MODES = np.random.default_rng(4).normal(0.0, [[[0.5, 5e-3, 0.3, 3e-3]]], (POINTS, 2, 4))
 
 
-def frame(weight=0.0, place=(3e-3, 0.0, 0.04), bias=0.0, noise=0.0, hidden=(), lean=0.0):
-    """A frame with a weight [N], in which a lean of the force is already counted."""
-    left = MODES[:, :, 3] * (weight / NORMAL - lean) + bias + noise
+ASIDE = np.random.default_rng(5).normal(0.0, 0.3e-3, (POINTS, 2))  # [m/N]
+
+
+def frame(weight=0.0, place=(3e-3, 0.0, 0.04), bias=0.0, noise=0.0, hidden=(), lean=0.0, across=0.0, counted=0.0):
+    """A frame with a weight [N] along and one across, in which a lean and a force across are already counted."""
+    left = MODES[:, :, 3] * (weight / NORMAL - lean) + ASIDE * (across - counted) + bias + noise
     weights = np.ones(POINTS)
     weights[list(hidden)] = 0.0
     spread = np.tile((0.1e-3) ** 2 * np.eye(2), (POINTS, 1, 1))
     data = Residuals(left, MODES[:, :, :3].copy(), weights, spread, np.zeros(POINTS), POINTS, POINTS, 0.0, POINTS)
-    return HeldFrame(data, MODES.copy(), NORMAL, lean, np.zeros(3), np.array(place))
+    return HeldFrame(data, MODES.copy(), NORMAL, lean, np.zeros(3), np.array(place), ASIDE.copy(), counted)
 
 
 def follow(held, frames):
@@ -59,6 +62,25 @@ def test_a_weight_that_turns_is_followed_though_it_moves_the_object_from_one_jaw
     places = 3e-3 + 1e-3 * np.sin(angles)
     turned = follow(held, [frame(0.5 * np.cos(a), place=(x, 0.0, 0.04)) for a, x in zip(angles, places, strict=True)])
     assert np.abs(turned - 0.5 * np.cos(angles))[20:].max() < 0.15
+
+
+def test_a_force_across_shows_and_does_not_look_like_one_along():
+    held, random = HeldWeight(), np.random.default_rng(1)
+    noise = random.normal(0.0, 0.03e-3, (90, POINTS, 2))
+    follow(held, [frame(noise=noise[i]) for i in range(20)])
+    assert held.across_stddev == np.inf
+    found = follow(held, [frame(0.2, noise=noise[20 + i], across=-0.6, counted=0.1) for i in range(60)])
+    assert held.across == pytest.approx(-0.6, abs=0.1)
+    assert found[-1] == pytest.approx(0.2, abs=0.1)
+    assert 0.0 < held.across_stddev < 0.2
+
+
+def test_what_was_lifted_and_set_down_again_weighs_nothing():
+    held = HeldWeight()
+    follow(held, [frame() for _ in range(20)])
+    follow(held, [frame(0.6, across=0.3) for _ in range(40)])
+    assert follow(held, [frame() for _ in range(60)])[-1] == pytest.approx(0.0, abs=0.02)
+    assert held.across == pytest.approx(0.0, abs=0.02)
 
 
 def test_what_the_mechanics_errs_by_on_the_way_is_no_weight():
