@@ -33,7 +33,7 @@ _DEEPER, _HIGHER, _BEYOND = 2.5e-3, 0.6e-3, 0.05
 _SETTLES, _WEIGHT = 0.05, 0.7
 # The errors of so many successive frames count for one. An object is lifted from a change of so many standard
 # deviations on.
-_ALIKE, _SURE = 1.5, 2.5
+_ALIKE, _SURE = 4.0, 2.5
 # Fewer points than these say nothing.
 _FEWEST = 6
 

@@ -461,12 +461,12 @@ class PlaceTracker:
         )
 
     def _describe_across(self, normal: float) -> AcrossFinger:
-        """Returns what acts across the finger; of what two jaws hold the key points' motion in x and z tells more."""
+        """Returns what acts across the finger; what a lifted object may do there besides is doubt."""
         seen, held = self._width.across, self._held
         if self.settings.held != "yes" or not held.across_stddev < np.inf:
             return seen
-        stddev = sqrt((held.across_stddev / max(normal, _LEAST_NORMAL)) ** 2 + _LEAN**2)
-        return AcrossFinger(seen.place, seen.place_stddev, held.across, stddev)
+        doubt = max(held.across_stddev, abs(held.across - seen.force)) / max(normal, _LEAST_NORMAL)
+        return AcrossFinger(seen.place, seen.place_stddev, seen.force, max(seen.lean_stddev, doubt))
 
     def _describe_lean(self, normal: float) -> float:
         """Returns the standard deviation of the lean of a force [N] along the finger that friction leaves [-]."""
