@@ -28,9 +28,9 @@ from finforce_contact.pose.tracker import PoseTracker
 from finforce_contact.settings import ContactSettings
 from finforce_eval.evaluation.keypoint_source import build_records
 from finforce_eval.evaluation.machine import write_json
+from finforce_eval.experiments.grasp_sensors import observe_found
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import load_calibration
-from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.detector import JawKeypoints
@@ -156,9 +156,7 @@ def _track(tracker: PoseTracker, view: MeshView, image: RgbdImage, T: NDArray) -
 def _said(loop: ForceLoop, stamp: float, keypoints: JawKeypoints, pose: NDArray | None) -> bool:
     """Returns whether a jaw's object is said to slide."""
     poses = [] if pose is None else [(stamp, np.linalg.inv(keypoints.T_camera_jaw) @ pose)]
-    points = np.where(keypoints.valid[:, None], keypoints.points, np.nan)
-    seen = Observation(stamp=stamp, points=points, likelihood=keypoints.likelihood, stddev=keypoints.stddev)
-    loop.update(seen, poses)
+    loop.update(observe_found(stamp, keypoints), poses)
     last = loop.contact.last
     slip = None if last is None else last.estimate.slip
     return slip is not None and slip.sliding

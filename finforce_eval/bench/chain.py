@@ -19,7 +19,7 @@ from finforce.stamps import NANOSECONDS
 from finforce.systems.processes import Process, ReplayOptions, replay_processes
 from finforce_eval.bench.scenes import GRASP, GRASP_FAST, find_scene
 from finforce_eval.evaluation.keypoint_source import KeypointSource
-from finforce_eval.evaluation.scoring import match_truth
+from finforce_eval.evaluation.scoring import match_truth, rms
 from finforce_eval.figures.time_error import ErrorPoint, ErrorSeries, TimeStats, draw_time_error, time_stats
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.recording import read_recording
@@ -175,8 +175,8 @@ def make_row(source: str, rate: int, run: NodeRun, truth: TrueGrasp) -> ChainRow
         solved=len(solved),
         answered=len(answered),
         latency=time_stats([log.grasp_latency[int(stamp)] for stamp in answered]),
-        error_N=_rms(error),
-        error_now_N=_rms(error_now(log, truth, sent)),
+        error_N=rms(error),
+        error_now_N=rms(error_now(log, truth, sent)),
         largest_N=float(np.nanmax(truth.force)),
         cpu=run.cpu,
         others=run.others,
@@ -200,12 +200,6 @@ def error_now(log: ReplayLog, truth: TrueGrasp, sent: NDArray[np.int64]) -> NDAr
     row = np.searchsorted(arrived, times, side="right") - 1
     times, stamps = times[row >= 0], newest[row[row >= 0]]
     return np.array([log.grasp[int(stamp)] for stamp in stamps]) - truth.at(times)
-
-
-def _rms(errors: NDArray) -> float:
-    """Return the root mean square of what is finite; NaN of nothing."""
-    finite = errors[np.isfinite(errors)]
-    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
 
 def format_table(figures: ChainFigures) -> str:

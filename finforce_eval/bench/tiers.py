@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_eval.bench.cases import ReplayedPress
+from finforce_eval.evaluation.scoring import rms
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.settings import SOLVERS, EstimatorSettings
@@ -229,11 +230,6 @@ def score_shapes(runs: Sequence[Run]) -> ShapeErrors:
         factor=factor,
         by_height={name: rms((estimated - true)[heights == name]) for name in names},
     )
-
-
-def rms(errors: NDArray) -> float:
-    """Returns the root mean square of errors, those that are NaN left out; NaN when there are no others."""
-    return float(np.sqrt(_or_nan(np.nanmean, np.square(errors))))
 
 
 def _is_moving(run: Run) -> NDArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 from finforce_eval.cli.parser import SOURCES
@@ -15,55 +15,24 @@ TWIN = "twin"
 QUICK_SIZE = "320x240"
 
 
-def _bench(options: RunOptions) -> Experiment:
-    from finforce_eval.experiments.letter_tables import BenchExperiment
-
-    return BenchExperiment(options=options)
-
-
-def _places(options: RunOptions) -> Experiment:
-    from finforce_eval.experiments.letter_tables import PlacesExperiment
-
-    return PlacesExperiment(options=options)
-
-
-def _grasp(options: RunOptions) -> Experiment:
-    from finforce_eval.experiments.grasp import GraspExperiment
-
-    return GraspExperiment(options=options)
-
-
-def _manipulation(options: RunOptions) -> Experiment:
-    from finforce_eval.experiments.manipulation import ManipulationExperiment
-
-    return ManipulationExperiment(options=options)
-
-
-def _chip(options: RunOptions) -> Experiment:
-    from finforce_eval.experiments.chip import ChipExperiment
-
-    return ChipExperiment(options=options)
-
-
-def _pose(options: RunOptions) -> Experiment:
-    from finforce_eval.experiments.pose import PoseExperiment
-
-    return PoseExperiment(options=options)
-
-
-EXPERIMENTS: dict[str, tuple[str, Callable[[RunOptions], Experiment]]] = {
-    "bench": ("Table I: nine cylinders pressed on one jaw", _bench),
-    "places": ("Table II: what knowing the place is worth", _places),
-    "grasp": ("27 grasps: three objects, places and forces, both jaws", _grasp),
-    "manipulation": ("a held weight of 100 g that is turned, in two lights", _manipulation),
-    "chip": ("something that breaks at 5.43 N, grasped to 5 N by force, position and current", _chip),
-    "pose": ("poses of the object that are late, flipped or lost", _pose),
+# what each does, its module and its class
+EXPERIMENTS = {
+    "bench": ("Table I: nine cylinders pressed on one jaw", "letter_tables", "BenchExperiment"),
+    "places": ("Table II: what knowing the place is worth", "letter_tables", "PlacesExperiment"),
+    "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp", "GraspExperiment"),
+    "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation", "ManipulationExperiment"),
+    "chip": (
+        "what breaks at 5.43 N, grasped to 5 N by force, position and current",
+        "chip",
+        "ChipExperiment",
+    ),
+    "pose": ("poses of the object that are late, flipped or lost", "pose", "PoseExperiment"),
 }
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    names = "; ".join(f"{name}: {text}" for name, (text, _) in EXPERIMENTS.items())
+    names = "; ".join(f"{name}: {text}" for name, (text, *_) in EXPERIMENTS.items())
     parser.add_argument("name", choices=tuple(EXPERIMENTS), metavar="NAME", help=names)
     text = "twin, or recordings with measured forces (twin)"
     parser.add_argument("--on", nargs="+", default=[TWIN], metavar="twin|BAG", help=text)
@@ -105,7 +74,9 @@ def read_options(options: argparse.Namespace) -> RunOptions:
 
 def run(options: argparse.Namespace) -> None:
     """Run an experiment, print its tables, name its page."""
-    experiment = EXPERIMENTS[options.name][1](read_options(options))
+    _, module, kind = EXPERIMENTS[options.name]
+    build = getattr(import_module(f"finforce_eval.experiments.{module}"), kind)
+    experiment: Experiment = build(options=read_options(options))
     findings = run_experiment(experiment, Path(options.report))
     print(format_tables(findings))
     print(f"Page: {Path(options.report) / experiment.name / PAGE}")

@@ -354,10 +354,14 @@ class CaseResult:
         return self.magnitude - self.true_magnitude
 
     @property
+    def lag(self) -> NDArray[np.float64]:
+        """What passes from what the call began with, images or key points, to the force (n,) [s]."""
+        return 1e-3 * (self.step_ms if self.latency_ms is None else self.latency_ms)
+
+    @property
     def delays(self) -> list[Delay]:
         """What the estimate took to show after each onset of the true force."""
-        lag = 1e-3 * (self.step_ms if self.latency_ms is None else self.latency_ms)
-        return force_delays(self.stamps * 1e-9, self.true_magnitude, self.magnitude, lag)
+        return force_delays(self.stamps * 1e-9, self.true_magnitude, self.magnitude, self.lag)
 
     @property
     def counted(self) -> NDArray[np.bool_]:

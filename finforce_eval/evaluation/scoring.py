@@ -26,6 +26,12 @@ WATCHED = 30
 _NOTHING = 1e-3  # [N] along an axis, which needs no standard deviation
 
 
+def rms(errors: NDArray) -> float:
+    """Return the root mean square of what is finite; NaN of nothing."""
+    finite = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
+
+
 @dataclass(frozen=True, kw_only=True)
 class PlaceStats:
     """Distances of heights from the true pressure centre [mm]; None where there is nothing to compute from."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from finforce_eval.errors import OptionError
-from finforce_eval.experiments.experiment import Case, Findings, Table
+from finforce_eval.experiments.experiment import Case, Findings, ResultTable, leave_out
 from finforce_eval.experiments.runs import RunOptions
 
 BEARS, BREAKS = 5.0, 5.43  # [N]
@@ -112,13 +113,13 @@ class ChipExperiment:
         head = ("by", "grasps", "broken", "peak/N: least", "mean", "largest", "at the end/N: least", "mean", "largest",
                 "ended early")  # fmt: skip
         note = f"Broken: a true force of {BREAKS:g} N was reached; wanted: {BEARS:g} N."
-        table = Table(title="**Grasps**", head=head, rows=rows, note=note)
-        plain = {name: {k: v for k, v in row.items() if k not in DRAWN} for name, row in figures.items()}
+        table = ResultTable(title="**Grasps**", head=head, rows=rows, note=note)
         pictures = {"True force over time; the line is where it breaks": "chips.png"}
-        return Findings(figures={"ways": summary, "grasps": plain}, tables=[table], pictures=pictures)
-
-
-DRAWN = ("seconds", "force")
+        return Findings(
+            figures={"ways": summary, "grasps": leave_out(figures, "seconds", "force")},
+            tables=[table],
+            pictures=pictures,
+        )
 
 
 def _lay(seed: int | None) -> Any:
@@ -134,6 +135,7 @@ def _lay(seed: int | None) -> Any:
     return PressedGrasp(build_scenario("grasp_cylinder", object=OBJECT, height=height, scale=scale), step=5e-4)
 
 
+@cache
 def find_taught_opening() -> float:
     """Return the opening [m] that makes 5 N where the thing lay when it was taught."""
     taught = _lay(None)

@@ -27,7 +27,7 @@ class Case:
 
     Attributes:
         name: unlike the others', and a part of file names.
-        settings: that decide its figures, as JSON has them.
+        settings: that decide its figures, as JSON has them; what stands under `words` becomes part of them.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Case:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table:
+class ResultTable:
     """Figures in rows, the first column of which are words.
 
     Attributes:
@@ -62,7 +62,7 @@ class Findings:
     """
 
     figures: Mapping[str, Any]
-    tables: Sequence[Table]
+    tables: Sequence[ResultTable]
     pictures: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -158,7 +158,7 @@ def run_experiment(experiment: Experiment, report: Path) -> Findings:
             if log.find(case) is None:
                 bar.set_postfix_str(case.name)
                 try:
-                    log.keep(case, experiment.run(case, folder))
+                    log.keep(case, {**case.settings.get("words", {}), **experiment.run(case, folder)})
                 except FinforceError as error:
                     failed[case.name] = " ".join(str(error).split())
                     print(f"failed: {case.name}: {failed[case.name]}", file=sys.stderr)
@@ -172,6 +172,11 @@ def run_experiment(experiment: Experiment, report: Path) -> Findings:
     write_figures(folder / f"{experiment.name}.json", {**about, **findings.figures})
     (folder / PAGE).write_text(_write_page(experiment, findings, len(cases), failed), encoding="utf-8")
     return findings
+
+
+def leave_out(figures: Mapping[str, Mapping[str, Any]], *names: str) -> dict[str, dict[str, Any]]:
+    """Return the figures of the cases without some of them: series that are only drawn."""
+    return {case: {name: row[name] for name in row if name not in names} for case, row in figures.items()}
 
 
 def format_tables(findings: Findings) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_eval.evaluation.evaluate import Evaluation
-from finforce_eval.evaluation.results import ONSET, CaseResult, force_delays
-from finforce_eval.experiments.experiment import Case, Findings, Table
-from finforce_eval.experiments.runs import (
-    RunOptions,
-    build_setup,
-    evaluate_case,
-    forget_case,
-    hide_object,
-    read_case,
-    rmse,
-)
+from finforce_eval.evaluation.results import ONSET, force_delays
+from finforce_eval.evaluation.scoring import rms
+from finforce_eval.evaluation.setup import evaluate_all
+from finforce_eval.evaluation.tables import format_number
+from finforce_eval.experiments.experiment import Case, Findings, ResultTable, leave_out
+from finforce_eval.experiments.runs import RunOptions, build_setup, keep_poses
 from finforce_eval.recordings.tracks import Recording
 
 SCENES = {"cylinder": "grasp_cylinder", "cube": "grasp_cube", "asymmetric": "grasp_asymmetric"}
@@ -79,12 +74,8 @@ def join_jaws(evaluation: Evaluation, name: str) -> GraspCourse:
         truth=truths.min(axis=0),
         found=forces.min(axis=0),
         stddev=np.maximum(left.stddev[mine], right.stddev[theirs]),
-        delay=np.maximum(_delay(left)[mine], _delay(right)[theirs]),
+        delay=np.maximum(left.lag[mine], right.lag[theirs]),
     )
-
-
-def _delay(result: CaseResult) -> NDArray:
-    return 1e-3 * (result.step_ms if result.latency_ms is None else result.latency_ms)
 
 
 def score_course(course: GraspCourse) -> dict[str, Any]:
@@ -93,7 +84,7 @@ def score_course(course: GraspCourse) -> dict[str, Any]:
     known = phases["all"] & np.isfinite(course.found)
     span = float(np.ptp(course.truth[phases["all"]])) if phases["all"].any() else float("nan")
     delays = force_delays(course.seconds, course.truth, np.nan_to_num(course.found), course.delay)
-    errors = {name: rmse(error[mask]) for name, mask in phases.items()}
+    errors = {name: rms(error[mask]) for name, mask in phases.items()}
     return {
         "peak_N": float(np.nanmax(course.truth, initial=0.0)),
         "rmse_N": errors,
@@ -140,24 +131,14 @@ class GraspExperiment:
 
     def run(self, case: Case, folder: Path) -> dict[str, Any]:
         """Return the figures of a grasp; see `Experiment`."""
-        settings = _with_displacement(case.settings)
-        recording = read_case(settings, case.name, folder)
-        setup = build_setup(settings)
-        course = join_jaws(evaluate_case(recording, setup), recording.name)
-        hidden = hide_object(recording, _full_force(course, recording))
-        unseen = join_jaws(evaluate_case(hidden, setup), recording.name)
-        if not self.options.keep:
-            forget_case(settings, case.name, folder)
-        drawn = {
-            name: np.round(values[::DRAWN_EVERY], 4).tolist()
-            for name, values in (("seconds", course.seconds), ("truth", course.truth), ("found", course.found))
-        }
-        return {
-            **dict(case.settings.get("words", {})),
-            **score_course(course),
-            "hidden": score_course(unseen),
-            "course": drawn,
-        }
+        with self.options.open_case(_with_displacement(case), folder) as recording:
+            setup = build_setup(case.settings)
+            course = join_jaws(evaluate_all([recording], setup), recording.name)
+            hidden = keep_poses(recording, recording.object_pose.stamps < _full_force(course, recording))
+            unseen = join_jaws(evaluate_all([hidden], setup), recording.name)
+        series = {"seconds": course.seconds, "truth": course.truth, "found": course.found}
+        drawn = {name: np.round(values[::DRAWN_EVERY], 4).tolist() for name, values in series.items()}
+        return {**score_course(course), "hidden": score_course(unseen), "course": drawn}
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return errors by force and by object and place; see `Experiment`."""
@@ -172,20 +153,22 @@ class GraspExperiment:
             draw_grasps(figures).savefig(folder / "grasps.png")
             pictures["Measured (dashed) and estimated grasp force"] = "grasps.png"
         tables = [_level_table(summary), _case_table(figures)]
-        cases = {name: {key: value for key, value in row.items() if key != "course"} for name, row in figures.items()}
-        return Findings(figures={"levels": summary, "grasps": cases}, tables=tables, pictures=pictures)
+        return Findings(
+            figures={"levels": summary, "grasps": leave_out(figures, "course")}, tables=tables, pictures=pictures
+        )
 
 
-def _with_displacement(settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a scene's settings with each jaw's way beyond first touch that makes the force of its level."""
+def _with_displacement(case: Case) -> Case:
+    """Return a scene with each jaw's way beyond first touch that makes the force of its level."""
+    settings = case.settings
     if "bag" in settings:
-        return settings
+        return case
     from finforce_twin.gripper.pressing import PressedGrasp
     from finforce_twin.scenes.scenarios import build_scenario
 
     grasp = PressedGrasp(build_scenario(settings["scene"], **settings["changes"]), step=5e-4)
     way = grasp.find_closing(settings["words"]["force"])
-    return {**settings, "changes": {**settings["changes"], "displacement": way}}
+    return replace(case, settings={**settings, "changes": {**settings["changes"], "displacement": way}})
 
 
 def _full_force(course: GraspCourse, recording: Recording) -> int:
@@ -225,7 +208,7 @@ def _cell(spread: Sequence[float], digits: int = 3) -> str:
     return f"{spread[0]:.{digits}f} ± {spread[1]:.{digits}f}"
 
 
-def _level_table(summary: Mapping[str, Mapping[str, Any]]) -> Table:
+def _level_table(summary: Mapping[str, Mapping[str, Any]]) -> ResultTable:
     head = ("force", "n", "peak/N", *(f"{phase}: RMSE/N" for phase in PHASES), "NRMSD/%", "load: NRMSD/%",
             "hidden: RMSE/N", "answered/%", "within 3σ/%", "shows after/ms")  # fmt: skip
     rows = [
@@ -251,15 +234,15 @@ def _level_table(summary: Mapping[str, Mapping[str, Any]]) -> Table:
         "grasp's own range of force. Shows after: from 0.02 N of true force to an estimate above 0.1 N, computed. "
         "Letter: ranges without its worst case, the highest force at the lower place."
     )
-    return Table(title="**By force**", head=head, rows=rows, note=note)
+    return ResultTable(title="**By force**", head=head, rows=rows, note=note)
 
 
-def _case_table(figures: Mapping[str, Mapping[str, Any]]) -> Table:
+def _case_table(figures: Mapping[str, Mapping[str, Any]]) -> ResultTable:
     head = ("grasp", "peak/N", "RMSE/N", "load/N", "hold/N", "release/N", "largest/N", "bias/N", "NRMSD/%", "hidden/N",
             "answered/%")  # fmt: skip
     rows = []
     for name, row in figures.items():
         numbers = [row["peak_N"], *(row["rmse_N"][phase] for phase in PHASES), row["max_error_N"], row["bias_N"]]
         numbers += [row["nrmsd_pct"]["all"], row["hidden"]["rmse_N"]["all"], row["answered_pct"]]
-        rows.append((name, *("-" if number is None else f"{number:.2f}" for number in numbers)))
-    return Table(title="**Each grasp**", head=head, rows=rows)
+        rows.append((name, *map(format_number, numbers)))
+    return ResultTable(title="**Each grasp**", head=head, rows=rows)

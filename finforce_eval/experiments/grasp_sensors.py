@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from finforce.messages import magnitude_stddev
 from finforce_contact.estimator import ContactEstimator
@@ -18,16 +17,17 @@ from finforce_ifea.observation import Observation, Solution
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.detectors.dots import DotSettings
+from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import DetectorParameters, load_jaws
 from finforce_keypoints.settings import DetectorSettings
-from finforce_twin.gripper.footage import parse_size, set_stage
+from finforce_twin.gripper.footage import disturb_pose, parse_size, set_stage
 from finforce_twin.gripper.gripper import TwinState
 from finforce_twin.gripper.pressing import PressedGrasp
 from finforce_twin.rendering.photographer import Photographer
 
 POINT_NOISE = 0.15e-3  # [m] per axis, of a detected key point from image to image
-POSE_PERIOD, POSE_SHIFT, POSE_TURN = 0.1, 0.3e-3, np.deg2rad(0.3)  # [s], [m], [rad] of the object's tracker
+POSE_PERIOD = 0.1  # [s] of the object's tracker
 
 
 def build_plant(name: str, pressed: PressedGrasp) -> Plant:
@@ -38,6 +38,12 @@ def build_plant(name: str, pressed: PressedGrasp) -> Plant:
         touch_opening=pressed.touch_opening,
         terms=pressed.assembly.material.terms,
     )
+
+
+def observe_found(stamp: float, keypoints: JawKeypoints) -> Observation:
+    """Return what a solver is told of found key points: of those that are not valid no place."""
+    points = np.where(keypoints.valid[:, None], keypoints.points, np.nan)
+    return Observation(stamp=stamp, points=points, likelihood=keypoints.likelihood, stddev=keypoints.stddev)
 
 
 class JawSensor:
@@ -92,7 +98,7 @@ class EstimatorSensor:
         state = self._pressed.state(opening, stamp)
         if stamp >= self._next_pose:
             self._next_pose = stamp + POSE_PERIOD
-            pose = self._disturb(state.T_gripper_object)
+            pose = disturb_pose(state.T_gripper_object, self._random)
             for side, jaw in self._jaws.items():
                 jaw.take_pose(stamp, pose, state.jaws[side].origin_x)
         seen = self._look(state)
@@ -113,12 +119,6 @@ class EstimatorSensor:
         noisy = keypoints + POINT_NOISE * self._random.standard_normal(keypoints.shape)
         return Observation(stamp=stamp, points=noisy, likelihood=np.full(len(noisy), 0.9))
 
-    def _disturb(self, T: NDArray) -> NDArray:
-        noisy = T.copy()
-        noisy[:3, :3] = Rotation.from_rotvec(POSE_TURN * self._random.standard_normal(3)).as_matrix() @ T[:3, :3]
-        noisy[:3, 3] += POSE_SHIFT * self._random.standard_normal(3)
-        return noisy
-
 
 class ImageSensor(EstimatorSensor):
     """The same from rendered images, by the key point detector."""
@@ -135,12 +135,4 @@ class ImageSensor(EstimatorSensor):
         shot = self._photographer.shoot(state)
         image = RgbdImage(stamp=state.stamp, color=shot.color, depth=shot.depth, camera=self._camera)
         found = self._detector.detect(image)
-        return {
-            side: Observation(
-                stamp=state.stamp,
-                points=np.where(one.valid[:, None], one.points, np.nan),
-                likelihood=one.likelihood,
-                stddev=one.stddev,
-            )
-            for side, one in found.items()
-        }
+        return {side: observe_found(state.stamp, one) for side, one in found.items()}

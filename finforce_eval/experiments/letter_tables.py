@@ -13,9 +13,10 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.evaluate import Evaluation
 from finforce_eval.evaluation.results import ONSET
-from finforce_eval.experiments.experiment import Case, Findings, Table
-from finforce_eval.experiments.runs import RunOptions, build_setup, evaluate_case, forget_case, read_case
-from finforce_eval.recordings.recording import read_recording
+from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
+from finforce_eval.experiments.experiment import Case, Findings, ResultTable
+from finforce_eval.experiments.runs import RunOptions, build_setup
+from finforce_eval.recordings.tracks import Recording
 
 # Ø [mm] and height of the axis [mm] of the twin's cylinders, whose finger the letter's heights do not fit
 DIAMETERS = (15, 25, 35)
@@ -53,8 +54,8 @@ def list_cylinders(options: RunOptions, chosen: Sequence[tuple[int, str]]) -> li
 
 def _list_own(options: RunOptions, chosen: Sequence[tuple[int, str]]) -> list[Case]:
     cases = []
-    for case in options.bag_cases(needed=("left",)):
-        shape = read_recording(case.settings["bag"]).case.get("object")
+    for case, recording in options.read_bags(needed=("left",)):
+        shape = recording.case.get("object")
         diameter, z = (shape.get(key) if isinstance(shape, Mapping) else None for key in ("diameter", "z"))
         place = next((place for place, height in BENCH_HEIGHTS.items() if height == z), None)
         if place is None or diameter not in DIAMETERS:
@@ -71,31 +72,38 @@ def _list_own(options: RunOptions, chosen: Sequence[tuple[int, str]]) -> list[Ca
     return cases
 
 
-def measure_contacts(case: Case, folder: Path, contacts: Mapping[str, ContactChoice], *, keep: bool) -> dict[str, Any]:
-    """Return RMSE, its spread over the cycles, bias and solved share of a cylinder under each contact, by name."""
-    recording, found = read_case(case.settings, case.name, folder), {}
-    for name, contact in contacts.items():
-        try:
-            evaluation = evaluate_case(recording, build_setup(case.settings, contact))
-        except RecordingError as error:
-            found[name] = {"rmse_N": float("nan"), "solved_pct": 0.0, "reason": str(error)}
-            continue
-        score = evaluation.total
-        cycles = {phase: score.cycles[phase].rmse_N for phase in ("all", "load", "unload")}
-        found[name] = {
-            "rmse_N": score.all.rmse_N,
-            "std_N": cycles["all"].std,
-            "load_N": cycles["load"].mean,
-            "unload_N": cycles["unload"].mean,
-            "nrmsd_pct": score.cycles["all"].nrmsd_pct.mean,
-            "bias_N": score.all.bias_N,
-            "solved_pct": _share_solved(evaluation),
-            "place_median_mm": score.place.median_mm,
-            "place_p95_mm": score.place.p95_mm,
+def measure_contacts(
+    options: RunOptions, case: Case, folder: Path, contacts: Mapping[str, ContactChoice]
+) -> dict[str, Any]:
+    """Return what `score_contact` says of a cylinder under each contact, by name."""
+    with options.open_case(case, folder) as recording:
+        return {
+            "contacts": {
+                name: score_contact(recording, build_setup(case.settings, contact))
+                for name, contact in contacts.items()
+            }
         }
-    if not keep:
-        forget_case(case.settings, case.name, folder)
-    return {**case.settings["words"], "contacts": found}
+
+
+def score_contact(recording: Recording, setup: EvaluationSetup) -> dict[str, Any]:
+    """Return RMSE, its spread over the cycles, bias and solved share of a recording, or why there are none."""
+    try:
+        evaluation = evaluate_all([recording], setup)
+    except RecordingError as error:
+        return {"rmse_N": float("nan"), "solved_pct": 0.0, "reason": str(error)}
+    score = evaluation.total
+    cycles = {phase: score.cycles[phase].rmse_N for phase in ("all", "load", "unload")}
+    return {
+        "rmse_N": score.all.rmse_N,
+        "std_N": cycles["all"].std,
+        "load_N": cycles["load"].mean,
+        "unload_N": cycles["unload"].mean,
+        "nrmsd_pct": score.cycles["all"].nrmsd_pct.mean,
+        "bias_N": score.all.bias_N,
+        "solved_pct": _share_solved(evaluation),
+        "place_median_mm": score.place.median_mm,
+        "place_p95_mm": score.place.p95_mm,
+    }
 
 
 def _share_solved(evaluation: Evaluation) -> float:
@@ -133,7 +141,7 @@ class BenchExperiment:
         """Return the errors on a cylinder; see `Experiment`."""
         own = _fixed(case.settings["words"]["height_mm"])
         contacts = {"given": own, ESTIMATE: ContactChoice(mode="estimate")}
-        return measure_contacts(case, folder, contacts, keep=self.options.keep)
+        return measure_contacts(self.options, case, folder, contacts)
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return Table I; see `Experiment`."""
@@ -146,12 +154,12 @@ class BenchExperiment:
                 rows.append((place, *(f"{_format(one)} ({own:.2f})" for one, own in zip(cells, letter, strict=True))))
             known = [row["contacts"][contact]["rmse_N"] for row in figures.values()]
             known = [value for value in known if value is not None]
-            summary[contact] = {"mean_N": float(np.mean(known)), "worst_N": float(np.max(known))} if known else {}
-            note = (
-                f"Mean {np.mean(known):.3f} N, worst {np.max(known):.3f} N; the letter's in brackets." if known else ""
-            )
+            note = ""
+            if known:
+                summary[contact] = one = {"mean_N": float(np.mean(known)), "worst_N": float(np.max(known))}
+                note = f"Mean {one['mean_N']:.3f} N, worst {one['worst_N']:.3f} N; the letter's in brackets."
             head = ("RMSE/N", *(f"Ø{diameter}" for diameter in DIAMETERS))
-            tables.append(Table(title=f"**With {words}**", head=head, rows=rows, note=note))
+            tables.append(ResultTable(title=f"**With {words}**", head=head, rows=rows, note=note))
         return Findings(figures={"summary": summary, "cylinders": figures}, tables=tables)
 
 
@@ -178,7 +186,7 @@ class PlacesExperiment:
         heights = BENCH_HEIGHTS if self.options.bags else HEIGHTS
         contacts = {mode: ContactChoice(mode=mode) for mode in (ESTIMATE, *OTHERS)}
         contacts |= {place: _fixed(height) for place, height in heights.items()}
-        return measure_contacts(case, folder, contacts, keep=self.options.keep)
+        return measure_contacts(self.options, case, folder, contacts)
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return Table II; see `Experiment`."""
@@ -191,7 +199,7 @@ class PlacesExperiment:
                 rows.append((place, *ours, *others))
         head = ("really at", "estimated", *(f"fixed {place}" for place in HEIGHTS), *OTHERS.values())
         note = "RMSE [N] over the record phases, the letter's in brackets; %: share of the images that was answered."
-        table = Table(title="**Ø15**", head=head, rows=rows, note=note)
+        table = ResultTable(title="**Ø15**", head=head, rows=rows, note=note)
         return Findings(figures={"cylinders": figures}, tables=[table])
 
 

@@ -9,9 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from finforce.gripper_frames import SIDES
 from finforce_eval.evaluation.manipulation import NetForces, join_net
-from finforce_eval.experiments.experiment import Case, Findings, Table
-from finforce_eval.experiments.runs import RunOptions, build_setup, evaluate_case, forget_case, read_case, rmse
+from finforce_eval.evaluation.scoring import rms
+from finforce_eval.evaluation.setup import evaluate_all
+from finforce_eval.evaluation.tables import format_number
+from finforce_eval.experiments.experiment import Case, Findings, ResultTable, leave_out
+from finforce_eval.experiments.runs import RunOptions, build_setup
 
 MASS, SPEED = 0.1, 1.2  # [kg], [rad/s]
 AXES = {"x": 0.0, "y": 0.5 * np.pi}  # [rad] from the gripper's x to its y
@@ -54,13 +58,9 @@ class ManipulationExperiment:
 
     def run(self, case: Case, folder: Path) -> dict[str, Any]:
         """Return the figures of a turn; see `Experiment`."""
-        recording = read_case(case.settings, case.name, folder)
-        evaluation = evaluate_case(recording, build_setup(case.settings))
-        jaws = (evaluation.results[f"{recording.name}/{side}"] for side in ("left", "right"))
-        net = join_net(*jaws, recording)
-        if not self.options.keep:
-            forget_case(case.settings, case.name, folder)
-        return {**dict(case.settings.get("words", {})), **score_weight(net)}
+        with self.options.open_case(case, folder) as recording:
+            evaluation = evaluate_all([recording], build_setup(case.settings))
+        return score_weight(join_net(*(evaluation.results[f"{recording.name}/{side}"] for side in SIDES), recording))
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return errors along gravity by light; see `Experiment`."""
@@ -78,15 +78,14 @@ class ManipulationExperiment:
             for light, one in summary.items()
         ]
         note = "RMSE of the net force of both jaws (Eq. 3) along the true one, while that is above 0.5 N."
-        first = Table(
+        first = ResultTable(
             title="**By light**", head=("light", "turns", "along gravity/N", "letter/N"), rows=rows, note=note
         )
         head = ("turn", "along gravity/N", "bias/N", "across/N", "x/N", "y/N", "z/N", "within 3σ/%", "answered/%")
-        cells = [(name, *(_number(row[key]) for key in KEYS)) for name, row in figures.items()]
-        second = Table(title="**Each turn**", head=head, rows=cells)
-        plain = {name: {k: v for k, v in row.items() if k != "course"} for name, row in figures.items()}
+        cells = [(name, *(format_number(row[key], 3) for key in KEYS)) for name, row in figures.items()]
+        second = ResultTable(title="**Each turn**", head=head, rows=cells)
         return Findings(
-            figures={"lights": summary, "turns": plain},
+            figures={"lights": summary, "turns": leave_out(figures, "course")},
             tables=[first, second],
             pictures={"Net force along gravity over its direction in the gripper": "weights.png"},
         )
@@ -109,10 +108,10 @@ def score_weight(net: NetForces) -> dict[str, Any]:
     angle = np.unwrap(np.arctan2(*(down @ plane.T).T[::-1])) if held.any() else np.zeros(0)
     found = np.einsum("ij,ij->i", net.found.force[held], down)
     return {
-        "along_rmse_N": rmse(along),
+        "along_rmse_N": rms(along),
         "along_bias_N": float(along.mean()) if held.any() else float("nan"),
-        "across_rmse_N": rmse(np.linalg.norm(error - along[:, None] * down, axis=1)),
-        **{f"{axis}_rmse_N": rmse(error[:, row]) for row, axis in enumerate("xyz")},
+        "across_rmse_N": rms(np.linalg.norm(error - along[:, None] * down, axis=1)),
+        **{f"{axis}_rmse_N": rms(error[:, row]) for row, axis in enumerate("xyz")},
         "within_3_sigma_pct": float("nan") if sigma is None else 100.0 * float((np.abs(along) <= 3.0 * sigma).mean()),
         "answered_pct": net.answered_pct,
         "course": {
@@ -121,7 +120,3 @@ def score_weight(net: NetForces) -> dict[str, Any]:
             "found": np.round(found, 4).tolist(),
         },
     }
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None or not np.isfinite(value) else f"{value:.3f}"

@@ -11,9 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from finforce_eval.evaluation.contact_source import ContactChoice
-from finforce_eval.experiments.experiment import Case, Findings, Table
+from finforce_eval.evaluation.setup import evaluate_all
+from finforce_eval.experiments.experiment import Case, Findings, ResultTable
 from finforce_eval.experiments.grasp import join_jaws, score_course
-from finforce_eval.experiments.runs import RunOptions, build_setup, evaluate_case, forget_case, read_case
+from finforce_eval.experiments.runs import RunOptions, build_setup, keep_poses
 from finforce_eval.recordings.tracks import Recording
 
 SCENES = {
@@ -44,11 +45,9 @@ def flip_poses(recording: Recording, seed: int) -> Recording:
 
 def drop_poses(recording: Recording) -> Recording:
     """Return a recording whose object is lost for a while now and then."""
-    track = recording.object_pose
-    seconds = 1e-9 * (track.stamps - track.stamps[0])
-    seen = np.mod(seconds, GAPS_EVERY) < GAPS_EVERY - GAP
-    shown = {name: getattr(track, name)[seen] for name in ("stamps", "position", "quaternion")}
-    return replace(recording, object_pose=replace(track, **shown))
+    stamps = recording.object_pose.stamps
+    seconds = 1e-9 * (stamps - stamps[0])
+    return keep_poses(recording, np.mod(seconds, GAPS_EVERY) < GAPS_EVERY - GAP)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,20 +75,18 @@ class PoseExperiment:
 
     def run(self, case: Case, folder: Path) -> dict[str, Any]:
         """Return the figures of a grasp in each way; see `Experiment`."""
-        recording = read_case(case.settings, case.name, folder)
-        flipped, lost = flip_poses(recording, self.options.seed), drop_poses(recording)
-        ways = {name: (recording, delay) for name, delay in DELAYS.items()}
-        ways |= {"flips": (flipped, 0), "gaps": (lost, 0), WORST: (drop_poses(flipped), DELAYS["200 ms late"])}
-        found = {}
-        for way, (seen, delay) in ways.items():
-            setup = build_setup(case.settings, ContactChoice(mode="estimate", pose_delay=delay))
-            evaluation = evaluate_case(seen, setup)
-            places = [score.solved_place.median_mm for score in evaluation.scores.values()]
-            known = [place for place in places if place is not None]
-            score = score_course(join_jaws(evaluation, recording.name))
-            found[way] = {**score, "place_median_mm": max(known) if known else float("nan")}
-        if not self.options.keep:
-            forget_case(case.settings, case.name, folder)
+        with self.options.open_case(case, folder) as recording:
+            flipped, lost = flip_poses(recording, self.options.seed), drop_poses(recording)
+            ways = {name: (recording, delay) for name, delay in DELAYS.items()}
+            ways |= {"flips": (flipped, 0), "gaps": (lost, 0), WORST: (drop_poses(flipped), DELAYS["200 ms late"])}
+            found = {}
+            for way, (seen, delay) in ways.items():
+                setup = build_setup(case.settings, ContactChoice(mode="estimate", pose_delay=delay))
+                evaluation = evaluate_all([seen], setup)
+                places = [score.solved_place.median_mm for score in evaluation.scores.values()]
+                known = [place for place in places if place is not None]
+                score = score_course(join_jaws(evaluation, recording.name))
+                found[way] = {**score, "place_median_mm": max(known) if known else float("nan")}
         return {"ways": found}
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
@@ -113,9 +110,9 @@ class PoseExperiment:
                          f"{one['place_worst_median_mm']:.2f}", f"{one['answered_pct']:.1f}"))  # fmt: skip
         head = ("poses", "RMSE/N", "added/N", "most added/N", "place: worst median/mm", "answered/%")
         note = "Grasp force, mean over the grasps of each one's RMSE while the true force is above 0.02 N."
-        first = Table(title="**By way**", head=head, rows=rows, note=note)
+        first = ResultTable(title="**By way**", head=head, rows=rows, note=note)
         cells = [(name, *(f"{row['ways'][way]['rmse_N']['all']:.3f}" for way in ways)) for name, row in figures.items()]
-        second = Table(title="**Each grasp, RMSE [N]**", head=("grasp", *ways), rows=cells)
+        second = ResultTable(title="**Each grasp, RMSE [N]**", head=("grasp", *ways), rows=cells)
         return Findings(figures={"ways": summary, "grasps": figures}, tables=[first, second])
 
 

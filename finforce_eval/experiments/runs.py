@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
-import numpy as np
+from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice
-from finforce_eval.evaluation.evaluate import Evaluation
 from finforce_eval.evaluation.keypoint_source import KeypointSource
-from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
+from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.experiments.experiment import Case
 from finforce_eval.recordings.bags import bag_source
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import PoseTrack, Recording
+from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
@@ -66,7 +66,11 @@ class RunOptions:
         return Case(name=name, settings=self.shared | made | more)
 
     def bag_cases(self, needed: Sequence[str] = SIDES) -> list[Case]:
-        """Return the recordings of one's own as cases.
+        """Return the recordings of one's own as cases; see `read_bags`."""
+        return [case for case, _ in self.read_bags(needed)]
+
+    def read_bags(self, needed: Sequence[str] = SIDES) -> list[tuple[Case, Recording]]:
+        """Return the recordings of one's own, each as a case and as it was read.
 
         Args:
             needed: jaws whose measured force, and about which the object's poses, an experiment cannot do without.
@@ -74,7 +78,7 @@ class RunOptions:
         Raises:
             RecordingError: a recording lacks something, and which it is.
         """
-        cases = []
+        read = []
         for bag in self.bags:
             recording = read_recording(bag)
             missing = list_missing(recording, needed)
@@ -83,8 +87,26 @@ class RunOptions:
             source = bag_source(Path(bag))
             files = sorted(source.glob("*")) if source.is_dir() else [source]
             size = sum(path.stat().st_size for path in files)
-            cases.append(Case(name=recording.name, settings=self.shared | {"bag": str(bag), "bytes": size}))
-        return cases
+            settings = self.shared | {"bag": str(bag), "bytes": size}
+            read.append((Case(name=recording.name, settings=settings), recording))
+        return read
+
+    @contextmanager
+    def open_case(self, case: Case, folder: Path) -> Iterator[Recording]:
+        """Give the recording of a case with its key points; a scene is rendered first, and forgotten once it is scored.
+
+        Raises:
+            FinforceError: the scene cannot be rendered, the recording not be read, or no key points are found.
+        """
+        settings, source = case.settings, case.settings["source"]
+        is_own = "bag" in settings
+        bag = Path(settings["bag"]) if is_own else folder / RECORDINGS / case.name
+        if not is_own:
+            render_scene(settings, bag)
+            source = source or "images"
+        yield KeypointSource(source=source, jaw_file=settings["jaw"]).apply(read_recording(bag))
+        if not is_own and not self.keep:
+            rmtree(bag, ignore_errors=True)
 
 
 def list_missing(recording: Recording, needed: Sequence[str]) -> list[str]:
@@ -109,52 +131,18 @@ def build_setup(settings: Mapping[str, Any], contact: ContactChoice | None = Non
     )
 
 
-def read_case(settings: Mapping[str, Any], name: str, folder: Path) -> Recording:
-    """Return the recording of a case with its key points; a scene is rendered first.
-
-    Raises:
-        FinforceError: the scene cannot be rendered, the recording not be read, or no key points are found.
-    """
-    source = settings["source"]
-    if "bag" in settings:
-        bag = Path(settings["bag"])
-    else:
-        bag, source = render_scene(settings, folder / RECORDINGS / name), source or "images"
-    return KeypointSource(source=source, jaw_file=settings["jaw"]).apply(read_recording(bag))
-
-
-def render_scene(settings: Mapping[str, Any], bag: Path) -> Path:
-    """Return the recording of a scene, which is rendered unless it is there."""
+def render_scene(settings: Mapping[str, Any], bag: Path) -> None:
+    """Write the recording of a scene, unless it is there."""
     if (bag / "case.json").exists():
-        return bag
+        return
     rmtree(bag, ignore_errors=True)  # what a killed run has left
     scenario = build_scenario(settings["scene"], **settings["changes"])
     form = RecordingForm(farthest=FARTHEST)
     record_scene(scenario, settings["seed"], bag, camera=parse_size(settings["size"]), form=form)
-    return bag
 
 
-def forget_case(settings: Mapping[str, Any], name: str, folder: Path) -> None:
-    """Remove the recording of a scene; one's own stay."""
-    if "bag" not in settings:
-        rmtree(folder / RECORDINGS / name, ignore_errors=True)
-
-
-def evaluate_case(recording: Recording, setup: EvaluationSetup) -> Evaluation:
-    """Return the evaluation of all jaws of a recording that have ground truth."""
-    return evaluate_all([recording], setup)
-
-
-def hide_object(recording: Recording, since: int) -> Recording:
-    """Return a recording whose object is not seen any more from a stamp [ns] on."""
+def keep_poses(recording: Recording, seen: NDArray) -> Recording:
+    """Return a recording with those poses of the object (n,) alone that are seen."""
     track = recording.object_pose
-    seen = track.stamps < since
-    shown = {name: getattr(track, name)[seen] for name in ("stamps", "position", "quaternion")}
-    return replace(recording, object_pose=PoseTrack(frame_id=track.frame_id, **shown))
-
-
-def rmse(errors: Any) -> float:
-    """Return the root mean square of what is finite; NaN of nothing."""
-    errors = np.asarray(errors, dtype=float)
-    errors = errors[np.isfinite(errors)]
-    return float(np.sqrt(np.mean(errors**2))) if errors.size else float("nan")
+    kept = {name: getattr(track, name)[seen] for name in ("stamps", "position", "quaternion")}
+    return replace(recording, object_pose=replace(track, **kept))

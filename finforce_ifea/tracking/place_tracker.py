@@ -293,7 +293,7 @@ class PlaceTracker:
                 moved=moved,
                 place=update.place,
                 aside=width.sideways[:, ::2],
-                across=width.total,
+                across=width.across.force,
             )
             wanted = upright + self._held.update(frame, self._prior_variance) / normal
             rubbing.lean += _HELD_GAIN * (min(max(wanted, -_LARGEST_LEAN), _LARGEST_LEAN) - rubbing.lean)
@@ -432,6 +432,7 @@ class PlaceTracker:
         covariance = update.covariance * max(1.0, update.misfit**2)
         covariance[DEPTH, DEPTH] += update.depth_variance * max(1.0, update.misfit**2)
         finite = np.isfinite(force.sum() + update.covariance.sum() + self.q.sum())
+        normal = float(np.hypot(*force[::2]))
         return Track(
             covariance=covariance,
             force=force,
@@ -446,8 +447,8 @@ class PlaceTracker:
             iterations=iterations,
             converged=settled,
             bearable=self._levels[0].contact.bearable,
-            across=self._describe_across(float(np.hypot(*force[::2]))) if self._is_known else None,
-            lean_stddev=self._describe_lean(float(np.hypot(*force[::2]))) if self._is_known else None,
+            across=self._describe_across(normal) if self._is_known else None,
+            lean_stddev=self._describe_lean(normal) if self._is_known else None,
             ambiguity=0.0 if settled else float(np.linalg.norm(state.force_modes[:, :3] @ moved)),
             sound=bool(finite and state.smallest_det > 0),
             quiet=bool(pressed < _TOUCH_DEPTH),

@@ -65,7 +65,7 @@ class WidthTracker:
         count = self._count
         self._means = _Means(np.zeros(count), np.zeros((count, 2)), np.zeros(count))
         self.motions, self.sideways = np.zeros((count, 3)), np.zeros((count, 3))
-        self.across, self.total = AcrossFinger(*self._expected, 0.0, self._lean), 0.0
+        self.across = AcrossFinger(*self._expected, 0.0, self._lean)
 
     def expect(self, place: float, stddev: float) -> None:
         """Takes where along y the object stands nearest [m], and how wide it does so."""
@@ -93,7 +93,6 @@ class WidthTracker:
         self.across, self.motions = _update(
             self._means, frame, answers, self.across, self._expected, torsion.half_width
         )
-        self.total = self.across.force
 
 
 @njit(**_OPTIONS)

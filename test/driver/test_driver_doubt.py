@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import emulator_fakes  # noqa: F401 - finds the benchmarks
 import pytest
 from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
 from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, spring

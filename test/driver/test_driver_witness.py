@@ -1,6 +1,5 @@
 """Claims about the motor's current as a second witness of the force; the true force on the object is the judge."""
 
-import emulator_fakes  # noqa: F401 - finds the benchmarks
 import numpy as np
 import pytest
 

@@ -3,7 +3,6 @@
 import math
 from itertools import count
 
-import emulator_fakes  # noqa: F401 - finds the benchmarks
 import numpy as np
 import pytest
 from joint_fakes import LEROBOT, ROBOTIQ, EmulatedJoint

@@ -15,12 +15,12 @@ from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.contact_source import EstimatedContact
 from finforce_eval.evaluation.manipulation import NetForces
 from finforce_eval.experiments.chip import ChipExperiment
-from finforce_eval.experiments.experiment import Case, Findings, Table, format_tables, run_experiment
+from finforce_eval.experiments.experiment import Case, Findings, ResultTable, format_tables, run_experiment
 from finforce_eval.experiments.grasp import GraspCourse, GraspExperiment, score_course
 from finforce_eval.experiments.letter_tables import BenchExperiment
 from finforce_eval.experiments.manipulation import ManipulationExperiment, score_weight
 from finforce_eval.experiments.pose import PoseExperiment, drop_poses, flip_poses
-from finforce_eval.experiments.runs import RunOptions, hide_object, list_missing
+from finforce_eval.experiments.runs import RunOptions, keep_poses, list_missing
 from finforce_eval.recordings.objects import ObjectTrack
 from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.grasp_force import Wrench
@@ -53,7 +53,7 @@ class Counting:
 
     def find(self, figures, folder):
         total = sum(row["letters"] for row in figures.values())
-        table = Table(title="**Letters**", head=("case", "n"), rows=[(name, "1") for name in figures])
+        table = ResultTable(title="**Letters**", head=("case", "n"), rows=[(name, "1") for name in figures])
         return Findings(figures={"total": total}, tables=[table])
 
 
@@ -195,8 +195,8 @@ def test_a_recording_that_lacks_something_is_told_what(tmp_path, capsys):
 
 def test_an_object_that_is_hidden_has_no_poses_any_more():
     one = make_recording("one")
-    since = int(one.object_pose.stamps[5])
-    hidden = hide_object(one, since)
+    stamps = one.object_pose.stamps
+    hidden = keep_poses(one, stamps < stamps[5])
     assert len(hidden.object_pose.stamps) == 5
     assert len(hidden.object_pose.position) == 5
     assert len(one.object_pose.stamps) > 5
@@ -271,6 +271,6 @@ def test_the_bench_runs_on_the_recording_in_the_package(tmp_path, capsys):
 
 
 def test_tables_have_a_title_and_a_note():
-    table = Table(title="**T**", head=("a", "b"), rows=[("x", "1")], note="N.")
+    table = ResultTable(title="**T**", head=("a", "b"), rows=[("x", "1")], note="N.")
     lines = format_tables(Findings(figures={}, tables=[table])).splitlines()
     assert lines[0] == "**T**" and lines[-1] == "N."
