@@ -57,8 +57,8 @@ def write_network(network: FingerNetwork, folder: Path, factor: float) -> None:
     said = {"kind": KIND, "stddev_factor": round(factor, 4), "network": asdict(folded.shape)}
     coarse, fine = make_examples(folded.shape)
     points = {name: {0: "batch", 1: "points"} for name in ("points", "guesses", "context")}
-    _write(ExportedCoarse(folded), coarse, COARSE_LAYOUT, folder / COARSE, said, points)
-    _write(ExportedFine(folded), fine, FINE_LAYOUT, folder / FINE, said, {})
+    write_onnx(ExportedCoarse(folded), coarse, COARSE_LAYOUT, folder / COARSE, said, points)
+    write_onnx(ExportedFine(folded), fine, FINE_LAYOUT, folder / FINE, said, {})
 
 
 def make_examples(shape: NetworkShape, batch: int = 2, count: int = 5) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -72,10 +72,19 @@ def make_examples(shape: NetworkShape, batch: int = 2, count: int = 5) -> tuple[
     return coarse, (pieces, pieces, torch.zeros(batch * count, shape.coarse[1]), colours, colours)
 
 
-def _write(
+def write_onnx(
     module: Any, inputs: tuple[Any, ...], layout: Any, path: Path, said: dict[str, Any], axes: dict[str, Any]
 ) -> None:
-    """Write one part as ONNX, with what is said of it in the file's metadata."""
+    """Write a module as ONNX, with what is said of it in the file's metadata.
+
+    Args:
+        module: of tensors to tensors.
+        inputs: an example of each.
+        layout: names of inputs and outputs; the first axis of each is free.
+        path: of the file.
+        said: as JSON has it.
+        axes: further free axes, names by name and number.
+    """
     onnx = import_onnx()
     free = {name: {0: "batch"} for names in layout for name in names} | axes
     with warnings.catch_warnings():

@@ -21,11 +21,8 @@ EXPERIMENTS = {
     "places": ("Table II: what knowing the place is worth", "letter_tables", "PlacesExperiment"),
     "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp", "GraspExperiment"),
     "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation", "ManipulationExperiment"),
-    "chip": (
-        "what breaks at 5.43 N, grasped to 5 N by force, position and current",
-        "chip",
-        "ChipExperiment",
-    ),
+    "chip": ("what breaks at 5.43 N, grasped to 5 N by force, position and current", "chip", "ChipExperiment"),
+    "network": ("an end-to-end network on what it has seen and what it has not", "network", "NetworkExperiment"),
     "pose": ("poses of the object that are late, flipped or lost", "pose", "PoseExperiment"),
 }
 
@@ -45,6 +42,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", metavar="FILE", help=text)
     parser.add_argument("--seed", type=int, default=100, help="of the first scene (100)")
     parser.add_argument("--size", metavar="WxH", help="of the twin's images (640x480; 320x240 with --quick)")
+    text = "end-to-end network of training.baseline (the shipped one)"
+    parser.add_argument("--network", default="", metavar="FILE", help=text)
     parser.add_argument("--keep", action="store_true", help="keep the twin's recordings, some 20 MB a grasp")
 
 
@@ -69,6 +68,7 @@ def read_options(options: argparse.Namespace) -> RunOptions:
         size=options.size or (QUICK_SIZE if options.quick else RunOptions.size),
         keep=options.keep,
         quick=options.quick,
+        network=options.network,
     )
 
 

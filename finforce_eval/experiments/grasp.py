@@ -17,7 +17,6 @@ from finforce_eval.evaluation.setup import evaluate_all
 from finforce_eval.evaluation.tables import format_number
 from finforce_eval.experiments.experiment import Case, Findings, ResultTable, leave_out
 from finforce_eval.experiments.runs import RunOptions, build_setup, keep_poses
-from finforce_eval.recordings.tracks import Recording
 
 SCENES = {"cylinder": "grasp_cylinder", "cube": "grasp_cube", "asymmetric": "grasp_asymmetric"}
 PLACES = {"lower": 0.024, "middle": 0.040, "upper": 0.058}  # [m] of the object's middle
@@ -37,18 +36,23 @@ class GraspCourse:
     """The grasp force over time, n images.
 
     Attributes:
-        seconds: (n,) of the images.
+        stamps: (n,) of the images [ns].
         truth: (n,) min(|F_left|, |F_right|) [N], as measured.
         found: (n,) the same of the estimates; NaN unless both are trusted.
         stddev: (n,) stated of the jaw whose force is less certain [N].
         delay: (n,) from an image to its force [s].
     """
 
-    seconds: NDArray
+    stamps: NDArray
     truth: NDArray
     found: NDArray
     stddev: NDArray
     delay: NDArray
+
+    @property
+    def seconds(self) -> NDArray:
+        """Times (n,) of the images since the first."""
+        return 1e-9 * (self.stamps - self.stamps[0])
 
     @property
     def phases(self) -> dict[str, NDArray]:
@@ -70,7 +74,7 @@ def join_jaws(evaluation: Evaluation, name: str) -> GraspCourse:
     forces = np.stack([left.magnitude[mine], right.magnitude[theirs]])
     truths = np.stack([left.true_magnitude[mine], right.true_magnitude[theirs]])
     return GraspCourse(
-        seconds=1e-9 * (left.stamps[mine] - left.stamps[0]),
+        stamps=left.stamps[mine],
         truth=truths.min(axis=0),
         found=forces.min(axis=0),
         stddev=np.maximum(left.stddev[mine], right.stddev[theirs]),
@@ -134,7 +138,7 @@ class GraspExperiment:
         with self.options.open_case(_with_displacement(case), folder) as recording:
             setup = build_setup(case.settings)
             course = join_jaws(evaluate_all([recording], setup), recording.name)
-            hidden = keep_poses(recording, recording.object_pose.stamps < _full_force(course, recording))
+            hidden = keep_poses(recording, recording.object_pose.stamps < _full_force(course))
             unseen = join_jaws(evaluate_all([hidden], setup), recording.name)
         series = {"seconds": course.seconds, "truth": course.truth, "found": course.found}
         drawn = {name: np.round(values[::DRAWN_EVERY], 4).tolist() for name, values in series.items()}
@@ -171,11 +175,10 @@ def _with_displacement(case: Case) -> Case:
     return replace(case, settings={**settings, "changes": {**settings["changes"], "displacement": way}})
 
 
-def _full_force(course: GraspCourse, recording: Recording) -> int:
+def _full_force(course: GraspCourse) -> int:
     """Return the stamp [ns] at which loading ends."""
     load = np.flatnonzero(course.phases["load"])
-    stamps = recording.jaw("left").keypoints.stamps
-    return int(stamps[0] + 1e9 * course.seconds[load[-1]]) if load.size else int(stamps[-1])
+    return int(course.stamps[load[-1] if load.size else -1])
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -69,3 +69,25 @@ def draw_chips(figures: Mapping[str, Mapping[str, Any]], bears: float, breaks: f
         axes.set(xlabel="after first touch [s]", xlim=(-0.5, 8.0))
     panels[0].set_ylabel("true force [N]")
     return figure
+
+
+def draw_networks(figures: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return a figure of the grasp force by both methods over time, a panel for each grasp."""
+    columns = min(len(figures), 4)
+    rows = -(-len(figures) // columns)
+    figure = new_figure(3.6 * columns, 2.5 * rows + 0.4)
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    for axes in panels.flat[len(figures) :]:
+        axes.set_visible(False)
+    for axes, (name, row) in zip(panels.flat, figures.items(), strict=False):
+        style_axes(axes)
+        course = {key: np.array(values, dtype=float) for key, values in row["course"].items()}
+        axes.plot(course["seconds"], course["network"], color=ORANGE, linewidth=1.0)
+        axes.plot(course["seconds"], course["found"], color=BLUE, linewidth=1.2)
+        axes.plot(course["seconds"], course["truth"], color=BLACK, linewidth=0.9, dashes=(4, 2))
+        axes.set_title(f"{name} ({row.get('group', 'recording')})", loc="left", fontsize=9)
+    for line in panels:
+        line[0].set_ylabel("grasp force [N]")
+    for axes in panels[-1]:
+        axes.set_xlabel("time [s]")
+    return figure

@@ -16,11 +16,14 @@ from finforce_eval.evaluation.contact_source import EstimatedContact
 from finforce_eval.evaluation.manipulation import NetForces
 from finforce_eval.experiments.chip import ChipExperiment
 from finforce_eval.experiments.experiment import Case, Findings, ResultTable, format_tables, run_experiment
+from finforce_eval.experiments.force_network import HEIGHT, SHOWN, WIDTH, ForceNetwork, reduce_image
 from finforce_eval.experiments.grasp import GraspCourse, GraspExperiment, score_course
 from finforce_eval.experiments.letter_tables import BenchExperiment
 from finforce_eval.experiments.manipulation import ManipulationExperiment, score_weight
+from finforce_eval.experiments.network import NetworkExperiment
 from finforce_eval.experiments.pose import PoseExperiment, drop_poses, flip_poses
 from finforce_eval.experiments.runs import RunOptions, keep_poses, list_missing
+from finforce_eval.recordings.images import StampedImage
 from finforce_eval.recordings.objects import ObjectTrack
 from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.grasp_force import Wrench
@@ -115,7 +118,11 @@ def course(error=0.0, stddev=0.1):
     truth = np.interp(seconds, [0.5, 1.5, 2.5, 3.5], [0.0, 4.0, 4.0, 0.0])
     nothing = np.zeros_like(seconds)
     return GraspCourse(
-        seconds=seconds, truth=truth, found=truth + error * (truth > 0.0), stddev=nothing + stddev, delay=nothing
+        stamps=np.round(1e9 * seconds).astype(np.int64),
+        truth=truth,
+        found=truth + error * (truth > 0.0),
+        stddev=nothing + stddev,
+        delay=nothing,
     )
 
 
@@ -177,7 +184,15 @@ def test_the_twin_has_27_grasps_with_seeds_of_their_own():
 
 
 def test_quick_cases_are_some_of_the_others():
-    for kind in (GraspExperiment, ManipulationExperiment, ChipExperiment, BenchExperiment, PoseExperiment):
+    kinds = (
+        GraspExperiment,
+        ManipulationExperiment,
+        ChipExperiment,
+        BenchExperiment,
+        PoseExperiment,
+        NetworkExperiment,
+    )
+    for kind in kinds:
         every, few = ([c.name for c in kind(options=RunOptions(quick=q)).list_cases()] for q in (False, True))
         assert set(few) < set(every)
 
@@ -274,3 +289,45 @@ def test_tables_have_a_title_and_a_note():
     table = ResultTable(title="**T**", head=("a", "b"), rows=[("x", "1")], note="N.")
     lines = format_tables(Findings(figures={}, tables=[table])).splitlines()
     assert lines[0] == "**T**" and lines[-1] == "N."
+
+
+def test_the_end_to_end_network_needs_ten_images():
+    pytest.importorskip("onnxruntime", reason="the network runs on onnxruntime: pip install onnxruntime")
+    network = ForceNetwork()
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 255, (96, 128, 3), dtype=np.uint8) for _ in range(12)]
+    images = [StampedImage(7 * number, SimpleNamespace(color=color)) for number, color in enumerate(pictures)]
+    stamps, forces = network.follow(images)
+    assert stamps.tolist() == [7 * number for number in range(12)]
+    assert np.isnan(forces[: SHOWN - 1]).all()
+    assert np.isfinite(forces[SHOWN - 1 :]).all()
+    last = np.stack([reduce_image(color) for color in pictures[-SHOWN:]])
+    assert last.shape == (SHOWN, HEIGHT, WIDTH, 3)
+    assert network.predict(last[None]) == pytest.approx(forces[-1:], abs=1e-5)
+
+
+def test_another_network_than_an_end_to_end_one_is_refused(tmp_path, capsys):
+    pytest.importorskip("onnxruntime", reason="the network runs on onnxruntime: pip install onnxruntime")
+    other = Path(__file__).parents[2] / "finforce_keypoints" / "models" / "side_plane" / "coarse.onnx"
+    report = ["--report", str(tmp_path)]
+    assert main(["experiment", "network", "--quick", "--network", str(other), *report]) == 2
+    words = capsys.readouterr().err
+    assert "coarse.onnx: got a network of" in words
+    assert "expected one of training.baseline.train" in words
+    assert main(["experiment", "network", "--quick", "--network", str(tmp_path / "none.onnx"), *report]) == 2
+    assert "none.onnx" in capsys.readouterr().err
+
+
+def test_both_methods_are_compared_by_what_the_network_has_seen(tmp_path):
+    series = {"seconds": [0.0, 1.0], "truth": [0.0, 2.0], "found": [0.0, 2.1], "network": [None, 1.0]}
+    row = {"peak_N": 2.0, "span_N": 2.0, "network_bias_N": 0.0, "answered_pct": 100.0, "course": series}
+    figures = {
+        "known": {**row, "group": "as trained", "rmse_N": 0.1, "network_rmse_N": 0.2},
+        "new": {**row, "group": "another object", "rmse_N": 0.1, "network_rmse_N": 0.6},
+        "newer": {**row, "group": "another object", "rmse_N": 0.3, "network_rmse_N": 1.0},
+    }
+    groups = NetworkExperiment(options=RunOptions()).find(figures, tmp_path).figures["groups"]
+    assert groups["as trained"]["ratio"] == pytest.approx(2.0)
+    assert groups["another object"]["ratio"] == pytest.approx(4.0)
+    assert groups["another object"]["network_nrmsd_pct"] == pytest.approx(40.0)
+    assert (tmp_path / "network.png").stat().st_size > 1000
