@@ -221,7 +221,9 @@ class ContactEstimator:
             raise PoseError("this pose puts the object around the camera: check its pose, mesh and unit")
         outcome = self._poses.update(stamp, T, covariance)
         if outcome in ("used", "aside") and self._face is not None:
-            self._slips.update(stamp, T, self._face, odd=outcome == "aside")
+            slip = self._slips.update(stamp, T, self._face, odd=outcome == "aside")
+            if slip is not None and slip.stamp == stamp:
+                self._poses.slide(T, slip.velocity[1:] * slip.sliding)
         self._counts["late pose"] += outcome == "late"
         self._counts["odd pose"] += outcome == "aside"
 

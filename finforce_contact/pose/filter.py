@@ -20,6 +20,8 @@ _TREND_SHARE, _TREND_SIGMA = 0.35, 3.5
 _TREND_STDDEV = float(np.sqrt(_TREND_SHARE / (2.0 - _TREND_SHARE)))
 _SPEED_SURPRISE = 5e-3
 _LONGEST_FORECAST = 0.2
+# Noise of poses by which a trajectory is widened while an object slides: it follows them by four fifths.
+_SLIDING = 4.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,7 +62,7 @@ class PoseFilter:
         self.believed = 0.0
         self.latest: NDArray | None = None
         self._scale = np.ones(6)
-        self._learnt = _NOISE_PRIOR
+        self._learnt, self._slide = _NOISE_PRIOR, np.zeros(2)
         self._aside: deque[tuple[float, NDArray]] = deque(maxlen=self._settings.jump_samples)
 
     def update(self, stamp: float, T: NDArray, covariance: NDArray | None = None) -> str:
@@ -95,6 +97,21 @@ class PoseFilter:
         self.believed = stamp
         return "used"
 
+    def slide(self, T: NDArray, velocity: NDArray) -> None:
+        """Takes an object for one that slides: this pose, the last that came, is near it, and it goes on so.
+
+        Args:
+            T: T_jaw_object (4, 4).
+            velocity: in the jaw's y and z (2,) [m/s], zero once it rests.
+        """
+        self._slide = velocity
+        if velocity.any():
+            noise = self._noise(None)
+            self._P[1:] += _SLIDING * noise[1:]
+            self._correct(step_between(self._T, T), noise)
+            self.believed = self.stamp
+            self._aside.clear()
+
     def at(self, stamp: float) -> FilteredPose:
         """Returns the pose at a time [s], continued at its speed for a fifth of a second at most.
 
@@ -106,7 +123,7 @@ class PoseFilter:
         ahead = max(stamp - self.stamp, 0.0)
         dt = min(ahead, _LONGEST_FORECAST)
         T = self._T.copy()
-        T[_X, 3] += dt * self._speed
+        T[:3, 3] += dt * np.array([self._speed, *self._slide])
         variance = self._P + self._drift * ahead
         variance[_X] += 2.0 * dt * self._cross + dt**2 * self._speed_variance
         return FilteredPose(T=T, stddev=np.sqrt(np.maximum(variance, 0.0)), speed=self._speed)
@@ -131,9 +148,9 @@ class PoseFilter:
         self._aside.clear()
 
     def _predict(self, stamp: float) -> None:
-        """Moves the trajectory on to a time [s]: constant speed of x under white acceleration, a random walk else."""
+        """Moves the trajectory on to a time [s]: constant speed under white acceleration in x, a random walk else."""
         dt, power = stamp - self.stamp, self._settings.acceleration**2
-        self._T[_X, 3] += dt * self._speed
+        self._T[:3, 3] += dt * np.array([self._speed, *self._slide])
         self._P = self._P + self._drift * dt
         self._P[_X] += 2.0 * dt * self._cross + dt**2 * self._speed_variance + power * dt**3 / 3.0
         self._cross += dt * self._speed_variance + power * dt**2 / 2.0

@@ -27,10 +27,12 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 _REMEMBERED, _AVERAGED = 15, 5.0
 # A hold has ended once the object is so much deeper or higher [m]: a weight that goes over from one jaw to the other
 # moves the object by a millimetre. Standard deviation of what the mechanics errs by on the way there, as a share of it.
-_DEEPER, _HIGHER, _BEYOND = 2.5e-3, 0.6e-3, 0.05
+_DEEPER, _HIGHER, _BEYOND = 2.5e-3, 1.5e-3, 0.05
 # Standard deviations of how a lifted object settles, as a share of what shape and height were expected to be off, and
 # of the weight [N].
 _SETTLES, _WEIGHT = 0.05, 0.7
+# And of how far it has slid, as a share of what its pose says.
+_SLIDES = 0.3
 # The errors of so many successive frames count for one. An object is lifted from a change of so many standard
 # deviations on.
 _ALIKE, _SURE = 4.0, 2.5
@@ -86,7 +88,15 @@ class HeldWeight:
         """Starts to remember."""
         self._frames, self._place = 0, np.zeros(3)
         self._information, self._vector = np.zeros((4, 4)), np.zeros(4)
-        self._before, self._changed = self.force, False
+        self._before, self._changed, self._led = self.force, False, 0.0
+
+    def lead(self, way: float) -> None:
+        """Takes the object for one that has slid by `way` [m] along the finger: what that moves is no force."""
+        if self._frames < _REMEMBERED:
+            self._begin()
+            return
+        self._led += way
+        self._information, self._vector = np.zeros((4, 4)), np.zeros(4)
 
     def update(self, frame: HeldFrame, prior: NDArray) -> float:
         """Takes one frame of something that presses and returns the force along the finger [N].
@@ -96,30 +106,41 @@ class HeldWeight:
             prior: variance of shape and height (2,).
         """
         away = frame.place - self._place
-        if self._frames and (abs(away[DEPTH]) > _DEEPER or abs(away[2]) > _HIGHER):
+        has_slid = abs(away[2]) > _HIGHER
+        if self._frames and (abs(away[DEPTH]) > _DEEPER or has_slid):
+            if has_slid and self._frames == _REMEMBERED:
+                self._compare(frame, away, prior)
             self._begin()
         if not self._frames:
             self._place, away = frame.place.copy(), np.zeros(3)
             self._memory, self._counts = np.zeros((len(frame.data.weights), 2)), np.zeros(len(frame.data.weights))
-        left = _find_left(frame, away, self._before)
         if self._frames < _REMEMBERED:
             self._frames += 1
-            seen = frame.data.weights > 0.0
+            left, seen = _find_left(frame, away, self._before), frame.data.weights > 0.0
             self._counts += seen
             self._memory += np.where(seen[:, None], left - self._memory, 0.0) / np.maximum(self._counts, 1.0)[:, None]
-            return self.force
-        known = np.where(self._counts > 0.5 * _REMEMBERED, frame.data.weights, 0.0)
-        if np.count_nonzero(known) >= _FEWEST:
-            beyond = (_BEYOND * away[DEPTH]) ** 2
-            _accumulate(frame, left - self._memory, known, beyond, self._information, self._vector)
-            settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2, _WEIGHT**2])
-            spread = np.linalg.inv(self._information / _ALIKE + np.diag(1.0 / settles))
-            changes, self.stddev = spread[2:] @ self._vector / _ALIKE, float(np.sqrt(spread[2, 2]))
-            aside = float(np.sqrt(spread[3, 3]))
-            self._changed |= abs(changes[0]) > _SURE * self.stddev or abs(changes[1]) > _SURE * aside
-            if self._changed:
-                self.force, self.across, self.across_stddev = self._before + changes[0], float(changes[1]), aside
+        else:
+            self._compare(frame, away, prior)
         return self.force
+
+    def _compare(self, frame: HeldFrame, away: NDArray, prior: NDArray) -> None:
+        """Explains what has changed since the memory, at a place that is `away` (3,) from there."""
+        known = np.where(self._counts > 0.5 * _REMEMBERED, frame.data.weights, 0.0)
+        if np.count_nonzero(known) < _FEWEST:
+            return
+        left = _find_left(frame, away, self._before) - self._memory
+        beyond = _BEYOND**2 * (away[DEPTH] ** 2 + away[2] ** 2)
+        _accumulate(frame, left, known, beyond, self._information, self._vector)
+        settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2, _WEIGHT**2])
+        settles[1] += (_SLIDES * self._led) ** 2
+        spread = np.linalg.inv(self._information / _ALIKE + np.diag(1.0 / settles))
+        asked = self._vector / _ALIKE
+        asked[1] += self._led / settles[1]
+        changes, self.stddev = spread[2:] @ asked, float(np.sqrt(spread[2, 2]))
+        aside = float(np.sqrt(spread[3, 3]))
+        self._changed |= abs(changes[0]) > _SURE * self.stddev or abs(changes[1]) > _SURE * aside
+        if self._changed:
+            self.force, self.across, self.across_stddev = self._before + changes[0], float(changes[1]), aside
 
 
 @njit(**_OPTIONS)

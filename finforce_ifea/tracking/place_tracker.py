@@ -31,7 +31,7 @@ from finforce_ifea.tracking.place_update import (
     update_place,
     weigh_residuals,
 )
-from finforce_ifea.tracking.slip_history import SlipHistory
+from finforce_ifea.tracking.slip_history import SlipHistory, leave_play
 from finforce_ifea.tracking.track import UNSEEN_LEAN, AcrossFinger, Track, explain_offsets
 from finforce_ifea.tracking.width_tracker import WidthTracker
 
@@ -63,6 +63,8 @@ _STRANGE, _BACK = 1.0, 0.8
 _LARGEST_LEAN, _HELD_GAIN = 0.9, 0.5
 # What of the friction the mechanics does not follow, and a lean of the force that is never excluded [-].
 _UNFOLLOWED, _LEAN = 0.25, 0.08
+# What is kept of the averaged residuals where an object slides.
+_KEPT = 0.5
 # Of a weight that nobody knows, as a share of the normal force, and the least normal force that counts [N].
 _WEIGHT, _LEAST_NORMAL = 0.15, 0.1
 
@@ -182,7 +184,7 @@ class PlaceTracker:
         self._forget_place()
 
     def _forget_place(self) -> None:
-        self._slow = self._prior.copy()
+        self._slow, self._led = self._prior.copy(), float(self._prior[1])
         count = len(self._rest)
         self._average = Average(np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros(count))
 
@@ -333,6 +335,7 @@ class PlaceTracker:
             self._width.expect(*contact.outline.across)
         expected = expect_object(contact, self.settings, self._outline)
         self._prior, self._prior_variance = expected.mean, expected.variance
+        self._lead_place()
         self._outline = after = expected.indenter
         self.contact.set_indenter(after)
         self._given, self._stiffness = None, self.response.stiffness_at(float(expected.mean[1]))
@@ -346,6 +349,19 @@ class PlaceTracker:
             self._motion[0] += change
             self._reached[DEPTH] += change
             self.slips.shift(change)
+
+    def _lead_place(self) -> None:
+        """Takes the place along where the object slides, beyond what its pose may be off by chance.
+
+        The averaged residuals are those of an object that stays where it is, and would hold the place back.
+        """
+        moved = self._prior[1] - self._led
+        way = leave_play(moved, sqrt(self._prior_variance[1]))
+        if way != 0.0:
+            self._slow[1] += way
+            self._led += way
+            self._average = self._average._replace(count=_KEPT * self._average.count)
+            self._held.lead(way)
 
     def _predict(self, dt: float) -> Forecast:
         """Returns the place dt [s] later: constant speed of the depth under white acceleration."""

@@ -371,6 +371,22 @@ class TestPoseFilter:
         # a slip of four standard deviations is below the gate; without notice of its trend 0.9 mm would be left
         assert filtered.at(4.9).T[2, 3] == pytest.approx(0.0412, abs=0.45 * MM)
 
+    def test_object_that_slides_is_followed_at_once_and_foreseen_until_it_rests(self):
+        filtered, random = PoseFilter(SETTINGS), np.random.default_rng(5)
+        heights = 0.04 + 8 * MM * np.clip(0.1 * np.arange(80) - 4.0, 0.0, 1.5)
+        sliding, resting = [], []
+        for sample, height in enumerate(heights):
+            T, now = noisy(pose(0.03, height), random), 0.1 * sample
+            filtered.update(now, T)
+            is_sliding = 4.2 <= now < 5.5
+            filtered.slide(T, np.array([0.0, 8 * MM]) * is_sliding)
+            if is_sliding:
+                sliding.append(filtered.at(now + 2 * FRAME).T[2, 3] - height - 8 * MM * 2 * FRAME)
+            elif now > 6.5:
+                resting.append(filtered.at(now + 0.1).T[2, 3] - height)
+        assert np.sqrt(np.mean(np.square(sliding))) < 0.4 * MM  # without, it is more than a millimetre behind
+        assert np.abs(resting).max() < 0.3 * MM
+
     def test_single_wild_pose_is_set_aside_and_three_that_agree_are_believed(self):
         filtered = PoseFilter(SETTINGS)
         for sample in range(20):

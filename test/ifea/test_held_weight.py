@@ -105,3 +105,24 @@ def test_too_few_points_leave_the_weight_as_it_was():
     few = follow(held, [frame(0.9, hidden=range(7)) for _ in range(30)])
     assert few[-1] == 0.0
     assert held.stddev == np.inf
+
+
+def test_an_object_that_slides_is_not_taken_for_a_force_along():
+    modes = MODES.copy()
+    modes[:, :, 2] = 700.0 * MODES[:, :, 3] / NORMAL  # a millimetre looks like 0.7 N
+    rest, drawn = (frame(bias=bias)._replace(modes=modes) for bias in (0.0, 1e-3 * modes[:, :, 2]))
+    held = HeldWeight()
+    follow(held, [rest] * 20)
+    guess = follow(held, [drawn] * 20)[-1]
+    assert guess == pytest.approx(0.7, abs=0.1)  # so it looks, until the pose says better
+    held.lead(1e-3)
+    assert abs(follow(held, [drawn] * 20)[-1]) < 0.3 * guess
+
+
+def test_a_weight_stays_what_it_was_while_the_object_slides():
+    held = HeldWeight()
+    follow(held, [frame() for _ in range(20)])
+    follow(held, [frame(0.6) for _ in range(40)])
+    for step in range(1, 30):
+        held.lead(0.4e-3)
+        assert held.update(frame(0.6, place=(3e-3, 0.0, 0.04 + 0.4e-3 * step)), PRIOR) == pytest.approx(0.6, abs=0.1)
