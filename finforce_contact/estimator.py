@@ -26,6 +26,7 @@ from finforce_contact.mesh.object_mesh import surrounds
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.paper_contact import IntersectionLocalizer
 from finforce_contact.pose.filter import FilteredPose, PoseFilter
+from finforce_contact.pose.symmetry import parse_symmetry, read_symmetry
 from finforce_contact.settings import ContactSettings
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.observation import Contact, ObjectOutline
@@ -137,9 +138,10 @@ class ContactEstimator:
         """Prepares the jaw's inner face; without `skips` every rule of what need not be done is applied.
 
         Raises:
-            FinforceError: The jaw has no mesh of that density, or the object does not do for the mode.
+            FinforceError: The jaw has no mesh of that density, or symmetry or object do not do.
         """
         self.jaw, self.settings = jaw, settings or ContactSettings()
+        parse_symmetry(self.settings.symmetry)
         self.face = build_inner_face(jaw, self.settings.mesh)
         self._rest_line = self.face.deform(self.face.mesh.nodes)
         self._samples = np.unique(np.linspace(0, len(self.face.mesh.nodes) - 1, _JAW_SAMPLES).astype(int))
@@ -167,6 +169,7 @@ class ContactEstimator:
             MissingDependencyError: The mode needs a library that is not installed.
         """
         self._mesh: ObjectMesh | None = None
+        self._symmetry = read_symmetry(self.settings.symmetry, mesh) if mesh is not None else None
         self._localizer = self._build_localizer(mesh) if mesh is not None else None
         if mesh is not None:
             low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
@@ -219,6 +222,8 @@ class ContactEstimator:
         watched = camera is not None and self._mesh is not None
         if watched and surrounds(self._mesh, (invert_pose(T) @ np.append(camera, 1.0))[:3]):
             raise PoseError("this pose puts the object around the camera: check its pose, mesh and unit")
+        if self._symmetry is not None and self._poses.latest is not None:
+            T = self._symmetry.choose(T, self._poses.at(stamp).T)
         outcome = self._poses.update(stamp, T, covariance)
         if outcome in ("used", "aside") and self._face is not None:
             slip = self._slips.update(stamp, T, self._face, odd=outcome == "aside")

@@ -291,7 +291,7 @@ def turn_covariance(covariance: NDArray | None, T_jaw_camera: NDArray) -> NDArra
 
 
 JAW, OBJECT = "jaw", "object"
-DEPTH = 16  # images that may wait for their other pose
+DEPTH = 48  # images that may wait for their other pose: half a second of 90 Hz, as poses may be late
 BRIDGED = 250_000_000  # [ns] between two poses of a jaw that stand for the time between, while it does not move
 UNMOVED = 0.2e-3  # [m] and, for its axes, [1]: a jaw that differs by less has not moved
 

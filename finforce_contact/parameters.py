@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from finforce.settings import TimeParameters, setting
+from finforce_contact.pose.source import ORIGINS
 
 if TYPE_CHECKING:
     from finforce_contact.reconstruction.result import GeneratedMesh
@@ -35,6 +36,12 @@ class ContactParameters(TimeParameters):
         "topic",
         "object poses: PoseStamped on object_pose, Detection3DArray on object_detections, or the built-in tracker",
         choices=("topic", "detections", "tracker"),
+    )
+    pose_origin: str = setting(
+        "mesh",
+        "what poses from elsewhere are of: the mesh's own origin; the middle of its box; or its origin with the middle "
+        "added where it ought to be taken off, as isaac_ros_foundationpose does up to release 4.4",
+        choices=tuple(ORIGINS),
     )
     pose_tolerance: float = setting(
         0.017, "greatest distance between the stamps of a jaw pose and its object pose", "s", 0.0, 1.0

@@ -64,6 +64,7 @@ class ContactSession:
         self.mesh: ObjectMesh | None = None
         self.trouble = ""
         self._frame = parameters.camera_frame
+        self._origin = parameters.pose_origin
         self._source = ExternalPoseSource(self._frame)
         self._camera = DepthFeed(parameters, tracker) if parameters.tracks else None
         self._camera_lock, self._lock = RLock(), RLock()
@@ -119,7 +120,7 @@ class ContactSession:
         """Work with another object from now on, to be looked for near the guessed poses (4, 4)."""
         with self._camera_lock, self._lock:
             self.mesh, self.trouble = mesh, ""
-            self._source = ExternalPoseSource(self._frame, mesh=mesh)
+            self._source = ExternalPoseSource(self._frame, mesh=mesh, origin=self._origin)
             for jaw in self.jaws.values():
                 jaw.set_object(mesh)
             if self._camera:

@@ -56,6 +56,9 @@ class ContactSettings:
     )
     gate: float = setting(5.0, "a pose farther off than this is not believed at once", "sigma", 2.0, 100.0)
     jump_samples: int = setting(3, "consecutive consistent poses off the course that are believed", "poses", 2, 20)
+    symmetry: str = setting(
+        "auto", "turns that map the object onto itself: auto, none, or words as x_180 z_full, axes of its mesh's frame"
+    )
     pose_timeout: float = setting(1.0, "a pose older than this is none, unless the grasp rests", "s", 0.01, 60.0)
     rest_time: float = setting(1.0, "a grasp that was still for this long needs no new pose", "s", 0.1, 60.0)
     rest_motion: float = setting(

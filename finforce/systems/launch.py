@@ -37,6 +37,13 @@ def solver_arguments(*, images: str = "false", parameter_file: str = NONE, use_s
         Argument("contact", default_value=NONE, description="contact by: estimate, paper (Algorithm 1) or closest"),
         Argument("pose_source", default_value=NONE, description="object poses: topic, detections or tracker"),
         Argument(
+            "pose_topic",
+            default_value=NONE,
+            description="where other programs publish them, as /pose_estimation/output; "
+            "none: object_pose, object_detections",
+        ),
+        Argument("pose_origin", default_value=NONE, description="what those are of: mesh, middle or added"),
+        Argument(
             "images",
             default_value=images,
             choices=SWITCH,

@@ -155,7 +155,7 @@ def see_camera(process: Process, options: RobotOptions) -> Process:
         }
         return replace(process, parameters={**process.parameters, **frame, **topics})
     topics = {f"/camera/camera/{stream}": f"/camera/{name}/{stream}" for stream in (COLOR, DEPTH, INFO)}
-    return replace(process, parameters={**process.parameters, **frame}, remappings=topics)
+    return replace(process, parameters={**process.parameters, **frame}, remappings={**process.remappings, **topics})
 
 
 def _frame(name: str) -> str:

@@ -8,7 +8,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from typing import Any
 SINGLE_THREAD = {
     name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 }
+POSE_TOPICS = ("object_pose", "object_detections")  # where a contact estimator listens for poses of other programs
 DEPTHS = {"aligned": "aligned", "auto": "auto", "off": "none"}  # options of a system: the detector's parameter `depth`
 
 
@@ -128,10 +129,15 @@ def contact_processes(jaws: str, options: SolverOptions, *, waits: bool = False)
         "object_mesh": options.object_mesh,
         "object_mesh_unit": options.object_mesh_unit,
         "pose_source": options.pose_source,
+        "pose_origin": options.pose_origin,
         "contact.mode": options.contact,
         "contact.mesh": "coarse" if options.solver == "paper" else options.mesh,
     }
-    return [_jaws_process("contact_estimator", jaws, asked, options)]
+    process = _jaws_process("contact_estimator", jaws, asked, options)
+    if options.pose_topic:
+        topics = {name: options.pose_topic for name in POSE_TOPICS}
+        process = replace(process, remappings={**process.remappings, **topics})
+    return [process]
 
 
 def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
@@ -232,6 +238,8 @@ class SolverOptions:
     object_mesh_unit: str = ""
     contact: str = ""
     pose_source: str = ""
+    pose_topic: str = ""
+    pose_origin: str = ""
     images: bool = False
     finder: str = ""
     model: str = ""

@@ -12,6 +12,10 @@ from finforce.transforms import check_pose, invert_pose, pose_from_quaternion
 from finforce_contact.mesh.object_mesh import surrounds
 from finforce_contact.mesh.triangles import ObjectMesh
 
+# How many times the middle of the mesh's bounding box, in the mesh's axes, is taken off a pose: some trackers tell that
+# of the middle, and isaac_ros_foundationpose up to release 4.4 adds the middle where it ought to be taken off.
+ORIGINS = {"mesh": 0.0, "middle": 1.0, "added": 2.0}
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectPose:
@@ -56,13 +60,19 @@ class ExternalPoseSource:
     """
 
     def __init__(
-        self, frame: str, *, mesh: ObjectMesh | None = None, stddev: ArrayLike = (0.002,) * 3 + (0.02,) * 3
+        self,
+        frame: str,
+        *,
+        mesh: ObjectMesh | None = None,
+        origin: str = "mesh",
+        stddev: ArrayLike = (0.002,) * 3 + (0.02,) * 3,
     ) -> None:
         """Prepares to listen.
 
         Args:
             frame: the camera optical frame that the messages must be in.
             mesh: the object, for the check that it is not around the camera; None to do without.
+            origin: what the poses are of, one of `ORIGINS`.
             stddev: standard deviations (6,) [m, rad] that the poses are taken to have, as such messages state none.
 
         Raises:
@@ -73,6 +83,9 @@ class ExternalPoseSource:
             raise PoseError(f"standard deviations of poses: got {stddev}, expected six positive numbers [m, rad]")
         self.latest: ObjectPose | None = None
         self._frame, self._mesh, self._covariance = frame.lstrip("/"), mesh, np.diag(stddev**2)
+        self._back = np.zeros(3)
+        if mesh is not None:
+            self._back = -ORIGINS[origin] * 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
 
     def reset(self) -> None:
         """Forgets the latest pose, so that a stamp before it is taken again."""
@@ -120,6 +133,7 @@ class ExternalPoseSource:
                 "reset after time has jumped back"
             )
         T_camera_object = pose_from_quaternion(_position(pose), _quaternion(pose))
+        T_camera_object[:3, 3] += T_camera_object[:3, :3] @ self._back
         if self._mesh is not None:
             check_camera_outside(T_camera_object, self._mesh)
         self.latest = ObjectPose(

@@ -4,13 +4,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import control_msgs_fakes
+import message_fakes
 
 
 def test_both_actions_move_the_gripper_over_real_ros():
     trials = Path(__file__).with_name("action_trials.py")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", str(trials)]
-    environment = control_msgs_fakes.environment()
+    environment = message_fakes.environment("control_msgs")
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
     assert "9 passed" in done.stdout

@@ -11,7 +11,7 @@ from eval_fakes import make_recording
 
 from finforce.errors import FinforceError
 from finforce_eval.cli.main import main
-from finforce_eval.errors import OptionError
+from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.contact_source import EstimatedContact
 from finforce_eval.evaluation.manipulation import NetForces
 from finforce_eval.experiments.chip import ChipExperiment
@@ -22,9 +22,11 @@ from finforce_eval.experiments.letter_tables import BenchExperiment
 from finforce_eval.experiments.manipulation import ManipulationExperiment, score_weight
 from finforce_eval.experiments.network import NetworkExperiment
 from finforce_eval.experiments.pose import PoseExperiment, drop_poses, flip_poses
-from finforce_eval.experiments.runs import RunOptions, keep_poses, list_missing
+from finforce_eval.experiments.runs import RunOptions, keep_poses, list_missing, render_scene
+from finforce_eval.experiments.tracked_poses import score_poses, track_object, true_poses
 from finforce_eval.recordings.images import StampedImage
 from finforce_eval.recordings.objects import ObjectTrack
+from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.grasp_force import Wrench
 
@@ -233,6 +235,26 @@ def test_gaps_leave_no_pose_for_a_while():
     gaps = np.diff(stamps)
     assert (gaps > 0.75e9).sum() > 5
     assert len(stamps) < 0.7 * len(one.object_pose.stamps)
+
+
+def test_the_built_in_tracker_stands_in_for_the_recorded_poses(tmp_path):
+    pytest.importorskip("open3d", reason="the tracker casts rays: pip install open3d")
+    changes = {"clearance": 0.001, "displacement": 0.001, "closing_speed": 0.01, "settle": 0.1, "record": 0.1}
+    case = RunOptions(size="320x240").scene_case("small", "grasp_asymmetric", changes, 0)
+    truth = true_poses(case.settings)
+    render_scene(case.settings, tmp_path / "small")
+    recording = read_recording(tmp_path / "small")
+    assert set(recording.object_pose.stamps.tolist()) <= set(truth)
+    tracked = track_object(recording)
+    assert tracked.lost == 0
+    recorded, found = score_poses(recording, truth), score_poses(tracked.recording, truth)
+    assert (recorded["rate_Hz"], found["rate_Hz"]) == pytest.approx((10.0, 30.0), rel=0.01)
+    assert 0.3 < recorded["position_median_mm"] < 0.7  # 0.3 mm along each axis
+    assert found["position_median_mm"] < recorded["position_median_mm"]
+    turned = flip_poses(recording, 3)
+    assert score_poses(turned, truth)["rotation_p95_deg"] > 90.0
+    with pytest.raises(RecordingError, match="small: the built-in tracker needs depth images"):
+        track_object(replace(recording, images=recording.images.colors_alone()))
 
 
 def test_poses_that_are_late_come_late():

@@ -1,6 +1,6 @@
-"""Builds the two actions of control_msgs that the driver offers, where ROS 2 comes from wheels, which lack them.
+"""Builds what is used of a message package, where ROS 2 comes from wheels, which lack it.
 
-    python test/action_messages/build.py PREFIX
+    python test/message_packages/build.py control_msgs|vision_msgs PREFIX
 
 The wheels hold generators, headers and libraries, but name the folders of the machine on which they were made: a copy
 of their share, in which these are put right, is what CMake reads. Needs CMake and a C++ compiler.
@@ -35,8 +35,8 @@ def copy_prefix(venv: Path, prefix: Path) -> None:
             path.write_text(NUMPY.sub(numpy.get_include(), PYTHON.sub(include, text)))
 
 
-def build(target: Path) -> None:
-    """Generate, compile and install into a folder.
+def build(package: str, target: Path) -> None:
+    """Generate, compile and install a package into a folder.
 
     Raises:
         SystemExit: something of it fails, with what was printed.
@@ -53,7 +53,7 @@ def build(target: Path) -> None:
     }
     options = [f"-DCMAKE_INSTALL_PREFIX={target}", f"-DPython3_EXECUTABLE={sys.executable}", "-DBUILD_TESTING=OFF"]
     for command in (
-        ["cmake", "-S", str(HERE), "-B", str(work), *options],
+        ["cmake", "-S", str(HERE / package), "-B", str(work), *options],
         ["cmake", "--build", str(work), "-j2"],
         ["cmake", "--install", str(work)],
     ):
@@ -66,4 +66,4 @@ def build(target: Path) -> None:
 
 
 if __name__ == "__main__":
-    build(Path(sys.argv[1]).resolve())
+    build(sys.argv[1], Path(sys.argv[2]).resolve())

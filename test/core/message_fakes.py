@@ -1,4 +1,4 @@
-"""The message package control_msgs for a process of its own: the installed one, or two of its actions built for it."""
+"""Message packages for a process of its own: installed ones, or what is needed of them, built for it."""
 
 import fcntl
 import importlib.util
@@ -10,19 +10,19 @@ from pathlib import Path
 
 import pytest
 
-SOURCES = Path(__file__).parents[1] / "action_messages"
+SOURCES = Path(__file__).parents[1] / "message_packages"
 
 
-def environment():
-    """The environment variables of a process that imports control_msgs; skips the test where it cannot be had."""
-    if importlib.util.find_spec("control_msgs") is not None:
+def environment(package):
+    """The environment variables of a process that imports a package; skips the test where it cannot be had."""
+    if importlib.util.find_spec(package) is not None:
         return dict(os.environ)
-    target = Path(sys.prefix) / "control_msgs"
+    target = Path(sys.prefix) / package
     target.mkdir(exist_ok=True)
     with (target / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # another worker may be building it
         if not (target / "done").exists():
-            _build(target)
+            _build(package, target)
     places = {
         "PYTHONPATH": str(next(target.glob("lib/python*/site-packages"))),
         "LD_LIBRARY_PATH": str(target / "lib"),
@@ -35,9 +35,11 @@ def environment():
     }
 
 
-def _build(target):
+def _build(package, target):
     missing = [name for name in ("cmake", "c++") if shutil.which(name) is None]
     if missing or not (Path(sys.prefix) / "generators").exists():
-        pytest.skip(f"neither control_msgs nor what builds it is installed: {missing or '.venv/generators'}")
-    done = subprocess.run([sys.executable, SOURCES / "build.py", target], capture_output=True, text=True, check=False)
+        pytest.skip(f"neither {package} nor what builds it is installed: {missing or '.venv/generators'}")
+    done = subprocess.run(
+        [sys.executable, SOURCES / "build.py", package, target], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
