@@ -23,6 +23,7 @@ EXPERIMENTS = {
     "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation", "ManipulationExperiment"),
     "chip": ("what breaks at 5.43 N, grasped to 5 N by force, position and current", "chip", "ChipExperiment"),
     "network": ("an end-to-end network on what it has seen and what it has not", "network", "NetworkExperiment"),
+    "shape": ("generated meshes brought to scale, in two file formats", "shape", "ShapeExperiment"),
     "pose": ("poses of the object that are late, flipped or lost", "pose", "PoseExperiment"),
 }
 

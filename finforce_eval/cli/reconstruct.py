@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.optional import import_trimesh
-from finforce_contact.errors import ObjectMeshError
-from finforce_contact.mesh.object_mesh import read_triangles
 from finforce_contact.reconstruction.evidence import ImageEvidence, collect_evidence
+from finforce_contact.reconstruction.generated import read_generated as read_mesh
 from finforce_contact.reconstruction.reconstruction import FROM_GENERATED, reconstruct
 from finforce_contact.reconstruction.result import GeneratedMesh, Reconstruction
 from finforce_eval.errors import OptionError
@@ -30,7 +29,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     intrinsics = "fx fy cx cy [k1 k2 p1 p2 k3] in pixels, or a JSON or YAML file"
     parser.add_argument("--intrinsics", required=True, nargs="+", metavar="NUMBER", help=intrinsics)
     parser.add_argument("--color", metavar="FILE", help="colour picture, for the picture that is written")
-    parser.add_argument("--mesh", metavar="FILE", help="generated mesh (STL, OBJ, PLY, GLB), in any unit")
+    parser.add_argument(
+        "--mesh", metavar="FILE", help="generated mesh (STL, OBJ, PLY, GLB), or splats (PLY), in any unit"
+    )
     pose = "JSON of its place: rotation (w x y z), translation, scale as SAM-3D gives them, or a 4x4 matrix"
     parser.add_argument("--pose", metavar="FILE", help=pose)
     method = "default: robust with a generated mesh; without, a primitive where one fits, else a completion"
@@ -93,9 +94,7 @@ def read_generated(options: argparse.Namespace) -> GeneratedMesh:
     Raises:
         FinforceError: mesh or pose cannot be used.
     """
-    vertices, triangles = read_triangles(options.mesh)
-    if len(triangles) == 0:
-        raise ObjectMeshError(f"{options.mesh}: no triangles; expected a mesh")
+    vertices, triangles = read_mesh(options.mesh)
     affine = read_generated_pose(options.pose)
     return GeneratedMesh(vertices=vertices, triangles=triangles, affine=affine, name=Path(options.mesh).stem)
 

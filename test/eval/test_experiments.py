@@ -10,6 +10,12 @@ import pytest
 from eval_fakes import make_recording
 
 from finforce.errors import FinforceError
+from finforce.transforms import pose_from_quaternion
+from finforce_contact.errors import ObjectMeshError
+from finforce_contact.mesh.chamfer import compute_chamfer
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.reconstruction.generated import read_generated
+from finforce_contact.reconstruction.result import GeneratedMesh
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.contact_source import EstimatedContact
@@ -23,12 +29,16 @@ from finforce_eval.experiments.manipulation import ManipulationExperiment, score
 from finforce_eval.experiments.network import NetworkExperiment
 from finforce_eval.experiments.pose import PoseExperiment, drop_poses, flip_poses
 from finforce_eval.experiments.runs import RunOptions, keep_poses, list_missing, render_scene
+from finforce_eval.experiments.shape import write_generated
 from finforce_eval.experiments.tracked_poses import score_poses, track_object, true_poses
+from finforce_eval.recordings.image_files import read_generated_pose
 from finforce_eval.recordings.images import StampedImage
 from finforce_eval.recordings.objects import ObjectTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.grasp_force import Wrench
+from finforce_twin.scenes.guesses import place_mesh
+from finforce_twin.scenes.objects import build_object
 
 DATA = Path(__file__).parents[2] / "finforce_eval" / "data"
 
@@ -255,6 +265,43 @@ def test_the_built_in_tracker_stands_in_for_the_recorded_poses(tmp_path):
     assert score_poses(turned, truth)["rotation_p95_deg"] > 90.0
     with pytest.raises(RecordingError, match="small: the built-in tracker needs depth images"):
         track_object(replace(recording, images=recording.images.colors_alone()))
+
+
+@pytest.mark.parametrize("form", ["glb", "ply"])
+def test_generated_meshes_are_read_in_their_own_axes_and_scale(tmp_path, form):
+    pytest.importorskip("open3d", reason="splats become a surface by Open3D: pip install open3d")
+    rng = np.random.default_rng(3)
+    mesh = build_object("asymmetric")
+    size = float(np.ptp(mesh.vertices, axis=0).max())
+    affine = pose_from_quaternion([0.02, -0.03, 0.25], [0.1, -0.5, 0.3, 0.8] / np.linalg.norm([0.1, -0.5, 0.3, 0.8]))
+    affine[:3, :3] *= size
+    guess = GeneratedMesh(vertices=mesh.vertices / size, triangles=mesh.triangles, affine=affine, name="thing")
+    file, layout = write_generated(guess, tmp_path / f"thing.{form}", rng)
+    vertices, triangles = read_generated(file)
+    assert 0.9 < np.ptp(vertices, axis=0).max() < 1.15
+    placed = ObjectMesh(vertices=vertices, triangles=triangles, watertight=False, name="thing")
+    placed = place_mesh(placed, read_generated_pose(layout))
+    true = place_mesh(mesh, affine @ np.diag([1.0 / size] * 3 + [1.0]))
+    assert compute_chamfer(placed, true).mean < 1.2e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda data: data[:-4000], "expected as many as the header says"),
+        (lambda data: data.replace(b"binary_little_endian", b"binary_big_endian"), "binary_little_endian"),
+        (lambda data: data.replace(b"vertex 20300", b"vertex 99999999"), "for 99999999 splats"),
+        (lambda data: data.replace(b"vertex 20300", b"vertex 7"), "got 7 splats that can be seen"),
+        (lambda data: data.replace(b"property float opacity", b"property float opacit_"), "no triangles"),
+    ],
+)
+def test_damaged_splats_are_refused(tmp_path, change, words):
+    mesh = build_object("cube")
+    guess = GeneratedMesh(vertices=mesh.vertices / 0.06, triangles=mesh.triangles, affine=np.eye(4), name="cube")
+    file, _ = write_generated(guess, tmp_path / "cube.ply", np.random.default_rng(0))
+    file.write_bytes(change(file.read_bytes()))
+    with pytest.raises(ObjectMeshError, match=words):
+        read_generated(file)
 
 
 def test_poses_that_are_late_come_late():
