@@ -86,6 +86,7 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
         "object_mesh_unit": "mm",
         "contact": "paper",
         "pose_source": "tracker",
+        "pose_origin": "middle",
         "images": True,
         "finder": "frame",
         "model": "d",

@@ -88,6 +88,15 @@ def test_detector_and_contacts_read_the_camera_that_is_started():
     assert detector["depth_topic"] == contacts.remappings["/camera/camera/aligned_depth_to_color/image_raw"] == depth
 
 
+def test_poses_of_another_program_come_from_its_topic_beside_those_of_the_camera():
+    asked = {"object_mesh": "c.stl", "pose_source": "detections", "pose_origin": "added"}
+    contacts = robot(camera_name="hand", pose_topic="/pose_estimation/output", **asked)["contact_estimator"]
+    assert contacts.remappings["object_detections"] == contacts.remappings["object_pose"] == "/pose_estimation/output"
+    assert contacts.remappings["/camera/camera/color/image_raw"] == "/camera/hand/color/image_raw"
+    assert (contacts.parameters["pose_source"], contacts.parameters["pose_origin"]) == ("detections", "added")
+    assert "object_pose" not in robot(**asked)["contact_estimator"].remappings
+
+
 def test_a_camera_without_a_name_leaves_topics_and_frame_to_the_parameter_file():
     parts = robot(camera_name="", camera=False)
     assert "camera_frame" not in parts["keypoint_detector"].parameters
