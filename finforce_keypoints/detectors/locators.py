@@ -41,9 +41,9 @@ class AnyFinger:
             together = span_shapes(find_motions(jaws[side]), points, grid.scale)
             self._templates[side] = network.prepare(draw_template(shapes[side], grid), points, together)
 
-    def locate(self, pictures: NDArray, sides: Sequence[str]) -> Places:
+    def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
         """Return where the points are; see `SideLocator`."""
-        return self._network.locate(pictures, [self._templates[side] for side in sides])
+        return self._network.locate(pictures, [self._templates[side] for side in sides], starts)
 
 
 class OneFinger:
@@ -62,8 +62,8 @@ class OneFinger:
         self.grids = dict.fromkeys(jaws, grid_from_metadata(model.metadata.extra))
         self._rows = {side: _order_names(model, jaw) for side, jaw in jaws.items()}
 
-    def locate(self, pictures: NDArray, sides: Sequence[str]) -> Places:
-        """Return where the points are; see `SideLocator`."""
+    def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
+        """Return where the points are, wherever they were before; see `SideLocator`."""
         peaks = self._model.locate(pictures)
         rows = np.stack([self._rows[side] for side in sides])
         return Places(

@@ -31,12 +31,13 @@ class SideLocator(Protocol):
 
     grids: Mapping[str, PlaneGrid]
 
-    def locate(self, pictures: NDArray, sides: Sequence[str]) -> Places:
+    def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
         """Return where the points are: of each picture the jaw's key points, then its reference point.
 
         Args:
             pictures: (B, h, w, 3) uint8 RGB, on the grids of the sides.
             sides: B, the jaw that each shows.
+            starts: B, how its points had moved in the picture before; None where nobody knows.
         """
         ...
 
@@ -79,11 +80,13 @@ class PlaneFinder:
         self._rest = {side: find_rest(jaw) for side, jaw in jaws.items()}
         self._kept: dict[str, _View] = {}
         self._camera: CameraIntrinsics | None = None
+        self._moves: dict[str, NDArray] = {}
 
     def find(self, image: RgbdImage, expected: Mapping[str, NDArray | None]) -> Mapping[str, PixelFinding]:
         """Return where the key points of each jaw are; see `PixelFinder`."""
         if image.camera is not self._camera:
-            self._kept, self._camera = {}, image.camera
+            self._kept, self._camera, self._moves = {}, image.camera, {}
+        self._moves = {side: moves for side, moves in self._moves.items() if expected.get(side) is not None}
         views = [view for side, pose in expected.items() for view in self._views_of(side, pose)]
         if not views:
             return {}
@@ -105,7 +108,8 @@ class PlaneFinder:
 
     def _locate(self, image: RgbdImage, views: Sequence[_View]) -> Places:
         pictures = np.stack([take_picture(image.color, view.mapping) for view in views])
-        return self._locator.locate(pictures, [view.side for view in views])
+        starts = [self._moves.get(view.side) for view in views]
+        return self._locator.locate(pictures, [view.side for view in views], starts)
 
     def _views_of(self, side: str, pose: NDArray | None) -> list[_View]:
         """Return where to look for one jaw: where it is expected, or all along the closing axis."""
@@ -133,7 +137,9 @@ class PlaneFinder:
         return jaw
 
     def _describe(self, view: _View, places: Places, number: int) -> PixelFinding:
-        """Return the finding of one picture, in pixels of the image."""
+        """Return the finding of one picture, in pixels of the image; the next one begins where its points are."""
+        if places.moves is not None and places.likelihood[number].mean() >= LEAST_SCORE:
+            self._moves[view.side] = places.moves[number]
         plane, grid, camera = self._planes[view.side], self._locator.grids[view.side], self._camera
         on_plane = grid.places(places.pixels[number])
         pixels = project_plane(on_plane, plane, view.T_camera_jaw, camera)

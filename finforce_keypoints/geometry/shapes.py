@@ -25,7 +25,7 @@ PIXELS = 2.0  # standard deviation of where the whole finger is in its picture [
 TURN = 0.01  # standard deviation of how it is turned there [rad]
 STEPS, NEWTON = 6, 4  # in which a jaw is pressed far, and of its equilibrium in each
 RIDGE = 1e-4  # of the products' fit, in the mean of its normal matrix
-ROUNDS = 10  # of reweighting
+ROUNDS, SETTLED = 10, 0.02  # of reweighting, and the largest change after which there is no other [px]
 FARTHEST = 3.0  # standard deviations that a motion can be large
 TOLERANCE, SHARE = 1.0, 0.05  # [px] and share of a point's motion by which a finger may differ from its shapes
 _known: dict[tuple[str, bytes], NDArray] = {}
@@ -171,7 +171,9 @@ def fit_shapes(shapes: NDArray, moves: NDArray, stddev: NDArray, weight: NDArray
         missing = (wanted - found).reshape(len(shapes), -1, 1) + slopes @ sizes[..., None]
         sizes = np.linalg.solve(weighted @ slopes + prior, weighted @ missing)[..., 0].clip(-FARTHEST, FARTHEST)
         together = np.column_stack([sizes[:, i] * sizes[:, j] for i, j in PAIRS])
-        found = (linear @ sizes[..., None] + products @ together[..., None]).reshape(moves.shape)
+        before, found = found, (linear @ sizes[..., None] + products @ together[..., None]).reshape(moves.shape)
+        if np.abs(found - before).max(initial=0.0) < SETTLED:
+            break
         doubt = 1.0 / (1.0 + 0.5 * ((wanted - found) ** 2).sum(axis=2) / variance)
     return found
 

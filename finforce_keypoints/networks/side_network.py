@@ -27,6 +27,7 @@ KIND = "side plane"
 COARSE, FINE = "coarse.onnx", "fine.onnx"
 COARSE_LAYOUT = (("pictures", "templates", "points"), ("guesses", "context", "mean", "gain"))
 GUESS, BLUR = 4.0, 1.0  # [px] by which the coarse part is off, and by which a finger differs from its shapes
+ASTRAY = 12.0  # [px] off the coarse part: a shape of the picture before is not where one begins to look any more
 NEAR = 1.0  # [px] within which a better guess is none: the fine part finds the same from both
 FINE_LAYOUT = (("pieces", "templates", "context", "mean", "gain"), ("offsets", "likelihood", "spread"))
 
@@ -56,11 +57,13 @@ class Places:
         pixels: (B, K, 2) column and row in the picture [px].
         likelihood: (B, K) from 0 to 1, that a point can be seen.
         stddev: (B, K) one standard deviation along a row or a column [px].
+        moves: (B, K, 2) how the points have moved as one shape [px]; None where no shapes are known.
     """
 
     pixels: NDArray
     likelihood: NDArray
     stddev: NDArray
+    moves: NDArray | None = None
 
 
 class SideNetwork:
@@ -153,12 +156,14 @@ class SideNetwork:
         half = cv2.resize(template, (self.width // 2, self.height // 2), interpolation=cv2.INTER_AREA)
         return Template(half=half, points=points, pieces=self._cut(template, points), shapes=shapes)
 
-    def locate(self, pictures: NDArray, templates: Sequence[Template]) -> Places:
+    def locate(self, pictures: NDArray, templates: Sequence[Template], starts: Sequence[NDArray | None] = ()) -> Places:
         """Find points in pictures.
 
         Args:
             pictures: (B, height, width, 3) uint8 RGB.
             templates: B, of fingers with the same number of points.
+            starts: `moves` (K, 2) [px] in each one's picture before, where that is known; what the coarse part does not
+                contradict is a better place to look than its own.
 
         Raises:
             DetectionError: the network cannot be computed for these.
@@ -171,6 +176,9 @@ class SideNetwork:
             return self._compare(pictures, templates, seen, guesses, everywhere)
         shapes = np.stack([template.shapes for template in templates])
         moves = fit_shapes(shapes, guesses - points, np.full(everywhere.shape, GUESS), np.ones(everywhere.shape))
+        for move, start in zip(moves, starts, strict=False):
+            if start is not None and np.linalg.norm(start - move, axis=1).max() < ASTRAY:
+                move[:] = start
         places = self._compare(pictures, templates, seen, points + moves, everywhere)
         better = _fit(shapes, points, places)
         wrong = np.linalg.norm(better - moves, axis=2) > NEAR
@@ -183,7 +191,7 @@ class SideNetwork:
             )
             better = _fit(shapes, points, places)
         believed = trust(places.pixels - points, better)
-        return replace(places, likelihood=places.likelihood * np.nan_to_num(believed))
+        return replace(places, likelihood=places.likelihood * np.nan_to_num(believed), moves=better)
 
     def _compare(
         self,

@@ -35,7 +35,7 @@ class ShadeNetwork:
         assert template.shape == (self.height, self.width, 3) and template[..., 0].any()
         return Template(half=template, points=points, pieces=template[None])
 
-    def locate(self, pictures, templates):
+    def locate(self, pictures, templates, starts=()):
         self.batches.append(len(pictures))
         count = len(templates[0].points)
         pixels = np.full((len(pictures), count, 2), np.nan)
