@@ -31,8 +31,9 @@ _DEEPER, _HIGHER, _BEYOND = 2.5e-3, 1.5e-3, 0.05
 # Standard deviations of how a lifted object settles, as a share of what shape and height were expected to be off, and
 # of the weight [N].
 _SETTLES, _WEIGHT = 0.05, 0.7
-# And of how far it has slid, as a share of what its pose says.
-_SLIDES = 0.3
+# And of how far it has slid or tilted, as a share of what its pose says. A tilt [rad] after which a hold begins anew,
+# and how far from its axis a tilted object presses [m].
+_SLIDES, _TILTED, _ARM = 0.3, 0.05, 0.01
 # The errors of so many successive frames count for one. An object is lifted from a change of so many standard
 # deviations on.
 _ALIKE, _SURE = 4.0, 2.5
@@ -88,10 +89,10 @@ class HeldWeight:
         """Starts to remember."""
         self._frames, self._place = 0, np.zeros(3)
         self._information, self._vector = np.zeros((4, 4)), np.zeros(4)
-        self._before, self._changed, self._led = self.force, False, 0.0
+        self._before, self._changed, self._led = self.force, False, np.zeros(2)
 
-    def lead(self, way: float) -> None:
-        """Takes the object for one that has slid by `way` [m] along the finger: what that moves is no force."""
+    def lead(self, way: NDArray) -> None:
+        """Takes the object for one whose shape and height (2,) have changed by `way`: what that moves is no force."""
         if self._frames < _REMEMBERED:
             self._begin()
             return
@@ -106,7 +107,7 @@ class HeldWeight:
             prior: variance of shape and height (2,).
         """
         away = frame.place - self._place
-        has_slid = abs(away[2]) > _HIGHER
+        has_slid = abs(away[2]) > _HIGHER or abs(self._led[0]) > _TILTED
         if self._frames and (abs(away[DEPTH]) > _DEEPER or has_slid):
             if has_slid and self._frames == _REMEMBERED:
                 self._compare(frame, away, prior)
@@ -129,13 +130,13 @@ class HeldWeight:
         if np.count_nonzero(known) < _FEWEST:
             return
         left = _find_left(frame, away, self._before) - self._memory
-        beyond = _BEYOND**2 * (away[DEPTH] ** 2 + away[2] ** 2)
+        beyond = _BEYOND**2 * (away[DEPTH] ** 2 + away[2] ** 2 + (_ARM * self._led[0]) ** 2)
         _accumulate(frame, left, known, beyond, self._information, self._vector)
         settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2, _WEIGHT**2])
-        settles[1] += (_SLIDES * self._led) ** 2
+        settles[:2] += (_SLIDES * self._led) ** 2
         spread = np.linalg.inv(self._information / _ALIKE + np.diag(1.0 / settles))
         asked = self._vector / _ALIKE
-        asked[1] += self._led / settles[1]
+        asked[:2] += self._led / settles[:2]
         changes, self.stddev = spread[2:] @ asked, float(np.sqrt(spread[2, 2]))
         aside = float(np.sqrt(spread[3, 3]))
         self._changed |= abs(changes[0]) > _SURE * self.stddev or abs(changes[1]) > _SURE * aside

@@ -184,7 +184,7 @@ class PlaceTracker:
         self._forget_place()
 
     def _forget_place(self) -> None:
-        self._slow, self._led = self._prior.copy(), float(self._prior[1])
+        self._slow, self._led = self._prior.copy(), self._prior.copy()
         count = len(self._rest)
         self._average = Average(np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros(count))
 
@@ -351,14 +351,14 @@ class PlaceTracker:
             self.slips.shift(change)
 
     def _lead_place(self) -> None:
-        """Takes the place along where the object slides, beyond what its pose may be off by chance.
+        """Takes the place along where the object slides or tilts, beyond what its pose may be off by chance.
 
         The averaged residuals are those of an object that stays where it is, and would hold the place back.
         """
-        moved = self._prior[1] - self._led
-        way = leave_play(moved, sqrt(self._prior_variance[1]))
-        if way != 0.0:
-            self._slow[1] += way
+        chance, moved = np.sqrt(self._prior_variance), self._prior - self._led
+        way = np.array([leave_play(moved[0], chance[0]), leave_play(moved[1], chance[1])])
+        if way.any():
+            self._slow += way
             self._led += way
             self._average = self._average._replace(count=_KEPT * self._average.count)
             self._held.lead(way)

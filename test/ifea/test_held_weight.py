@@ -115,7 +115,7 @@ def test_an_object_that_slides_is_not_taken_for_a_force_along():
     follow(held, [rest] * 20)
     guess = follow(held, [drawn] * 20)[-1]
     assert guess == pytest.approx(0.7, abs=0.1)  # so it looks, until the pose says better
-    held.lead(1e-3)
+    held.lead(np.array([0.0, 1e-3]))
     assert abs(follow(held, [drawn] * 20)[-1]) < 0.3 * guess
 
 
@@ -124,5 +124,5 @@ def test_a_weight_stays_what_it_was_while_the_object_slides():
     follow(held, [frame() for _ in range(20)])
     follow(held, [frame(0.6) for _ in range(40)])
     for step in range(1, 30):
-        held.lead(0.4e-3)
+        held.lead(np.array([0.0, 0.4e-3]))
         assert held.update(frame(0.6, place=(3e-3, 0.0, 0.04 + 0.4e-3 * step)), PRIOR) == pytest.approx(0.6, abs=0.1)
