@@ -19,7 +19,7 @@ from finforce_eval.experiments.grasp import join_jaws
 from finforce_eval.experiments.runs import RunOptions, build_setup
 
 GRASP = {"settle": 0.2, "record": 0.6, "clearance": 0.003, "closing_speed": 0.004}
-FIRM, SOFT = 0.006, 0.004  # [m] of each jaw beyond first touch
+FIRM, SOFT, SLIGHT = 0.006, 0.004, 0.0015  # [m] of each jaw beyond first touch
 SEEN, OBJECT, PLACE, LIGHT = "as trained", "another object", "another place", "dim light"
 # group, name, scene, what is changed; trained is on rod25 and block, 28 to 54 mm, bright
 GRASPS = (
@@ -34,7 +34,7 @@ GRASPS = (
     (PLACE, "cylinder_upper", "grasp_cylinder", {"displacement": FIRM, "height": 0.061}),
     (PLACE, "cylinder_lower", "grasp_cylinder", {"displacement": SOFT, "height": 0.022}),
     (PLACE, "cube_upper", "grasp_cube", {"displacement": FIRM, "height": 0.061}),
-    (PLACE, "cube_lower", "grasp_cube", {"displacement": SOFT, "height": 0.022}),
+    (PLACE, "cube_lower", "grasp_cube", {"displacement": SLIGHT, "height": 0.022}),
     (LIGHT, "cylinder_dim", "grasp_cylinder", {"displacement": FIRM, "height": 0.040, "light": "dim"}),
     (LIGHT, "cylinder_soft_dim", "grasp_cylinder", {"displacement": SOFT, "height": 0.046, "light": "dim"}),
     (LIGHT, "cube_dim", "grasp_cube", {"displacement": FIRM, "height": 0.040, "light": "dim"}),
