@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.setup import evaluate_all
+from finforce_eval.evaluation.tables import format_number
 from finforce_eval.experiments.experiment import Case, Findings, ResultTable
 from finforce_eval.experiments.grasp import join_jaws, score_course
 from finforce_eval.experiments.runs import RunOptions, build_setup, keep_poses
@@ -137,7 +138,13 @@ def _source_table(figures: Mapping[str, Mapping[str, Any]], summary: Mapping[str
         known = [row["poses"][way] for row in figures.values() if way in row["poses"]]
         if known:
             cells = [np.mean([one.get(key, np.nan) for one in known]) for key in POSE_FIGURES]
-            rows.append((words, *(f"{cell:.2f}" for cell in cells), f"{summary[way]['rmse_N']:.3f}"))
+            rows.append(
+                (
+                    words,
+                    *(format_number(None if np.isnan(cell) else cell) for cell in cells),
+                    f"{summary[way]['rmse_N']:.3f}",
+                )
+            )
     head = ("source", "rate/Hz", "delay/ms", "position: median/mm", "95 %/mm", "turn: median/°", "95 %/°", "force/N")
     note = (
         "Means over the grasps. FoundationPose needs a GPU and is not run: its figures are those of a publisher that "

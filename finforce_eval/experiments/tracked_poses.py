@@ -97,19 +97,20 @@ def true_poses(settings: Mapping[str, Any]) -> dict[int, NDArray]:
 def score_poses(recording: Recording, truth: Mapping[int, NDArray]) -> dict[str, float]:
     """Return how often poses come [Hz], and their median and 95th percentile of distance [mm] and turn [°] from truth.
 
-    Distances are of the middle of the object; of what looks the same turned the nearest turn counts.
+    Distances are of the middle of the object; of what looks the same turned the nearest turn counts. Without truth only
+    the rate is known.
     """
     mesh = load_object_mesh(require_mesh(recording))
     symmetry = read_symmetry("auto", mesh)
     track = recording.object_pose
     pairs = zip(track.stamps.tolist(), _read_poses(track), strict=True)
     errors = np.array([_measure(T, truth[stamp], symmetry) for stamp, T in pairs if stamp in truth])
-    if not len(errors):
-        return {}
-    away, turn = 1e3 * errors[:, 0], np.degrees(errors[:, 1])
     seconds = NANOSECOND * float(np.ptp(track.stamps))
-    return {
-        "rate_Hz": (len(track.stamps) - 1) / seconds if seconds > 0.0 else float("nan"),
+    rate = {"rate_Hz": (len(track.stamps) - 1) / seconds if seconds > 0.0 else float("nan")}
+    if not len(errors):
+        return rate
+    away, turn = 1e3 * errors[:, 0], np.degrees(errors[:, 1])
+    return rate | {
         "position_median_mm": float(np.median(away)),
         "position_p95_mm": float(np.quantile(away, 0.95)),
         "rotation_median_deg": float(np.median(turn)),

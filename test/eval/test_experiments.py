@@ -261,6 +261,7 @@ def test_the_built_in_tracker_stands_in_for_the_recorded_poses(tmp_path):
     assert (recorded["rate_Hz"], found["rate_Hz"]) == pytest.approx((10.0, 30.0), rel=0.01)
     assert 0.3 < recorded["position_median_mm"] < 0.7  # 0.3 mm along each axis
     assert found["position_median_mm"] < recorded["position_median_mm"]
+    assert score_poses(recording, {}) == {"rate_Hz": recorded["rate_Hz"]}
     turned = flip_poses(recording, 3)
     assert score_poses(turned, truth)["rotation_p95_deg"] > 90.0
     with pytest.raises(RecordingError, match="small: the built-in tracker needs depth images"):
