@@ -80,7 +80,7 @@ def run_trials(condition: Condition, name: str, seed: int) -> list[Reconstructio
     mask = roughen_mask(scene.mask, rng, condition.mask_error) if condition.mask_error else scene.mask
     guess = draw_guess(scene, rng, rng.uniform(*DISTANCES), condition.error)
     trials = [
-        _make_trial(condition, scene, seed, method, compare(scene, _place(guess, affine)), 0.0)
+        _make_trial(condition, scene, seed, method, compare(scene, place_mesh(guess.mesh, affine)), 0.0)
         for method, affine in (("raw", guess.affine), ("coarse", scale_guess(scene, mask, guess)))
     ]
     evidence = collect_evidence(scene.depth, mask, scene.camera)
@@ -104,13 +104,7 @@ def compare(scene: TableScene, placed: ObjectMesh) -> Chamfer:
 def scale_guess(scene: TableScene, mask: NDArray, guess: GeneratedMesh) -> NDArray:
     """Return the guess's map (4, 4) after the paper's coarse scale."""
     cloud = deproject(scene.depth, scene.camera, mask)
-    mesh = ObjectMesh(vertices=guess.vertices, triangles=guess.triangles, watertight=False, name="guess")
-    return scale_coarsely(mesh, guess.affine, cloud)
-
-
-def _place(guess: GeneratedMesh, affine: NDArray) -> ObjectMesh:
-    mesh = ObjectMesh(vertices=guess.vertices, triangles=guess.triangles, watertight=False, name="guess")
-    return place_mesh(mesh, affine)
+    return scale_coarsely(guess.mesh, guess.affine, cloud)
 
 
 def _make_trial(

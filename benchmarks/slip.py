@@ -19,7 +19,6 @@ from tqdm import tqdm
 from finforce.gripper_frames import ROBOT_CAMERA, SIDES
 from finforce.stamps import SECOND
 from finforce.transforms import pose_numbers
-from finforce_contact.errors import PoseLostError
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.jaw_contact import ForceLoop
 from finforce_contact.localization.slip import SlipWatch, TouchedFace
@@ -29,6 +28,7 @@ from finforce_contact.settings import ContactSettings
 from finforce_eval.evaluation.keypoint_source import build_records
 from finforce_eval.evaluation.machine import write_json
 from finforce_eval.experiments.grasp_sensors import observe_found
+from finforce_eval.experiments.tracked_poses import find_pose
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.settings import EstimatorSettings
@@ -133,24 +133,13 @@ def watch_images(scene: str, seed: int) -> Iterator[Seen]:
         T = np.linalg.inv(ROBOT_CAMERA) @ witness.state.T_gripper_object
         stamp = frame.stamp * SECOND
         image = RgbdImage(stamp=stamp, color=frame.color, depth=frame.depth, camera=camera)
-        found, pose = detector.detect(image), _track(tracker, view, image, T)
+        found, pose = detector.detect(image), find_pose(tracker, view, image, T, ON_MESH)
         said = [_said(loops[side], stamp, keypoints, pose) for side, keypoints in found.items()]
         height = witness.state.T_gripper_object[2, 3]
         slides = before is not None and abs(height - before) * 30.0 > SLIDES
         error = np.inf if pose is None else float(np.linalg.norm(pose[:3, 3] - T[:3, 3]))
         before = height
         yield Seen(stamp, slides, any(said), error)
-
-
-def _track(tracker: PoseTracker, view: MeshView, image: RgbdImage, T: NDArray) -> NDArray | None:
-    """Returns the tracked pose (4, 4), None without; the first is looked for near the true one."""
-    try:
-        if tracker.latest is not None:
-            return tracker.track(image.stamp, image.depth).T_camera_object
-        mask = np.abs(image.depth - view.render(T, image.camera).depth) < ON_MESH
-        return tracker.locate(image.stamp, image.depth, mask, [T]).T_camera_object
-    except PoseLostError:
-        return None
 
 
 def _said(loop: ForceLoop, stamp: float, keypoints: JawKeypoints, pose: NDArray | None) -> bool:

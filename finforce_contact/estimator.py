@@ -172,8 +172,8 @@ class ContactEstimator:
         self._symmetry = read_symmetry(self.settings.symmetry, mesh) if mesh is not None else None
         self._localizer = self._build_localizer(mesh) if mesh is not None else None
         if mesh is not None:
-            low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-            self._centre, self._half = 0.5 * (low + high), 0.5 * (high - low)
+            low, high = mesh.bounds
+            self._centre, self._half = mesh.middle, 0.5 * (high - low)
             span = (float(self.face.heights[0]), float(self.face.heights[-1]))
             self._sections = SectionKeeper(mesh, self.face.half_width, self.settings, span)
         self._mesh = mesh

@@ -39,7 +39,12 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint; the file before it stays whole until the new one is complete."""
     content = {name: getattr(checkpoint, name) for name in checkpoint.__dataclass_fields__}
     content["shape"] = asdict(checkpoint.shape)
-    part = Path(path).with_suffix(".part")
+    save_whole(content, Path(path))
+
+
+def save_whole(content: Mapping[str, Any], path: Path) -> None:
+    """Write what torch can; the file before it stays whole until the new one is complete."""
+    part = path.with_suffix(".part")
     torch.save(content, part)
     part.replace(path)
 

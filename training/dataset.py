@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -106,10 +106,15 @@ class FingerPictures:
 
 def save_shard(path: Path, pictures: FingerPictures) -> None:
     """Write one shard, `train_*.npz` or `val_*.npz`; it appears whole or not at all."""
+    save_arrays(path, {name: getattr(pictures, name) for name in _SHAPES})
+
+
+def save_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
+    """Write arrays by name as a .npz file, which appears whole or not at all."""
     unfinished = path.with_suffix(".part")
     with unfinished.open("wb") as file:
-        np.savez(file, **{name: getattr(pictures, name) for name in _SHAPES})
-    unfinished.rename(path)
+        np.savez(file, **arrays)
+    unfinished.replace(path)
 
 
 def load_shard(path: Path) -> FingerPictures:

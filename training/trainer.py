@@ -19,7 +19,7 @@ from training.loading import LoadingSettings, load_batches
 from training.losses import Batch, Losses, compute_losses, to_layers
 from training.network import FingerNetwork
 from training.optional import import_torch
-from training.recipe import Recipe
+from training.recipe import Recipe, Schedule
 from training.scoring import Detections, Score, gather_detections, score_detections
 
 torch = import_torch()
@@ -57,10 +57,8 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        """How much of the training is done, 0 to 1: by steps where the recipe counts them, else by time."""
-        if self.recipe.steps:
-            return min(self.step / self.recipe.steps, 1.0)
-        return min(self.elapsed / (60.0 * self.recipe.minutes), 1.0)
+        """How much of the training is done, 0 to 1."""
+        return measure_progress(self.step, self.elapsed, self.recipe)
 
     def learn(self, batch: Batch) -> Losses:
         """Take one step on a batch and return its losses."""
@@ -112,7 +110,12 @@ class Trainer:
         self.step, self.elapsed = checkpoint.step, checkpoint.elapsed
 
 
-def compute_rate(progress: float, recipe: Recipe) -> float:
+def measure_progress(step: int, elapsed: float, recipe: Schedule) -> float:
+    """Return how much is done, 0 to 1, after some steps and seconds: by steps where the recipe counts them."""
+    return min(step / recipe.steps if recipe.steps else elapsed / (60.0 * recipe.minutes), 1.0)
+
+
+def compute_rate(progress: float, recipe: Schedule) -> float:
     """Return the learning rate at a progress from 0 to 1: a linear rise, then half a cosine down to a hundredth."""
     if progress < recipe.warm_up:
         return recipe.rate * (0.02 + 0.98 * progress / recipe.warm_up)

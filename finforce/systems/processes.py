@@ -133,11 +133,8 @@ def contact_processes(jaws: str, options: SolverOptions, *, waits: bool = False)
         "contact.mode": options.contact,
         "contact.mesh": "coarse" if options.solver == "paper" else options.mesh,
     }
-    process = _jaws_process("contact_estimator", jaws, asked, options)
-    if options.pose_topic:
-        topics = {name: options.pose_topic for name in POSE_TOPICS}
-        process = replace(process, remappings={**process.remappings, **topics})
-    return [process]
+    topics = dict.fromkeys(POSE_TOPICS, options.pose_topic) if options.pose_topic else {}
+    return [replace(_jaws_process("contact_estimator", jaws, asked, options), remappings=topics)]
 
 
 def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:

@@ -51,13 +51,21 @@ def compute_chamfer(mesh_a: ObjectMesh, mesh_b: ObjectMesh, *, count: int = SAMP
 
 def sample_surface(mesh: ObjectMesh, count: int, rng: np.random.Generator) -> NDArray:
     """Return points (count, 3), drawn evenly over the area of a mesh."""
+    return sample_with_normals(mesh, count, rng)[0]
+
+
+def sample_with_normals(mesh: ObjectMesh, count: int, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
+    """Return points (count, 3), drawn evenly over the area of a mesh, and the normals of their triangles there."""
     corners = mesh.vertices[mesh.triangles]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    chosen = corners[rng.choice(len(areas), size=count, p=areas / areas.sum())]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(across, axis=1)
+    which = rng.choice(len(areas), size=count, p=areas / areas.sum())
+    chosen = corners[which]
     u, v = rng.random((2, count, 1))
     folds = u + v > 1.0
     u, v = np.where(folds, 1.0 - u, u), np.where(folds, 1.0 - v, v)
-    return chosen[:, 0] + u * (chosen[:, 1] - chosen[:, 0]) + v * (chosen[:, 2] - chosen[:, 0])
+    points = chosen[:, 0] + u * (chosen[:, 1] - chosen[:, 0]) + v * (chosen[:, 2] - chosen[:, 0])
+    return points, across[which] / areas[which, None]
 
 
 def _distances(points: NDArray, mesh: ObjectMesh) -> NDArray:

@@ -210,7 +210,7 @@ def surrounds(mesh: ObjectMesh, point: NDArray) -> bool:
 
     The generalised winding number, the triangles' solid angles over 4 pi, exceeds a half (Jacobson et al. 2013).
     """
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    low, high = mesh.bounds
     if ((point <= low) | (point >= high)).any():
         return False
     corners = np.ascontiguousarray(mesh.vertices[mesh.triangles] - point, dtype=float)

@@ -79,6 +79,16 @@ class ObjectMesh:
         """The edges of the triangles, found once."""
         return build_edge_table(self.triangles)
 
+    @cached_property
+    def bounds(self) -> NDArray:
+        """Least and greatest coordinates (2, 3) [m]."""
+        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    @property
+    def middle(self) -> NDArray:
+        """The middle of the bounding box (3,) [m]."""
+        return 0.5 * (self.bounds[0] + self.bounds[1])
+
     def with_triangles(self, vertices: NDArray, triangles: NDArray, note: str = "") -> "ObjectMesh":
         """Return the object with other triangles (m, 3), on those of the vertices (n, 3) that they use, and a note."""
         used, compact = np.unique(triangles, return_inverse=True)

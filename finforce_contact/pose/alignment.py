@@ -140,8 +140,8 @@ class MeshAligner:
             MissingDependencyError: Open3D is not installed.
         """
         self.camera, self.settings = camera, settings
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        self.middle, self.radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+        low, high = mesh.bounds
+        self.middle, self.radius = mesh.middle, 0.5 * float(np.linalg.norm(high - low))
         self._view, self._outline = MeshView(mesh), MeshOutline(mesh)
 
     def middle_of(self, T_camera_object: NDArray) -> NDArray:

@@ -85,7 +85,7 @@ class ExternalPoseSource:
         self._frame, self._mesh, self._covariance = frame.lstrip("/"), mesh, np.diag(stddev**2)
         self._back = np.zeros(3)
         if mesh is not None:
-            self._back = -ORIGINS[origin] * 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
+            self._back = -ORIGINS[origin] * mesh.middle
 
     def reset(self) -> None:
         """Forgets the latest pose, so that a stamp before it is taken again."""

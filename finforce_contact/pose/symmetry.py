@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from finforce.transforms import rotation_between
 from finforce_contact.errors import ContactError
+from finforce_contact.mesh.chamfer import sample_with_normals
 from finforce_contact.mesh.triangles import ObjectMesh
 
 AUTO, NONE, FULL = "auto", "none", "full"
@@ -84,10 +86,9 @@ def read_symmetry(text: str, mesh: ObjectMesh) -> Symmetry:
     axes = [name[0] for name in names if name.endswith(FULL)]
     if len(axes) > 1:  # a ball: any turn; about one axis and to any other is enough to keep it from flipping
         names = (f"{axes[0]}_{FULL}", *(f"{letter}_90" for letter in AXES if letter != axes[0]))
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     axis = np.eye(3)[AXES[axes[0]]] if axes else None
     steps = [_step(name) for name in names if not name.endswith(FULL)]
-    return Symmetry(names=tuple(names), turns=_close(steps), axis=axis, middle=0.5 * (low + high))
+    return Symmetry(names=tuple(names), turns=_close(steps), axis=axis, middle=mesh.middle)
 
 
 def parse_symmetry(text: str) -> tuple[str, ...] | None:
@@ -95,20 +96,22 @@ def parse_symmetry(text: str) -> tuple[str, ...] | None:
     words = text.replace(",", " ").split()
     if words in ([AUTO], [NONE]):
         return None if words == [AUTO] else ()
+    expected = f"symmetry {text!r}: expected {AUTO}, {NONE}, or words as x_180 and z_{FULL}"
     for word in words:
         found = re.fullmatch(rf"[xyz]_({FULL}|\d{{1,3}})", word)
         angle = found and found.group(1)
         if not found or (angle != FULL and (int(angle) < 15 or int(angle) > 180 or 360 % int(angle))):
-            raise ContactError(f"symmetry {text!r}: expected {AUTO}, {NONE}, or words as x_180 and z_{FULL}")
+            raise ContactError(expected)
     if not words:
-        raise ContactError(f"symmetry {text!r}: expected {AUTO}, {NONE}, or words as x_180 and z_{FULL}")
+        raise ContactError(expected)
     return tuple(words)
 
 
+@lru_cache(maxsize=1)  # both jaws hold the same object
 def find_symmetries(mesh: ObjectMesh) -> tuple[str, ...]:
     """Return the turns about the axes of a mesh's frame, through its middle, that map it onto itself."""
-    points, normals = _sample(mesh, _SAMPLES)
-    points = points - 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
+    points, normals = sample_with_normals(mesh, _SAMPLES, np.random.default_rng(0))
+    points = points - mesh.middle
     tree, size = cKDTree(points), float(np.linalg.norm(np.ptp(points, axis=0)))
 
     def fits(axis: NDArray, angle: float) -> bool:
@@ -128,18 +131,6 @@ def find_symmetries(mesh: ObjectMesh) -> tuple[str, ...]:
             fold = next((fold for fold in _FOLDS if fits(axis, 2.0 * np.pi / fold)), 0)
             found += [f"{letter}_{360 // fold}"] if fold else []
     return tuple(found)
-
-
-def _sample(mesh: ObjectMesh, count: int) -> tuple[NDArray, NDArray]:
-    """Return points (count, 3) [m] spread over a surface by chance, and its normals there."""
-    random, corners = np.random.default_rng(0), mesh.vertices[mesh.triangles]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(across, axis=1)
-    chosen = random.choice(len(area), count, p=area / area.sum())
-    u, v = random.random((2, count, 1))
-    u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
-    a, b, c = (corners[chosen, k] for k in range(3))
-    return a + u * (b - a) + v * (c - a), across[chosen] / area[chosen, None]
 
 
 def _step(name: str) -> NDArray:

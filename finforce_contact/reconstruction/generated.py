@@ -47,8 +47,8 @@ def read_splats(path: Path) -> NDArray | None:
     """
     if path.stat().st_size > FILE_BOUND:
         raise ObjectMeshError(f"{path.name}: got {path.stat().st_size} bytes, expected {FILE_BOUND} at most")
-    content = path.read_bytes()
-    head, end, body = content[:HEADER_BOUND].partition(b"end_header\n")
+    with path.open("rb") as file:
+        head, end, _ = file.read(HEADER_BOUND).partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     elements = [line for line in lines if line[:1] == ["element"]]
     names = [line[2] for line in lines if line[:2] == ["property", "float"] and len(line) == 3]
@@ -56,7 +56,7 @@ def read_splats(path: Path) -> NDArray | None:
     if not end or len(elements) != 1 or not is_plain or not {*PLACE, OPACITY} <= set(names):
         return None
     count = int(elements[0][2]) if elements[0][2:] and elements[0][2].isdigit() else -1
-    body = content[len(head) + len(end) :]
+    body = path.read_bytes()[len(head) + len(end) :]
     if ["format", "binary_little_endian", "1.0"] not in lines or not 0 <= count * 4 * len(names) <= len(body):
         raise ObjectMeshError(
             f"{path.name}: got {len(body)} bytes for {count} splats of {len(names)} numbers, expected as many as the "

@@ -98,6 +98,11 @@ class GeneratedMesh:
                 f"{np.linalg.det(A[:3, :3]):.3g}; expected a rotation times a scale, neither sheared nor mirrored"
             )
 
+    @property
+    def mesh(self) -> ObjectMesh:
+        """The triangles, in the generator's unit and axes."""
+        return ObjectMesh(vertices=self.vertices, triangles=self.triangles, watertight=False, name=self.name)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reconstruction:

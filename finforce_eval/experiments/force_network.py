@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from finforce.optional import import_cv2
 from finforce_eval.errors import OptionError
 from finforce_eval.recordings.images import StampedImage
+from finforce_keypoints.networks.network import CPU, open_session
+from finforce_keypoints.networks.side_network import METADATA
 
 SHOWN = 10  # images that the network is given at a time
 HEIGHT, WIDTH = 120, 160  # [px]
-KIND, METADATA = "force_from_images", "finforce"
+KIND = "force_from_images"
 LAYOUT = (("images",), ("force",))
 SHIPPED = Path(__file__).parents[1] / "data" / "force_network" / "force_network.onnx"
-CPU = "CPUExecutionProvider"
 
 
 def reduce_image(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -42,8 +43,6 @@ class ForceNetwork:
     """
 
     def __init__(self, path: str | Path = SHIPPED) -> None:
-        from finforce_keypoints.networks.network import open_session
-
         self.path = Path(path)
         self._session = open_session(self.path, 1, (CPU,))
         text = self._session.get_modelmeta().custom_metadata_map.get(METADATA, "")

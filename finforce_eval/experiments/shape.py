@@ -87,7 +87,7 @@ class ShapeExperiment:
         file.unlink()
         layout.unlink()
         true = place_mesh(scene.mesh, scene.T_camera_object)
-        raw = ObjectMesh(vertices=vertices, triangles=triangles, watertight=False, name=file.stem)
+        raw = generated.mesh
         coarse = scale_coarsely(raw, affine, deproject(scene.depth, scene.camera, mask))
         figures = {name: _distance(place_mesh(raw, A), true) for name, A in (("raw_mm", affine), ("coarse_mm", coarse))}
         evidence = collect_evidence(scene.depth, mask, scene.camera)
@@ -165,8 +165,7 @@ def write_generated(guess: GeneratedMesh, path: Path, rng: np.random.Generator) 
 
 def _encode_splats(guess: GeneratedMesh, rng: np.random.Generator) -> bytes:
     """Return a PLY file of Gaussian splats on a mesh, some of them faint and astray."""
-    mesh = ObjectMesh(vertices=guess.vertices, triangles=guess.triangles, watertight=False, name=guess.name)
-    places = sample_surface(mesh, SPLATS, rng) + SPREAD * rng.standard_normal((SPLATS, 3))
+    places = sample_surface(guess.mesh, SPLATS, rng) + SPREAD * rng.standard_normal((SPLATS, 3))
     places = np.vstack((places, rng.uniform(-0.6, 0.6, (STRAYS, 3))))
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]

@@ -19,6 +19,7 @@ from finforce_contact.pose.tracker import PoseTracker
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.tracks import PoseTrack, Recording
+from finforce_keypoints.images import RgbdImage
 from finforce_twin.gripper.footage import CAMERAS, FINGER, START
 from finforce_twin.gripper.gripper import TwinGripper
 from finforce_twin.scenes.scenarios import build_scenario
@@ -58,18 +59,13 @@ def track_object(recording: Recording) -> TrackedObject:
     stamps, poses, times, lost = [], [], [], 0
     for stamp, image in images.at(images.stamps[images.stamps >= known.stamps[0] - FIRST_WITHIN]):
         began = time.perf_counter()
-        try:
-            if tracker.latest is None:
-                mask = np.abs(image.depth - view.render(first, image.camera).depth) < ON_MESH
-                pose = tracker.locate(image.stamp, image.depth, mask, [first])
-            else:
-                pose = tracker.track(image.stamp, image.depth)
-        except PoseLostError:
+        pose = find_pose(tracker, view, image, first, ON_MESH)
+        if pose is None:
             lost += 1
             continue
         times.append(time.perf_counter() - began)
         stamps.append(stamp)
-        poses.append(pose.T_camera_object)
+        poses.append(pose)
     if not stamps:
         raise RecordingError(f"{recording.name}: the built-in tracker did not find the object in {lost} depth images")
     track = PoseTrack(
@@ -81,6 +77,27 @@ def track_object(recording: Recording) -> TrackedObject:
     return TrackedObject(
         recording=replace(recording, object_pose=track), delay=round(np.median(times) / NANOSECOND), lost=lost
     )
+
+
+def find_pose(
+    tracker: PoseTracker, view: MeshView, image: RgbdImage, T_first: NDArray, within: float
+) -> NDArray | None:
+    """Return T_camera_object (4, 4) in an image, None where the object is lost.
+
+    Args:
+        tracker: that has seen the images before.
+        view: of the object.
+        image: with depth.
+        T_first: (4, 4) near which it is, as long as the tracker has no pose.
+        within: depth by which a pixel may be off the mesh there and still be the object's [m].
+    """
+    try:
+        if tracker.latest is not None:
+            return tracker.track(image.stamp, image.depth).T_camera_object
+        mask = np.abs(image.depth - view.render(T_first, image.camera).depth) < within
+        return tracker.locate(image.stamp, image.depth, mask, [T_first]).T_camera_object
+    except PoseLostError:
+        return None
 
 
 def true_poses(settings: Mapping[str, Any]) -> dict[int, NDArray]:

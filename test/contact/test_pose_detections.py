@@ -1,7 +1,5 @@
 """Claims about poses by vision_msgs over real ROS, in a process that has it; and about turns that nobody sees."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import message_fakes
@@ -19,12 +17,8 @@ from finforce_twin.scenes.objects import build_object
 
 
 def test_poses_of_foundationpose_over_real_ros():
-    trials = Path(__file__).with_name("detection_trials.py")
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", str(trials)]
-    environment = message_fakes.environment("vision_msgs")
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400, check=False)
-    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
-    assert "7 passed" in done.stdout
+    said = message_fakes.run_trials("vision_msgs", Path(__file__).with_name("detection_trials.py"))
+    assert "7 passed" in said
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,14 @@ def environment(package):
     }
 
 
+def run_trials(package, trials):
+    """What pytest prints of a file of trials, in a process that has a package; all of them pass."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", str(trials)]
+    done = subprocess.run(command, env=environment(package), capture_output=True, text=True, timeout=400, check=False)
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
+    return done.stdout
+
+
 def _build(package, target):
     missing = [name for name in ("cmake", "c++") if shutil.which(name) is None]
     if missing or not (Path(sys.prefix) / "generators").exists():

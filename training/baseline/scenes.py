@@ -21,6 +21,7 @@ from finforce_twin.gripper.gripper import TwinGripper
 from finforce_twin.rendering.photographer import Photographer
 from finforce_twin.scenes.scenarios import Scenario, build_scenario
 from training.arguments import one_line_errors
+from training.dataset import save_arrays
 from training.errors import DatasetError
 
 OBJECTS = ("grasp_cylinder", "grasp_cube")
@@ -104,10 +105,7 @@ def write_films(seeds: Sequence[int], folder: Path, name: str) -> Iterator[int]:
         except FinforceError:  # pressed too far: another seed will do
             yield 0
             continue
-        part = path.with_suffix(".part")
-        with part.open("wb") as file:
-            np.savez(file, images=film.images, force=film.force)
-        part.replace(path)
+        save_arrays(path, {"images": film.images, "force": film.force})
         yield len(film.force)
 
 

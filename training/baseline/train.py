@@ -14,15 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce.settings import check_bounds, setting
+from finforce.settings import setting
+from finforce_eval.evaluation.results import ONSET
+from finforce_eval.evaluation.scoring import rms
 from finforce_eval.experiments.force_network import HEIGHT, KIND, LAYOUT, SHOWN, WIDTH
 from training.arguments import add_settings, one_line_errors, settings_from
 from training.baseline.network import BACKBONES, SMALL, EndToEnd
 from training.baseline.scenes import TRAIN, VALIDATION, GraspFilm, load_films
-from training.errors import CheckpointError, RecipeError
+from training.checkpoint import save_whole
+from training.errors import CheckpointError
 from training.export import write_onnx
 from training.optional import import_torch
-from training.trainer import compute_rate, has_bfloat16
+from training.recipe import Schedule
+from training.trainer import compute_rate, has_bfloat16, measure_progress
 
 torch = import_torch()
 
@@ -31,25 +35,17 @@ SEGMENT = 24  # images in a row that share their features: 15 windows of ten
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaselineRecipe:
-    """How the network is trained; a run ends after its minutes, whatever it has seen by then."""
+class BaselineRecipe(Schedule):
+    """How the end-to-end network is trained."""
 
     minutes: float = setting(180.0, "time that training may take, evaluation included", "min", 0.01, 10_000.0)
-    steps: int = setting(0, "batches until the end; 0: until the minutes are over, not repeatable", "", 0, 10**9)
-    seed: int = setting(0, "of weights, order and augmentation", "", 0, 2**31)
     batch: int = setting(8, "pieces of 24 images per step", "", 1, 4096)
     rate: float = setting(1e-3, "largest learning rate of AdamW", "", 1e-6, 1.0)
-    warm_up: float = setting(0.04, "part of the time in which the rate rises", "-", 0.0, 0.5)
     decay: float = setting(5e-2, "weight decay of AdamW", "", 0.0, 1.0)
     clip: float = setting(1.0, "largest norm of the gradient", "", 1e-3, 1e6)
-    threads: int = setting(1, "threads of the network's arithmetic", "", 1, 256)
-    evaluate_every: float = setting(5.0, "time between evaluations and checkpoints", "min", 0.01, 10_000.0)
     shift: int = setting(6, "largest shift of the images", "px", 0, 40)
     light: float = setting(0.3, "largest change of brightness and of contrast", "-", 0.0, 0.9)
     noise: float = setting(4.0, "largest standard deviation of a pixel's noise", "", 0.0, 50.0)
-
-    def __post_init__(self) -> None:
-        check_bounds(self, RecipeError)
 
 
 def draw_batch(films: Sequence[GraspFilm], recipe: BaselineRecipe, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
@@ -98,9 +94,8 @@ class BaselineTrainer:
 
     @property
     def progress(self) -> float:
-        """Share of the training that is over."""
-        recipe = self.recipe
-        return self.step / recipe.steps if recipe.steps else min(self.elapsed / (60.0 * recipe.minutes), 1.0)
+        """How much of the training is done, 0 to 1."""
+        return measure_progress(self.step, self.elapsed, self.recipe)
 
     def learn(self, images: NDArray[np.uint8], forces: NDArray) -> float:
         """Take one step on images (b, 24, h, w, 3) and forces (b, 24) [N]; return the loss."""
@@ -133,17 +128,13 @@ class BaselineTrainer:
             errors.append(self.network.judge(windows).cpu().numpy() - film.force[SHOWN - 1 :])
             true.append(film.force[SHOWN - 1 :])
         error, force = np.concatenate(errors), np.concatenate(true)
-        return {
-            "rmse_N": float(np.sqrt(np.mean(error**2))),
-            "held_N": float(np.sqrt(np.mean(error[force > 0.02] ** 2))),
-        }
+        return {"rmse_N": rms(error), "held_N": rms(error[force > ONSET])}
 
     def save(self, folder: Path) -> None:
         """Write a checkpoint; the one before it stays whole until the new one is complete."""
         states = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict()}
-        part = folder / f"{CHECKPOINT}.part"
-        torch.save({"backbone": self.network.backbone, "step": self.step, "elapsed": self.elapsed, **states}, part)
-        part.replace(folder / CHECKPOINT)
+        about = {"backbone": self.network.backbone, "step": self.step, "elapsed": self.elapsed}
+        save_whole({**about, **states}, folder / CHECKPOINT)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint.
