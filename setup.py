@@ -77,6 +77,7 @@ setup(
             "gripper_driver = finforce.ros.start:gripper_driver",
             "ifea_solver = finforce.ros.start:ifea_solver",
             "keypoint_detector = finforce.ros.start:keypoint_detector",
+            "pipeline = finforce.ros.start:pipeline",
             "recording_player = finforce.ros.start:recording_player",
             "twin_camera = finforce.ros.start:twin_camera",
         ],

@@ -9,14 +9,12 @@ from functools import partial
 from time import perf_counter
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 
 from finforce.errors import FinforceError
 from finforce.health import Health, Outcome, Report
-from finforce.messages import read_stamp, stamp_of
+from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce.settings import refresh_record
 from finforce.skipping import CONTACT, IDLE, UNNEEDED, Skips
@@ -34,13 +32,14 @@ class ContactEstimatorNode(Node):
     """Says where the object touches the jaws, image by image; lives on without an object.
 
     Args:
+        stage: what the node is in a process of several.
         options: of `rclpy.node.Node`.
 
     Raises:
         FinforceError: a parameter or the jaw cannot be used.
     """
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, stage: ros.Stage | None = None, **options: Any) -> None:
         super().__init__("contact_estimator", **options)
         self.parameters = parameters = ros.declare_record(self, ContactParameters)
         contact = ros.declare_record(self, ContactSettings, "contact")
@@ -51,7 +50,7 @@ class ContactEstimatorNode(Node):
         self.session = ContactSession(parameters, contact, tracker, self.skips)
         self.gates = {side: StampGate(max_age=age, restart_gap=parameters.restart_gap) for side in sides}
         self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in sides}
-        self.qos = ros.QosWatch(self)
+        self.qos = ros.QosWatch(self, stage)
         self.out = ContactOutputs(self.qos, parameters, self.skips)
         with self._refusals(sides):
             self.get_logger().info(self.session.load_mesh(parameters))
@@ -66,9 +65,9 @@ class ContactEstimatorNode(Node):
         """Offer services, whose long work holds up nothing else, and diagnostics."""
         session, period = self.session, self.parameters.diagnostics_period
         one_by_one = MutuallyExclusiveCallbackGroup()
-        ros.serve_trigger(self, "~/load_mesh", lambda: session.load_mesh(self._refreshed()), one_by_one)
-        ros.serve_trigger(self, "~/reconstruct", lambda: session.reconstruct(self._refreshed()), one_by_one)
-        ros.serve_trigger(self, "~/reset", session.reset)
+        ros.serve_trigger(self.qos, "~/load_mesh", lambda: session.load_mesh(self._refreshed()), one_by_one)
+        ros.serve_trigger(self.qos, "~/reconstruct", lambda: session.reconstruct(self._refreshed()), one_by_one)
+        ros.serve_trigger(self.qos, "~/reset", session.reset)
         for side in self.parameters.sides:
             report = partial(self._report, side)
             ros.publish_diagnostics(self, self.qos, f"finforce: {side} contact", period, report)
@@ -77,19 +76,19 @@ class ContactEstimatorNode(Node):
         """Return the parameters with the present values of those that may be set at run time."""
         return refresh_record(self.parameters, lambda name: self.get_parameter(name).value)
 
-    def on_jaw_pose(self, side: str, data: bytes) -> None:
+    def on_jaw_pose(self, side: str, unread: ros.Unread) -> None:
         """Find the contact of an image, unless it may be passed over."""
-        began, stamp = perf_counter(), read_stamp(data)
+        began, stamp = perf_counter(), unread.stamp
         self.health[side].arrive()
         with self._refusals((side,)):
             if self.idling[side].passes(stamp):
                 self.skips.count(IDLE)
-                self.session.pass_over(side, stamp, partial(deserialize_message, data, PoseStamped))
+                self.session.pass_over(side, stamp, unread.read)
                 return
             if self.gates[side].enter(stamp, self._now()):
                 self.session.restart(side)
                 self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
-            message = deserialize_message(data, PoseStamped)
+            message = unread.read()
             self._read_late(side)
             self._send(side, began, self.session.take_jaw_pose(side, message))
             self._rest(side, stamp)
@@ -114,18 +113,20 @@ class ContactEstimatorNode(Node):
         self.skips.count(UNNEEDED)
         self.inputs[side].close()
 
-    def on_jaw(self, side: str, kind: type, take: Callable[[str, Any], list[TimedEstimate]], data: bytes) -> None:
+    def on_jaw(
+        self, side: str, kind: type, take: Callable[[str, Any], list[TimedEstimate]], unread: ros.Unread
+    ) -> None:
         """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own.
 
         Of an image that is passed over it is read when the next contact is looked for, if nothing newer came.
         """
-        began, stamp = perf_counter(), read_stamp(data)
+        began, stamp = perf_counter(), unread.stamp
         if self.idling[side].passes(stamp):
-            self.unread[side][kind] = partial(self.on_jaw, side, kind, take, data)
+            self.unread[side][kind] = partial(self.on_jaw, side, kind, take, unread)
             return
         self.unread[side].pop(kind, None)
         with self._refusals((side,)):
-            message = deserialize_message(data, kind)
+            message = unread.read()
             self._check_ahead(message)
             self._send(side, began, take(side, message))
 

@@ -251,10 +251,10 @@ class Handlers(Protocol):
     async def on_image(self, take: Callable[[Any], Any], image: Any) -> None:
         """Use the object's pose that `take` finds with an image."""
 
-    def on_jaw_pose(self, side: str, data: bytes) -> None:
+    def on_jaw_pose(self, side: str, unread: ros.Unread) -> None:
         """Use the pose of a jaw, a message that was not read yet."""
 
-    def on_jaw(self, side: str, kind: type, take: Callable[[str, Any], list[Any]], data: bytes) -> None:
+    def on_jaw(self, side: str, kind: type, take: Callable[[str, Any], list[Any]], unread: ros.Unread) -> None:
         """Use what `take` makes of a message of a jaw's solver, which was not read yet."""
 
 
@@ -287,13 +287,13 @@ class JawInputs:
     def open(self) -> None:
         """Listen to the jaw's solver from now on."""
         if not self._made:
-            # as bytes: of an image that is passed over no more than the stamp is read
-            self._made = [self._qos.subscription(*topic, ros.SENSOR, raw=True) for topic in self._topics]
+            # of an image that is passed over no more than the stamp is read
+            self._made = [self._qos.subscription(*topic, ros.SENSOR, unread=True) for topic in self._topics]
 
     def close(self) -> None:
         """Listen no more."""
         while self._made:
-            self._qos.node.destroy_subscription(self._made.pop())
+            self._qos.drop(self._made.pop())
 
 
 def subscribe(
@@ -313,7 +313,8 @@ def subscribe(
     jaws = {side: JawInputs(qos, side, session, handlers) for side in parameters.sides}
     for side, inputs in jaws.items():
         inputs.open()
-        qos.subscription(ros.PoseStamped, f"{side}/jaw_pose", partial(handlers.on_jaw_pose, side), WAITING, raw=True)
+        take = partial(handlers.on_jaw_pose, side)
+        qos.subscription(ros.PoseStamped, f"{side}/jaw_pose", take, WAITING, unread=True, can_wait=True)
     return jaws
 
 

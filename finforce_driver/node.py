@@ -97,11 +97,11 @@ class GripperDriverNode(Node):
         """Offer services, whose waiting holds up nothing else, and diagnostics."""
         tasks = self.tasks
         for name in ("estop", "stop"):
-            ros.serve_trigger(self, f"~/{name}", getattr(tasks, name))
+            ros.serve_trigger(self.qos, f"~/{name}", getattr(tasks, name))
         for name in ("calibrate", "clear_errors", "grasp", "grasp_without_vision", "release"):
             # what waits for an earlier call would move the jaws after a stop
-            ros.serve_trigger(self, f"~/{name}", getattr(tasks, name), ReentrantCallbackGroup())
-        ros.serve_switch(self, "~/activate", tasks.activate)
+            ros.serve_trigger(self.qos, f"~/{name}", getattr(tasks, name), ReentrantCallbackGroup())
+        ros.serve_switch(self.qos, "~/activate", tasks.activate)
         offered = [] if self.is_other else ACTIONS
         self.actions = [action for action in map(self._offer_action, offered) if action is not None]
         ros.publish_diagnostics(self, self.qos, "finforce: gripper", self.parameters.diagnostics_period, self._report)

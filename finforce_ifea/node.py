@@ -12,13 +12,12 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from finforce.errors import FinforceError
 from finforce.gripper_frames import SIDES
 from finforce.health import Health, Outcome, Report
-from finforce.messages import pose_from_message, read_stamp, stamp_of, wrench_from_message
+from finforce.messages import pose_from_message, stamp_of, wrench_from_message
 from finforce.ros import node as ros
 from finforce.skipping import AWAY, IDLE, LATE, SOLVER, Skips
 from finforce.stamps import Idling, StampGate
@@ -43,13 +42,16 @@ class IfeaSolverNode(Node):
 
     Args:
         build: makes the estimator from jaw, parameters and settings.
+        stage: what the node is in a process of several.
         options: of `rclpy.node.Node`.
 
     Raises:
         FinforceError: a parameter, the jaw or the calibration cannot be used.
     """
 
-    def __init__(self, build: Callable[..., Any] = build_estimator, **options: Any) -> None:
+    def __init__(
+        self, build: Callable[..., Any] = build_estimator, stage: ros.Stage | None = None, **options: Any
+    ) -> None:
         super().__init__("ifea_solver", **options)
         self.parameters = parameters = ros.declare_record(self, NodeParameters)
         settings = ros.declare_record(self, EstimatorSettings, "estimator")
@@ -64,7 +66,7 @@ class IfeaSolverNode(Node):
         self.pairing = ForcePairing(parameters.jaw_name)
         self.idling = Idling()
         self.last: Solution | None = None
-        self.qos = ros.QosWatch(self)
+        self.qos = ros.QosWatch(self, stage)
         self.out = SolverOutputs(self.qos, parameters, self.skips)
         self._serve(parameters.jaw_name)
         self._subscribe(parameters.jaw_name)
@@ -84,8 +86,8 @@ class IfeaSolverNode(Node):
 
     def _serve(self, side: str) -> None:
         """Offer services and diagnostics."""
-        ros.serve_trigger(self, f"{side}/tare", lambda: str(self.estimator.tare()))
-        ros.serve_trigger(self, f"{side}/reset", lambda: self._restart("reset by service"))
+        ros.serve_trigger(self.qos, f"{side}/tare", lambda: str(self.estimator.tare()))
+        ros.serve_trigger(self.qos, f"{side}/reset", lambda: self._restart("reset by service"))
         period = self.parameters.diagnostics_period
         ros.publish_diagnostics(self, self.qos, f"finforce: {side} jaw", period, self._report)
 
@@ -99,21 +101,21 @@ class IfeaSolverNode(Node):
             for jaw in SIDES:
                 self.qos.subscription(PoseStamped, f"{jaw}/jaw_pose", partial(self._on_jaw_pose, jaw), ros.SENSOR)
         topic = f"{side}/keypoints"
-        # as bytes: of an image that is passed over no more than the stamp is read
-        self.keypoints = self.qos.subscription(PointCloud2, topic, self._on_keypoints, ros.SENSOR, raw=True)
+        # of an image that is passed over no more than the stamp is read
+        self.keypoints = self.qos.subscription(PointCloud2, topic, self._on_keypoints, ros.SENSOR, unread=True)
 
-    def _on_keypoints(self, data: bytes) -> None:
+    def _on_keypoints(self, unread: ros.Unread) -> None:
         """Solve the newest image and publish its wrench, if it can be trusted."""
         began, overtaken = perf_counter(), 0
         if self.skips.allows(LATE):
-            data, overtaken = ros.take_newest(self.keypoints, data)
-        passed = self.idling.passes(read_stamp(data))
+            unread, overtaken = ros.take_newest(self.keypoints, unread)
+        passed = self.idling.passes(unread.stamp)
         # what waited while nothing happened was not late
         self.skips.count(IDLE if self.idling.is_idle else LATE, overtaken + passed)
         self.health.arrive(0 if self.idling.is_idle else overtaken)
         if passed:
             return
-        cloud = deserialize_message(data, PointCloud2)
+        cloud = unread.read()
         header, stamp = cloud.header, stamp_of(cloud)
         with self._refusals():
             observation = observation_from_cloud(cloud, self.parameters.frame)

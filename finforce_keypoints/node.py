@@ -61,13 +61,16 @@ class KeypointDetectorNode(Node):
 
     Args:
         build: makes the detector from jaws, parameters, and the settings of detector and dots.
+        stage: what the node is in a process of several.
         options: of `rclpy.node.Node`.
 
     Raises:
         FinforceError: a parameter, a jaw or the network cannot be used.
     """
 
-    def __init__(self, build: Callable[..., BuiltDetector] = build_detector, **options: Any) -> None:
+    def __init__(
+        self, build: Callable[..., BuiltDetector] = build_detector, stage: ros.Stage | None = None, **options: Any
+    ) -> None:
         super().__init__("keypoint_detector", **options)
         self.parameters = parameters = ros.declare_record(self, DetectorParameters)
         settings = ros.declare_record(self, DetectorSettings, "detector")
@@ -85,7 +88,7 @@ class KeypointDetectorNode(Node):
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}
         self.rested, self.idling, self.info = float("-inf"), Idling(), b""
-        self.qos = ros.QosWatch(self)
+        self.qos = ros.QosWatch(self, stage)
         self.out = DetectorOutputs(self.qos, parameters, names, self.card, self.skips)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
         self._serve()
@@ -94,7 +97,7 @@ class KeypointDetectorNode(Node):
 
     def _serve(self) -> None:
         """Offer services and diagnostics."""
-        ros.serve_trigger(self, "~/reset", lambda: self._restart("reset by service"))
+        ros.serve_trigger(self.qos, "~/reset", lambda: self._restart("reset by service"))
         for side in self.parameters.sides:
             report, period = partial(self._report, side), self.parameters.diagnostics_period
             ros.publish_diagnostics(self, self.qos, f"finforce: {side} key points", period, report)

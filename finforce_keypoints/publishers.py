@@ -69,8 +69,8 @@ class DetectorOutputs:
         if kept is None or kept.points is not found.points:
             kept = self._kept[side] = self._build(side, found)
         # the pose goes first: the contact estimator and the solver work at the same time then
-        self.pose[side].publish(kept.pose.at(stamp))
-        self.keypoints[side].publish(kept.cloud.at(stamp))
+        ros.send_kept(self.pose[side], kept.pose, stamp)
+        ros.send_kept(self.keypoints[side], kept.cloud, stamp)
 
     def _build(self, side: str, found: JawKeypoints) -> _Kept:
         """Return the messages of a jaw, without a stamp."""

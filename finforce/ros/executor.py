@@ -57,24 +57,29 @@ class KeepingExecutor(SingleThreadedExecutor):
 
     def __init__(self, *, context: Any = None) -> None:
         super().__init__(context=context)
-        self._skips, self._spare_time = Skips(()), lambda: 0.0
+        self._skips: Sequence[Skips] = ()
+        self._spare_time: Callable[[], float] = lambda: 0.0
         self._kept: _KeptSet | None = None
         self._is_strange = False
 
-    def obey(self, node: Any) -> None:
-        """Ask a node's `skips` whether the wait set may be kept, its `spare_time` [s] how long messages may wait."""
-        self._skips = getattr(node, "skips", self._skips)
-        self._spare_time = getattr(node, "spare_time", self._spare_time)
+    def obey(self, nodes: Sequence[Any]) -> None:
+        """Ask nodes' `skips` whether the wait set may be kept, an only one's `spare_time` [s] how long messages wait."""
+        self._skips = [node.skips for node in nodes if hasattr(node, "skips")]
+        if len(nodes) == 1:
+            self._spare_time = getattr(nodes[0], "spare_time", self._spare_time)
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait for work and do it; with a time limit [s] as the base does."""
-        if timeout_sec is not None or self._is_strange or not self._skips.allows(UNCHANGED):
+        if timeout_sec is not None or self._is_strange or not self._may_keep():
             super().spin_once(timeout_sec)
             return
         try:
             self._spin_kept()
         except _UnknownRclpyError as error:
             self._be_base(error)
+
+    def _may_keep(self) -> bool:
+        return all(skips.allows(UNCHANGED) for skips in self._skips)
 
     def _spin_kept(self) -> None:
         """Wait with the kept wait set and do what is ready."""
@@ -137,7 +142,8 @@ class KeepingExecutor(SingleThreadedExecutor):
                     taken = handle.take_message(subscription.msg_type, subscription.raw)
                 if taken is None:
                     return
-                self._skips.count(UNCHANGED)
+                for skips in self._skips[:1]:
+                    skips.count(UNCHANGED)
                 subscription.callback(taken[0])
                 if not self.can_execute(subscription):
                     return

@@ -6,6 +6,7 @@ import array
 import math
 import struct
 from collections.abc import Mapping, Sequence
+from copy import copy
 from functools import lru_cache
 from typing import Any
 
@@ -34,20 +35,27 @@ def stamp_message(stamp: int) -> Time:
 
 
 class KeptMessage:
-    """A message with a header in its serialised form, which can be sent again under other stamps.
+    """A message with a header, which can be sent again under other stamps without being serialised again.
 
     Args:
         message: of any type that begins with a std_msgs/Header.
     """
 
     def __init__(self, message: Any) -> None:
-        self._data = bytearray(serialize_message(message))
-        self._numbers = "<iI" if self._data[1] & 1 else ">iI"
+        self._message = message
+        self._data = bytearray()
 
     def at(self, stamp: int) -> bytes:
-        """Return the message with a stamp [ns]."""
-        struct.pack_into(self._numbers, self._data, 4, *divmod(stamp, NANOSECONDS))
+        """Return the serialised message with a stamp [ns]."""
+        self._data = self._data or bytearray(serialize_message(self._message))
+        struct.pack_into("<iI" if self._data[1] & 1 else ">iI", self._data, 4, *divmod(stamp, NANOSECONDS))
         return bytes(self._data)
+
+    def message_at(self, stamp: int) -> Any:
+        """Return the message with a stamp [ns]; all that it has beside its header is shared."""
+        message = copy(self._message)
+        message.header = Header(stamp=stamp_message(stamp), frame_id=self._message.header.frame_id)
+        return message
 
 
 def cloud_message(header: Header, columns: Mapping[str, ArrayLike]) -> PointCloud2:

@@ -18,7 +18,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
@@ -50,6 +50,7 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
     wrench_message,
     xyz_columns,
 )
+from finforce.ros.pipeline import Outlet, Port, Stage, Unread
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
 from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe
 from finforce.stamps import NANOSECONDS  # noqa: F401 - for those with stamps
@@ -130,25 +131,93 @@ def describe_field(entry: Field) -> ParameterDescriptor:
 
 
 class QosWatch:
-    """Says which connections do not come about because the two ends ask for different service.
+    """Makes a node's ends of topics, and says which do not meet because the two ends ask for different service.
 
     Attributes:
         node: whose connections these are.
+
+    Args:
+        node: the same.
+        stage: what the node is in a process of several.
     """
 
-    def __init__(self, node: Node) -> None:
-        self.node = node
+    def __init__(self, node: Node, stage: Stage | None = None) -> None:
+        self.node, self._stage = node, stage
         self._suspects: dict[str, tuple[bool, QoSProfile]] = {}
+
+    @property
+    def fault(self) -> str:
+        """What has stopped this node while others of its process go on; empty while it works."""
+        return self._stage.fault if self._stage else ""
+
+    def guard(self, callback: Callable) -> Callable:
+        """Return a callback whose failure stops this node alone, where its process has others."""
+        return self._stage.guard(self.node, callback) if self._stage else callback
+
+    def guard_taker(self, callback: Callable) -> Callable:
+        """Return a guarded callback for messages, after which others of the process may have their turn."""
+        return self._stage.pipeline.turn(self.guard(callback)) if self._stage else callback
+
+    def when_open(self, connect: Callable[[], None]) -> None:
+        """Connect to the outside, once all nodes of the process are there."""
+        if self._stage:
+            self._stage.pipeline.when_open(connect)
+        else:
+            connect()
 
     def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
         """Create a watched publisher."""
         events = PublisherEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, True, qos))
-        return self.node.create_publisher(kind, topic, qos, event_callbacks=events)
+        made = self.node.create_publisher(kind, topic, qos, event_callbacks=events)
+        return self._stage.pipeline.outlet(self.node.resolve_topic_name(topic), made, qos) if self._stage else made
 
-    def subscription(self, kind: type, topic: str, callback: Callable, qos: QoSProfile, **options: Any) -> Subscription:
-        """Create a watched subscription."""
+    def subscription(
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable,
+        qos: QoSProfile,
+        *,
+        unread: bool = False,
+        can_wait: bool = False,
+        **options: Any,
+    ) -> Subscription | Port:
+        """Create a watched subscription.
+
+        Args:
+            kind: of the messages.
+            topic: of the messages.
+            callback: takes them.
+            qos: that is asked for.
+            unread: give messages as `Unread`, for those of which hardly ever more than the stamp is read.
+            can_wait: a process of several nodes may go on without this one where it takes long.
+            options: of the subscription, as its callback group.
+        """
         events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
-        return self.node.create_subscription(kind, topic, callback, qos, event_callbacks=events, **options)
+        guarded = self.guard_taker(callback)
+        take, options = guarded, {**options, "event_callbacks": events}
+        if unread:
+            take, options = lambda data: guarded(Unread(data, kind)), {**options, "raw": True}
+        subscribe = partial(self.node.create_subscription, kind, topic, take, qos, **options)
+        if self._stage is None:
+            return subscribe()
+        port = Port(
+            self._stage,
+            self.node.resolve_topic_name(topic),
+            guarded,
+            subscribe,
+            self.node.destroy_subscription,
+            is_unread=unread,
+            can_wait=can_wait,
+        )
+        return self._stage.pipeline.add(port)
+
+    def drop(self, subscription: Subscription | Port) -> None:
+        """End a subscription."""
+        if isinstance(subscription, Port):
+            subscription.close()
+        else:
+            self.node.destroy_subscription(subscription)
 
     def _suspect(self, topic: str, writes: bool, qos: QoSProfile) -> None:
         self._suspects[self.node.resolve_topic_name(topic)] = (writes, qos)
@@ -176,7 +245,7 @@ class LargeSubscription:
     Best effort alone loses most of such messages where Fast DDS has its default of 512 kB of shared memory.
 
     Attributes:
-        current: the subscription.
+        current: the subscription; None until all nodes of the process are there.
 
     Args:
         qos: makes subscriptions and watches them.
@@ -190,8 +259,15 @@ class LargeSubscription:
         self._qos, self._node, self._steady = qos, qos.node, True
         self._asked: Any = (kind, topic, callback)
         self._options = options
+        self.current: Subscription | Port | None = None
+        qos.when_open(self._connect)
+
+    def _connect(self) -> None:
+        kind, topic, callback = self._asked
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch)
-        self.current = qos.node.create_subscription(kind, topic, callback, STEADY, event_callbacks=events, **options)
+        self.current = self._node.create_subscription(
+            kind, topic, self._qos.guard_taker(callback), STEADY, event_callbacks=events, **self._options
+        )
 
     def _on_mismatch(self, _: Any) -> None:
         """Take the messages as they come from a publisher that offers no more."""
@@ -208,31 +284,43 @@ def publish_diagnostics(
     """Publish a report on /diagnostics every `period` seconds; mismatches of `qos` are its alarms."""
     publisher = qos.publisher(DiagnosticArray, "/diagnostics", RESULT)
 
+    def make() -> Report | None:
+        return report([Outcome(level=Level.ERROR, reason="qos", text=fault) for fault in qos.faults()])
+
+    guarded = qos.guard(make)
+
     def publish() -> None:
-        alarms = [Outcome(level=Level.ERROR, reason="qos", text=fault) for fault in qos.faults()]
-        status = status_message(name, node.get_name(), report(alarms))
+        made = guarded() or Report(level=Level.ERROR, message=f"stopped by {qos.fault}; start the process again")
+        status = status_message(name, node.get_name(), made)
         publisher.publish(DiagnosticArray(header=Header(stamp=node.get_clock().now().to_msg()), status=[status]))
 
     # on the steady clock: a stopped /clock must show, too
     node.create_timer(period, publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def serve_trigger(node: Node, name: str, action: Callable[[], str], group: CallbackGroup | None = None) -> None:
+def serve_trigger(qos: QosWatch, name: str, action: Callable[[], str], group: CallbackGroup | None = None) -> None:
     """Offer an action as a Trigger service, aside in a group if it takes long; a refusal comes back as the message."""
-    _serve(node, Trigger, name, lambda _: action(), group)
+    _serve(qos, Trigger, name, lambda _: action(), group)
 
 
-def serve_switch(node: Node, name: str, action: Callable[[bool], str]) -> None:
+def serve_switch(qos: QosWatch, name: str, action: Callable[[bool], str]) -> None:
     """Offer an action that is told yes or no as a SetBool service; what it refuses comes back as the message."""
-    _serve(node, SetBool, name, lambda request: action(request.data), None)
+    _serve(qos, SetBool, name, lambda request: action(request.data), None)
 
 
-def _serve(node: Node, kind: type, name: str, action: Callable[[Any], str], group: CallbackGroup | None) -> None:
-    def attempt(request: Any) -> tuple[bool, str]:
+def _serve(qos: QosWatch, kind: type, name: str, action: Callable[[Any], str], group: CallbackGroup | None) -> None:
+    node = qos.node
+
+    def act(request: Any) -> tuple[bool, str]:
         try:
             return True, action(request)
         except FinforceError as error:
             return False, str(error)
+
+    guarded = qos.guard(act)
+
+    def attempt(request: Any) -> tuple[bool, str]:
+        return guarded(request) or (False, f"stopped by {qos.fault}; start the process again")
 
     async def answer(request: Any, response: Any) -> Any:
         answered = await run_aside(node, partial(attempt, request)) if group else attempt(request)
@@ -257,8 +345,20 @@ async def run_aside(node: Node, action: Callable[[], Any]) -> Any:
     return await done
 
 
-def take_newest(subscription: Subscription, message: Any) -> tuple[Any, int]:
+def send_kept(publisher: Any, kept: KeptMessage, stamp: int) -> None:
+    """Publish a kept message under a stamp [ns]."""
+    publisher.publish(kept.message_at(stamp) if isinstance(publisher, Outlet) else kept.at(stamp))
+
+
+def take_newest(subscription: Subscription | Port, message: Any) -> tuple[Any, int]:
     """Return the newest message waiting behind `message` and how many were passed over."""
+    if isinstance(subscription, Port):
+        if subscription.outside is None:
+            return message, 0  # one of the same process, where nothing waits
+        subscription = subscription.outside
+    if isinstance(message, Unread):
+        data, passed = take_newest(subscription, message.data)
+        return Unread(data, message.kind), passed
     passed = 0
     with (handle := subscription.handle):
         while (taken := handle.take_message(subscription.msg_type, subscription.raw)) is not None:
@@ -270,17 +370,32 @@ def run_node(
     name: str, build: Callable[[], Node], args: Sequence[str] | None = None, work: Callable[..., None] = rclpy.spin
 ) -> int:
     """Build a node and let it work until it is done, Ctrl-C or SIGTERM; return 0, or 2 on our errors."""
+    return run_nodes(name, lambda: [build()], args, lambda nodes, executor: work(*nodes, executor))
+
+
+def spin(nodes: Sequence[Node], executor: Executor) -> None:
+    """Let nodes work until their process is told to end."""
+    for node in nodes:
+        executor.add_node(node)
+    while executor.context.ok():
+        executor.spin_once()
+
+
+def run_nodes(
+    name: str, build: Callable[[], Sequence[Node]], args: Sequence[str] | None, work: Callable[..., None] = spin
+) -> int:
+    """Build nodes and let them work in one thread, as `run_node` does one."""
     try:
         rclpy.init(args=args)
     except RuntimeError as error:  # what stands after --ros-args is none of its words
         print(f"{name}: {str(error).partition(', at ')[0]}", file=sys.stderr)
         return 2
     # an executor that is made after a signal cannot be taken down quietly; a node takes long to build
-    executor, node = KeepingExecutor(), None
+    executor, nodes = KeepingExecutor(), ()
     try:
-        node = build()
-        executor.obey(node)
-        work(node, executor)
+        nodes = build()
+        executor.obey(nodes)
+        work(nodes, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a launch sends it again after the terminal
     except FinforceError as error:
@@ -290,7 +405,7 @@ def run_node(
         if rclpy.ok():  # else the signal took the context away while the node was being built
             raise
     finally:
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0

@@ -11,6 +11,7 @@ NODES = {
     "ifea_solver": "finforce_ifea.node",
     "contact_estimator": "finforce_contact.node",
     "keypoint_detector": "finforce_keypoints.node",
+    "pipeline": "finforce.ros.composition",
     "gripper_driver": "finforce_driver.node",
     "emulated_gripper": "finforce_driver.emulator.pty_port",
     "recording_player": "finforce_eval.replay.node",
@@ -32,6 +33,11 @@ def contact_estimator() -> int:
 def keypoint_detector() -> int:
     """Run the key point detector of one jaw or both."""
     return start("keypoint_detector")
+
+
+def pipeline() -> int:
+    """Run detector, contact estimator and solvers in one process."""
+    return start("pipeline")
 
 
 def gripper_driver() -> int:

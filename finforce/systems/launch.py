@@ -64,6 +64,12 @@ def solver_arguments(*, images: str = "false", parameter_file: str = NONE, use_s
         Argument("mesh", default_value=NONE, description="mesh density: default, coarse or fine"),
         Argument("parameter_file", default_value=parameter_file, description="YAML file with parameters of the nodes"),
         Argument("use_sim_time", default_value=use_sim_time, choices=SWITCH, description="take the time from /clock"),
+        Argument(
+            "composed",
+            default_value="true",
+            choices=SWITCH,
+            description="detector, contact estimator and solvers in one process; false: each in its own",
+        ),
         Argument("rviz", default_value="false", choices=SWITCH, description="show the markers in RViz"),
     ]
 

@@ -18,6 +18,7 @@ from finforce.systems.processes import (
     Process,
     RobotOptions,
     SolverOptions,
+    compose,
     contact_processes,
     detector_processes,
     emulated_port,
@@ -56,7 +57,7 @@ def bench_processes(options: BenchOptions, share: Path) -> list[Process | Includ
         raise ValueError(f"jaw:={options.jaw}: the simulated bench has the left jaw only")
     options = complete(options, share, "bench")
     driven = options.sim or options.gripper_port
-    return [
+    parts = [
         *twin_processes("bench_cylinder", options),
         solver_process(options.jaw, options, completes_grasp=True),
         *contact_processes(options.jaw, options),
@@ -64,6 +65,7 @@ def bench_processes(options: BenchOptions, share: Path) -> list[Process | Includ
         *([gripper_process(options)] if driven else []),
         *viewer(options, share),
     ]
+    return compose(parts) if options.composed else parts
 
 
 def robot_processes(options: RobotOptions, share: Path) -> list[Process | Include]:
@@ -73,7 +75,7 @@ def robot_processes(options: RobotOptions, share: Path) -> list[Process | Includ
         ValueError: the simulated robot is asked for what it has not got, or a camera that is to be started has no name.
     """
     options = complete(options, share, "robot")
-    return [
+    parts = [
         *[see_camera(process, options) for process in twin_processes("grasp_cylinder", options)],
         *camera_includes(options, share),
         *arm_includes(options, share),
@@ -85,6 +87,7 @@ def robot_processes(options: RobotOptions, share: Path) -> list[Process | Includ
         *frame_processes(options, share),
         *viewer(options, share, "robot.rviz"),
     ]
+    return compose(parts) if options.composed else parts
 
 
 def complete(options: OptionsT, share: Path, setup: str) -> OptionsT:

@@ -7,7 +7,7 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,8 @@ SINGLE_THREAD = {
     name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 }
 POSE_TOPICS = ("object_pose", "object_detections")  # where a contact estimator listens for poses of other programs
+PIPELINE = "pipeline"
+STAGES = ("keypoint_detector", "contact_estimator", "ifea_solver")  # in the order in which an image passes them
 DEPTHS = {"aligned": "aligned", "auto": "auto", "off": "none"}  # options of a system: the detector's parameter `depth`
 
 
@@ -50,8 +52,17 @@ class Process:
 
     def command(self) -> list[str]:
         """Return the command line that runs one of our nodes with this Python, without `ros2`."""
-        words = [sys.executable, "-m", "finforce.ros.start", self.executable, *self.arguments]
-        words += ["--ros-args", *(["-r", f"__node:={self.name}"] if self.name else [])]
+        return [sys.executable, "-m", "finforce.ros.start", self.executable, *self.arguments, "--ros-args", *self.words]
+
+    @property
+    def label(self) -> str:
+        """What the process is called."""
+        return self.name or self.executable
+
+    @property
+    def words(self) -> list[str]:
+        """The node's ROS arguments."""
+        words = ["-r", f"__node:={self.name}"] if self.name else []
         if self.parameter_file:
             words += ["--params-file", self.parameter_file]
         for name, value in self.parameters.items():
@@ -85,6 +96,27 @@ class Include:
 def _yaml(value: Any) -> str:
     """Return a value as YAML with its type beyond doubt, which JSON is, but for NaN."""
     return ".nan" if value != value else json.dumps(value)
+
+
+def compose(parts: Sequence[Process | Include]) -> list[Process | Include]:
+    """Return parts of a system with detector, contact estimator and solvers in one process, where there are several."""
+    stages = [part for part in parts if isinstance(part, Process) and part.executable in STAGES]
+    if len(stages) < 2:
+        return list(parts)
+    stages.sort(key=lambda stage: STAGES.index(stage.executable))
+    words = tuple(json.dumps([stage.executable, *stage.words]) for stage in stages)
+    return [Process(executable=PIPELINE, name="", arguments=words), *(part for part in parts if part not in stages)]
+
+
+def executables_of(parts: Sequence[Process | Include]) -> list[str]:
+    """Return the executables of the nodes that parts of a system have, composed or not."""
+    found = []
+    for part in parts:
+        if isinstance(part, Process):
+            found += (
+                [json.loads(word)[0] for word in part.arguments] if part.executable == PIPELINE else [part.executable]
+            )
+    return found
 
 
 def solver_process(side: str, options: SolverOptions, **parameters: Any) -> Process:
@@ -188,7 +220,7 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
     else:
         solvers = [solver_process(options.jaws, options, completes_grasp=True)]
     awaited = {"awaits_poses": True} if options.object_mesh else {}
-    awaited |= {"awaits_images": True} if options.images else {}
+    awaited |= {"awaits_images": True, "composed": options.composed} if options.images else {}
     player = Process(
         executable="recording_player",
         name="recording_player",
@@ -197,7 +229,8 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
     )
     played = [player] if options.bag else []
     estimators = [*contact_processes(options.jaws, options), *detector_processes(options.jaws, options)]
-    return [*solvers, *estimators, *played, *viewer(options, share)]
+    parts = [*solvers, *estimators, *played, *viewer(options, share)]
+    return compose(parts) if options.composed else parts
 
 
 def viewer(options: SolverOptions, share: Path, config: str = "finforce.rviz") -> list[Process]:
@@ -246,6 +279,7 @@ class SolverOptions:
     mesh: str = ""
     parameter_file: str = ""
     use_sim_time: bool = False
+    composed: bool = True
     rviz: bool = False
 
 

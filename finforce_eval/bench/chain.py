@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.stamps import NANOSECONDS
-from finforce.systems.processes import Process, ReplayOptions, replay_processes
+from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
 from finforce_eval.bench.scenes import GRASP, GRASP_FAST, find_scene
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.evaluation.scoring import match_truth, rms
@@ -27,7 +27,6 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import QUIET, NodeRun, describe_load, run_nodes
 from finforce_eval.replay.synthetic_stream import SyntheticStream, stream_images, stream_keypoints
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 RATES = (30, 60, 90)  # [Hz]
 IMAGES, KEYPOINTS = "images", "key points"
@@ -112,7 +111,7 @@ def measure(quick: bool) -> ChainFigures:
 def _run(source: str, rate: int, stream: SyntheticStream, recording: Recording) -> ChainRow:
     """Play a stream to the nodes and return what came of it."""
     processes = chain_processes(recording, images=source == IMAGES)
-    run = run_nodes(processes, stream, SIDES, awaited_topics(source == IMAGES), detector=source == IMAGES)
+    run = run_nodes(processes, stream, SIDES, detector=source == IMAGES)
     return make_row(source, rate, run, true_grasp(recording))
 
 
@@ -132,20 +131,15 @@ def chain_processes(recording: Recording, *, images: bool, **options: Any) -> li
         "use_sim_time": False,
         "images": images,
     }
-    processes = replay_processes(ReplayOptions(**{**asked, **options}), Path())
+    asked = ReplayOptions(**{**asked, **options})
     camera = KeypointSource().node_parameters(recording)
-    return [
+    processes = [
         replace(process, parameters={**process.parameters, **camera})
         if process.executable == "keypoint_detector"
         else process
-        for process in processes
+        for process in replay_processes(replace(asked, composed=False), Path())
     ]
-
-
-def awaited_topics(images: bool) -> list[str]:
-    """Return the topics that the nodes listen to once all of them are ready."""
-    topics = [f"/{side}/{name}" for side in SIDES for name in ("keypoints", "jaw_pose")]
-    return [*topics, *([COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC] if images else [])]
+    return compose(processes) if asked.composed else processes
 
 
 def true_grasp(recording: Recording) -> TrueGrasp:

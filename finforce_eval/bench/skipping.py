@@ -18,11 +18,11 @@ import numpy as np
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
 from finforce.skipping import ALL, AWAY, CONTACT, EVERYWHERE, IDLE, SOLVER, STILL, UNCHANGED, UNHEARD, UNNEEDED
-from finforce_eval.bench.chain import SIDES, awaited_topics, chain_processes
+from finforce_eval.bench.chain import SIDES, chain_processes
 from finforce_eval.bench.scenes import OBJECT_TOPIC, BenchScene, SceneStream, Span, StreamPart, cut_sections, find_scene
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.live import ReplayLog
-from finforce_eval.replay.node_run import await_listeners, find_processes
+from finforce_eval.replay.node_run import await_listeners, awaited_topics
 from finforce_eval.replay.playback import RawMessage, read_playback
 from finforce_eval.replay.processes import CpuMeter, ProcessGroup, busy_seconds, resident_bytes
 from finforce_keypoints.settings import ANNOTATED, RULES
@@ -102,7 +102,7 @@ def _plan(sections: Mapping[str, Sequence[Any]], seconds: float) -> list[StreamP
 def _build_nodes(source: Path, off: Sequence[str], solver: str) -> list[Process]:
     """Return the nodes from images to the grasp force, some rules off."""
     nodes = []
-    for node in chain_processes(read_recording(source), images=True):
+    for node in chain_processes(read_recording(source), images=True, composed=False):
         more = {"estimator.solver": solver} if solver and node.executable == "ifea_solver" else {}
         known = {"", ALL, *EVERYWHERE, *OF_NODE[node.executable]}
         more |= {"max_age": MAX_AGE, "skip_off": [rule for rule in off if rule in known] or [""]}
@@ -166,7 +166,7 @@ def _run(nodes: Sequence[Process], stream: SceneStream, setting: str) -> _Run:
     except ImportError as error:
         raise MissingDependencyError(f"running nodes needs ROS 2: pip install 'finforce[ros]' ({error})") from error
     domain, log, run = free_domain(), ReplayLog(SIDES), _Run()
-    awaited = [*awaited_topics(images=True), OBJECT_TOPIC]
+    awaited = [*awaited_topics(nodes, SIDES), OBJECT_TOPIC]
     with ExitStack() as stack:
         player = stack.enter_context(open_player(domain))
         group = stack.enter_context(ProcessGroup(nodes, {"ROS_DOMAIN_ID": str(domain)}))
@@ -175,7 +175,7 @@ def _run(nodes: Sequence[Process], stream: SceneStream, setting: str) -> _Run:
 
         await_listeners(player, group, awaited)
         player.spin_until(monotonic() + 0.5)
-        pids = find_processes([node.name for node in nodes])
+        pids = group.pids
         watch = _SkipWatch(CpuMeter(pids), stream, lambda: len(log.grasp), setting)
         offset = time_ns() - stream.begin
         log.begin(offset)

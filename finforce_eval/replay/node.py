@@ -177,6 +177,8 @@ def find_awaited(types: Iterable[str], parameters: PlayerParameters) -> set[str]
     kinds = ("keypoints", "jaw_pose") if parameters.awaits_poses else ("keypoints",)
     if not parameters.awaits_images:
         return {topic for topic in types if topic.endswith(tuple(f"/{kind}" for kind in kinds))}
+    if parameters.composed:
+        return {COLOR_TOPIC}
     sides = [side for side in JAWS if any(topic.startswith(f"/{side}/") for topic in types)]
     return {COLOR_TOPIC, *(f"/{side}/{kind}" for side in sides for kind in kinds)}
 
@@ -212,4 +214,5 @@ class PlayerParameters:
     awaits_images: bool = setting(
         False, "wait for who finds key points in the images, and for those who use the key points"
     )
+    composed: bool = setting(False, "those are one process, which takes images once it is ready")
     patience: float = setting(120.0, "wait for listeners, which compile first", "s", 0.0, 3600.0)

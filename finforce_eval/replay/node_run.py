@@ -7,12 +7,12 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from os import getpid
-from pathlib import Path
 from time import monotonic, time_ns
 from typing import TYPE_CHECKING, Protocol
 
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
+from finforce.systems.processes import PIPELINE, executables_of
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.processes import (
@@ -20,12 +20,13 @@ from finforce_eval.replay.processes import (
     ProcessError,
     ProcessGroup,
     busy_seconds,
-    child_processes,
     resident_bytes,
 )
 from finforce_eval.replay.synthetic_stream import SyntheticStream
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 if TYPE_CHECKING:
+    from finforce.systems.processes import Process
     from finforce_eval.replay.node import PlayerNode
 
 PATIENCE = 180.0  # [s]; a first start compiles the element loops
@@ -45,9 +46,9 @@ def describe_load(others: Iterable[float]) -> str:
 
 
 class Runnable(Protocol):
-    """What a `ProcessGroup` starts: a name, and a command line that has it as `__node:=NAME`."""
+    """What a `ProcessGroup` starts."""
 
-    name: str
+    label: str
 
     def command(self) -> list[str]:
         """Return the command line."""
@@ -74,6 +75,17 @@ class NodeRun:
     seconds: float
 
 
+def awaited_topics(processes: Sequence[Process], sides: Sequence[str]) -> list[str]:
+    """Return the topics that nodes of some jaws listen to once all of them are ready."""
+    names, composed = executables_of(processes), any(process.executable == PIPELINE for process in processes)
+    sees, localizes = "keypoint_detector" in names, "contact_estimator" in names
+    topics = [COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC] if sees else []
+    if not (sees and composed):
+        kinds = ("keypoints", "jaw_pose") if localizes else ("keypoints",)
+        topics += [f"/{side}/{kind}" for side in sides for kind in kinds]
+    return topics
+
+
 def await_listeners(player: PlayerNode, nodes: ProcessGroup, topics: Collection[str]) -> None:
     """Wait until somebody beside the player listens to each of the topics.
 
@@ -93,7 +105,7 @@ def run_nodes(
     processes: Sequence[Runnable],
     stream: SyntheticStream,
     sides: Sequence[str],
-    awaited: Collection[str],
+    awaited: Collection[str] = (),
     *,
     detector: bool = False,
 ) -> NodeRun:
@@ -103,7 +115,7 @@ def run_nodes(
         processes: to be started, and ended.
         stream: what is played.
         sides: jaws whose results are heard.
-        awaited: topics that somebody has to listen to before the stream begins.
+        awaited: topics that somebody has to listen to before the stream begins; without any those of our own nodes.
         detector: whether the results of a key point detector are heard, too.
 
     Raises:
@@ -121,9 +133,9 @@ def run_nodes(
         player.offer(stream)
         player.listen(sides, log, detector=detector)
 
-        await_listeners(player, nodes, awaited)
+        await_listeners(player, nodes, awaited or awaited_topics(processes, sides))
         player.spin_until(monotonic() + LINGER)
-        pids = find_processes([process.name for process in processes])
+        pids = nodes.pids
         meter = CpuMeter({**pids, PLAYER: getpid()})
         offset = time_ns() - stream.begin
         log.begin(offset)
@@ -152,31 +164,6 @@ def _note(log: ReplayLog, message: RawMessage) -> None:
     log.take_sent(message.topic, message.stamp, monotonic())
 
 
-def find_processes(names: Sequence[str], parent: int | None = None) -> dict[str, int]:
-    """Return the process ids by node name among the children of a process.
-
-    Args:
-        names: of nodes, as `__node:=NAME` in their command lines.
-        parent: whose children; this process's without one.
-
-    Raises:
-        ProcessError: there is none of a name.
-    """
-    words = {pid: _command_of(pid) for pid in child_processes(getpid() if parent is None else parent)}
-    found = {name: pid for name in names for pid, command in words.items() if f"__node:={name}" in command}
-    if missing := sorted(set(names) - set(found)):
-        raise ProcessError(f"no process runs as node {', '.join(missing)}")
-    return found
-
-
-def _command_of(pid: int) -> list[str]:
-    """Return the command line of a process; empty when it has gone."""
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
-    except (FileNotFoundError, ProcessLookupError):
-        return []
-
-
 LISTENER = """
 import sys
 from importlib import import_module
@@ -201,14 +188,14 @@ class Listener:
     """A process that hears topics and does nothing: what receiving them costs by itself.
 
     Attributes:
-        name: of the node.
+        label: name of the node.
         topics: type by topic.
     """
 
-    name: str
+    label: str
     topics: Mapping[str, str]
 
     def command(self) -> list[str]:
         """Return the command line."""
         topics = [f"{topic}={kind}" for topic, kind in self.topics.items()]
-        return [sys.executable, "-c", LISTENER, *topics, "--ros-args", "-r", f"__node:={self.name}"]
+        return [sys.executable, "-c", LISTENER, *topics, "--ros-args", "-r", f"__node:={self.label}"]

@@ -60,8 +60,13 @@ class ProcessGroup:
                 start_new_session=True,  # Ctrl-C comes to us alone; we end the children in our order
             )
         except OSError as error:
-            raise ProcessError(f"{process.name} cannot be started: {error}") from error
+            raise ProcessError(f"{process.label} cannot be started: {error}") from error
         self._children.append(child)
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """The process ids by what the processes are called."""
+        return {process.label: child.pid for process, child in zip(self._processes, self._children, strict=True)}
 
     def check(self) -> None:
         """Make sure that all processes run.
@@ -72,7 +77,7 @@ class ProcessGroup:
         for process, child, log in zip(self._processes, self._children, self._logs, strict=True):
             if child.poll() is not None:
                 words = last_words(log)
-                raise ProcessError(f"{process.name} ended with status {child.returncode}: {words}")
+                raise ProcessError(f"{process.label} ended with status {child.returncode}: {words}")
 
     def __exit__(self, *_: Any) -> None:
         for number, patience in PATIENCE:

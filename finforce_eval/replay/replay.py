@@ -15,7 +15,7 @@ from tqdm import tqdm
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
 from finforce.skipping import IDLE
-from finforce.systems.processes import Process, ReplayOptions, replay_processes
+from finforce.systems.processes import Process, ReplayOptions, compose, executables_of, replay_processes
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import FIXED, ContactChoice
 from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, score_results
@@ -27,9 +27,10 @@ from finforce_eval.recordings.objects import find_mesh, require_mesh
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.live import ReplayLog, live_result
-from finforce_eval.replay.node_run import await_listeners
+from finforce_eval.replay.node_run import await_listeners, awaited_topics
 from finforce_eval.replay.playback import Playback, RawMessage, read_playback
 from finforce_eval.replay.processes import ProcessGroup
+from finforce_eval.replay.synthetic_stream import OBJECT_TOPIC
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
@@ -108,9 +109,10 @@ def replay(
         recording = _choose_keypoints(recording, setup.jaw, keypoints, stack)
         messages = read_playback(recording.path, without=_results_of(sides) | _unplayed(sides, from_images))
         options = _graph_options(recording, setup, calibration_file, playing)
-        processes = replay_processes(replace(options, images=from_images), Path())
+        processes = replay_processes(replace(options, images=from_images, composed=False), Path())
         log = ReplayLog(sides)
-        _run(_for_scores(processes, recording, keypoints), messages, log, playing)
+        processes = _for_scores(processes, recording, keypoints)
+        _run(compose(processes) if options.composed else processes, messages, log, playing)
     if from_images:
         recording = with_detections(recording, {side: found.side_log() for side, found in log.detections.items()})
     evaluation = _score(recording, setup, log)
@@ -213,12 +215,10 @@ def _run(processes: Sequence[Process], messages: Playback, log: ReplayLog, playi
     except ImportError as error:
         raise MissingDependencyError(f"replay needs ROS 2: pip install 'finforce[ros]' ({error})") from error
     domain = free_domain() if playing.domain is None else playing.domain
-    awaited = [f"/{side}/keypoints" for side in log.jaws]
-    detects = any(process.executable == "keypoint_detector" for process in processes)
-    if detects:
-        awaited += [COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC]
-    if any(process.executable == "contact_estimator" for process in processes):
-        awaited += ["/object_pose", *(f"/{side}/jaw_pose" for side in log.jaws)]
+    awaited, names = awaited_topics(processes, tuple(log.jaws)), executables_of(processes)
+    detects = "keypoint_detector" in names
+    if "contact_estimator" in names:
+        awaited.append(OBJECT_TOPIC)
     with ExitStack() as stack:
         player = stack.enter_context(open_player(domain))
         nodes = stack.enter_context(ProcessGroup(processes, {"ROS_DOMAIN_ID": str(domain)}))

@@ -27,7 +27,7 @@ class Worker(Node):
         self.plain = self.create_subscription(String, "plain", lambda message: self.heard.append(message.data), 10)
         self.create_subscription(String, "slow", self.think, 10)
         self.create_timer(0.02, self.tick)
-        ros.serve_trigger(self, "ask", lambda: "answer")
+        ros.serve_trigger(ros.QosWatch(self), "ask", lambda: "answer")
 
     async def think(self, message):
         self.heard.append(await ros.run_aside(self, lambda: message.data.upper()))
@@ -44,7 +44,7 @@ class Worker(Node):
 def working(request, probe):
     """A worker with its executor, as `run_node` puts them together."""
     worker, executor = Worker(*request.param, context=probe.context), KeepingExecutor(context=probe.context)
-    executor.obey(worker)
+    executor.obey([worker])
     executor.add_node(worker)
     yield worker, executor
     executor.remove_node(worker)
@@ -140,7 +140,7 @@ def test_where_rclpy_is_another_one_all_are_answered_by_its_own_executor(probe, 
     said = []
     monkeypatch.setattr(executor_module, "get_logger", lambda _: SimpleNamespace(warning=said.append))
     out = probe.speak("plain", String)
-    executor.obey(worker)
+    executor.obey([worker])
     executor.add_node(worker)
     work(probe, (worker, executor), out.get_subscription_count)
     change(monkeypatch)
