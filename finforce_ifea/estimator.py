@@ -336,6 +336,7 @@ class JawEstimator:
 _STDDEV = 0.3e-3
 _NOISE = 0.05e-3
 _EACH = 3
+_BENDS = [1e-3 * bend for bend in (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 2.5, 2.0, 2.5, 3.0)]  # [m] a press, a release, a press
 Update = Callable[[Observation, Contact], object]
 
 
@@ -353,8 +354,10 @@ def warm_up(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None
         reset()
         contacts = list(_imagine_contacts(jaw))
         sequence = [contacts[0]] * tare_frames + [contact for contact in contacts for _ in range(_EACH)]
-        for count, contact in enumerate(sequence):
-            update(_imagine_image(jaw, count / 30.0, stddev, random), contact)
+        bends = [0.0] * len(sequence) + _BENDS
+        for count, bend in enumerate(bends):
+            contact = sequence[min(count, len(sequence) - 1)]
+            update(_imagine_image(jaw, count / 30.0, bend, stddev, random), contact)
     reset()
 
 
@@ -364,8 +367,12 @@ def _imagine_contacts(jaw: Jaw) -> Iterator[Contact]:
     yield from (fixed, replace(fixed, free=False), sketch_contact(jaw))
 
 
-def _imagine_image(jaw: Jaw, stamp: float, stddev: NDArray | None, random: np.random.Generator) -> Observation:
+def _imagine_image(
+    jaw: Jaw, stamp: float, bend: float, stddev: NDArray | None, random: np.random.Generator
+) -> Observation:
+    """Returns the key points of a jaw whose tip is bent by so much [m]."""
     points = jaw.keypoints + _NOISE * random.standard_normal(jaw.keypoints.shape)
+    points[:, 0] -= bend * (points[:, 2] / jaw.keypoints[:, 2].max()) ** 2
     return Observation(stamp=stamp, points=points, likelihood=np.ones(len(points)), stddev=stddev)
 
 

@@ -78,6 +78,14 @@ def lie_inside(image: RgbdImage, pixels: NDArray) -> NDArray:
         return (pixels >= -0.5).all(axis=1) & (pixels <= size).all(axis=1)
 
 
+def _sum_tiles(values: NDArray) -> NDArray:
+    """Return the sums (_TILES, _TILES) of the parts of values (h, w), rows and columns cut as evenly as they can be."""
+    summed = np.zeros((values.shape[0] + 1, values.shape[1] + 1), dtype=int)
+    summed[1:, 1:] = values.cumsum(axis=0).cumsum(axis=1)
+    rows, columns = (np.arange(_TILES + 1) * size // _TILES for size in values.shape)
+    return np.diff(np.diff(summed[np.ix_(rows, columns)], axis=0), axis=1)
+
+
 class ImageWatch:
     """Notices a camera that gives black pictures, or the same one, or the same part of one, again and again."""
 
@@ -132,13 +140,9 @@ class ImageWatch:
         same = (seen == self._color).all(axis=2) if is_known else np.zeros(seen.shape[:2], dtype=bool)
         lively = ((seen > _NEAR_BLACK) & (seen < _NEAR_WHITE)).all(axis=2)
         self._same = self._same + 1 if same.all() else 0
-        for place in np.ndindex(_TILES, _TILES):
-            tile = tuple(
-                slice(number * size // _TILES, (number + 1) * size // _TILES)
-                for number, size in zip(place, same.shape, strict=True)
-            )
-            is_still = same[tile].size > 0 and same[tile].all() and lively[tile].mean() >= _LIVELY
-            self._same_tiles[place] = self._same_tiles[place] + 1 if is_still else 0
+        pixels = _sum_tiles(np.ones(same.shape, dtype=int))
+        still = (pixels > 0) & (_sum_tiles(same) == pixels) & (_sum_tiles(lively) >= _LIVELY * pixels)
+        self._same_tiles = np.where(still, self._same_tiles + 1, 0)
         measured = np.empty(0) if depth is None else depth[::_WATCHED_STEP, ::_WATCHED_STEP].copy()
         # a plain depth image, or one without any depth, is no camera's: it is refused for what it is
         is_plain = len(np.unique(measured[np.isfinite(measured)])) < 2

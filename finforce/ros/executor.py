@@ -63,7 +63,7 @@ class KeepingExecutor(SingleThreadedExecutor):
         self._is_strange = False
 
     def obey(self, nodes: Sequence[Any]) -> None:
-        """Ask nodes' `skips` whether the wait set may be kept, an only one's `spare_time` [s] how long messages wait."""
+        """Ask nodes' `skips` whether the wait set may be kept, a single one's `spare_time` [s] how long it may wait."""
         self._skips = [node.skips for node in nodes if hasattr(node, "skips")]
         if len(nodes) == 1:
             self._spare_time = getattr(nodes[0], "spare_time", self._spare_time)

@@ -13,8 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from finforce.camera import CameraIntrinsics, project, rays_from_pixels
+from finforce.camera import (
+    EQUIDISTANT,
+    UNDISTORTION_STEPS,
+    UNDISTORTION_TOLERANCE,
+    CameraIntrinsics,
+    rays_from_pixels,
+)
 from finforce_ifea.jaw.jaw import Jaw
+from finforce_keypoints.geometry.kernels import fit_shape, sample_side, undistort, weigh_samples
 
 _SPACING = 0.15e-3  # of the raster on which the finger's side is drawn [m]
 _STRIDE = 3  # every so many points of it are sampled: a pixel is 0.25 to 0.5 mm
@@ -39,7 +46,7 @@ class SideSamples:
     used: NDArray
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class DepthEvidence:
     """What the depth image says about points on the finger's side.
 
@@ -120,16 +127,8 @@ def sample_depths(
         samples: places around them.
         T_camera_jaw: (4, 4).
     """
-    places = (points[:, None, :] + samples.offsets)[samples.used] @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3]
-    pixels = project(places, camera)
-    with np.errstate(invalid="ignore"):
-        inside = (pixels > -0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(axis=1)
-    measured = np.full(len(places), np.nan)
-    columns, rows = np.rint(pixels[inside]).astype(np.intp).T
-    measured[inside] = depth[rows, columns] - places[inside, 2]
-    excess = np.full(samples.used.shape, np.nan)
-    excess[samples.used] = measured
-    return excess
+    T, depth = np.ascontiguousarray(T_camera_jaw, dtype=float), np.asarray(depth)
+    return sample_side(depth, camera.lens, T, np.ascontiguousarray(points), samples.offsets, samples.used)
 
 
 def weigh_depths(excess: NDArray, centre: NDArray, gate: float, quantum: float) -> DepthEvidence:
@@ -145,35 +144,8 @@ def weigh_depths(excess: NDArray, centre: NDArray, gate: float, quantum: float) 
         gate: [m].
         quantum: step of the depths [m].
     """
-    away = excess - centre[:, None]
-    with np.errstate(invalid="ignore"):
-        known, is_near, is_far = np.isfinite(away), away < -gate, away > gate
-    finger = known & ~is_near & ~is_far
-    median = _masked_median(away, finger)
-    spread = _MAD_TO_STDDEV * _masked_median(np.abs(away - median[:, None]), finger)
-    with np.errstate(invalid="ignore"):
-        finger &= np.abs(away - median[:, None]) <= _INLIER_SIGMA * np.maximum(spread, 0.5 * quantum)[:, None]
-    count, measured = finger.sum(axis=1), np.maximum(known.sum(axis=1), 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(finger, away, 0.0).sum(axis=1) / count
-        stddev = np.maximum(spread, quantum / np.sqrt(12.0)) / np.sqrt(np.maximum(count / _CORRELATED, 1.0))
-    return DepthEvidence(
-        excess=mean + centre,
-        stddev=stddev,
-        known=known.sum(axis=1),
-        count=count,
-        share=count / measured,
-        nearer=is_near.sum(axis=1) / measured,
-    )
-
-
-def _masked_median(values: NDArray, mask: NDArray) -> NDArray:
-    """Return the medians (n,) of the chosen values in the rows (n, S), NaN in rows without any."""
-    ordered = np.sort(np.where(mask, values, np.inf), axis=1)
-    count = mask.sum(axis=1)
-    rows = np.arange(len(values))
-    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, values.shape[1] - 1)
-    return np.where(count > 0, 0.5 * (ordered[rows, low] + ordered[rows, high]), np.nan)
+    limits = np.array([_INLIER_SIGMA, _MAD_TO_STDDEV, _CORRELATED])
+    return DepthEvidence(*weigh_samples(excess, np.asarray(centre, dtype=float), gate, quantum, limits))
 
 
 _OUTLIER_SIGMA = 2.5
@@ -208,8 +180,11 @@ class SideView:
 
 def rays_through(pixels: NDArray, camera: CameraIntrinsics) -> NDArray:
     """Return the undistorted rays (n, 3), z = 1, camera frame, through pixels (n, 2); NaN where these are."""
-    rays = np.full((len(pixels), 3), np.nan)
-    seen = np.isfinite(pixels).all(axis=1)
+    if camera.model != EQUIDISTANT:
+        rays, found = undistort(camera.lens, pixels, UNDISTORTION_STEPS, UNDISTORTION_TOLERANCE)
+        if found:
+            return rays
+    rays, seen = np.full((len(pixels), 3), np.nan), np.isfinite(pixels).all(axis=1)
     rays[seen] = rays_from_pixels(pixels[seen], camera)
     return rays
 
@@ -278,33 +253,13 @@ def fit_side(model: SideModel, measured: NDArray, stddev: NDArray, lever: NDArra
         lever: (K + 1,) derivative l of y by the depth's relative error [m].
         scale: what is known of the relative error s beforehand.
     """
-    rigid = np.append(np.ones(len(measured) - 1), 0.0)
-    shape = rigid[:, None] * np.column_stack((np.ones(len(measured)), model.places, model.places[:, 1] ** 2))
-    seen = np.isfinite(measured)
-    rows = np.column_stack((shape, lever))[seen]
-    known, own = measured[seen] - lever[seen] * scale.error, (model.relief * rigid[seen]) ** 2
-    beforehand = (model.offset, model.tilt, model.tilt, model.bow, scale.stddev)
-    prior = np.diag(1.0 / np.maximum(beforehand, _LEAST_STDDEV) ** 2)
-    measured_variance = np.maximum(stddev[seen], _LEAST_STDDEV) ** 2
-    noise = measured_variance
-    for _ in range(_ROBUST_STEPS):
-        weights = 1.0 / (own + noise)
-        covariance = np.linalg.inv(prior + (rows * weights[:, None]).T @ rows)
-        theta = covariance @ (rows.T @ (weights * known))
-        left = known - rows @ theta
-        standard = left**2 / (own + measured_variance)
-        noise = measured_variance * (1.0 + standard / _OUTLIER_SIGMA**2)
-    share = np.zeros(len(measured))
-    share[seen] = own / (own + noise)
-    y = shape @ theta[:4]
-    y[seen] += share[seen] * left
-    spread = np.column_stack((shape, np.zeros(len(measured))))
-    spread[seen] -= share[seen, None] * rows
-    variance = np.einsum("ij,jk,ik->i", spread, covariance, spread) + (1.0 - share) * (model.relief * rigid) ** 2
-    misfit = np.full(len(measured), np.nan)
-    misfit[seen] = left / np.sqrt(own + measured_variance)
-    found = DepthScale(error=float(scale.error + theta[4]), stddev=float(np.sqrt(covariance[4, 4])))
-    return SideFit(y=y, stddev=np.sqrt(variance), misfit=misfit, scale=found)
+    beforehand = np.array([model.offset, model.tilt, model.tilt, model.bow, scale.stddev])
+    limits = np.array([_LEAST_STDDEV, _OUTLIER_SIGMA, _ROBUST_STEPS])
+    places = np.ascontiguousarray(model.places)
+    (y, spread, misfit), error, left = fit_shape(
+        places, model.relief, beforehand, measured, stddev, lever, scale.error, limits
+    )
+    return SideFit(y=y, stddev=spread, misfit=misfit, scale=DepthScale(error=float(error), stddev=float(left)))
 
 
 def compute_stddev(sight: SideView, depths: NDArray, y_stddev: NDArray, ray_stddev: NDArray) -> NDArray:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics, project, rays_from_pixels
+from finforce.camera import CameraIntrinsics, rays_from_pixels
+from finforce_keypoints.geometry.kernels import map_side, project_side
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -77,6 +78,11 @@ class SidePlane:
         """Return the points (n, 3) [m] of the side at x and z (n, 2) [m]."""
         return np.insert(np.asarray(places, dtype=float), 1, self.at(places), axis=1)
 
+    @property
+    def numbers(self) -> NDArray:
+        """Level [m] and slopes (3,)."""
+        return np.array([self.level, *self.slope])
+
 
 def find_side(jaw: Jaw) -> SidePlane:
     """Return the plane of least squares through a jaw's key points, level across what they do not tell."""
@@ -88,7 +94,8 @@ def find_side(jaw: Jaw) -> SidePlane:
 
 def project_plane(places: NDArray, side: SidePlane, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
     """Return the image pixels (n, 2) of places x, z (n, 2) [m] on a jaw's side."""
-    return project(side.points(places) @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3], camera)
+    places = np.ascontiguousarray(places, dtype=float)
+    return project_side(camera.lens, np.ascontiguousarray(T_camera_jaw, dtype=float), side.numbers, places)
 
 
 def intersect_plane(pixels: NDArray, side: SidePlane, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
@@ -111,20 +118,9 @@ def map_picture(
 
     Parts of the plane that the camera does not see come from outside the image.
     """
-    columns = np.arange(0, grid.width + COARSE, COARSE)
-    rows = np.arange(0, grid.height + COARSE, COARSE)
-    knots = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    exact = project_plane(grid.places(knots), side, T_camera_jaw, camera)
-    exact = np.where(np.isfinite(exact), exact, -1e4).astype(np.float32).reshape(len(rows), len(columns), 2)
-    down = _interpolate(exact, grid.height)
-    return np.ascontiguousarray(_interpolate(down.swapaxes(0, 1), grid.width).swapaxes(0, 1))
-
-
-def _interpolate(knots: NDArray, count: int) -> NDArray:
-    """Return values (count, ...) between knots (k, ...) that are COARSE apart, linearly."""
-    at, share = np.divmod(np.arange(count), COARSE)
-    share = (share / COARSE).astype(np.float32).reshape(-1, *([1] * (knots.ndim - 1)))
-    return knots[at] + share * np.diff(knots, axis=0)[at]
+    place = np.array([grid.scale, grid.x, grid.z])
+    T = np.ascontiguousarray(T_camera_jaw, dtype=float)
+    return map_side(camera.lens, T, side.numbers, place, grid.width, grid.height, COARSE)
 
 
 def take_picture(image: NDArray, mapping: NDArray) -> NDArray:
