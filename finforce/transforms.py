@@ -69,16 +69,29 @@ def pose_from_quaternion(position: ArrayLike, quaternion: ArrayLike) -> NDArray:
     norm = np.linalg.norm(quaternion)
     if abs(norm - 1.0) > _TOLERANCE:
         raise PoseError(f"pose: got a quaternion of norm {norm:.4g}, expected 1; (0, 0, 0, 0) is an unset message")
+    x, y, z, w = (quaternion / norm).tolist()
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    T[0, :3] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
+    T[1, :3] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
+    T[2, :3] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)
     T[:3, 3] = position
     return T
 
 
 def quaternion_from_pose(T: ArrayLike) -> NDArray:
     """Returns the quaternion x, y, z, w (4,) of a pose (4, 4), with w >= 0; raises PoseError as `check_pose` does."""
-    quaternion = Rotation.from_matrix(check_pose(T)[:3, :3]).as_quat()
-    return quaternion if quaternion[3] >= 0.0 else -quaternion
+    R = check_pose(T)[:3, :3]
+    # of the four ways the one without cancellation: K. Shoemake, Animating rotation with quaternion curves, 1985
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    ways = (
+        (1.0 + a - e - i, b + d, g + c, h - f),
+        (b + d, 1.0 - a + e - i, f + h, c - g),
+        (g + c, f + h, 1.0 - a - e + i, d - b),
+        (h - f, c - g, d - b, 1.0 + a + e + i),
+    )
+    quaternion = np.array(max(enumerate(ways), key=lambda way: way[1][way[0]])[1])
+    quaternion /= np.copysign(np.linalg.norm(quaternion), quaternion[3])
+    return quaternion
 
 
 def pose_numbers(T: ArrayLike) -> tuple[float, ...]:

@@ -78,6 +78,18 @@ def lie_inside(image: RgbdImage, pixels: NDArray) -> NDArray:
         return (pixels >= -0.5).all(axis=1) & (pixels <= size).all(axis=1)
 
 
+def _all_colors(values: NDArray) -> NDArray:
+    """Return where all three of values (h, w, 3) bool hold; ten times as fast as `all`."""
+    return values[..., 0] & values[..., 1] & values[..., 2]
+
+
+def _brightest(seen: NDArray) -> float:
+    """Return how bright the brightest hundredth of pixels (h, w, 3) is."""
+    brightness = np.maximum(np.maximum(seen[..., 0], seen[..., 1]), seen[..., 2]).ravel()
+    place = int(_BRIGHTEST_PERCENT / 100.0 * (brightness.size - 1))
+    return float(np.partition(brightness, place)[place])
+
+
 def _sum_tiles(values: NDArray) -> NDArray:
     """Return the sums (_TILES, _TILES) of the parts of values (h, w), rows and columns cut as evenly as they can be."""
     summed = np.zeros((values.shape[0] + 1, values.shape[1] + 1), dtype=int)
@@ -111,8 +123,7 @@ class ImageWatch:
         """
         seen = image.color[::_WATCHED_STEP, ::_WATCHED_STEP].copy()
         self._count_same(seen, image.depth)
-        brightest = float(np.percentile(seen.max(axis=2), _BRIGHTEST_PERCENT))
-        if brightest < _DARKEST:
+        if (brightest := _brightest(seen)) < _DARKEST:
             raise BlackImageError(
                 f"black image: its brightest pixels are {brightest:.0f} of 255; expected at least {_DARKEST}; "
                 "is the lens covered, or the exposure far too short?"
@@ -137,8 +148,8 @@ class ImageWatch:
     def _count_same(self, seen: NDArray, depth: NDArray | None) -> None:
         """Count how often in a row the picture, its parts and the depth were what they had been before."""
         is_known = seen.shape == self._color.shape
-        same = (seen == self._color).all(axis=2) if is_known else np.zeros(seen.shape[:2], dtype=bool)
-        lively = ((seen > _NEAR_BLACK) & (seen < _NEAR_WHITE)).all(axis=2)
+        same = _all_colors(seen == self._color) if is_known else np.zeros(seen.shape[:2], dtype=bool)
+        lively = _all_colors((seen > _NEAR_BLACK) & (seen < _NEAR_WHITE))
         self._same = self._same + 1 if same.all() else 0
         pixels = _sum_tiles(np.ones(same.shape, dtype=int))
         still = (pixels > 0) & (_sum_tiles(same) == pixels) & (_sum_tiles(lively) >= _LIVELY * pixels)
