@@ -168,6 +168,7 @@ class JawEstimator:
             ObservationError: Key points of wrong shape, infinite, or stamps that do not rise.
             ContactError: The contact is not on the jaw.
         """
+        self.learn()
         check_observation(observation, len(self.jaw.keypoints), self._stamp)
         dt = 0.0 if self._stamp is None else observation.stamp - self._stamp
         if contact is not None and contact is not self._contact:
@@ -194,6 +195,10 @@ class JawEstimator:
         except UnobservableError as error:
             return self._fail("unobservable", str(error), used)
         return self._conclude(track, used)
+
+    def learn(self) -> None:
+        """Learns what the last image says beside its force; the next image does it where nobody had time before."""
+        self._rolling.learn()
 
     def tare(self) -> TareReport:
         """Takes the last frames as unloaded and learns each key point's offset.

@@ -23,7 +23,7 @@ from finforce.skipping import AWAY, IDLE, LATE, SOLVER, Skips
 from finforce.stamps import Idling, StampGate
 from finforce_ifea.grasp_force import ForcePairing, Wrench, single_jaw_grasp
 from finforce_ifea.messages import observation_from_cloud
-from finforce_ifea.observation import Solution
+from finforce_ifea.observation import Observation, Solution
 from finforce_ifea.parameters import NodeParameters, build_contact_feed, build_estimator, load_parameter_jaw
 from finforce_ifea.publishers import (
     SolverOutputs,
@@ -136,7 +136,12 @@ class IfeaSolverNode(Node):
             self.out.send_stddev(header, solution)
             age = (self._now() - stamp) / ros.NANOSECONDS
             self.health.publish(outcome_of_solution(solution), latency=perf_counter() - began, age=age)
-            self.out.send_shape(header, observation, solution, self.estimator)
+            self.qos.afterwards(partial(self._finish, header, observation, solution))
+
+    def _finish(self, header: Any, observation: Observation, solution: Solution) -> None:
+        """Do what no force waits for."""
+        self.out.send_shape(header, observation, solution, self.estimator)
+        self.estimator.learn()
 
     def _note_idle(self, stamp: int) -> None:
         """Note whether the jaw was left alone in this image, and the next ones may be passed over."""

@@ -158,6 +158,13 @@ class QosWatch:
         """Return a guarded callback for messages, after which others of the process may have their turn."""
         return self._stage.pipeline.turn(self.guard(callback)) if self._stage else callback
 
+    def afterwards(self, action: Callable[[], None]) -> None:
+        """Do something once the image is through the whole process."""
+        if self._stage:
+            self._stage.pipeline.afterwards(self.guard(action))
+        else:
+            action()
+
     def when_open(self, connect: Callable[[], None]) -> None:
         """Connect to the outside, once all nodes of the process are there."""
         if self._stage:

@@ -199,6 +199,7 @@ class Pipeline:
         self._ports: dict[str, list[Port]] = {}
         self._topics: set[str] = set()
         self._waiting: dict[Port, Any] = {}
+        self._left: deque[Callable[[], None]] = deque()
         self._delayed: list[Callable[[], None]] = []
         self._is_open = False
         self._depth = 0
@@ -266,7 +267,14 @@ class Pipeline:
 
         return call
 
+    def afterwards(self, action: Callable[[], None]) -> None:
+        """Do something once the outermost callback has returned."""
+        self._left.append(action)
+        self._catch_up()
+
     def _catch_up(self) -> None:
         while self._waiting and not self._depth:
             port, message = self._waiting.popitem()
             port.take(message)
+        while self._left and not self._depth:
+            self._left.popleft()()

@@ -5,6 +5,8 @@ Kalman filter with constant velocity. Shape and height change slowly: the maximu
 averaged over the last frames, so that their priors count once and errors of the mechanics are no information.
 """
 
+from collections.abc import Callable
+from functools import partial
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -181,6 +183,7 @@ class PlaceTracker:
         self._held.reset()
         self._width.reset()
         self._released, self._jumped = 0, False
+        self._unlearnt: Callable[[], None] | None = None
         self._forget_place()
 
     def _forget_place(self) -> None:
@@ -279,7 +282,7 @@ class PlaceTracker:
         return self._outline is self.contact.indenter
 
     def _learn_friction(self, state: PressedState, data: Residuals, update: PlaceUpdate, forecast: Forecast) -> None:
-        """Follows how the object slides, and learns its coefficient where something presses."""
+        """Learns how the object leans where it is held; what slides is followed by `learn`."""
         if self._reached[DEPTH] - self._find_touch(self._reached) < _LOADED_DEPTH or self._jumped:
             return
         normal, moved = float(np.hypot(*state.force[::2])), update.place - forecast.place
@@ -300,6 +303,16 @@ class PlaceTracker:
             wanted = upright + self._held.update(frame, self._prior_variance) / normal
             rubbing.lean += _HELD_GAIN * (min(max(wanted, -_LARGEST_LEAN), _LARGEST_LEAN) - rubbing.lean)
             return
+        self._unlearnt = partial(self._follow_slide, normal, moved, data, update)
+
+    def learn(self) -> None:
+        """Learns what the last frame says of friction, which its force did not wait for."""
+        unlearnt, self._unlearnt = self._unlearnt, None
+        if unlearnt is not None:
+            unlearnt()
+
+    def _follow_slide(self, normal: float, moved: NDArray, data: Residuals, update: PlaceUpdate) -> None:
+        """Follows how an object slides that presses with a normal force [N] and has moved (3,)."""
         expected = np.array([self._reached[DEPTH], self._prior[0], self._prior[1]])
         before, known = self.slips.mobilised, self.roughness.coefficient.mean
         self.slips.set_indenter(self.contact.indenter)

@@ -45,7 +45,7 @@ def by_name(processes):
 
 
 def test_one_jaw_completes_the_grasp_by_itself():
-    (solver,) = bench_processes(BenchOptions(jaw="right", contact_height=0.04), ROOT)
+    (solver,) = bench_processes(BenchOptions(composed=False, jaw="right", contact_height=0.04), ROOT)
     assert solver.name == "right_ifea_solver"
     assert solver.parameters["jaw_name"] == "right"
     assert solver.parameters["completes_grasp"] is True
@@ -53,25 +53,27 @@ def test_one_jaw_completes_the_grasp_by_itself():
 
 
 def test_of_two_jaws_exactly_one_completes_the_grasp():
-    solvers = by_name(replay_processes(ReplayOptions(jaws="both"), ROOT))
+    solvers = by_name(replay_processes(ReplayOptions(composed=False, jaws="both"), ROOT))
     assert solvers["left_ifea_solver"].parameters["peer"] == "right"
     assert "peer" not in solvers["right_ifea_solver"].parameters
     assert not any("completes_grasp" in solver.parameters for solver in solvers.values())
 
 
 def test_the_player_runs_only_with_a_bag_and_its_end_ends_all():
-    assert len(replay_processes(ReplayOptions(), ROOT)) == 1
-    player = by_name(replay_processes(ReplayOptions(bag="x", rate=2.0), ROOT))["recording_player"]
+    assert len(replay_processes(ReplayOptions(composed=False), ROOT)) == 1
+    player = by_name(replay_processes(ReplayOptions(composed=False, bag="x", rate=2.0), ROOT))["recording_player"]
     assert player.parameters == {"bag": "x", "rate": 2.0} and player.ends_all
-    waiting = by_name(replay_processes(ReplayOptions(bag="x", object_mesh="can.stl"), ROOT))["recording_player"]
+    waiting = by_name(replay_processes(ReplayOptions(composed=False, bag="x", object_mesh="can.stl"), ROOT))[
+        "recording_player"
+    ]
     assert waiting.parameters["awaits_poses"] is True
     assert "awaits_images" not in waiting.parameters
-    seeing = by_name(replay_processes(ReplayOptions(bag="x", images=True), ROOT))["recording_player"]
+    seeing = by_name(replay_processes(ReplayOptions(composed=False, bag="x", images=True), ROOT))["recording_player"]
     assert seeing.parameters["awaits_images"] is True
 
 
 def test_what_was_not_asked_for_stays_the_nodes_own():
-    (solver,) = replay_processes(ReplayOptions(), ROOT)
+    (solver,) = replay_processes(ReplayOptions(composed=False), ROOT)
     assert set(solver.parameters) == {"jaw_name", "completes_grasp", "use_sim_time"}
 
 
@@ -99,7 +101,7 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
         "keypoint_detector": DETECTOR_PARAMETERS,
         "recording_player": PLAYER_PARAMETERS,
     }
-    processes = replay_processes(ReplayOptions(jaws="both", bag="x", **given), ROOT)
+    processes = replay_processes(ReplayOptions(composed=False, jaws="both", bag="x", **given), ROOT)
     assert {process.executable for process in processes} == set(known)
     for process in processes:
         assert set(process.parameters) <= known[process.executable]
@@ -109,14 +111,14 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
 def test_colour_alone_is_asked_for_by_another_word_than_nothing(asked, told):
     (detector,) = [
         process
-        for process in replay_processes(ReplayOptions(images=True, depth=asked, bag="x"), ROOT)
+        for process in replay_processes(ReplayOptions(composed=False, images=True, depth=asked, bag="x"), ROOT)
         if process.executable == "keypoint_detector"
     ]
     assert detector.parameters.get("depth") == told
 
 
 def test_an_object_mesh_brings_one_contact_estimator_and_its_contacts_go_to_the_solvers():
-    options = ReplayOptions(jaws="both", object_mesh="can.stl", contact="closest", contact_height=0.04)
+    options = ReplayOptions(composed=False, jaws="both", object_mesh="can.stl", contact="closest", contact_height=0.04)
     processes = by_name(replay_processes(options, ROOT))
     estimator = processes["contact_estimator"]
     assert estimator.executable == "contact_estimator" and estimator.parameters["jaws"] == "both"
@@ -127,36 +129,40 @@ def test_an_object_mesh_brings_one_contact_estimator_and_its_contacts_go_to_the_
 
 
 def test_without_an_object_mesh_no_contact_is_estimated():
-    processes = bench_processes(BenchOptions(contact_height=0.04, contact="paper"), ROOT)
+    processes = bench_processes(BenchOptions(composed=False, contact_height=0.04, contact="paper"), ROOT)
     assert [process.executable for process in processes] == ["ifea_solver"]
 
 
 @pytest.mark.parametrize(("solver", "mesh", "seen"), [("", "fine", "fine"), ("paper", "", "coarse"), ("", "", None)])
 def test_solver_and_contact_estimator_have_the_same_mesh_of_the_jaw(solver, mesh, seen):
-    options = BenchOptions(object_mesh="can.stl", solver=solver, mesh=mesh, jaw_file="j", calibration_file="k")
+    options = BenchOptions(
+        composed=False, object_mesh="can.stl", solver=solver, mesh=mesh, jaw_file="j", calibration_file="k"
+    )
     _, estimator = bench_processes(options, ROOT)
     assert estimator.parameters.get("contact.mesh") == seen
     assert (estimator.parameters["jaw_file"], estimator.parameters["calibration_file"]) == ("j", "k")
 
 
 def test_images_start_one_detector_for_all_jaws():
-    options = ReplayOptions(jaws="both", images=True, finder="dots", jaw_file="j", T_gripper_camera="0 0 0.1 0 0 0 1")
+    options = ReplayOptions(
+        composed=False, jaws="both", images=True, finder="dots", jaw_file="j", T_gripper_camera="0 0 0.1 0 0 0 1"
+    )
     detector = by_name(replay_processes(options, ROOT))["keypoint_detector"]
     assert detector.parameters["jaws"] == "both" and detector.parameters["use_sim_time"] is True
     assert detector.parameters["finder"] == "dots" and detector.parameters["jaw_file"] == "j"
     assert detector.parameters["T_gripper_camera"] == [0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0]
-    assert "keypoint_detector" in by_name(bench_processes(BenchOptions(images=True), ROOT))
+    assert "keypoint_detector" in by_name(bench_processes(BenchOptions(composed=False, images=True), ROOT))
 
 
 def test_without_images_key_points_come_by_topic():
-    processes = replay_processes(ReplayOptions(jaws="both", finder="dots", model="m"), ROOT)
+    processes = replay_processes(ReplayOptions(composed=False, jaws="both", finder="dots", model="m"), ROOT)
     assert "keypoint_detector" not in by_name(processes)
 
 
 @pytest.mark.parametrize("text", ["bench", "0 0 0", "0 0 0 0 0 0 x"])
 def test_a_camera_pose_that_is_not_seven_numbers_is_named(text):
     with pytest.raises(ValueError, match="T_gripper_camera.*7 numbers"):
-        bench_processes(BenchOptions(images=True, T_gripper_camera=text), ROOT)
+        bench_processes(BenchOptions(composed=False, images=True, T_gripper_camera=text), ROOT)
 
 
 @pytest.mark.parametrize("name", ["bench", "bench_sim"])
@@ -168,7 +174,7 @@ def test_the_bench_configuration_has_the_camera_of_the_bench(name):
 
 
 def test_rviz_is_started_with_a_configuration_that_is_there():
-    viewer = by_name(bench_processes(BenchOptions(rviz=True), ROOT))["rviz"]
+    viewer = by_name(bench_processes(BenchOptions(composed=False, rviz=True), ROOT))["rviz"]
     assert Path(viewer.arguments[1]).is_file()
 
 

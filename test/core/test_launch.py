@@ -9,6 +9,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from finforce.errors import MissingDependencyError
+from finforce.ros.composition import read_part
 from finforce.systems import launch as launch_module
 from finforce.systems.processes import BenchOptions, ReplayOptions, RobotOptions
 from finforce.systems.stacks import StackOptions
@@ -58,13 +59,28 @@ def recorded_launch(monkeypatch):
 def act(path, **texts):
     """Describe a launch file's system with arguments; its actions."""
     *arguments, opaque = runpy.run_path(str(path))["generate_launch_description"]()
-    values = {action.args[0]: action.kwargs["default_value"] for action in arguments} | texts
+    defaults = {action.args[0]: action.kwargs["default_value"] for action in arguments}
+    values = {**defaults, **({"composed": "false"} if "composed" in defaults else {}), **texts}
     return opaque.kwargs["function"](SimpleNamespace(launch_configurations=values))
 
 
 def start(path, **texts):
     """Describe a launch file's system with arguments; the keyword arguments of its nodes, by name."""
     return {action.kwargs["name"]: action.kwargs for action in act(path, **texts) if "name" in action.kwargs}
+
+
+@pytest.mark.parametrize("path", SYSTEMS, ids=lambda path: path.name)
+def test_detector_and_solver_are_one_process_unless_it_is_said_otherwise(recorded_launch, path):
+    arguments = runpy.run_path(str(path))["generate_launch_description"]()[:-1]
+    assert {a.args[0]: a.kwargs["default_value"] for a in arguments}["composed"] == "true"
+    apart = [action.kwargs["executable"] for action in act(path, images="true") if "executable" in action.kwargs]
+    (pipeline, *others) = [a.kwargs for a in act(path, images="true", composed="true") if "executable" in a.kwargs]
+    assert pipeline["executable"] == "pipeline" and pipeline["name"] is None  # which would be all nodes' name
+    parts = [read_part(word) for word in pipeline["arguments"]]
+    together = [part.executable for part in parts]
+    assert together[0] == "keypoint_detector" and "ifea_solver" in together
+    assert sorted([*together, *(other["executable"] for other in others)]) == sorted(apart)
+    assert "__node:=left_ifea_solver" in parts[-2 if together.count("ifea_solver") == 2 else -1].words
 
 
 @pytest.mark.parametrize("path", SYSTEMS, ids=lambda path: path.name)

@@ -38,7 +38,7 @@ def by_name(parts):
 
 
 def robot(**options):
-    return by_name(robot_processes(RobotOptions(**options), ROOT))
+    return by_name(robot_processes(RobotOptions(composed=False, **options), ROOT))
 
 
 def test_a_robot_has_two_solvers_detector_contacts_gripper_camera_and_frames():
@@ -147,10 +147,12 @@ def test_the_published_camera_is_where_the_detector_is_told_that_it_is(tmp_path)
     assert (told["--frame-id"], told["--child-frame-id"]) == ("gripper_base", "wrist_camera_color_optical_frame")
     file = tmp_path / "lab.yaml"
     file.write_text("keypoint_detector: {ros__parameters: {T_gripper_camera: [0, 0, 0.5, 0, 0, 0, 1]}}")
-    options = RobotOptions(parameter_file=str(file))
+    options = RobotOptions(composed=False, parameter_file=str(file))
     assert camera_pose(options)[2] == 0.5
     assert camera_pose(replace(options, T_gripper_camera=HAND_EYE))[2] == -0.04
-    default = DetectorParameters(T_gripper_camera=tuple(camera_pose(RobotOptions(parameter_file=options_file()))))
+    default = DetectorParameters(
+        T_gripper_camera=tuple(camera_pose(RobotOptions(composed=False, parameter_file=options_file())))
+    )
     np.testing.assert_allclose(default.camera_pose, ROBOT_CAMERA, atol=1e-12)
 
 
@@ -178,7 +180,9 @@ def test_without_hardware_no_camera_and_no_arm_are_touched():
     assert parts["kortex_bringup"].arguments["use_fake_hardware"] == "true"
 
 
-@pytest.mark.parametrize("build", [robot, lambda **options: by_name(bench_processes(BenchOptions(**options), ROOT))])
+@pytest.mark.parametrize(
+    "build", [robot, lambda **options: by_name(bench_processes(BenchOptions(composed=False, **options), ROOT))]
+)
 def test_without_hardware_the_driver_opens_the_port_that_the_twin_makes(build):
     parts = build(sim=True)
     twin = parts["twin_camera"].parameters
@@ -187,7 +191,9 @@ def test_without_hardware_the_driver_opens_the_port_that_the_twin_makes(build):
     assert build(sim=True, gripper_port="/tmp/p")["twin_camera"].parameters["gripper_link"] == "/tmp/p"
 
 
-@pytest.mark.parametrize("build", [robot, lambda **options: by_name(bench_processes(BenchOptions(**options), ROOT))])
+@pytest.mark.parametrize(
+    "build", [robot, lambda **options: by_name(bench_processes(BenchOptions(composed=False, **options), ROOT))]
+)
 def test_without_hardware_the_twins_object_is_the_one_whose_contact_is_estimated(build):
     parts = build(sim=True)
     assert parts["twin_camera"].parameters["object"] == parts["contact_estimator"].parameters["object_mesh"]
@@ -221,14 +227,14 @@ def test_robot_and_twin_have_a_configuration_each():
 
 
 def test_the_gripper_of_a_bench_runs_when_it_has_a_port():
-    assert "gripper_driver" not in by_name(bench_processes(BenchOptions(), ROOT))
-    driver = by_name(bench_processes(BenchOptions(gripper_port="/dev/x"), ROOT))["gripper_driver"]
+    assert "gripper_driver" not in by_name(bench_processes(BenchOptions(composed=False), ROOT))
+    driver = by_name(bench_processes(BenchOptions(composed=False, gripper_port="/dev/x"), ROOT))["gripper_driver"]
     assert driver.parameters["port"] == "/dev/x"
 
 
 def test_the_simulated_bench_has_the_left_jaw_only():
     with pytest.raises(ValueError, match="jaw:=right"):
-        bench_processes(BenchOptions(sim=True, jaw="right"), ROOT)
+        bench_processes(BenchOptions(composed=False, sim=True, jaw="right"), ROOT)
 
 
 def test_only_the_frames_can_be_done_without():
