@@ -200,12 +200,47 @@ def _plan(columns: tuple[tuple[str, np.dtype, tuple[int, ...]], ...]) -> tuple[t
     return tuple(fields), _layout(entries, point_step, False)
 
 
+@dataclass(eq=False)
+class CloudColumns:
+    """A point cloud of height 1 that was not packed yet, and need not be within one process.
+
+    Attributes:
+        header: of the message.
+        columns: name -> (n,) array, which nobody changes.
+    """
+
+    header: Any
+    columns: Mapping[str, NDArray]
+    height: int = 1
+
+    @property
+    def width(self) -> int:
+        """The number of points."""
+        return len(next(iter(self.columns.values()), ()))
+
+    @property
+    def fields(self) -> tuple[PointField, ...]:
+        """The descriptions of the columns."""
+        return _plan(tuple((name, array.dtype, array.shape[1:]) for name, array in self.columns.items()))[0]
+
+    def pick(self, names: Sequence[str], optional: Sequence[str]) -> dict[str, NDArray]:
+        """Return columns by name as `decode_cloud` does of the packed cloud."""
+        if not self.width:
+            return {name: np.empty(0) for name in names}
+        missing = [name for name in names if name not in self.columns]
+        if missing:
+            raise ObservationError(f"the cloud has no field {', '.join(missing)}; expected {', '.join(names)}")
+        return {name: array for name, array in self.columns.items() if name in names or name in optional}
+
+
 def decode_columns(cloud: Any, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray]:
     """Return the named columns of any object with the attributes of PointCloud2; see `decode_cloud`.
 
     Raises:
         ObservationError: a field is missing or leaves the point, or the buffer is too short.
     """
+    if isinstance(cloud, CloudColumns):
+        return cloud.pick(names, optional)
     return decode_cloud(
         cloud.fields,
         cloud.data,

@@ -45,9 +45,9 @@ class ContactOutputs:
         header = ros.Header(stamp=ros.stamp_message(timed.stamp), frame_id=f"{side}_jaw")
         # the outline goes first: the solver looks for it when the contact comes
         if ros.is_wanted(self.outline[side], self._skips):
-            self.outline[side].publish(ros.cloud_message(header, columns_from_outline(timed.estimate.outline)))
+            ros.send_cloud(self.outline[side], header, columns_from_outline(timed.estimate.outline))
         if ros.is_wanted(self.contact[side], self._skips):
-            self.contact[side].publish(ros.cloud_message(header, contact_columns(timed.estimate)))
+            ros.send_cloud(self.contact[side], header, contact_columns(timed.estimate))
         self._send_slip(side, timed.estimate.slip)
 
     def _send_slip(self, side: str, slip: Slip | None) -> None:

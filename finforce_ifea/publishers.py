@@ -71,7 +71,7 @@ class SolverOutputs:
     def send_shape(self, header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> None:
         """Send the deformed surface, and markers at their own rate; markers only to listeners, whatever the rules."""
         if self._parameters.publish_surface and ros.is_wanted(self.surface, self._skips):
-            self.surface.publish(ros.cloud_message(header, ros.xyz_columns(estimator.surface())))
+            ros.send_cloud(self.surface, header, ros.xyz_columns(estimator.surface()))
         due = monotonic() - self._markers_sent >= 1.0 / self._parameters.marker_rate
         if due and self.markers.get_subscription_count():
             self._markers_sent = monotonic()

@@ -19,6 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from finforce.errors import FinforceError
 from finforce.health import Health, Outcome, Report
 from finforce.messages import stamp_of
+from finforce.processors import bind_caller
 from finforce.ros import node as ros
 from finforce.ros.raw_image import read_image, read_picture
 from finforce.skipping import IDLE, LATE, UNHEARD, Skips
@@ -241,7 +242,13 @@ class KeypointDetectorNode(Node):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until Ctrl-C."""
-    return ros.run_node("keypoint_detector", KeypointDetectorNode, args)
+
+    def build() -> KeypointDetectorNode:
+        node = KeypointDetectorNode()
+        bind_caller(node.parameters.threads)
+        return node
+
+    return ros.run_node("keypoint_detector", build, args)
 
 
 if __name__ == "__main__":

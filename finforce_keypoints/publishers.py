@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.messages import CloudColumns
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
 from finforce_keypoints.diagnostics import build_skeleton, describe_names, draw_keypoints
@@ -75,7 +76,7 @@ class DetectorOutputs:
     def _build(self, side: str, found: JawKeypoints) -> _Kept:
         """Return the messages of a jaw, without a stamp."""
         pose = ros.pose_message(ros.Header(frame_id=self._frame), pose_numbers(found.T_camera_jaw))
-        cloud = ros.cloud_message(ros.Header(frame_id=f"{side}_jaw"), keypoint_columns(found))
+        cloud = CloudColumns(ros.Header(frame_id=f"{side}_jaw"), keypoint_columns(found))
         return _Kept(points=found.points, pose=ros.KeptMessage(pose), cloud=ros.KeptMessage(cloud))
 
     def send_annotated(self, stamp: int, color: NDArray, found: Mapping[str, JawKeypoints]) -> None:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from rclpy.node import Node
 
+from finforce.processors import bind_caller
 from finforce.ros import node as ros
 from finforce.ros.pipeline import Pipeline, Stage
 from finforce.ros.start import NODES
@@ -56,6 +57,7 @@ def build_nodes(parts: Sequence[Part]) -> list[Node]:
         kind = getattr(import_module(NODES[part.executable]), CLASSES[part.executable])
         nodes.append(kind(stage=Stage(pipeline), cli_args=["--ros-args", *part.words]))
     pipeline.open()
+    bind_caller(max(getattr(node.parameters, "threads", 1) for node in nodes))
     return nodes
 
 

@@ -22,7 +22,7 @@ from visualization_msgs.msg import Marker
 
 from finforce.errors import ObservationError
 from finforce.health import Report
-from finforce.messages import check_cloud, check_frame, decode_columns, encode_cloud, magnitude_stddev
+from finforce.messages import CloudColumns, check_cloud, check_frame, decode_columns, encode_cloud, magnitude_stddev
 from finforce.stamps import NANOSECONDS
 
 MARKERS = {"triangles": Marker.TRIANGLE_LIST, "spheres": Marker.SPHERE_LIST, "arrow": Marker.ARROW}
@@ -38,7 +38,7 @@ class KeptMessage:
     """A message with a header, which can be sent again under other stamps without being serialised again.
 
     Args:
-        message: of any type that begins with a std_msgs/Header.
+        message: of any type that begins with a std_msgs/Header, or the columns of a cloud.
     """
 
     def __init__(self, message: Any) -> None:
@@ -47,7 +47,7 @@ class KeptMessage:
 
     def at(self, stamp: int) -> bytes:
         """Return the serialised message with a stamp [ns]."""
-        self._data = self._data or bytearray(serialize_message(self._message))
+        self._data = self._data or bytearray(serialize_message(pack(self._message)))
         struct.pack_into("<iI" if self._data[1] & 1 else ">iI", self._data, 4, *divmod(stamp, NANOSECONDS))
         return bytes(self._data)
 
@@ -71,6 +71,11 @@ def cloud_message(header: Header, columns: Mapping[str, ArrayLike]) -> PointClou
         data=array.array("B", encoded.data),  # an ndarray would be checked byte by byte
         is_dense=all(bool(np.isfinite(values).all()) for values in columns.values()),
     )
+
+
+def pack(message: Any) -> Any:
+    """Return a message as it can be sent: of the columns of a cloud the PointCloud2."""
+    return cloud_message(message.header, message.columns) if isinstance(message, CloudColumns) else message
 
 
 @lru_cache(maxsize=64)

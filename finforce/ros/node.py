@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields
 from functools import partial
 from threading import Thread
@@ -13,6 +13,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: F401 - for those who publish
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped  # noqa: F401 - for those who publish
+from numpy.typing import NDArray
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -33,6 +34,8 @@ from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who pub
 
 from finforce.errors import FinforceError
 from finforce.health import Level, Outcome, Report
+from finforce.messages import CloudColumns
+from finforce.processors import free_caller
 from finforce.ros.executor import KeepingExecutor, is_wanted  # noqa: F401 - for those who publish
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     KeptMessage,
@@ -41,6 +44,7 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
     grasp_force,
     image_message,
     is_touching,
+    pack,
     points_marker,
     pose_message,
     stamp_message,
@@ -342,6 +346,7 @@ async def run_aside(node: Node, action: Callable[[], Any]) -> Any:
     done, executor = Future(), node.executor
 
     def run() -> None:
+        free_caller()
         try:
             done.set_result(action())
         except Exception as error:
@@ -350,6 +355,12 @@ async def run_aside(node: Node, action: Callable[[], Any]) -> Any:
 
     Thread(target=run, daemon=True).start()
     return await done
+
+
+def send_cloud(publisher: Any, header: Header, columns: Mapping[str, NDArray]) -> None:
+    """Publish a cloud of columns (n,), which is packed only where it leaves the process."""
+    cloud = CloudColumns(header, columns)
+    publisher.publish(cloud if isinstance(publisher, Outlet) else pack(cloud))
 
 
 def send_kept(publisher: Any, kept: KeptMessage, stamp: int) -> None:

@@ -17,6 +17,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from finforce.messages import read_stamp, stamp_of
+from finforce.ros.messages import pack
 
 BUDGET = 5e-3  # [s] that a stage may take before those that could go on without it do
 WATCHED = 15  # messages over which that is judged
@@ -180,7 +181,7 @@ class Outlet:
         """Publish a message."""
         self._pipeline.hand_on(self._topic, message)
         if self._is_kept or self._publisher.get_subscription_count():
-            self._publisher.publish(message)
+            self._publisher.publish(pack(message))
 
     def get_subscription_count(self) -> int:
         """Return how many listen, here and outside."""

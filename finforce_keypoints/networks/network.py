@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.optional import import_onnxruntime
+from finforce.processors import places_of_helpers
 from finforce_keypoints.errors import DetectionError, ModelError
 
 if TYPE_CHECKING:
@@ -107,6 +108,8 @@ def open_session(path: Path, threads: int, providers: Sequence[str]) -> Inferenc
     options.log_severity_level = 3  # errors, which are raised anyway
     # Threads that spin while they wait double the time where the solver's process needs the cores, too.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    if places := places_of_helpers(threads):
+        options.add_session_config_entry("session.intra_op_thread_affinities", places)
     try:
         return runtime.InferenceSession(str(path), options, providers=list(providers))
     except Exception as error:  # onnxruntime has no base class of its errors
