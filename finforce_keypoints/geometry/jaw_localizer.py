@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,7 +145,8 @@ class ReferencePatch:
     def _take(self, color: NDArray, camera: CameraIntrinsics, T_camera_jaw: NDArray) -> NDArray:
         """Return the patch (h, w) of a jaw at a place, smoothed."""
         picture = take_picture(color, map_picture(self._grid, self._side, T_camera_jaw, camera))
-        grey = picture.astype(np.float32).mean(axis=2)
+        red, green, blue = np.moveaxis(picture.astype(np.float32), 2, 0)
+        grey = (red + green + blue) / np.float32(3.0)
         return import_cv2().GaussianBlur(grey, (0, 0), BLUR).astype(np.float64)
 
 
@@ -155,11 +157,11 @@ class PatchMatcher:
     patch = a template - a (s_x d_x + s_z d_z) template + b
 
     Attributes:
-        columns: (n, 4) d_x template, d_z template, template and 1 of the inner pixels.
+        template: (n,) of the inner pixels, without its mean and of length 1.
         inverse: (4, n) that gives -a s_x, -a s_z, a and b of a patch.
     """
 
-    columns: NDArray
+    template: NDArray
     inverse: NDArray
 
     def match(self, patch: NDArray) -> Slide:
@@ -168,9 +170,8 @@ class PatchMatcher:
         slope_x, _, gain, _ = self.inverse @ values
         if not gain > 0.0:
             return Slide(x=0.0, likeness=0.0)
-        template = self.columns[:, 2]
-        seen, known = values - values.mean(), template - template.mean()
-        likeness = float(seen @ known / max(np.linalg.norm(seen) * np.linalg.norm(known), 1e-9))
+        seen = values - values.sum() / values.size
+        likeness = float(seen @ self.template / max(sqrt(seen @ seen), 1e-9))
         return Slide(x=float(-slope_x / gain), likeness=likeness)
 
 
@@ -180,7 +181,9 @@ def build_matcher(template: NDArray) -> PatchMatcher:
     values = template[_INNER].ravel()
     columns = np.column_stack([by_x[_INNER].ravel(), by_z[_INNER].ravel(), values, np.ones(values.size)])
     normal = columns.T @ columns + 1e-6 * np.eye(4)
-    return PatchMatcher(columns=columns, inverse=np.linalg.solve(normal, columns.T))
+    known = values - values.mean()
+    known /= max(np.linalg.norm(known), 1e-9)
+    return PatchMatcher(template=known, inverse=np.linalg.solve(normal, columns.T))
 
 
 _LEAST_SEEN = 3  # points, or all there are: fewer likely ones are no jaw
