@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import sys
+import traceback
 from collections.abc import Sequence
 from importlib import import_module
+from threading import Thread
 from typing import NamedTuple
 
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
 
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
+from finforce.ros.executor import KeepingExecutor
 from finforce.ros.pipeline import Pipeline, Stage
 from finforce.ros.start import NODES
 
@@ -19,7 +23,9 @@ CLASSES = {
     "keypoint_detector": "KeypointDetectorNode",
     "contact_estimator": "ContactEstimatorNode",
     "ifea_solver": "IfeaSolverNode",
+    "gripper_driver": "GripperDriverNode",
 }
+APART = ("gripper_driver",)  # in a thread of its own: it waits for no image, and its topics are those between processes
 
 
 class Part(NamedTuple):
@@ -55,17 +61,46 @@ def build_nodes(parts: Sequence[Part]) -> list[Node]:
     pipeline, nodes = Pipeline(), []
     for part in parts:
         kind = getattr(import_module(NODES[part.executable]), CLASSES[part.executable])
-        nodes.append(kind(stage=Stage(pipeline), cli_args=["--ros-args", *part.words]))
+        stage = {} if part.executable in APART else {"stage": Stage(pipeline)}
+        nodes.append(kind(**stage, cli_args=["--ros-args", *part.words]))
     pipeline.open()
-    bind_caller(max(getattr(node.parameters, "threads", 1) for node in nodes))
     return nodes
+
+
+def spin(parts: Sequence[Part], nodes: Sequence[Node], executor: Executor) -> None:
+    """Let the nodes work until the process is told to end."""
+    aside = [node for part, node in zip(parts, nodes, strict=True) if part.executable in APART]
+    for node in aside:
+        Thread(target=_spin_apart, args=(node,), daemon=True).start()
+    together = [node for node in nodes if node not in aside]
+    bind_caller(max((getattr(node.parameters, "threads", 1) for node in together), default=1))
+    ros.spin(together, executor)
+
+
+def _spin_apart(node: Node) -> None:
+    """Let one node work in this thread; what nobody catches ends it alone."""
+    executor = KeepingExecutor(context=node.context)
+    executor.obey([node])
+    try:
+        ros.spin([node], executor)
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        if node.context.ok():
+            node.get_logger().error(f"this node has stopped, the others go on\n{traceback.format_exc()}")
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the nodes until Ctrl-C."""
     words = sys.argv[1:] if args is None else list(args)
     own = words[: words.index("--ros-args")] if "--ros-args" in words else words
-    return ros.run_nodes("pipeline", lambda: build_nodes([read_part(word) for word in own]), args)
+    parts: list[Part] = []
+
+    def build() -> list[Node]:
+        parts.extend(map(read_part, own))
+        return build_nodes(parts)
+
+    return ros.run_nodes("pipeline", build, args, lambda nodes, executor: spin(parts, nodes, executor))
 
 
 if __name__ == "__main__":

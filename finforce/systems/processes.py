@@ -103,9 +103,14 @@ def compose(parts: Sequence[Process | Include]) -> list[Process | Include]:
     stages = [part for part in parts if isinstance(part, Process) and part.executable in STAGES]
     if len(stages) < 2:
         return list(parts)
-    stages.sort(key=lambda stage: STAGES.index(stage.executable))
-    words = tuple(json.dumps([stage.executable, *stage.words]) for stage in stages)
-    return [Process(executable=PIPELINE, name="", arguments=words), *(part for part in parts if part not in stages)]
+    return [merge(stages), *(part for part in parts if part not in stages)]
+
+
+def merge(nodes: Sequence[Process]) -> Process:
+    """Return the process that has some nodes, in the order in which an image passes them, others behind these."""
+    ordered = sorted(nodes, key=lambda node: (*STAGES, node.executable).index(node.executable))
+    words = tuple(json.dumps([node.executable, *node.words]) for node in ordered)
+    return Process(executable=PIPELINE, name="", arguments=words)
 
 
 def executables_of(parts: Sequence[Process | Include]) -> list[str]:

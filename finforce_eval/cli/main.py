@@ -14,6 +14,7 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_
 COMMANDS = {
     "evaluate": "run the estimator over recordings offline and score it against the measured force",
     "replay": "play a recording through the real nodes in real time and score it",
+    "pipeline": "find the grasp force in a camera's images, all stages in one process",
     "jaw": "make the jaw file of a printed finger from its STL, STEP, DXF or SVG file",
     "calibrate": "identify the material from recordings with ground truth",
     "weigh": "scale the stiffness of a finger by the readings of a kitchen scale, one for each steady hold",

@@ -1,0 +1,65 @@
+"""`finforce pipeline`: from a camera's images to the grasp force in one process, without a launch file."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from finforce.errors import MissingDependencyError
+from finforce.systems.launch import NONE, options_from_texts
+from finforce.systems.live import gripper_process
+from finforce.systems.processes import GripperOptions, Process, ReplayOptions, merge, replay_processes
+from finforce_eval.errors import OptionError
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelineOptions(ReplayOptions, GripperOptions):
+    """What the command is asked for: what the launch files are, as far as it is about our nodes."""
+
+    jaws: str = "both"
+    images: bool = True
+    use_sim_time: bool = False
+    gripper: bool = False
+
+
+OTHER = ("bag", "rate", "rviz", "sim", "composed")  # of launch files, which start other programs, too
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    names = ", ".join(entry.name for entry in fields(PipelineOptions) if entry.name not in OTHER)
+    text = f"as for the launch files, object_mesh:=can.stl; {names}. gripper:=true takes the driver into the process"
+    parser.add_argument("words", nargs="*", metavar="NAME:=VALUE", help=text)
+
+
+def pipeline_process(words: list[str]) -> Process:
+    """Return the process that words such as `object_mesh:=can.stl` ask for.
+
+    Raises:
+        OptionError: a word names no option, or its value is none.
+    """
+    known = {entry.name: entry.default for entry in fields(PipelineOptions) if entry.name not in OTHER}
+    given = dict(word.partition(":=")[::2] for word in words)
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        raise OptionError(f"{unknown[0]!r} is no option; expected NAME:=VALUE with one of {', '.join(known)}")
+    texts = {entry.name: str(entry.default) or NONE for entry in fields(PipelineOptions)}
+    try:
+        options = options_from_texts(PipelineOptions, texts | given)
+        processes = replay_processes(replace(options, composed=False), Path())
+    except ValueError as error:
+        raise OptionError(str(error)) from error
+    if options.jaws not in ("both", "left", "right"):
+        raise OptionError(f"jaws:={options.jaws}: expected both, left or right")
+    return merge([*processes, *([gripper_process(options)] if options.gripper else [])])
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the process until Ctrl-C; return its exit status."""
+    process = pipeline_process(options.words)
+    try:
+        from finforce.ros.composition import main
+    except ImportError as error:
+        raise MissingDependencyError(f"the pipeline needs ROS 2: pip install 'finforce[ros]' ({error})") from error
+    return main([*process.arguments, "--ros-args"])
