@@ -65,6 +65,7 @@ class IfeaSolverNode(Node):
         self.health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
         self.pairing = ForcePairing(parameters.jaw_name)
         self.idling = Idling()
+        self.waiting: Callable[[], None] | None = None
         self.last: Solution | None = None
         self.qos = ros.QosWatch(self, stage)
         self.out = SolverOutputs(self.qos, parameters, self.skips)
@@ -88,14 +89,18 @@ class IfeaSolverNode(Node):
         """Offer services and diagnostics."""
         ros.serve_trigger(self.qos, f"{side}/tare", lambda: str(self.estimator.tare()))
         ros.serve_trigger(self.qos, f"{side}/reset", lambda: self._restart("reset by service"))
+        longest = self.parameters.contact_patience
+        self.overdue = self.create_timer(longest, self.qos.guard(self._solve_waiting), clock=ros.STEADY_CLOCK)
+        self.overdue.cancel()
         period = self.parameters.diagnostics_period
         ros.publish_diagnostics(self, self.qos, f"finforce: {side} jaw", period, self._report)
 
     def _subscribe(self, side: str) -> None:
         """Create the subscriptions; a node that has them is ready."""
         if not self.contacts.is_fixed:
-            self.qos.subscription(PointCloud2, f"{side}/contact", self._on_contact, ros.SENSOR)
+            # the outline first: a contact is whole with its own
             self.qos.subscription(PointCloud2, f"{side}/object_outline", self._on_outline, ros.SENSOR)
+            self.qos.subscription(PointCloud2, f"{side}/contact", self._on_contact, ros.SENSOR)
         if peer := self.parameters.peer:
             self.qos.subscription(WrenchStamped, f"{peer}/wrench", self._on_peer, ros.RESULT)
             for jaw in SIDES:
@@ -105,7 +110,7 @@ class IfeaSolverNode(Node):
         self.keypoints = self.qos.subscription(PointCloud2, topic, self._on_keypoints, ros.SENSOR, unread=True)
 
     def _on_keypoints(self, unread: ros.Unread) -> None:
-        """Solve the newest image and publish its wrench, if it can be trusted."""
+        """Take the newest image, to be solved with its contact, or the one before where that takes too long."""
         began, overtaken = perf_counter(), 0
         if self.skips.allows(LATE):
             unread, overtaken = ros.take_newest(self.keypoints, unread)
@@ -115,7 +120,21 @@ class IfeaSolverNode(Node):
         self.health.arrive(0 if self.idling.is_idle else overtaken)
         if passed:
             return
-        cloud = unread.read()
+        self.waiting = partial(self._solve, unread.read(), began)
+        if self.contacts.expect(unread.stamp, began):
+            self.overdue.reset()
+        else:
+            self._solve_waiting()
+
+    def _solve_waiting(self) -> None:
+        """Solve the image that waits for its contact, if there is one."""
+        self.overdue.cancel()
+        solve, self.waiting = self.waiting, None
+        if solve is not None:
+            solve()
+
+    def _solve(self, cloud: PointCloud2, began: float) -> None:
+        """Solve an image and publish its wrench, if it can be trusted."""
         header, stamp = cloud.header, stamp_of(cloud)
         with self._refusals():
             observation = observation_from_cloud(cloud, self.parameters.frame)
@@ -158,6 +177,8 @@ class IfeaSolverNode(Node):
         """Keep the newest contact."""
         with self._refusals():
             self.contacts.take(cloud, stamp_of(cloud))
+        if self.contacts.completes(perf_counter()):
+            self._solve_waiting()
 
     def _on_outline(self, cloud: PointCloud2) -> None:
         """Keep the newest outline of the object."""

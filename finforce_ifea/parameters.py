@@ -34,6 +34,13 @@ class NodeParameters(TimeParameters):
         1.0,
     )
     contact_free: bool = setting(False, "the solver may move a contact that came on the topic")
+    contact_patience: float = setting(
+        0.008,
+        "wait so long for the contact of an image, where those of the two images before came in time",
+        "s",
+        0.0,
+        1.0,
+    )
     peer: str = setting(
         "",
         "the other jaw, whose wrenches complete grasp_wrench and manipulation_wrench here; empty: none",
@@ -77,6 +84,7 @@ def build_contact_feed(jaw: Jaw, parameters: NodeParameters) -> ContactFeed:
         fixed=None if math.isnan(height) else Contact.fixed(jaw, height),
         free=parameters.contact_free,
         max_age=round(1e9 * parameters.max_age),
+        patience=parameters.contact_patience,
     )
 
 
@@ -100,6 +108,7 @@ def build_estimator(
 
 # Rows with which an image is still solved in time; a contact has a row every few millimetres, an outline some hundred.
 MOST_ROWS, MOST_CORNERS = 500, 5000
+IN_STEP = 2  # images in a row whose contacts came in time, after which the next one waits for its own
 
 
 class ContactFeed:
@@ -110,14 +119,33 @@ class ContactFeed:
         fixed: a contact that holds for ever, instead of messages.
         free: whether the solver may move a contact that came by message.
         max_age: greatest distance between the stamps of contact and image [ns].
+        patience: after an image, in which its contact comes in time [s].
     """
 
-    def __init__(self, *, frame: str, fixed: Contact | None, free: bool, max_age: int) -> None:
+    def __init__(self, *, frame: str, fixed: Contact | None, free: bool, max_age: int, patience: float = 0.0) -> None:
+        self._patience = patience
         self._frame, self._fixed, self._free, self._max_age = frame, fixed, free, max_age
         self._contact: Contact | None = None
         self._outline: ObjectOutline | None = None
         self._cut: ObjectOutline | None = None
         self._stamp = self._outline_stamp = 0
+        self._image, self._seen, self._in_time = 0, -math.inf, 0
+
+    def expect(self, stamp: int, now: float) -> bool:
+        """Note that an image [ns] has come at a time [s]; return whether its contact will, and is worth waiting for."""
+        if self._is_there(self._image) is False:
+            self._in_time = 0
+        self._image, self._seen = stamp, now
+        return not (self.is_fixed or self._is_there(stamp)) and self._in_time >= IN_STEP
+
+    def completes(self, now: float) -> bool:
+        """Say whether the contact of the last image is there, at a time [s]; outlines come before their contacts."""
+        is_there, is_next = self._is_there(self._image), self._is_there(self._image + 1)
+        self._in_time = self._in_time + 1 if is_next or (is_there and now - self._seen <= self._patience) else 0
+        return is_there
+
+    def _is_there(self, stamp: int) -> bool:
+        return min(self._stamp, self._outline_stamp) >= stamp
 
     @property
     def is_fixed(self) -> bool:

@@ -65,6 +65,8 @@ STEADY = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
 REQUESTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # one that is passed over waits for ever
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
+
 provide_transport()  # read when the first context is made, whoever makes it
 
 
@@ -306,7 +308,7 @@ def publish_diagnostics(
         publisher.publish(DiagnosticArray(header=Header(stamp=node.get_clock().now().to_msg()), status=[status]))
 
     # on the steady clock: a stopped /clock must show, too
-    node.create_timer(period, publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    node.create_timer(period, publish, clock=STEADY_CLOCK)
 
 
 def serve_trigger(qos: QosWatch, name: str, action: Callable[[], str], group: CallbackGroup | None = None) -> None:
