@@ -107,6 +107,7 @@ def run_nodes(
     sides: Sequence[str],
     awaited: Collection[str] = (),
     *,
+    heard: Sequence[str] | None = None,
     detector: bool = False,
 ) -> NodeRun:
     """Play a stream to processes in real time, stamps shifted to now; nothing outlives the call.
@@ -114,8 +115,9 @@ def run_nodes(
     Args:
         processes: to be started, and ended.
         stream: what is played.
-        sides: jaws whose results are heard.
+        sides: jaws that are played.
         awaited: topics that somebody has to listen to before the stream begins; without any those of our own nodes.
+        heard: jaws whose own results are heard beside the grasp force, which makes them work for it; all without.
         detector: whether the results of a key point detector are heard, too.
 
     Raises:
@@ -131,7 +133,7 @@ def run_nodes(
         player = stack.enter_context(open_player(domain))
         nodes = stack.enter_context(ProcessGroup(processes, {"ROS_DOMAIN_ID": str(domain)}))
         player.offer(stream)
-        player.listen(sides, log, detector=detector)
+        player.listen(sides if heard is None else heard, log, detector=detector)
 
         await_listeners(player, nodes, awaited or awaited_topics(processes, sides))
         player.spin_until(monotonic() + LINGER)
