@@ -2,9 +2,9 @@
 
 A rendered grasp is played from images, and from its true key points, to all stages in one process and to each in its
 own; once more while something else takes one processor. Who listens hears the grasp force alone, as a controller does,
-and every image is to be answered. Latency is from the image's leaving to the arrival of the grasp force. The force error
-is counted twice: at the image's own time, and "now": what is known at any time, the newest force that has arrived,
-against the truth at that time.
+and every image is to be answered. Latency is from the image's leaving to the arrival of the grasp force. The error is
+counted twice: at the image's own time, and "now": what is known at any time, the newest force that has arrived, against
+the truth at that time.
 """
 
 from __future__ import annotations
