@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -55,6 +56,7 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
     xyz_columns,
 )
 from finforce.ros.pipeline import Outlet, Port, Stage, Unread
+from finforce.ros.tracing import note, write_trace
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
 from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe
 from finforce.stamps import NANOSECONDS  # noqa: F401 - for those with stamps
@@ -160,8 +162,10 @@ class QosWatch:
         """Return a callback whose failure stops this node alone, where its process has others."""
         return self._stage.guard(self.node, callback) if self._stage else callback
 
-    def guard_taker(self, callback: Callable) -> Callable:
-        """Return a guarded callback for messages, after which others of the process may have their turn."""
+    def guard_taker(self, topic: str, callback: Callable) -> Callable:
+        """Return a guarded callback for a topic's messages, after which others of the process may have their turn."""
+        if not inspect.iscoroutinefunction(callback):
+            callback = note(self.node.get_name(), self.node.resolve_topic_name(topic), callback)
         return self._stage.pipeline.turn(self.guard(callback)) if self._stage else callback
 
     def afterwards(self, action: Callable[[], None]) -> None:
@@ -207,7 +211,7 @@ class QosWatch:
             options: of the subscription, as its callback group.
         """
         events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
-        guarded = self.guard_taker(callback)
+        guarded = self.guard_taker(topic, callback)
         take, options = guarded, {**options, "event_callbacks": events}
         if unread:
             take, options = lambda data: guarded(Unread(data, kind)), {**options, "raw": True}
@@ -279,7 +283,7 @@ class LargeSubscription:
         kind, topic, callback = self._asked
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_mismatch)
         self.current = self._node.create_subscription(
-            kind, topic, self._qos.guard_taker(callback), STEADY, event_callbacks=events, **self._options
+            kind, topic, self._qos.guard_taker(topic, callback), STEADY, event_callbacks=events, **self._options
         )
 
     def _on_mismatch(self, _: Any) -> None:
@@ -425,6 +429,7 @@ def run_nodes(
         if rclpy.ok():  # else the signal took the context away while the node was being built
             raise
     finally:
+        write_trace()
         for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()

@@ -15,6 +15,7 @@ COMMANDS = {
     "evaluate": "run the estimator over recordings offline and score it against the measured force",
     "replay": "play a recording through the real nodes in real time and score it",
     "pipeline": "find the grasp force in a camera's images, all stages in one process",
+    "trace": "show the way of a recording's images through the stages: who waits for whom, and where time goes",
     "jaw": "make the jaw file of a printed finger from its STL, STEP, DXF or SVG file",
     "calibrate": "identify the material from recordings with ground truth",
     "weigh": "scale the stiffness of a finger by the readings of a kitchen scale, one for each steady hold",

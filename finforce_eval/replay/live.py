@@ -59,6 +59,9 @@ class JawLog:
 class ReplayLog:
     """Takes messages, brings their stamps back to the recording's and keeps what they say.
 
+    Attributes:
+        offset: by which stamps are later than they were recorded [ns].
+
     Args:
         sides: the jaws that are played.
     """
@@ -70,12 +73,12 @@ class ReplayLog:
         self.grasp_latency: dict[int, float] = {}
         self.detections = {side: DetectionLog() for side in sides}
         self.health: dict[str, Mapping[str, str]] = {}
-        self._offset = 0
+        self.offset = 0
         self._ended = False
 
     def begin(self, offset: int) -> None:
         """Take stamps as later by so much than they were recorded [ns]."""
-        self._offset = offset
+        self.offset = offset
 
     def end(self) -> None:
         """Take what comes now as the nodes' last words."""
@@ -84,7 +87,7 @@ class ReplayLog:
     def _stamp(self, message: Any) -> int:
         """Return a stamp as it was recorded [ns]."""
         stamp = message.header.stamp
-        return stamp.sec * NANOSECONDS + stamp.nanosec - self._offset
+        return stamp.sec * NANOSECONDS + stamp.nanosec - self.offset
 
     def take_sent(self, topic: str, stamp: int, time: float) -> None:
         """Note when a message left [s, monotonic]; those count that a run begins with: key points, or an image."""

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic, time_ns
-from typing import Any
+from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
 from finforce.errors import MissingDependencyError
+from finforce.ros.tracing import FOLDER
 from finforce.ros.transport import free_domain
 from finforce.skipping import IDLE
 from finforce.systems.processes import Process, ReplayOptions, compose, executables_of, replay_processes
@@ -47,12 +48,17 @@ class Playing:
         sim_time: the same at the recorded speed; else the stamps are shifted to now.
         domain: ROS_DOMAIN_ID; None takes one by chance.
         parameter_file: YAML file with further ROS parameters of the solvers.
+        composed: detector, contact estimator and solvers in one process.
+        trace: folder in which the nodes note when they were at work; empty for none. Then nobody hears more than the
+            grasp force, which would make more work.
     """
 
     rate: float = 1.0
     sim_time: bool = False
     domain: int | None = None
     parameter_file: str = ""
+    composed: bool = True
+    trace: str = ""
 
     @property
     def has_clock(self) -> bool:
@@ -103,17 +109,11 @@ def replay(
         ProcessError: a node cannot be started, or ended early.
         MissingDependencyError: ROS 2 is not installed.
     """
-    playing, keypoints = playing or Playing(), keypoints or KeypointSource(jaw_file=str(setup.jaw.path))
-    sides, from_images = tuple(recording.jaws), keypoints.source_of(recording) == IMAGES
-    with ExitStack() as stack:
-        recording = _choose_keypoints(recording, setup.jaw, keypoints, stack)
-        messages = read_playback(recording.path, without=_results_of(sides) | _unplayed(sides, from_images))
-        options = _graph_options(recording, setup, calibration_file, playing)
-        processes = replay_processes(replace(options, images=from_images, composed=False), Path())
-        log = ReplayLog(sides)
-        processes = _for_scores(processes, recording, keypoints)
-        _run(compose(processes) if options.composed else processes, messages, log, playing)
-    if from_images:
+    played = play_to_nodes(
+        recording, setup, calibration_file=calibration_file, playing=playing or Playing(), source=keypoints
+    )
+    recording, log = played.recording, played.log
+    if log.detections and played.from_images:
         recording = with_detections(recording, {side: found.side_log() for side, found in log.detections.items()})
     evaluation = _score(recording, setup, log)
     return Replay(
@@ -123,6 +123,35 @@ def replay(
         grasp_score=score_grasp(recording, log.grasp, log.grasp_latency),
         recording=recording,
     )
+
+
+class Played(NamedTuple):
+    """A recording with the key points that it was played with, what was answered, and whether it was seen in images."""
+
+    recording: Recording
+    log: ReplayLog
+    from_images: bool
+
+
+def play_to_nodes(
+    recording: Recording,
+    setup: EvaluationSetup,
+    *,
+    calibration_file: str,
+    playing: Playing,
+    source: KeypointSource | None = None,
+) -> Played:
+    """Play a recording through the nodes and return what they answered; see `replay`."""
+    keypoints = source or KeypointSource(jaw_file=str(setup.jaw.path))
+    sides, from_images = tuple(recording.jaws), keypoints.source_of(recording) == IMAGES
+    with ExitStack() as stack:
+        recording = _choose_keypoints(recording, setup.jaw, keypoints, stack)
+        messages = read_playback(recording.path, without=_results_of(sides) | _unplayed(sides, from_images))
+        options = _graph_options(recording, setup, calibration_file, playing)
+        processes = replay_processes(replace(options, images=from_images, composed=False), Path())
+        processes, log = _for_scores(processes, recording, keypoints), ReplayLog(sides)
+        _run(compose(processes) if playing.composed else processes, messages, log, playing)
+    return Played(recording, log, from_images)
 
 
 def _choose_keypoints(recording: Recording, jaw: Jaw, keypoints: KeypointSource, stack: ExitStack) -> Recording:
@@ -221,9 +250,10 @@ def _run(processes: Sequence[Process], messages: Playback, log: ReplayLog, playi
         awaited.append(OBJECT_TOPIC)
     with ExitStack() as stack:
         player = stack.enter_context(open_player(domain))
-        nodes = stack.enter_context(ProcessGroup(processes, {"ROS_DOMAIN_ID": str(domain)}))
+        environment = {"ROS_DOMAIN_ID": str(domain), **({FOLDER: playing.trace} if playing.trace else {})}
+        nodes = stack.enter_context(ProcessGroup(processes, environment))
         player.offer(messages)
-        player.listen(log.jaws, log, detector=detects)
+        player.listen(() if playing.trace else log.jaws, log, detector=detects)
 
         await_listeners(player, nodes, awaited)
         player.spin_until(monotonic() + LINGER)

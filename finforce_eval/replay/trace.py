@@ -1,0 +1,178 @@
+"""The way of images through the stages, from what every process has noted of its callbacks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from finforce.errors import FinforceError
+
+GRASP = "grasp_wrench"
+WAY = "image out to grasp force in"
+PERCENTS = (50, 95, 99)
+OTHER_WORK = ("/diagnostics", "/clock", "/camera/camera/color/camera_info")
+
+
+class TraceError(FinforceError, ValueError):
+    """Nothing was noted, or nothing that belongs to an image."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Span:
+    """One callback.
+
+    Attributes:
+        node: that was called back.
+        topic: of the message.
+        begin: after the image had left [ms].
+        end: after the image had left [ms].
+        own: time in which it did not wait for another stage that it had called [ms].
+    """
+
+    node: str
+    topic: str
+    begin: float
+    end: float
+    own: float
+
+    @property
+    def stage(self) -> str:
+        """Node and topic in a few words."""
+        return f"{self.node}: {self.topic.lstrip('/').removeprefix('camera/camera/')}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """The ways of the images of a recording.
+
+    Attributes:
+        ways: stamp of an image [ns] -> its callbacks, in their order.
+        late: stamp -> from the image's leaving to the grasp force's arrival [ms]; of answered images.
+        images: stamps of all images.
+        lost: reason -> how many images no grasp force came of, as the nodes say.
+    """
+
+    ways: Mapping[int, Sequence[Span]]
+    late: Mapping[int, float]
+    images: Sequence[int]
+    lost: Mapping[str, str]
+
+
+def read_spans(folder: Path, offset: int, sent: Mapping[int, float]) -> dict[int, list[Span]]:
+    """Return what processes have noted of images.
+
+    Args:
+        folder: of their files.
+        offset: by which stamps were later than they were recorded [ns].
+        sent: when each image left, by its recorded stamp [s, monotonic].
+
+    Raises:
+        TraceError: there is nothing.
+    """
+    ways: dict[int, list[Span]] = {}
+    for path in sorted(folder.glob("*.json")):
+        noted = json.loads(path.read_text(encoding="utf-8"))
+        owned = _own_times([(begin, end) for *_, begin, end in noted])
+        for (node, topic, stamp, begin, end), own in zip(noted, owned, strict=True):
+            left = sent.get(stamp - offset)
+            if left is not None and topic not in OTHER_WORK:
+                times = {"begin": 1e-6 * begin - 1e3 * left, "end": 1e-6 * end - 1e3 * left, "own": 1e-6 * own}
+                ways.setdefault(stamp - offset, []).append(Span(node=node, topic=topic, **times))
+    if not ways:
+        raise TraceError("no stage has noted anything of an image; expected at least one image to be answered")
+    return {stamp: sorted(spans, key=lambda span: span.begin) for stamp, spans in sorted(ways.items())}
+
+
+def _own_times(spans: Sequence[tuple[int, int]]) -> list[int]:
+    """Return how long each of nested spans (begin, end) was at work itself."""
+    own = [end - begin for begin, end in spans]
+    order = sorted(range(len(spans)), key=lambda i: (spans[i][0], -spans[i][1]))
+    around: list[int] = []
+    for index in order:
+        begin, end = spans[index]
+        while around and spans[around[-1]][1] <= begin:
+            around.pop()
+        if around:
+            own[around[-1]] -= end - begin
+        around.append(index)
+    return own
+
+
+def stage_figures(trace: Trace) -> dict[str, dict[str, Any]]:
+    """Return by stage how often it was at work, for how long itself, and when it began [ms], and the whole way."""
+    stages: dict[str, list[Span]] = {}
+    for spans in trace.ways.values():
+        for span in spans:
+            stages.setdefault(span.stage, []).append(span)
+    found = {
+        name: {
+            "n": len(spans),
+            "own_ms": _percentiles([span.own for span in spans]),
+            "begin_ms": _percentiles([span.begin for span in spans]),
+        }
+        for name, spans in stages.items()
+    }
+    ordered = dict(sorted(found.items(), key=lambda entry: entry[1]["begin_ms"][0]))
+    late = list(trace.late.values())
+    return {**ordered, WAY: {"n": len(late), "own_ms": _percentiles(late), "begin_ms": [0.0] * len(PERCENTS)}}
+
+
+def _percentiles(values: Sequence[float]) -> list[float]:
+    return [float(value) for value in np.percentile(values, PERCENTS)] if values else [float("nan")] * len(PERCENTS)
+
+
+def format_trace(trace: Trace) -> str:
+    """Return a table of the stages in Markdown, and what was lost."""
+    lines = ["| stage | images | begins at p50/ms | takes p50/ms | p95 | p99 |", "|---|---:|---:|---:|---:|---:|"]
+    for name, figures in stage_figures(trace).items():
+        begin, own = figures["begin_ms"][0], figures["own_ms"]
+        lines.append(f"| {name} | {figures['n']} | {begin:.2f} | " + " | ".join(f"{value:.2f}" for value in own) + " |")
+    answered = len(trace.late)
+    lines.append("")
+    lines.append(f"{answered} of {len(trace.images)} images answered. Where the others went, by the nodes themselves:")
+    return "\n".join([*lines, *(f"- {name}: {why}" for name, why in trace.lost.items())])
+
+
+def median_image(trace: Trace) -> int:
+    """Return the stamp [ns] of the image that was answered in the median time.
+
+    Raises:
+        TraceError: none was answered.
+    """
+    known = sorted((late, stamp) for stamp, late in trace.late.items() if stamp in trace.ways)
+    if not known:
+        raise TraceError("no image was answered; expected one at least")
+    return known[len(known) // 2][1]
+
+
+def draw_way(trace: Trace, path: Path | str) -> None:
+    """Draw who was at work when for the image in the middle of all, and how long images took in all."""
+    from finforce_eval.figures.figures import BLACK, BLUE, GREY, ORANGE, new_figure, style_axes
+
+    stamp = median_image(trace)
+    spans = trace.ways[stamp]
+    figure = new_figure(10.0, 1.6 + 0.28 * len(spans) + 1.8)
+    way, all_of_them = figure.subplots(2, 1, height_ratios=[0.28 * len(spans) + 0.6, 1.6])
+    for row, span in enumerate(spans):
+        way.barh(row, span.end - span.begin, left=span.begin, height=0.7, color=BLUE, alpha=0.85)
+        way.text(span.end + 0.1, row, f"{span.own:.2f} ms", va="center", fontsize=7, color=BLACK)
+    way.set_yticks(range(len(spans)), [span.stage for span in spans], fontsize=7)
+    way.invert_yaxis()
+    way.axvline(trace.late[stamp], color=ORANGE, linewidth=1.2)
+    way.text(trace.late[stamp], -0.9, "grasp force", color=ORANGE, ha="center", fontsize=8)
+    way.set_xlabel("after the image left [ms]; beside each bar what the stage itself took")
+    way.set_xlim(left=0.0, right=1.15 * max(trace.late[stamp], max(span.end for span in spans)))
+    late = np.array(list(trace.late.values()))
+    all_of_them.hist(late, bins=np.linspace(0.0, max(40.0, float(late.max())), 80), color=GREY)
+    for percent in PERCENTS:
+        all_of_them.axvline(np.percentile(late, percent), color=ORANGE, linewidth=1.0)
+    all_of_them.set_xlabel(f"{WAY} [ms]; lines: 50, 95 and 99 %")
+    all_of_them.set_ylabel("images")
+    for axes in (way, all_of_them):
+        style_axes(axes)
+    figure.savefig(path)

@@ -1,0 +1,93 @@
+"""Claims about traces: what is noted, whose time is whose, and which image stands for all."""
+
+import json
+
+import pytest
+from eval_fakes import drawn_hues
+
+from finforce.ros import tracing
+from finforce_eval.replay.trace import (
+    WAY,
+    Trace,
+    TraceError,
+    draw_way,
+    format_trace,
+    median_image,
+    read_spans,
+    stage_figures,
+)
+
+OFFSET = 5_000
+MS = 1_000_000
+
+
+def write(folder, name, *spans):
+    (folder / f"{name}.json").write_text(json.dumps(spans), encoding="utf-8")
+
+
+@pytest.fixture
+def ways(tmp_path):
+    """Two images: the detector calls the solver, another process hears the first image, too."""
+    write(
+        tmp_path,
+        "one",
+        ("solver", "/left/keypoints", 10 + OFFSET, 13 * MS, 16 * MS),
+        ("detector", "/color", 10 + OFFSET, 11 * MS, 18 * MS),
+        ("detector", "/color", 20 + OFFSET, 31 * MS, 33 * MS),
+        ("detector", "/color", 30 + OFFSET, 41 * MS, 43 * MS),
+    )
+    write(tmp_path, "two", ("other", "/left/wrench", 10 + OFFSET, 17 * MS, 19 * MS), ("other", "/clock", 10, 0, 1))
+    return read_spans(tmp_path, OFFSET, {10: 0.010, 20: 0.030})
+
+
+def make_trace(ways):
+    return Trace(ways=ways, late={10: 9.5, 20: 4.0, 40: 30.0}, images=[10, 20, 30, 40], lost={"left jaw": "1 late"})
+
+
+def test_spans_are_those_of_images_that_left_and_begin_with_them(ways):
+    assert sorted(ways) == [10, 20]
+    assert [span.node for span in ways[10]] == ["detector", "solver", "other"]
+    assert [span.begin for span in ways[10]] == pytest.approx([1.0, 3.0, 7.0])
+
+
+def test_what_a_stage_called_is_not_its_own_time_and_another_process_is_none_of_it(ways):
+    assert [span.own for span in ways[10]] == pytest.approx([4.0, 3.0, 2.0])
+
+
+def test_figures_come_in_the_order_of_the_way_with_the_whole_of_it_last(ways):
+    figures = stage_figures(make_trace(ways))
+    assert list(figures) == ["detector: color", "solver: left/keypoints", "other: left/wrench", WAY]
+    assert figures["detector: color"]["n"] == 2 and figures[WAY]["own_ms"][0] == 9.5
+    text = format_trace(make_trace(ways))
+    assert "3 of 4 images answered" in text and "left jaw: 1 late" in text
+    assert "| solver: left/keypoints | 1 | 3.00 | 3.00 |" in text
+
+
+def test_the_image_in_the_middle_is_one_that_was_noted(ways, tmp_path):
+    assert median_image(make_trace(ways)) == 10
+    draw_way(make_trace(ways), tmp_path / "way.png")
+    assert drawn_hues(tmp_path / "way.png") >= 2
+    with pytest.raises(TraceError, match="no image was answered"):
+        median_image(Trace(ways=ways, late={}, images=[10], lost={}))
+
+
+def test_a_folder_without_anything_of_an_image_is_said(tmp_path):
+    with pytest.raises(TraceError, match="nothing was noted|noted anything"):
+        read_spans(tmp_path, 0, {10: 0.0})
+
+
+def test_nothing_is_noted_unless_it_is_asked_for(monkeypatch, tmp_path):
+    def take(_):
+        pass
+
+    monkeypatch.delenv(tracing.FOLDER, raising=False)
+    assert tracing.note("node", "/topic", take) is take
+    monkeypatch.setenv(tracing.FOLDER, str(tmp_path))
+    monkeypatch.setattr(tracing, "_spans", [])
+    tracing.note("node", "/topic", take)(type("Unread", (), {"stamp": 7}))
+    tracing.note("node", "/said", take)("no header")
+    tracing.write_trace()
+    (path,) = tmp_path.glob("*.json")
+    noted = json.loads(path.read_text(encoding="utf-8"))
+    assert [entry[:3] for entry in noted] == [["node", "/topic", 7], ["node", "/said", 0]]
+    assert all(begin <= end for *_, begin, end in noted)
