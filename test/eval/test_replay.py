@@ -44,7 +44,7 @@ def run(*words, timeout=240):
 
 
 def solvers_of(domain):
-    """The solver processes on a DDS domain."""
+    """The processes with solvers on a DDS domain."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -52,7 +52,8 @@ def solvers_of(domain):
             variables = (folder / "environ").read_bytes()
         except OSError:
             continue
-        if b"finforce.ros.start\0ifea_solver" in words and f"ROS_DOMAIN_ID={domain}\0".encode() in variables:
+        is_ours = any(b"finforce.ros.start\0" + name in words for name in (b"ifea_solver", b"pipeline"))
+        if is_ours and f"ROS_DOMAIN_ID={domain}\0".encode() in variables:
             found.append(int(folder.name))
     return found
 
