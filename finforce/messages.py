@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import fields as fields_of
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
@@ -396,7 +397,7 @@ def same_camera(one: CameraIntrinsics | None, other: CameraIntrinsics) -> bool:
     """Say whether two cameras have the same numbers."""
     if one is None:
         return False
-    return all(np.array_equal(value, getattr(other, name)) for name, value in vars(one).items())
+    return all(np.array_equal(getattr(one, entry.name), getattr(other, entry.name)) for entry in fields_of(one))
 
 
 def layout_of(image: Any) -> ImageLayout:

@@ -15,7 +15,7 @@ from finforce_eval.replay.processes import ProcessError, ProcessGroup
 class Script:
     """A process that runs a few lines of Python."""
 
-    name: str
+    label: str
     code: str
 
     def command(self):
