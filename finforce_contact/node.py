@@ -58,6 +58,7 @@ class ContactEstimatorNode(Node):
         self.camera_group = MutuallyExclusiveCallbackGroup()
         self.idling = {side: Idling() for side in sides}
         self.unread: dict[str, dict[type, Callable[[], None]]] = {side: {} for side in sides}
+        self.objects: Any = None
         self.inputs = subscribe(self.qos, parameters, self.session, self)
         self.get_logger().info(f"jaws: {parameters.jaws}, ready, object poses by {parameters.pose_source}")
 
@@ -80,6 +81,9 @@ class ContactEstimatorNode(Node):
         """Find the contact of an image, unless it may be passed over."""
         began, stamp = perf_counter(), unread.stamp
         self.health[side].arrive()
+        # poses of the object that came while the image was looked at
+        for message in ros.take_waiting(self.objects):
+            self.on_object(message)
         with self._refusals((side,)):
             if self.idling[side].passes(stamp):
                 self.skips.count(IDLE)

@@ -240,10 +240,12 @@ class Handlers(Protocol):
     Attributes:
         camera_group: callback group of the images, which wait for each other.
         skips: rules of what need not be done.
+        objects: the subscription to the object's poses, where other programs find them.
     """
 
     camera_group: Any
     skips: Skips
+    objects: Any
 
     def on_object(self, message: Any) -> None:
         """Use the object's pose that a message holds."""
@@ -307,9 +309,9 @@ def subscribe(
     if parameters.tracks:
         _subscribe_camera(qos, session, handlers)
     elif parameters.pose_source == "topic":
-        qos.subscription(ros.PoseStamped, "object_pose", handlers.on_object, ros.SENSOR)
+        handlers.objects = qos.subscription(ros.PoseStamped, "object_pose", handlers.on_object, ros.SENSOR)
     else:
-        qos.subscription(detections_type(), "object_detections", handlers.on_object, ros.SENSOR)
+        handlers.objects = qos.subscription(detections_type(), "object_detections", handlers.on_object, ros.SENSOR)
     jaws = {side: JawInputs(qos, side, session, handlers) for side in parameters.sides}
     for side, inputs in jaws.items():
         inputs.open()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import Field, fields
 from functools import partial
 from threading import Thread
@@ -388,6 +388,17 @@ def take_newest(subscription: Subscription | Port, message: Any) -> tuple[Any, i
         while (taken := handle.take_message(subscription.msg_type, subscription.raw)) is not None:
             message, passed = taken[0], passed + 1
     return message, passed
+
+
+def take_waiting(subscription: Subscription | Port) -> Iterator[Any]:
+    """Yield the messages that wait to be taken, which would have their turn later."""
+    if isinstance(subscription, Port):
+        subscription = subscription.outside
+    if subscription is None:
+        return  # it is of the same process, where nothing waits
+    with (handle := subscription.handle):
+        while (taken := handle.take_message(subscription.msg_type, subscription.raw)) is not None:
+            yield taken[0]
 
 
 def run_node(
