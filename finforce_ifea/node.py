@@ -55,6 +55,7 @@ class IfeaSolverNode(Node):
         super().__init__("ifea_solver", **options)
         self.parameters = parameters = ros.declare_record(self, NodeParameters)
         settings = ros.declare_record(self, EstimatorSettings, "estimator")
+        settings = settings.resolve_held(both=parameters.paired or bool(parameters.peer))
         ros.name_unknown_parameters(self)
         self.skips = Skips(SOLVER, parameters.skip_off)
         jaw = load_parameter_jaw(parameters)

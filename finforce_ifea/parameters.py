@@ -46,6 +46,7 @@ class NodeParameters(TimeParameters):
         "the other jaw, whose wrenches complete grasp_wrench and manipulation_wrench here; empty: none",
         choices=("", "left", "right"),
     )
+    paired: bool = setting(False, "without a peer: there is another jaw, and the two hold what they press")
     completes_grasp: bool = setting(False, "without a peer: publish this jaw's force as grasp_wrench")
     publish_surface: bool = setting(True, "publish the deformed mesh vertices with every solved image")
     skip_off: tuple[str, ...] = setting(

@@ -1,6 +1,7 @@
 """What can be set on an estimator: defaults, units, bounds and meanings."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 from finforce.errors import ObservationError
 from finforce.settings import check_bounds, setting
@@ -35,8 +36,8 @@ class EstimatorSettings:
     )
     held: str = setting(
         "auto",
-        "whether the jaws alone hold the object, so that friction takes up what their faces lean; auto: yes in "
-        "recordings of both jaws, else no",
+        "whether the jaws alone hold the object, so that friction takes up what their faces lean; auto: yes where "
+        "there are both, else no",
         choices=("auto", "yes", "no"),
     )
     tare_frames: int = setting(45, "unloaded frames before the first force is reported", "frames", 5, 10000)
@@ -67,3 +68,7 @@ class EstimatorSettings:
             ObservationError: A setting is not among its choices or outside its bounds.
         """
         check_bounds(self, ObservationError)
+
+    def resolve_held(self, *, both: bool) -> Self:
+        """Return settings in which `held` is no longer `auto`; `both` where another jaw presses the same object."""
+        return self if self.held != "auto" else replace(self, held="yes" if both else "no")

@@ -80,7 +80,7 @@ def robot_processes(options: RobotOptions, share: Path) -> list[Process | Includ
         *camera_includes(options, share),
         *arm_includes(options, share),
         solver_process("left", options, peer="right"),
-        solver_process("right", options),
+        solver_process("right", options, paired=True),
         *[see_camera(process, options) for process in contact_processes("both", options, waits=True)],
         *[see_camera(process, options) for process in detector_processes("both", options)],
         *([gripper_process(options)] if options.gripper else []),

@@ -221,7 +221,7 @@ def replay_processes(options: ReplayOptions, share: Path) -> list[Process]:
     With two jaws the left one completes the forces on the gripper, with one jaw that one.
     """
     if options.jaws == "both":
-        solvers = [solver_process("left", options, peer="right"), solver_process("right", options)]
+        solvers = [solver_process("left", options, peer="right"), solver_process("right", options, paired=True)]
     else:
         solvers = [solver_process(options.jaws, options, completes_grasp=True)]
     awaited = {"awaits_poses": True} if options.object_mesh else {}

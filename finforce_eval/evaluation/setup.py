@@ -43,8 +43,7 @@ class EvaluationSetup:
 
     def estimator(self, held: bool = False) -> JawEstimator:
         """Return a fresh estimator that has nothing left to compile; `held` where both jaws hold an object."""
-        auto = replace(self.settings, held="yes" if held else "no")
-        settings = auto if self.settings.held == "auto" else self.settings
+        settings = self.settings.resolve_held(both=held)
         estimator = JawEstimator(self.jaw, settings=settings, calibration=self.calibration)
         estimator.warm_up()
         return estimator

@@ -56,6 +56,7 @@ def test_of_two_jaws_exactly_one_completes_the_grasp():
     solvers = by_name(replay_processes(ReplayOptions(composed=False, jaws="both"), ROOT))
     assert solvers["left_ifea_solver"].parameters["peer"] == "right"
     assert "peer" not in solvers["right_ifea_solver"].parameters
+    assert solvers["right_ifea_solver"].parameters["paired"] is True
     assert not any("completes_grasp" in solver.parameters for solver in solvers.values())
 
 

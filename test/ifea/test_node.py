@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from node_fakes import KEYPOINTS, FakeEstimator, keypoint_cloud, start_solver
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
@@ -18,6 +19,7 @@ from finforce.health import Level
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
+from finforce_ifea.node import IfeaSolverNode
 
 SECOND = 1_000_000_000
 
@@ -204,6 +206,30 @@ def test_rate_and_latency_are_in_the_diagnostics(probe):
     for measure in ("callback to published", "image to published"):
         assert 0.0 < float(values[f"{measure} p50 [ms]"]) <= float(values[f"{measure} p95 [ms]"]) < 200.0
     assert values["key points used"] == "15 of 15"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "held"),
+    [
+        ({}, "no"),
+        ({"completes_grasp": True}, "no"),
+        ({"peer": "right"}, "yes"),
+        ({"paired": True}, "yes"),
+        ({"paired": True, "estimator.held": "no"}, "no"),
+        ({"estimator.held": "yes"}, "yes"),
+    ],
+)
+def test_two_jaws_hold_what_they_press_unless_told_otherwise(probe, parameters, held):
+    given = {"contact_height": 0.04, **parameters}
+    overrides = [Parameter(name, value=value) for name, value in given.items()]
+    asked = []
+
+    def build(jaw, parameters, settings, outlined):
+        asked.append(settings.held)
+        return FakeEstimator()
+
+    IfeaSolverNode(build, context=probe.context, parameter_overrides=overrides).destroy_node()
+    assert asked == [held]
 
 
 def two_jaws(probe, right_force=(-3.0, 0.0, 0.5)):
