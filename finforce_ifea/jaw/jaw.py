@@ -97,11 +97,11 @@ class Jaw:
         Raises:
             MeshError: The density is unknown, or the mesh file is bad.
         """
-        if self.drawing is not None:
-            mesh = mesh_drawing(self.drawing, density or "default")
-        elif self.section is not None:
-            mesh = extrude_section(self.section, _find_share(density))
-        elif density in (None, "default"):
+        if self.drawing is not None:  # its own mirror image, as an extruded section is
+            return mesh_drawing(self.drawing, density or "default")
+        if self.section is not None:
+            return extrude_section(self.section, _find_share(density))
+        if density in (None, "default"):
             file = self.mesh_file
             mesh = read_volume_mesh(file.path, scale=file.scale, clamp=file.clamp)
         else:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields, replace
 from pathlib import Path
+from weakref import WeakValueDictionary
 from zipfile import BadZipFile
 
 import numpy as np
@@ -27,12 +28,14 @@ from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.reduced import build as manifold_build
 from finforce_ifea.reduced.build import build_manifold, build_rest
 from finforce_ifea.reduced.equilibria import Manifold
-from finforce_ifea.reduced.evaluation import ReducedContact, ReducedModel
+from finforce_ifea.reduced.evaluation import ReducedContact, ReducedModel, scale_manifold
 
 # To be raised when what is stored, or how it is found, changes.
 VERSION = 5
 # What reading a damaged archive raises, one or the other by where the damage is.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, struct.error, zlib.error)
+# By name and modulus [Pa]; two jaws of a gripper are each other's mirror image, for which the equilibria are the same.
+_SHARED: WeakValueDictionary[tuple[str, float], Manifold] = WeakValueDictionary()
 _LOG = logging.getLogger(__name__)
 
 
@@ -126,11 +129,8 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
         ContactError: The jaw cannot be pressed.
     """
     modulus = jaw.material.young_modulus
-    if linear:
-        manifold = build_rest(full, modulus)
-    else:
-        manifold = fetch_manifold(name_manifold(full, jaw), lambda: _build_watched(full, jaw))
-    model = ReducedModel(manifold, full.model, modulus, full.contact.face)
+    manifold = build_rest(full, modulus) if linear else _share_manifold(full, jaw)
+    model = ReducedModel(manifold, full.model, full.contact.face)
     surface = full.contact.surface
     middle = surface.points[:: surface.across].copy()
     middle[:, 1] = 0.0
@@ -142,6 +142,17 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
         contact=ReducedContact(model, surface, full.contact.face),
         full=None if linear else full,
     )
+
+
+def _share_manifold(full: Mechanics, jaw: Jaw) -> Manifold:
+    """Returns the manifold of a jaw with its modulus, the same one for all jaws of this process that are alike."""
+    modulus = jaw.material.young_modulus
+    key = (name_manifold(full, jaw), modulus)
+    found = _SHARED.get(key)
+    if found is None:
+        found = scale_manifold(fetch_manifold(key[0], lambda: _build_watched(full, jaw)), modulus)
+        _SHARED[key] = found
+    return found
 
 
 def name_manifold(full: Mechanics, jaw: Jaw) -> str:

@@ -91,11 +91,9 @@ class ReducedModel:
     rotations = None
     across: Across = "middle"
 
-    def __init__(self, manifold: Manifold, full: JawModel, young_modulus: float, face: FaceLine) -> None:
-        """Scales a manifold to a modulus [Pa] of the jaw that `full` describes, with its inner face."""
-        self._face = face
-        factor = young_modulus / manifold.young_modulus
-        self.manifold, self._full = scale_manifold(manifold, factor), full
+    def __init__(self, manifold: Manifold, full: JawModel, face: FaceLine) -> None:
+        """Keeps the manifold of the jaw that `full` describes, with its inner face."""
+        self.manifold, self._full, self._face = manifold, full, face
         self.rows = manifold.loads.shape[2]
         self.size = self.rows + 2
         self.loads, self.compliance = self.manifold.loads, self.manifold.compliance
@@ -173,14 +171,15 @@ class ReducedModel:
         return self.manifold.basis @ shape.ravel()
 
 
-def scale_manifold(manifold: Manifold, factor: float) -> Manifold:
-    """Returns the manifold of a jaw whose modulus is `factor` times as large."""
-    if factor == 1.0:
+def scale_manifold(manifold: Manifold, young_modulus: float) -> Manifold:
+    """Returns the manifold of a jaw with another modulus [Pa]."""
+    if young_modulus == manifold.young_modulus:
         return manifold
+    factor = young_modulus / manifold.young_modulus
     soft = np.float32(1.0 / factor)
     return replace(
         manifold,
-        young_modulus=manifold.young_modulus * factor,
+        young_modulus=young_modulus,
         loads=manifold.loads * factor,
         compliance=manifold.compliance * soft,
         shape_compliance=manifold.shape_compliance * soft,

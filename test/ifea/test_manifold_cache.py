@@ -10,11 +10,13 @@ from mechanics_fakes import BENCH, bench_mechanics
 from finforce_ifea.jaw.drawing import Drawing
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.reduced import cache as manifold_cache
+from finforce_ifea.reduced.build import build_rest
 from finforce_ifea.reduced.cache import cache_folder, fetch_manifold, hash_parts, name_manifold
 from finforce_ifea.reduced.equilibria import Manifold
 from finforce_ifea.settings import EstimatorSettings
 
 KEY = "0123"
+COARSE = EstimatorSettings(solver="reduced", mesh="coarse")
 
 
 @pytest.fixture
@@ -152,3 +154,17 @@ def test_name_depends_on_geometry_and_poissons_ratio_but_not_on_the_modulus(solv
 def test_models_and_meshes_have_equilibria_of_their_own():
     names = {name_manifold(bench_mechanics(*which), BENCH) for which in (("coarse", "solid"), ("default", "solid"))}
     assert len(names | {name_manifold(bench_mechanics("coarse", "frame"), BENCH)}) == 3
+
+
+def test_both_jaws_of_a_gripper_share_their_equilibria(folder, monkeypatch):
+    monkeypatch.setattr(manifold_cache, "build_manifold", lambda full, modulus, _: build_rest(full, modulus))
+    left = replace(BENCH, material=replace(BENCH.material, poisson_ratio=0.377))
+    stiff = replace(left, material=replace(left.material, young_modulus=5e7))
+    first, second, stiffer = (build_mechanics(jaw, COARSE) for jaw in (left, left.mirrored(), stiff))
+    assert second.model.manifold is first.model.manifold
+    assert stiffer.model.manifold.young_modulus == 5e7
+    ratio = 5e7 / BENCH.material.young_modulus
+    np.testing.assert_allclose(
+        stiffer.model.manifold.compliance, first.model.manifold.compliance / ratio, rtol=1e-6, atol=1e-9
+    )
+    assert len(list(folder.glob("*.npz"))) == 1

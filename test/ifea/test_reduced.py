@@ -202,7 +202,7 @@ def test_jaw_of_which_nothing_can_be_stored_is_described_in_full_unless_reduced_
     def refuse(*_):
         raise ContactError("the jaw cannot be pressed")
 
-    monkeypatch.setattr("finforce_ifea.reduced.cache.fetch_manifold", refuse)
+    monkeypatch.setattr("finforce_ifea.reduced.cache._share_manifold", refuse)
     chosen = build_chosen(BENCH, EstimatorSettings(mesh="coarse"))
     assert isinstance(chosen.model, SolidModel)
     assert "the jaw cannot be pressed" in caplog.text
