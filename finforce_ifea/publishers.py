@@ -12,6 +12,7 @@ from finforce.ros import node as ros
 from finforce.ros.messages import points_marker
 from finforce.skipping import Skips
 from finforce_ifea.grasp_force import Grasp
+from finforce_ifea.marker_style import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
 from finforce_ifea.parameters import NodeParameters
 
 if TYPE_CHECKING:
@@ -86,12 +87,7 @@ if TYPE_CHECKING:
 SURFACE = (0.45, 0.55, 0.65, 0.6)
 USED = (0.1, 0.8, 0.2, 1.0)
 UNUSED = (0.9, 0.2, 0.1, 1.0)
-CONTACT = (1.0, 0.8, 0.0, 1.0)
-FORCE = (0.9, 0.1, 0.6, 1.0)
-NEWTONS_PER_METRE = 200.0  # 5 N are drawn 25 mm long, a third of a bench finger
 KEYPOINT_DIAMETER = 0.003
-CONTACT_DIAMETER = 0.005
-ARROW = (0.002, 0.004, 0.005)  # shaft, head, head length
 
 
 def build_markers(header: Any, observation: Observation, solution: Solution, estimator: JawEstimator) -> list[Any]:

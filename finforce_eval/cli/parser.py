@@ -50,3 +50,16 @@ def add_set(parser: argparse.ArgumentParser) -> None:
     """Add changes of single settings."""
     text = "change a setting of the estimator, may be repeated; an unknown NAME lists them"
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
+
+
+def add_engine_options(parser: argparse.ArgumentParser) -> None:
+    """Add what says how many recordings are worked at, and where."""
+    engines = ("sequential", "processes", "ray")
+    parser.add_argument("--engine", default="sequential", choices=engines, help="how recordings are worked at")
+    text = "recordings at once; without it one for each processor"
+    parser.add_argument("--workers", type=int, default=0, metavar="N", help=text)
+    text = "of a task in processes [GB]; 0: any (4)"
+    parser.add_argument("--memory", type=float, default=4.0, metavar="GB", help=text)
+    parser.add_argument("--address", default="", help="of a Ray cluster; without it one of this machine")
+    text = "i/n: do the i-th of n parts of the recordings, as a job of a batch system"
+    parser.add_argument("--shard", default="", metavar="I/N", help=text)

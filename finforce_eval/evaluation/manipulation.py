@@ -89,8 +89,9 @@ def join_net(left: CaseResult, right: CaseResult, recording: Recording | None = 
     answered = 100.0 * float(both.mean()) if len(both) else None
     stamps, mine, theirs = stamps[both], mine[both], theirs[both]
     jaws = ((left, mine), (right, theirs))
-    found = _combine(*((jaw.force[rows], _rows_of(jaw.torque, rows)) for jaw, rows in jaws), _ways(recording, stamps))
-    ways = _ways(recording, stamps, true=True)
+    ways = find_distances(recording, stamps)
+    found = _combine(*((jaw.force[rows], _rows_of(jaw.torque, rows)) for jaw, rows in jaws), ways)
+    ways = find_distances(recording, stamps, true=True)
     true = _combine(*((jaw.truth[rows], _rows_of(jaw.true_torque, rows)) for jaw, rows in jaws), ways)
     stated = None
     if left.axis_stddev is not None and right.axis_stddev is not None:
@@ -120,7 +121,7 @@ def _rows_of(torque: NDArray | None, rows: NDArray) -> NDArray:
     return np.full((len(rows), 3), np.nan) if torque is None else torque[rows]
 
 
-def _ways(recording: Recording | None, stamps: NDArray, *, true: bool = False) -> list[float | None]:
+def find_distances(recording: Recording | None, stamps: NDArray, *, true: bool = False) -> list[float | None]:
     """Return the distance between the jaws in images (n,) [ns], as it was seen or as it was; None where unknown."""
     distance, tracks = JawDistance(_SAME), {}
     for side in SIDES if recording is not None else ():

@@ -49,6 +49,10 @@ class BagReader:
         for connection, time, data in self._reader.messages(connections=chosen) if chosen else ():
             yield RawSample(connection.topic, time, data)
 
+    def messages(self) -> Iterator[tuple[Any, int, bytes | memoryview]]:
+        """Yield connection (of rosbags), time of receipt [ns] and bytes of all messages, in the order of receipt."""
+        yield from self._reader.messages()
+
     def decode(self, sample: RawSample) -> Any:
         """Return the message of a sample."""
         return self._types.deserialize_cdr(sample.data, self.types[sample.topic])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +15,9 @@ from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, WRENCH
 from finforce_eval.recordings.tracks import KeypointTrack, PhaseTrack, PoseTrack, Recording, WrenchTrack
+from finforce_ifea.marker_style import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
+
+MARKERS = "visualization_msgs/msg/MarkerArray"
 
 
 class Entry(NamedTuple):
@@ -76,6 +79,54 @@ class MessageFactory:
         turn = self._types["geometry_msgs/msg/Quaternion"](*(float(value) for value in quaternion))
         pose = self._types["geometry_msgs/msg/Pose"](point, turn)
         return self._types[POSE](self.header(stamp, frame_id), pose)
+
+    def status(self, stamp: int, level: int, name: str, text: str, values: Mapping[str, str]) -> Any:
+        """Return a DiagnosticArray of one status."""
+        pairs = [self._types["diagnostic_msgs/msg/KeyValue"](key=key, value=value) for key, value in values.items()]
+        status = self._types["diagnostic_msgs/msg/DiagnosticStatus"](
+            level=level, name=name, message=text, hardware_id="", values=pairs
+        )
+        return self._types["diagnostic_msgs/msg/DiagnosticArray"](header=self.header(stamp, ""), status=[status])
+
+    def force_markers(self, stamp: int, frame_id: str, point: np.ndarray, force: np.ndarray) -> Any:
+        """Return a MarkerArray of a contact point (3,) [m] and an arrow that ends there, for a force (3,) [N]."""
+        types = self._types
+        known = bool(np.isfinite(point).all() and np.isfinite(force).all() and np.any(force))
+        ends = [point - force / NEWTONS_PER_METRE, point] if known else []
+        kind = types["visualization_msgs/msg/Marker"]
+        points = [types["geometry_msgs/msg/Point"](*(float(value) for value in end)) for end in ends]
+        zero = types["geometry_msgs/msg/Pose"](
+            types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0), types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        )
+        shapes = (
+            ("contact", kind.SPHERE_LIST, points[1:], (CONTACT_DIAMETER,) * 3, CONTACT),
+            ("force", kind.ARROW, points, ARROW, FORCE),
+        )
+        markers = [
+            kind(
+                header=self.header(stamp, frame_id),
+                ns=name,
+                id=0,
+                type=shape,
+                action=kind.ADD if known else kind.DELETE,
+                pose=zero,
+                scale=self.vector(np.array(scale)),
+                color=types["std_msgs/msg/ColorRGBA"](*color),
+                lifetime=types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0),
+                frame_locked=False,
+                points=ends_of,
+                colors=[],
+                texture_resource="",
+                texture=types["sensor_msgs/msg/CompressedImage"](self.header(0, ""), "", np.zeros(0, np.uint8)),
+                uv_coordinates=[],
+                text="",
+                mesh_resource="",
+                mesh_file=types["visualization_msgs/msg/MeshFile"]("", np.zeros(0, np.uint8)),
+                mesh_use_embedded_materials=False,
+            )
+            for name, shape, ends_of, scale, color in shapes
+        ]
+        return types[MARKERS](markers=markers)
 
     def string(self, text: str) -> Any:
         """Return a String."""

@@ -1,0 +1,1 @@
+"""Forces into recordings that exist."""

@@ -1,0 +1,198 @@
+"""A recording with forces beside what it held: the same messages, byte for byte, and new topics between them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.errors import FinforceError
+from finforce.messages import read_stamp
+from finforce_eval.annotation.forces import GraspForces, JawForces
+from finforce_eval.errors import RecordingError
+from finforce_eval.recordings.bags import BagReader, open_bag
+from finforce_eval.recordings.recording import CLOUD, WRENCH
+from finforce_eval.recordings.tracks import Recording
+from finforce_eval.recordings.writer import MARKERS, Entry, MessageFactory
+
+STATUS = "diagnostic_msgs/msg/DiagnosticArray"
+GRIPPER_FRAME = "gripper_base"
+_OK, _WARN = 0, 1
+# Of a type that was recorded without its definition nothing is known but its name.
+_NO_DIGEST = "RIHS01_" + 64 * "0"
+
+
+class ForceMessages:
+    """Makes the messages of one image after the other; what is not known is NaN, and its reason said.
+
+    Args:
+        jaws: forces by side.
+        grasp: of the gripper.
+    """
+
+    def __init__(self, jaws: Mapping[str, JawForces], grasp: GraspForces) -> None:
+        self.factory, self._jaws, self._grasp = MessageFactory(), jaws, grasp
+        self._rows = {side: _index(forces.stamps) for side, forces in jaws.items()}
+        self._grasp_rows = _index(grasp.stamps)
+        names = ("wrench", "wrench_stddev", "wrench_status", "contact", "markers")
+        self.topics = {f"/{side}/{name}" for side in jaws for name in names} | {"/grasp_wrench", "/manipulation_wrench"}
+
+    def __len__(self) -> int:
+        """Images with messages."""
+        return len(self._grasp_rows)
+
+    def at(self, stamp: int) -> Iterator[Entry]:
+        """Yield the messages of an image [ns]; none of an image that is not known, or was asked for before."""
+        row = self._grasp_rows.pop(stamp, None)
+        if row is None:
+            return
+        for side, rows in self._rows.items():
+            if stamp in rows:
+                yield from self._of_jaw(self._jaws[side], rows[stamp], stamp)
+        grasp, factory = self._grasp, self.factory
+        torque = np.where(np.isfinite(grasp.grasp[row]), 0.0, np.nan)
+        yield Entry(stamp, "/grasp_wrench", WRENCH, factory.wrench(stamp, GRIPPER_FRAME, grasp.grasp[row], torque))
+        net = factory.wrench(stamp, GRIPPER_FRAME, grasp.manipulation[row], grasp.torque[row])
+        yield Entry(stamp, "/manipulation_wrench", WRENCH, net)
+
+    def _of_jaw(self, forces: JawForces, row: int, stamp: int) -> Iterator[Entry]:
+        """Yield the messages of one jaw in one image."""
+        side, factory = forces.side, self.factory
+        frame = f"{side}_jaw"
+        wrench = factory.wrench(stamp, frame, forces.force[row], forces.torque[row])
+        yield Entry(stamp, f"/{side}/wrench", WRENCH, wrench)
+        stddev = factory.wrench(stamp, frame, forces.force_stddev[row], forces.torque_stddev[row])
+        yield Entry(stamp, f"/{side}/wrench_stddev", WRENCH, stddev)
+        level = _OK if forces.is_answered(row) else _WARN
+        status = str(forces.status[row])
+        text = forces.reason[row] or status
+        message = factory.status(stamp, level, f"finforce: {side} jaw", text, {"status": status})
+        yield Entry(stamp, f"/{side}/wrench_status", STATUS, message)
+        if forces.contact[row] is not None:
+            yield Entry(stamp, f"/{side}/contact", CLOUD, factory.cloud(stamp, frame, forces.contact[row]))
+        if forces.is_answered(row):
+            markers = factory.force_markers(stamp, frame, forces.point[row], forces.force[row])
+            yield Entry(stamp, f"/{side}/markers", MARKERS, markers)
+
+
+def _index(stamps: NDArray[np.int64]) -> dict[int, int]:
+    """Return the row of each stamp [ns]."""
+    return {stamp: row for row, stamp in enumerate(stamps.tolist())}
+
+
+def write_annotated(
+    recording: Recording, source: Path, forces: ForceMessages, folder: Path, *, side_file: bool = False
+) -> None:
+    """Write the messages of a bag and those of the forces, or the latter alone, as a new rosbag2 folder.
+
+    New messages follow the first message with their stamp that is of an image or of key points, at its time of receipt.
+    Files beside the bag in its own folder, as a `case.json` or the object's mesh, are copied, too.
+
+    Args:
+        recording: what was read of the bag.
+        source: the bag, as `bag_source` returned it.
+        forces: the new messages.
+        folder: to be made; see `new_folder`.
+        side_file: leave the bag's own messages out.
+
+    Raises:
+        RecordingError: the bag has a topic of the same name.
+        OSError: the folder cannot be written, or the disk is full.
+    """
+    with open_bag(source, recording.name) as bag:
+        if not side_file:
+            _refuse_same_topics(bag, forces.topics)
+        _write(bag, recording, forces, folder, side_file=side_file)
+        if len(forces):
+            raise RecordingError(f"{recording.name}: the forces of {len(forces)} images are of none in the bag")
+        if source.is_dir() and not side_file:
+            _copy_others(source, folder)
+
+
+def _refuse_same_topics(bag: BagReader, topics: Collection[str]) -> None:
+    """Refuse a bag that has a topic which is to be added."""
+    same = sorted(bag.types.keys() & topics)
+    if same:
+        raise RecordingError(
+            f"{bag.name}: has {', '.join(same)} already; expected a recording without, or --side-file, which writes "
+            "the new messages alone"
+        )
+
+
+def _write(bag: BagReader, recording: Recording, forces: ForceMessages, folder: Path, *, side_file: bool) -> None:
+    """Copy the bag into a folder that does not exist yet, the forces of an image behind it."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    types, triggers = forces.factory.typestore, _triggers(recording, bag)
+    plugin = StoragePlugin.SQLITE3 if _is_sqlite(recording.path) else StoragePlugin.MCAP
+    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+        known = {} if side_file else {each.id: _copy_connection(writer, each) for each in bag.connections}
+        added: dict[str, Any] = {}
+        for connection, time, data in bag.messages():
+            if not side_file:
+                writer.write(known[connection.id], time, data)
+            for entry in forces.at(read_stamp(data)) if connection.topic in triggers else ():
+                if entry.topic not in added:
+                    added[entry.topic] = writer.add_connection(entry.topic, entry.msgtype, typestore=types)
+                writer.write(added[entry.topic], time, types.serialize_cdr(entry.message, entry.msgtype))
+
+
+def _triggers(recording: Recording, bag: BagReader) -> set[str]:
+    """Return the topics whose messages have the stamps of the forces."""
+    colors = {recording.images.topics[0]} if recording.images is not None else set()
+    return (colors | {f"/{side}/keypoints" for side in recording.jaws}) & bag.types.keys()
+
+
+def _is_sqlite(path: Path) -> bool:
+    """Say whether a bag is of SQLite; what is written is of the same kind."""
+    return path.suffix == ".db3" or (path.is_dir() and not any(path.glob("*.mcap*")) and any(path.glob("*.db3*")))
+
+
+def _copy_connection(writer: Any, connection: Any) -> Any:
+    """Add a topic as it was recorded to a bag that is written."""
+    return writer.add_connection(
+        connection.topic,
+        connection.msgtype,
+        msgdef=connection.msgdef.data or "",
+        rihs01=connection.digest or _NO_DIGEST,
+        serialization_format=connection.ext.serialization_format,
+        offered_qos_profiles=connection.ext.offered_qos_profiles,
+    )
+
+
+def _copy_others(source: Path, folder: Path) -> None:
+    """Copy what lies beside the bag files in their folder."""
+    for path in source.iterdir():
+        if path.is_file() and path.suffix not in (".mcap", ".db3", ".zstd") and path.name != "metadata.yaml":
+            shutil.copy2(path, folder / path.name)
+
+
+@contextmanager
+def new_folder(target: Path) -> Iterator[Path]:
+    """Yield the path of a folder to be made, which takes its place under its own name once it is whole.
+
+    Raises:
+        RecordingError: the target exists.
+        OSError: it cannot be made.
+    """
+    if target.exists():
+        raise RecordingError(f"{target}: exists already; a recording is written to a new folder")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent))
+    try:
+        yield part / target.name
+        os.replace(part / target.name, target)
+    except (FinforceError, OSError, KeyboardInterrupt):
+        raise
+    except Exception as error:  # sqlite3 has its own classes for a full disk
+        raise OSError(f"{target}: cannot be written: {' '.join(str(error).split())}") from error
+    finally:
+        with suppress(OSError):
+            shutil.rmtree(part)

@@ -1,0 +1,112 @@
+"""Recordings into recordings with forces: a task each."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from finforce_eval.annotation.bag import ForceMessages, new_folder, write_annotated
+from finforce_eval.annotation.forces import JawForces, combine_forces, estimate_forces
+from finforce_eval.engine.tasks import OK, Task, hash_settings
+from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.setup import EvaluationSetup, make_setup, version
+from finforce_eval.recordings.bags import bag_source
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.salvage import sound_source
+from finforce_eval.recordings.tracks import JAWS, Recording
+
+NOTE = "annotation.json"
+# Options that change nothing in the outcome of a recording.
+_OUTSIDE = ("bags", "out", "engine", "workers", "memory", "address", "shard", "run", "json")
+
+
+def describe_options(options: argparse.Namespace) -> dict[str, Any]:
+    """Return all options that forces depend on, and the version."""
+    return {name: value for name, value in vars(options).items() if name not in _OUTSIDE} | {"version": version()}
+
+
+def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace) -> Task:
+    """Return the task of annotating a bag; nothing of it is read yet but its place.
+
+    Raises:
+        RecordingError: there is no such recording.
+    """
+    found = bag_source(source)
+    files = [found] if found.is_file() else [path for path in found.iterdir() if path.is_file()]
+    key = hash_settings(describe_options(options), files)
+    given = {"source": str(source), "target": str(target), "options": vars(options) | {"run": None}, "key": key}
+    return Task(name=name, key=key, work=annotate_bag, given=given)
+
+
+def annotate_bag(source: str, target: str, options: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """Write a recording with forces and return figures of it.
+
+    Args:
+        source: rosbag2 folder, .mcap or .db3 file.
+        target: the new folder.
+        options: of the command `annotate`.
+        key: of the task, which is kept beside what was written.
+
+    Raises:
+        FinforceError: the recording cannot be read, or no forces be found in it.
+        OSError: the folder cannot be written.
+    """
+    chosen = argparse.Namespace(**options)
+    setup, keypoints = make_setup(chosen), parse_source(chosen)
+    with sound_source(bag_source(Path(source))) as (sound, damage):
+        recording = read_recording(sound, keypoints.pairing, _sides(chosen))
+        recording = replace(recording, name=Path(source).stem)
+        recording = keypoints.apply(recording)
+        jaws = estimate_forces(recording, setup)
+        grasp = combine_forces(recording, jaws)
+        figures = _figures(recording, jaws, [*damage, *recording.notes])
+        note = {"key": key, "status": OK, "figures": figures, "settings": _settings(setup), "version": version()}
+        with new_folder(Path(target)) as folder:
+            write_annotated(recording, sound, ForceMessages(jaws, grasp), folder, side_file=chosen.side_file)
+            (folder / NOTE).write_text(json.dumps(note, indent=1) + "\n", encoding="utf-8")
+    return figures
+
+
+def _sides(options: argparse.Namespace) -> tuple[str, ...]:
+    """Return the jaws that images show."""
+    return {"": (), "both": JAWS}.get(options.jaws or "", (options.jaws,))
+
+
+def _settings(setup: EvaluationSetup) -> dict[str, str]:
+    return {name: str(value) for name, value in setup.about.items()}
+
+
+def _figures(recording: Recording, jaws: Mapping[str, JawForces], notes: list[str]) -> dict[str, Any]:
+    """Return what is said of a recording in the manifest."""
+    sides = {}
+    for side, forces in jaws.items():
+        reasons, counts = np.unique(forces.status[~forces.answered], return_counts=True)
+        magnitude = np.linalg.norm(forces.force, axis=1)
+        sides[side] = {
+            "images": len(forces.stamps),
+            "answered": int(forces.answered.sum()),
+            "unanswered": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
+            "largest_N": float(np.nanmax(magnitude)) if forces.answered.any() else float("nan"),
+        }
+    stamps = np.concatenate([forces.stamps for forces in jaws.values()])
+    span = 1e-9 * float(stamps.max() - stamps.min()) if len(stamps) else 0.0
+    return {"jaws": sides, "span_s": round(span, 3), "notes": notes}
+
+
+def ended_before(task: Task) -> dict[str, Any] | None:
+    """Return the line of a task whose folder is whole already, None of another; a run may be killed in between."""
+    path = Path(task.given["target"]) / NOTE
+    try:
+        note = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if not isinstance(note, dict) or note.get("key") != task.key:
+        return None
+    figures = note.get("figures", {})
+    return {"name": task.name, "key": task.key, "status": OK, "error": "", "figures": figures, "seconds": 0.0}

@@ -1,0 +1,1 @@
+"""Many recordings, one task each: one after the other, in processes, or on a Ray cluster."""

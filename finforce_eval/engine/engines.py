@@ -1,0 +1,167 @@
+"""How tasks are carried out: here, one after the other; in processes; on a Ray cluster. The outcome is the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from finforce.errors import FinforceError, MissingDependencyError
+from finforce_eval.engine.tasks import FAILED, OK, Manifest, Task, run_task
+
+SEQUENTIAL, PROCESSES, RAY = ENGINES = ("sequential", "processes", "ray")
+# Tasks that a process does before another one takes its place: what a library leaks stays bounded.
+_TASKS_PER_PROCESS = 50
+_GIGABYTE = 1 << 30
+Line = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineOptions:
+    """How many tasks are carried out, and where.
+
+    Attributes:
+        engine: "sequential", "processes" or "ray".
+        workers: at once; 0: one for each processor.
+        memory: that a task of "processes" may have [GB]; 0: any.
+        address: of a Ray cluster; "": one of this machine alone.
+    """
+
+    engine: str = SEQUENTIAL
+    workers: int = 0
+    memory: float = 4.0
+    address: str = ""
+
+
+def run_tasks(
+    tasks: Sequence[Task],
+    options: EngineOptions,
+    manifest: Manifest,
+    done: Callable[[Task], Line | None] = lambda task: None,
+) -> list[Line]:
+    """Carry out the tasks that are not done yet, under one progress bar, and return the lines of all in their order.
+
+    Args:
+        tasks: with names of their own.
+        options: of the engine.
+        manifest: where lines are kept; what it holds as done with the same key is not done again.
+        done: says what has become of a task that ended just before a run was killed; its line, or None.
+
+    Raises:
+        FinforceError: the engine cannot be used.
+    """
+    from tqdm import tqdm
+
+    lines: dict[str, Line] = {}
+    before, left = manifest.read(), []
+    for task in tasks:
+        line = before.get(task.name)
+        known = line if line and line.get("key") == task.key and line.get("status") == OK else None
+        if known is None and (known := done(task)) is not None:
+            manifest.append(known)
+        if known is None:
+            left.append(task)
+        else:
+            lines[task.name] = known
+    with tqdm(total=len(tasks), initial=len(lines), unit="recording", disable=None, leave=False) as bar:
+        for line in _RUNNERS[options.engine](left, options):
+            manifest.append(line)
+            lines[line["name"]] = line
+            bar.set_postfix_str(f"{sum(each['status'] == FAILED for each in lines.values())} failed")
+            bar.update()
+    return [lines[task.name] for task in tasks]
+
+
+def _run_here(tasks: Sequence[Task], options: EngineOptions) -> Iterator[Line]:
+    yield from map(run_task, tasks)
+
+
+def _run_in_processes(tasks: Sequence[Task], options: EngineOptions) -> Iterator[Line]:
+    """Yield lines as processes end their tasks; one that dies costs the task that it was at."""
+    from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+    from concurrent.futures.process import BrokenProcessPool
+    from multiprocessing import get_context
+
+    workers, left, alone = options.workers or _count_processors(), list(tasks), False
+    while left:
+        pool = ProcessPoolExecutor(
+            1 if alone else min(workers, len(left)),
+            mp_context=get_context("spawn"),
+            initializer=_limit_memory,
+            initargs=(options.memory,),
+            max_tasks_per_child=_TASKS_PER_PROCESS,
+        )
+        batch = left[:1] if alone else left
+        try:
+            running = {pool.submit(run_task, task): task for task in batch}
+            while running:
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    line, task = future.result(), running[future]
+                    del running[future]
+                    left.remove(task)
+                    yield line
+            alone = False
+        except BrokenProcessPool:
+            # which task it was is not known: the first one is tried again by itself, then all others as before
+            if alone:
+                yield _died(left.pop(0))
+            alone = not alone
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _died(task: Task) -> Line:
+    """Return the line of a task whose process ended without a word."""
+    error = "the process that was at it died: out of memory, or killed"
+    return {"name": task.name, "key": task.key, "status": FAILED, "error": error, "figures": {}, "seconds": 0.0}
+
+
+def _limit_memory(gigabytes: float) -> None:
+    """Bound what this process may allocate."""
+    if gigabytes > 0.0:
+        import resource
+
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        resource.setrlimit(resource.RLIMIT_DATA, (int(gigabytes * _GIGABYTE), hard))
+
+
+def _count_processors() -> int:
+    import os
+
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _run_on_ray(tasks: Sequence[Task], options: EngineOptions) -> Iterator[Line]:
+    """Yield lines as a cluster ends its tasks."""
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingDependencyError("--engine ray needs Ray: pip install 'finforce[ray]'") from error
+    if not tasks:
+        return
+    where = {"address": options.address} if options.address else {"num_cpus": options.workers or _count_processors()}
+    try:
+        ray.init(log_to_driver=False, logging_level="ERROR", **where)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise FinforceError(f"--address {options.address}: no Ray cluster: {error}") from error
+    try:
+        remote = ray.remote(run_task).options(num_cpus=1, max_retries=1)
+        running = {remote.remote(task): task for task in tasks}
+        while running:
+            (ready,), _ = ray.wait(list(running), num_returns=1)
+            task = running.pop(ready)
+            try:
+                yield ray.get(ready)
+            except ray.exceptions.WorkerCrashedError:
+                yield _died(task)
+    except (ray.exceptions.RaySystemError, ConnectionError) as error:
+        raise FinforceError(f"the Ray cluster has gone: {error}; start again to go on where this run was") from error
+    finally:
+        ray.shutdown()
+
+
+_RUNNERS: dict[str, Callable[[Sequence[Task], EngineOptions], Iterator[Line]]] = {
+    SEQUENTIAL: _run_here,
+    PROCESSES: _run_in_processes,
+    RAY: _run_on_ray,
+}
