@@ -71,7 +71,8 @@ def _name_recordings(texts: Sequence[str]) -> list[tuple[str, Path]]:
 def _say(task: Task, line: dict[str, Any]) -> None:
     """Print what became of a recording."""
     if line["status"] != OK:
-        print(f"{task.name}: {line['error']}", file=sys.stderr)
+        said = line["error"]
+        print(said if said.startswith(f"{task.name}: ") else f"{task.name}: {said}", file=sys.stderr)
         return
     for note in line["figures"].get("notes", ()):
         print(f"note: {task.name}: {note}", file=sys.stderr)

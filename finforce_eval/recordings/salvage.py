@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 import sqlite3
+import struct
+from collections import deque
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from finforce.errors import MissingDependencyError
 from finforce_eval.errors import RecordingError
@@ -16,6 +19,12 @@ from finforce_eval.recordings.bags import open_bag
 
 # No record of an mcap file is longer [bytes]: chunks have megabytes, an uncompressed 4K image 25.
 _LONGEST = 1 << 30
+# Of a chunk: opcode, length, first and last time, uncompressed size, checksum, length of the compression's name.
+_CHUNK, _CHUNK_OPCODE = struct.Struct("<BQQQQII"), 0x06
+_PIECE = 1 << 12
+# Of an SQLite file: size of a page, and their number. Messages that may share a page; zeros that end a torn one.
+_SQLITE_HEAD, _NEIGHBOURS, _ENDING = struct.Struct(">16xH10xI"), 8, 256
+_LARGEST_BASE = 1 << 42
 _NO_DIGEST = "RIHS01_" + 64 * "0"
 
 
@@ -95,18 +104,12 @@ def _read_mcap(path: Path) -> Iterator[_Message]:
     """Yield the messages of an mcap file that are whole."""
     try:
         from mcap.records import Channel, Message, Schema
-        from mcap.stream_reader import StreamReader
     except ImportError as error:
         raise MissingDependencyError("reading a recording that was cut off needs mcap: pip install mcap") from error
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}
     with path.open("rb") as file:
-        records = iter(StreamReader(file, record_size_limit=_LONGEST).records)
-        while True:
-            try:
-                record = next(records)
-            except Exception:  # the end, whole or not; each decompressor has its own classes for damage
-                return
+        for record in _read_records(file):
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
@@ -119,8 +122,82 @@ def _read_mcap(path: Path) -> Iterator[_Message]:
                     yield _Message(channel.topic, schema.name, text, record.log_time, record.data)
 
 
+def _read_records(file: BinaryIO, *, skip_magic: bool = False) -> Iterator[Any]:
+    """Yield the records of a file that are whole, those of a chunk that was cut off, too."""
+    from mcap.stream_reader import StreamReader
+
+    records = iter(StreamReader(file, skip_magic=skip_magic, record_size_limit=_LONGEST).records)
+    begin = 0
+    while True:
+        try:
+            record = next(records)
+        except StopIteration:
+            return
+        except Exception:  # each decompressor has its own classes for damage
+            break
+        # records of one chunk come one after the other while the file stands behind it
+        begin = file.tell()
+        yield record
+    if not skip_magic:
+        file.seek(begin)
+        yield from _read_records(io.BytesIO(_read_torn_chunk(file)), skip_magic=True)
+
+
+def _read_torn_chunk(file: BinaryIO) -> bytes:
+    """Return what is left of the records of the chunk at which a file is; nothing of another record."""
+    head = file.read(_CHUNK.size)
+    if len(head) < _CHUNK.size:
+        return b""
+    opcode, _, _, _, _, _, length = _CHUNK.unpack(head)
+    if opcode != _CHUNK_OPCODE or length > len("none"):
+        return b""
+    compression = file.read(length).decode(errors="replace")
+    file.read(8)
+    torn = file.read(_LONGEST)
+    if compression == "":
+        return torn
+    return _decompress(torn, compression)
+
+
+def _decompress(torn: bytes, compression: str) -> bytes:
+    """Return the beginning of compressed bytes of which the end is missing."""
+    if compression == "lz4":
+        import lz4.frame
+
+        decompressor: Any = lz4.frame.LZ4FrameDecompressor()
+    elif compression == "zstd":
+        import zstandard
+
+        decompressor = zstandard.ZstdDecompressor().decompressobj()
+    else:
+        return b""
+    found = []
+    for begin in range(0, len(torn), _PIECE):
+        try:
+            found.append(decompressor.decompress(torn[begin : begin + _PIECE]))
+        except Exception:  # what follows is damaged; each decompressor has its own classes
+            break
+    return b"".join(found)
+
+
 def _read_sqlite(path: Path) -> Iterator[_Message]:
     """Yield the messages of a db3 file that are whole."""
+    with TemporaryDirectory(prefix="finforce_") as folder:
+        copy = _pad_sqlite(path, Path(folder) / path.name)
+        last: deque[_Message] = deque()
+        for message in _read_rows(copy or path):
+            last.append(message)
+            if len(last) > _NEIGHBOURS:
+                yield last.popleft()
+        # the end of a message may be of what was put in place of the missing pages
+        for message in last:
+            if copy is not None and not any(message.data[-_ENDING:]):
+                return
+            yield message
+
+
+def _read_rows(path: Path) -> Iterator[_Message]:
+    """Yield the messages of a db3 file in the order in which they were written, up to the first damage."""
     with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro&immutable=1", uri=True)) as base:
         try:
             topics = {row[0]: row[1:] for row in base.execute("SELECT id, name, type FROM topics")}
@@ -130,3 +207,25 @@ def _read_sqlite(path: Path) -> Iterator[_Message]:
                     yield _Message(name, msgtype, "", time, data)
         except sqlite3.DatabaseError:
             return
+
+
+def _pad_sqlite(path: Path, copy: Path) -> Path | None:
+    """Write a db3 file with empty pages in place of those that are missing, without which nothing can be read of it.
+
+    Returns:
+        The copy; None where no page is missing.
+    """
+    with path.open("rb") as file:
+        head = file.read(_SQLITE_HEAD.size)
+    if len(head) < _SQLITE_HEAD.size:
+        return None
+    page, count = _SQLITE_HEAD.unpack(head)
+    page = page if page > 1 else 1 << 16
+    whole, left = page * count, path.stat().st_size
+    if not left < whole < _LARGEST_BASE:
+        return None
+    shutil.copyfile(path, copy)
+    with copy.open("r+b") as file:
+        file.truncate(left - left % page)  # half a page would pass for a whole one
+        file.truncate(whole)
+    return copy

@@ -1,0 +1,281 @@
+"""Claims about `finforce annotate`: nothing of a recording is lost, no force made up, nothing done twice."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from finforce_eval.annotation import bag as annotated_bag
+from finforce_eval.cli.main import main
+from finforce_eval.engine.engines import EngineOptions, run_tasks
+from finforce_eval.engine.tasks import Manifest, Task, choose_shard
+from finforce_eval.evaluation.evaluate import evaluate_recording
+from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.recordings.recording import DEMO, read_recording
+from finforce_eval.recordings.writer import write_recording
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+SECONDS = 6
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """The first seconds of a loading cycle."""
+    return short_bag(tmp_path_factory.mktemp("source") / "short")
+
+
+def short_bag(folder, *, storage="mcap", begin=0):
+    recording = read_recording(DEMO)
+    start = int(recording.jaw("left").keypoints.stamps[0]) + begin
+    return write_recording(recording.between(start, start + SECONDS * 10**9), folder, storage=storage)
+
+
+def annotate(out, *words):
+    return main(["annotate", *map(str, words), "--out", str(out)])
+
+
+def messages(folder):
+    with Reader(folder) as reader:
+        return [(connection.topic, time, bytes(data)) for connection, time, data in reader.messages()]
+
+
+def decoded(folder, topic):
+    with Reader(folder) as reader:
+        chosen = [each for each in reader.connections if each.topic == topic]
+        return [TYPES.deserialize_cdr(data, each.msgtype) for each, _, data in reader.messages(connections=chosen)]
+
+
+def lines_of(out):
+    return [json.loads(text) for text in (out / "manifest.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def annotated(source, tmp_path_factory):
+    out = tmp_path_factory.mktemp("annotated")
+    assert annotate(out, source) == 0
+    return out / source.name
+
+
+def test_every_message_is_there_byte_for_byte_and_new_topics_between_them(source, annotated):
+    before, after = messages(source), messages(annotated)
+    topics = {topic for topic, *_ in before}
+    assert [entry for entry in after if entry[0] in topics] == before
+    added = {topic for topic, *_ in after} - topics
+    own = ("wrench", "wrench_stddev", "wrench_status", "contact", "markers")
+    assert added == {f"/left/{name}" for name in own} | {"/grasp_wrench", "/manipulation_wrench"}
+    assert [time for _, time, _ in after] == sorted(time for _, time, _ in after)
+    assert (annotated / "case.json").read_bytes() == (source / "case.json").read_bytes()
+
+
+def test_types_and_qualities_of_the_topics_are_kept(source, annotated):
+    with Reader(source) as before, Reader(annotated) as after:
+        kept = {each.topic: each for each in after.connections}
+        for each in before.connections:
+            assert kept[each.topic].msgtype == each.msgtype
+            assert kept[each.topic].digest == each.digest
+            assert kept[each.topic].msgdef == each.msgdef
+            assert kept[each.topic].ext == each.ext
+
+
+def test_forces_are_those_of_evaluate_and_what_has_none_is_nan_with_its_reason(source, annotated, tmp_path):
+    recording = read_recording(source)
+    setup = make_setup(options_of(source))
+    expected = evaluate_recording(recording, setup.jaw, setup.source(recording), factory=setup.estimator)
+    forces = decoded(annotated, "/left/wrench")
+    found = np.array([[f.wrench.force.x, f.wrench.force.y, f.wrench.force.z] for f in forces])
+    np.testing.assert_array_equal(found, expected.force)
+    states = [message.status[0] for message in decoded(annotated, "/left/wrench_status")]
+    unanswered = np.isnan(found).any(axis=1)
+    assert 0 < unanswered.sum() < len(found)
+    assert not (np.linalg.norm(found[unanswered], axis=1) == 0).any()
+    for state, missing in zip(states, unanswered, strict=True):
+        assert (state.level != 0) == missing
+        assert state.message
+    assert any("tare" in state.message for state in states)
+    grasp = [message.wrench.force.x for message in decoded(annotated, "/grasp_wrench")]
+    np.testing.assert_allclose(grasp, np.linalg.norm(found, axis=1))
+
+
+def options_of(source):
+    from finforce_eval.cli.main import parse
+
+    return parse(["evaluate", str(source)])
+
+
+def test_an_sqlite_recording_stays_one(tmp_path):
+    source = short_bag(tmp_path / "lite", storage="sqlite3")
+    assert annotate(tmp_path / "out", source) == 0
+    assert [path.suffix for path in (tmp_path / "out" / "lite").glob("lite*.*")] == [".db3"]
+    kept = [entry for entry in messages(tmp_path / "out" / "lite") if entry[0] == "/left/keypoints"]
+    assert kept == [entry for entry in messages(source) if entry[0] == "/left/keypoints"]
+
+
+def test_a_side_file_has_the_new_messages_alone(source, annotated, tmp_path):
+    assert annotate(tmp_path, source, "--side-file") == 0
+    topics = {topic for topic, *_ in messages(source)}
+    whole = [entry for entry in messages(annotated) if entry[0] not in topics]
+    assert messages(tmp_path / source.name) == whole
+
+
+def test_what_is_annotated_already_is_refused_unless_aside(annotated, tmp_path, capsys):
+    assert annotate(tmp_path / "again", annotated) == 2
+    assert "/left/wrench, " in capsys.readouterr().err
+    assert not (tmp_path / "again" / annotated.name).exists()
+    assert annotate(tmp_path / "aside", annotated, "--side-file") == 0
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("share", [0.6, 0.9])
+def test_a_recording_that_was_cut_off_is_read_up_to_the_damage(tmp_path, capsys, storage, share):
+    source = short_bag(tmp_path / "cut", storage=storage)
+    (file,) = [path for path in source.iterdir() if path.suffix in (".mcap", ".db3")]
+    whole = messages(source)
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+    assert annotate(tmp_path / "out", source) == 0
+    assert "read up to the damage" in capsys.readouterr().err
+    after = messages(tmp_path / "out" / "cut")
+    own = [entry for entry in after if entry[0] == "/left/keypoints"]
+    assert own == [entry for entry in whole if entry[0] == "/left/keypoints"][: len(own)]
+    assert 0.3 * SECONDS * 30 < len(own) <= SECONDS * 30
+    assert len([entry for entry in after if entry[0] == "/left/wrench"]) == len(own)
+
+
+def test_of_a_recording_without_one_whole_message_only_that_is_said(tmp_path, capsys):
+    (tmp_path / "torn.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\x01" * 30)
+    assert annotate(tmp_path / "out", tmp_path / "torn.mcap") == 2
+    assert "not one message is whole" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "torn").exists()
+
+
+def test_a_bad_recording_costs_itself_only_and_a_second_run_does_what_is_left(source, tmp_path, capsys):
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"no recording")
+    out = tmp_path / "out"
+    assert annotate(out, bad, source) == 2
+    assert "bad: " in capsys.readouterr().err
+    assert {line["name"]: line["status"] for line in lines_of(out)} == {"bad": "failed", source.name: "ok"}
+    written = (out / source.name / "metadata.yaml").stat().st_mtime_ns
+    bad.unlink()
+    bad.write_bytes(next(source.glob("*.mcap")).read_bytes())
+    assert annotate(out, bad, source, "--contact", "fixed:40") == 2  # other settings: what is there is another's
+    assert "exists already" in capsys.readouterr().err
+    assert (out / source.name / "metadata.yaml").stat().st_mtime_ns == written
+    (out / "manifest.jsonl").unlink()
+    assert annotate(out, source) == 0
+    assert (out / source.name / "metadata.yaml").stat().st_mtime_ns == written
+    assert [line["name"] for line in lines_of(out)] == [source.name]
+
+
+def test_a_full_disk_leaves_nothing(source, tmp_path, monkeypatch, capsys):
+    def refuse(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(annotated_bag, "_copy_others", refuse)
+    assert annotate(tmp_path / "out", source) == 2
+    assert "No space left on device" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [".lock", "manifest.jsonl"]
+
+
+def test_two_runs_do_not_write_in_one_folder(source, tmp_path, capsys):
+    with Manifest(tmp_path).alone():
+        assert annotate(tmp_path, source) == 2
+    assert "another run writes there" in capsys.readouterr().err
+
+
+def test_shards_are_all_and_none_twice():
+    items = list(range(17))
+    parts = [choose_shard(items, f"{number}/5") for number in range(1, 6)]
+    assert sorted(sum(parts, [])) == items
+    assert choose_shard(items, "") == items
+
+
+@pytest.mark.parametrize("shard", ["0/3", "4/3", "1", "a/b", "1/0", "-1/2", "1/9999999"])
+def test_a_shard_that_is_none_is_refused(shard, tmp_path, source, capsys):
+    assert annotate(tmp_path, source, f"--shard={shard}") == 2
+    assert "expected i/n" in capsys.readouterr().err
+
+
+def square(number, fail=(), die=()):
+    """A task of the engines' tests."""
+    if number in fail:
+        raise ValueError(f"no {number}")
+    if number in die:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"square": number**2}
+
+
+def squares(count, **given):
+    return [Task(name=str(n), key=f"k{n}", work=square, given={"number": n, **given}) for n in range(count)]
+
+
+def results(lines):
+    return [{name: line[name] for name in ("name", "key", "status", "figures")} for line in lines]
+
+
+@pytest.mark.parametrize("engine", ["processes", "ray"])
+def test_engines_agree(engine, tmp_path, monkeypatch):
+    if engine == "ray":
+        pytest.importorskip("ray")
+        monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    tasks = squares(9, fail=(3,))
+    expected = run_tasks(tasks, EngineOptions(), Manifest(tmp_path / "here"))
+    found = run_tasks(tasks, EngineOptions(engine=engine, workers=2), Manifest(tmp_path / engine))
+    assert results(found) == results(expected)
+    assert found[3]["status"] == "failed" and "no 3" in found[3]["error"]
+    assert {line["figures"].get("square") for line in found} == {None, 0, 1, 4, 16, 25, 36, 49, 64}
+
+
+def test_a_process_that_dies_costs_its_own_task_only(tmp_path):
+    lines = run_tasks(squares(6, die=(2, 5)), EngineOptions(engine="processes", workers=2), Manifest(tmp_path))
+    assert [line["status"] for line in lines] == ["ok", "ok", "failed", "ok", "ok", "failed"]
+    assert "died" in lines[2]["error"]
+
+
+def test_a_line_that_was_cut_off_is_done_again(tmp_path):
+    manifest, tasks = Manifest(tmp_path), squares(4)
+    run_tasks(tasks, EngineOptions(), manifest)
+    text = manifest.path.read_text()
+    manifest.path.write_text(text[:-20])
+    lines = run_tasks(tasks, EngineOptions(), manifest)
+    assert [line["figures"]["square"] for line in lines] == [0, 1, 4, 9]
+    read = [json.loads(line) for line in manifest.path.read_text().splitlines() if line.endswith("}")]
+    assert [line["name"] for line in read] == ["0", "1", "2", "3"]
+
+
+def test_a_run_that_is_killed_again_and_again_loses_nothing_and_does_nothing_twice(source, tmp_path):
+    names = [f"part{number}" for number in range(4)]
+    bags = [short_bag(tmp_path / name, begin=number * 10**9) for number, name in enumerate(names)]
+    out, random = tmp_path / "out", np.random.default_rng(0)
+    command = [sys.executable, "-m", "finforce_eval.cli.main", "annotate", *map(str, bags), "--out", str(out)]
+    written, kills = {}, 0
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    for _ in range(40):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
+        try:
+            status = process.wait(timeout=random.uniform(1.5, 3.5))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            kills, status = kills + 1, None
+        for name in names:
+            path = out / name / "metadata.yaml"
+            if path.exists():  # whole once and for all
+                assert written.setdefault(name, path.stat().st_mtime_ns) == path.stat().st_mtime_ns
+        if status == 0:
+            break
+        time.sleep(0.1)
+    assert status == 0 and kills > 0
+    done = [line["name"] for line in lines_of(out) if line["status"] == "ok"]
+    assert sorted(done) == names
+    for bag, name in zip(bags, names, strict=True):
+        topics = {topic for topic, *_ in messages(bag)}
+        assert [entry for entry in messages(out / name) if entry[0] in topics] == messages(bag)
