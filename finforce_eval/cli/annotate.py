@@ -6,25 +6,38 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
-from finforce_eval.annotation.run import bag_task, ended_before
+from finforce_eval.annotation.bag import new_folder
+from finforce_eval.annotation.bag_task import bag_task
+from finforce_eval.annotation.bag_task import ended_before as bag_ended_before
+from finforce_eval.annotation.lerobot import ended_before as episode_ended_before
+from finforce_eval.annotation.lerobot import episode_tasks, write_dataset
+from finforce_eval.annotation.lerobot_layout import is_dataset
 from finforce_eval.cli.parser import add_engine_options, add_jaw_options, add_set, add_source_options
 from finforce_eval.engine.engines import EngineOptions, run_tasks
-from finforce_eval.engine.tasks import OK, Manifest, Task, choose_shard
+from finforce_eval.engine.tasks import OK, Manifest, choose_shard
 from finforce_eval.errors import OptionError
 from finforce_eval.recordings.tracks import JAWS
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
+    text = "rosbag2 folder, .mcap or .db3 file, or the folder of a LeRobot dataset"
+    parser.add_argument("bags", nargs="+", metavar="BAG", help=text)
     text = "folder of what is written: one folder per recording, and manifest.jsonl (annotated)"
     parser.add_argument("--out", default="annotated", metavar="DIR", help=text)
-    text = "write the new messages alone, beside the recording instead of a copy of it"
+    text = "of bags: write the new messages alone, beside the recording instead of a copy of it"
     parser.add_argument("--side-file", action="store_true", help=text)
-    text = "jaws that are in the images, where no topic tells"
+    text = "jaws that are in the images, where no topic tells; of datasets both by default"
     parser.add_argument("--jaws", choices=(*JAWS, "both"), help=text)
+    text = "of datasets: the feature with the wrist camera's pictures; without it the only one"
+    parser.add_argument("--images", default="", metavar="FEATURE", help=text)
+    text = "of datasets: fx fy cx cy [k1 k2 p1 p2 k3] of that camera in pixels, or a JSON or YAML file"
+    parser.add_argument("--intrinsics", nargs="+", metavar="NUMBER", help=text)
+    text = "of datasets: what the names of the new features begin with (observation)"
+    parser.add_argument("--prefix", default="observation", metavar="NAME", help=text)
     add_jaw_options(parser)
     add_source_options(parser)
     calibration = "calibration file, or a shipped name; without it the jaw file's own material"
@@ -35,20 +48,69 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Annotate recordings and print a line for each; 2 where one of them failed."""
-    out = Path(options.out)
-    tasks = [bag_task(name, path, out / name, options) for name, path in _name_recordings(options.bags)]
-    chosen = choose_shard(tasks, options.shard)
-    manifest = Manifest(out, options.shard)
-    engine = EngineOptions(
-        engine=options.engine, workers=options.workers, memory=options.memory, address=options.address
-    )
+    out, manifest = Path(options.out), Manifest(Path(options.out), options.shard)
+    named = _name_recordings(options.bags)
+    datasets = {name: path for name, path in named if is_dataset(path)}
+    if datasets:
+        _check_dataset_options(options)
     with manifest.alone():
-        lines = run_tasks(chosen, engine, manifest, ended_before)
-    for task, line in zip(chosen, lines, strict=True):
-        _say(task, line)
+        lines = _run_bags([(name, path) for name, path in named if name not in datasets], options, manifest)
+        for name, path in datasets.items():
+            lines += _run_dataset(name, path, options, manifest)
     failed = sum(line["status"] != OK for line in lines)
     print(f"{len(lines) - failed} of {len(lines)} annotated in {out}; {manifest.path.name} tells of each")
     return 2 if failed else 0
+
+
+def _check_dataset_options(options: argparse.Namespace) -> None:
+    """Complete the options of datasets.
+
+    Raises:
+        OptionError: the camera is not described, or part of a dataset is asked for.
+    """
+    if not options.intrinsics:
+        raise OptionError("--intrinsics: a dataset does not describe its camera; expected fx fy cx cy, or a file")
+    if options.shard:
+        raise OptionError(f"--shard {options.shard}: a dataset is written as one; give its folder to one job")
+    options.jaws = options.jaws or "both"
+    if not any(change.startswith("depth=") for change in options.detector):
+        options.detector = [*options.detector, "depth=none"]
+
+
+def _run_bags(
+    named: Sequence[tuple[str, Path]], options: argparse.Namespace, manifest: Manifest
+) -> list[dict[str, Any]]:
+    """Annotate bags and say what became of each."""
+    out = Path(options.out)
+    tasks = choose_shard([bag_task(name, path, out / name, options) for name, path in named], options.shard)
+    lines = run_tasks(tasks, _engine(options), manifest, bag_ended_before)
+    for line in lines:
+        _say(line)
+    return lines
+
+
+def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: Manifest) -> list[dict[str, Any]]:
+    """Annotate the episodes of a dataset, and write it anew once all of them are; say what became of each."""
+    out = Path(options.out)
+    parts, target = out / f".{name}.parts", out / name
+    if target.exists():
+        raise OptionError(f"{target}: exists already; a dataset is written to a new folder")
+    parts.mkdir(exist_ok=True)
+    lines = run_tasks(episode_tasks(path, parts, options), _engine(options), manifest, episode_ended_before)
+    for line in lines:
+        _say(line)
+    if any(line["status"] != OK for line in lines):
+        print(f"{name}: not written: some of its episodes failed", file=sys.stderr)
+        return lines
+    with new_folder(target) as folder:
+        folder.mkdir()
+        write_dataset(path, parts, folder, options)
+    rmtree(parts)
+    return lines
+
+
+def _engine(options: argparse.Namespace) -> EngineOptions:
+    return EngineOptions(engine=options.engine, workers=options.workers, memory=options.memory, address=options.address)
 
 
 def _name_recordings(texts: Sequence[str]) -> list[tuple[str, Path]]:
@@ -68,16 +130,16 @@ def _name_recordings(texts: Sequence[str]) -> list[tuple[str, Path]]:
     return list(zip(names, paths, strict=True))
 
 
-def _say(task: Task, line: dict[str, Any]) -> None:
+def _say(line: dict[str, Any]) -> None:
     """Print what became of a recording."""
+    name, said = line["name"], line["error"]
     if line["status"] != OK:
-        said = line["error"]
-        print(said if said.startswith(f"{task.name}: ") else f"{task.name}: {said}", file=sys.stderr)
+        print(said if said.startswith(f"{name}: ") else f"{name}: {said}", file=sys.stderr)
         return
     for note in line["figures"].get("notes", ()):
-        print(f"note: {task.name}: {note}", file=sys.stderr)
+        print(f"note: {name}: {note}", file=sys.stderr)
     words = [
         f"{side} {jaw['answered']} of {jaw['images']} images, {jaw['largest_N'] or 0.0:.2f} N at most"
         for side, jaw in line["figures"].get("jaws", {}).items()
     ]
-    print(f"{task.name}: {'; '.join(words)}")
+    print(f"{name}: {'; '.join(words) or 'was done before'}")

@@ -13,22 +13,16 @@ import numpy as np
 
 from finforce_eval.annotation.bag import ForceMessages, new_folder, write_annotated
 from finforce_eval.annotation.forces import JawForces, combine_forces, estimate_forces
+from finforce_eval.annotation.options import describe_options, sides_of
 from finforce_eval.engine.tasks import OK, Task, hash_settings
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import EvaluationSetup, make_setup, version
 from finforce_eval.recordings.bags import bag_source
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.salvage import sound_source
-from finforce_eval.recordings.tracks import JAWS, Recording
+from finforce_eval.recordings.tracks import Recording
 
 NOTE = "annotation.json"
-# Options that change nothing in the outcome of a recording.
-_OUTSIDE = ("bags", "out", "engine", "workers", "memory", "address", "shard", "run", "json")
-
-
-def describe_options(options: argparse.Namespace) -> dict[str, Any]:
-    """Return all options that forces depend on, and the version."""
-    return {name: value for name, value in vars(options).items() if name not in _OUTSIDE} | {"version": version()}
 
 
 def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace) -> Task:
@@ -60,7 +54,7 @@ def annotate_bag(source: str, target: str, options: Mapping[str, Any], key: str)
     chosen = argparse.Namespace(**options)
     setup, keypoints = make_setup(chosen), parse_source(chosen)
     with sound_source(bag_source(Path(source))) as (sound, damage):
-        recording = read_recording(sound, keypoints.pairing, _sides(chosen))
+        recording = read_recording(sound, keypoints.pairing, sides_of(chosen))
         recording = replace(recording, name=Path(source).stem)
         recording = keypoints.apply(recording)
         jaws = estimate_forces(recording, setup)
@@ -71,11 +65,6 @@ def annotate_bag(source: str, target: str, options: Mapping[str, Any], key: str)
             write_annotated(recording, sound, ForceMessages(jaws, grasp), folder, side_file=chosen.side_file)
             (folder / NOTE).write_text(json.dumps(note, indent=1) + "\n", encoding="utf-8")
     return figures
-
-
-def _sides(options: argparse.Namespace) -> tuple[str, ...]:
-    """Return the jaws that images show."""
-    return {"": (), "both": JAWS}.get(options.jaws or "", (options.jaws,))
 
 
 def _settings(setup: EvaluationSetup) -> dict[str, str]:
