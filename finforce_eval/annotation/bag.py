@@ -41,6 +41,7 @@ class ForceMessages:
         self.factory, self._jaws, self._grasp = MessageFactory(), jaws, grasp
         self._rows = {side: _index(forces.stamps) for side, forces in jaws.items()}
         self._grasp_rows = _index(grasp.stamps)
+        self._drawn: dict[str, bool] = {}
         names = ("wrench", "wrench_stddev", "wrench_status", "contact", "markers")
         self.topics = {f"/{side}/{name}" for side in jaws for name in names} | {"/grasp_wrench", "/manipulation_wrench"}
 
@@ -77,9 +78,15 @@ class ForceMessages:
         yield Entry(stamp, f"/{side}/wrench_status", STATUS, message)
         if forces.contact[row] is not None:
             yield Entry(stamp, f"/{side}/contact", CLOUD, factory.cloud(stamp, frame, forces.contact[row]))
-        if forces.is_answered(row):
+        if self._is_drawn(forces, row):
             markers = factory.force_markers(stamp, frame, forces.point[row], forces.force[row])
             yield Entry(stamp, f"/{side}/markers", MARKERS, markers)
+
+    def _is_drawn(self, forces: JawForces, row: int) -> bool:
+        """Say whether an image has another picture than the one before: there is a force, or one has gone."""
+        pressed = bool(np.isfinite(forces.force[row]).all() and forces.force[row].any())
+        before, self._drawn[forces.side] = self._drawn.get(forces.side, False), pressed
+        return pressed or before
 
 
 def _index(stamps: NDArray[np.int64]) -> dict[int, int]:

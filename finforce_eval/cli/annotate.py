@@ -19,6 +19,7 @@ from finforce_eval.cli.parser import add_engine_options, add_jaw_options, add_se
 from finforce_eval.engine.engines import EngineOptions, run_tasks
 from finforce_eval.engine.tasks import OK, Manifest, choose_shard
 from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.keypoint_source import IMAGES
 from finforce_eval.recordings.tracks import JAWS
 
 
@@ -50,6 +51,8 @@ def run(options: argparse.Namespace) -> int:
     """Annotate recordings and print a line for each; 2 where one of them failed."""
     out, manifest = Path(options.out), Manifest(Path(options.out), options.shard)
     named = _name_recordings(options.bags)
+    if options.source in (None, IMAGES):
+        _set_unless_given(options, "threads=1")  # a core for each recording, whatever the engine
     datasets = {name: path for name, path in named if is_dataset(path)}
     if datasets:
         _check_dataset_options(options)
@@ -73,8 +76,14 @@ def _check_dataset_options(options: argparse.Namespace) -> None:
     if options.shard:
         raise OptionError(f"--shard {options.shard}: a dataset is written as one; give its folder to one job")
     options.jaws = options.jaws or "both"
-    if not any(change.startswith("depth=") for change in options.detector):
-        options.detector = [*options.detector, "depth=none"]
+    _set_unless_given(options, "depth=none")
+
+
+def _set_unless_given(options: argparse.Namespace, change: str) -> None:
+    """Change a parameter of the detector, unless it was given."""
+    name = change.partition("=")[0]
+    if not any(given.startswith(f"{name}=") for given in options.detector):
+        options.detector = [*options.detector, change]
 
 
 def _run_bags(
