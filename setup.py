@@ -41,6 +41,7 @@ setup(
         "meshio",  # volume mesh files of jaws
         "pillow",  # picture files
         "rosbags",  # recordings, without ROS
+        "mcap",  # recordings that were cut off, record by record
         "manifold3d",  # Boolean intersections and outlines of object meshes
         "trimesh",  # object mesh files, surfaces of fingers
         "shapely",  # polygons: sections of fingers, what lies in them, whether they are sound
@@ -63,10 +64,12 @@ setup(
         ],
         "cad": ["cascadio", "ezdxf", "svgelements"],  # fingers from STEP, DXF and SVG files
         "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
+        "lerobot": ["pyarrow", "av"],  # LeRobot datasets: tables and videos, by the libraries that they are made with
+        "ray": ["ray"],  # recordings on a cluster
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
         "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0", "xacro"]
-        + ["cascadio", "ezdxf", "svgelements"],
+        + ["cascadio", "ezdxf", "svgelements", "pyarrow", "av", "ray"],
         "lint": ["ruff", "import-linter"],
     },
     entry_points={

@@ -29,6 +29,7 @@ from finforce_eval.annotation.lerobot_layout import (
     STATS,
     Dataset,
     Episode,
+    import_arrow,
     open_dataset,
     read_table,
 )
@@ -261,9 +262,7 @@ def _kinds_of(stats: Mapping[str, Any]) -> list[str]:
 
 def _add_episode_stats(path: Path, columns: Mapping[int, Columns], names: FeatureNames) -> None:
     """Add the statistics of the new features to a table of episodes."""
-    import pyarrow
-    from pyarrow import parquet
-
+    pyarrow, parquet = import_arrow(), import_arrow("pyarrow.parquet")
     table = read_table(path)
     heads = [name.split("/") for name in table.column_names if name.startswith("stats/")]
     known = list(dict.fromkeys(head[-1] for head in heads))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_eval.annotation.lerobot_images import rows_of
-from finforce_eval.annotation.lerobot_layout import Episode, read_table
+from finforce_eval.annotation.lerobot_layout import Episode, import_arrow, read_table
 from finforce_eval.errors import RecordingError
 
 _AXES = ["x", "y", "z"]
@@ -95,8 +95,7 @@ def add_columns(
     Raises:
         RecordingError: its rows are not those of its episodes, in their order.
     """
-    from pyarrow import parquet
-
+    parquet = import_arrow("pyarrow.parquet")
     table = read_table(source)
     for episode in episodes:
         rows_of(table, episode, source.name)
@@ -124,8 +123,7 @@ def _order_of(table: Any, episodes: Sequence[Episode], name: str) -> list[int]:
 
 def _arrow_columns(columns: Mapping[str, NDArray], names: FeatureNames) -> dict[str, Any]:
     """Return the new columns of a Parquet file."""
-    import pyarrow
-
+    pyarrow = import_arrow()
     found: dict[str, Any] = {}
     for feature, column in names.numeric.items():
         values = np.asarray(columns[column], np.float32)

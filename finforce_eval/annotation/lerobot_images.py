@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError
-from finforce.errors import MissingDependencyError
+from finforce.optional import import_library
 from finforce.stamps import NANOSECONDS
-from finforce_eval.annotation.lerobot_layout import Episode, read_table
+from finforce_eval.annotation.lerobot_layout import Episode, import_arrow, read_table
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import StampedImage
 from finforce_keypoints.images import RgbdImage, check_image
@@ -80,10 +80,7 @@ class EpisodeImages:
 
     def _read_video(self) -> Iterator[NDArray[np.uint8]]:
         """Yield the frames of the video from the beginning of the episode."""
-        try:
-            import av
-        except ImportError as error:
-            raise MissingDependencyError("videos need PyAV: pip install 'finforce[lerobot]'") from error
+        av = import_library("av", "reading videos", "'finforce[lerobot]'")
         video = self.episode.video
         if not video.is_file():
             raise RecordingError(f"{self.name}: no video {video.parent.name}/{video.name}")
@@ -120,10 +117,8 @@ def rows_of(table: Any, episode: Episode, name: str) -> Any:
     Raises:
         RecordingError: they are not as many as the episode is long.
     """
-    from pyarrow import compute
-
     chosen = (
-        table.filter(compute.equal(table["episode_index"], episode.index))
+        table.filter(import_arrow("pyarrow.compute").equal(table["episode_index"], episode.index))
         if "episode_index" in table.column_names
         else table
     )

@@ -12,9 +12,10 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from finforce.errors import MissingDependencyError
+from finforce.optional import import_library
 from finforce_eval.errors import OptionError, RecordingError
 
 INFO, STATS = Path("meta/info.json"), Path("meta/stats.json")
@@ -187,12 +188,13 @@ def read_table(path: Path, names: list[str] | None = None) -> Any:
         RecordingError: it is missing or damaged, or a column is missing.
         MissingDependencyError: pyarrow is not installed.
     """
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError as error:
-        raise MissingDependencyError("LeRobot datasets need pyarrow: pip install 'finforce[lerobot]'") from error
+    pyarrow, parquet = import_arrow(), import_arrow("pyarrow.parquet")
     try:
         return parquet.ParquetFile(path).read(columns=names)
     except (OSError, pyarrow.ArrowException, KeyError) as error:
         raise RecordingError(f"{path.parent.name}/{path.name}: {' '.join(str(error).split())}") from error
+
+
+def import_arrow(module: str = "pyarrow") -> ModuleType:
+    """Return pyarrow or one of its modules; raises MissingDependencyError where it is not installed."""
+    return import_library(module, "reading and writing LeRobot datasets", "'finforce[lerobot]'")

@@ -14,6 +14,7 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_
 COMMANDS = {
     "evaluate": "run the estimator over recordings offline and score it against the measured force",
     "annotate": "write the forces into recordings that exist: the same messages, and wrenches between them",
+    "compare": "say which recordings got better or worse from one evaluation to another, beyond chance",
     "replay": "play a recording through the real nodes in real time and score it",
     "pipeline": "find the grasp force in a camera's images, all stages in one process",
     "trace": "show the way of a recording's images through the stages: who waits for whom, and where time goes",

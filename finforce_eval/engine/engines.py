@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from finforce.errors import FinforceError, MissingDependencyError
+from finforce.errors import FinforceError
+from finforce.optional import import_library
 from finforce_eval.engine.tasks import FAILED, OK, Manifest, Task, run_task
 
 SEQUENTIAL, PROCESSES, RAY = ENGINES = ("sequential", "processes", "ray")
@@ -133,10 +134,7 @@ def _count_processors() -> int:
 
 def _run_on_ray(tasks: Sequence[Task], options: EngineOptions) -> Iterator[Line]:
     """Yield lines as a cluster ends its tasks."""
-    try:
-        import ray
-    except ImportError as error:
-        raise MissingDependencyError("--engine ray needs Ray: pip install 'finforce[ray]'") from error
+    ray = import_library("ray", "--engine ray", "'finforce[ray]'")
     if not tasks:
         return
     where = {"address": options.address} if options.address else {"num_cpus": options.workers or _count_processors()}

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from finforce_eval.evaluation.comparison import error_blocks
 from finforce_eval.evaluation.evaluate import Evaluation
 from finforce_eval.evaluation.manipulation import format_manipulation
 from finforce_eval.evaluation.scoring import CaseScore, Spread, Stats
@@ -174,7 +175,10 @@ def evaluation_json(evaluation: Evaluation, **about: Any) -> dict[str, Any]:
         evaluation: the scores.
         about: what else stands at the top: jaw, solver, contact, ...
     """
-    cases = {name: asdict(score) | _contact_name(evaluation, name) for name, score in evaluation.scores.items()}
+    cases = {
+        name: asdict(score) | _contact_name(evaluation, name) | {"seconds": error_blocks(evaluation.results[name])}
+        for name, score in evaluation.scores.items()
+    }
     net = {name: asdict(score) for name, score in evaluation.manipulation.items()}
     both = {"manipulation": net} if net else {}
     return {"cases": cases, "all": asdict(evaluation.total), **both, "force_range_N": evaluation.span, **about}

@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, NamedTuple
 
 from finforce.errors import MissingDependencyError
+from finforce.optional import import_library
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import open_bag
 
@@ -162,13 +163,9 @@ def _read_torn_chunk(file: BinaryIO) -> bytes:
 def _decompress(torn: bytes, compression: str) -> bytes:
     """Return the beginning of compressed bytes of which the end is missing."""
     if compression == "lz4":
-        import lz4.frame
-
-        decompressor: Any = lz4.frame.LZ4FrameDecompressor()
+        decompressor = import_library("lz4.frame", "reading a recording", "lz4").LZ4FrameDecompressor()
     elif compression == "zstd":
-        import zstandard
-
-        decompressor = zstandard.ZstdDecompressor().decompressobj()
+        decompressor = import_library("zstandard", "reading a recording").ZstdDecompressor().decompressobj()
     else:
         return b""
     found = []

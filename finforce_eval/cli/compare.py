@@ -1,0 +1,75 @@
+"""The subcommand `compare`: two evaluations, recording by recording."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from finforce_eval.evaluation.comparison import (
+    BETTER,
+    SAME,
+    WORSE,
+    Change,
+    compare_evaluations,
+    differing_settings,
+    read_evaluation,
+    total_change,
+)
+from finforce_eval.evaluation.machine import without_nan, write_json
+
+WORSE_FOUND = 1
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    parser.add_argument("before", metavar="A.json", help="what finforce evaluate --json wrote")
+    parser.add_argument("after", metavar="B.json", help="the same of other settings, fingers or versions")
+    parser.add_argument("--json", metavar="OUT", help="write the changes as JSON")
+    parser.add_argument("--figure", metavar="PNG", help="draw the error of each recording before and after")
+    parser.add_argument("--strict", action="store_true", help="exit with 1 where a recording got worse beyond chance")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Compare two evaluations: print the table, write JSON and picture."""
+    before, after = (read_evaluation(path) for path in (options.before, options.after))
+    changes = compare_evaluations(before, after)
+    for name, (old, new) in differing_settings(before, after).items():
+        print(f"{name}: {old} -> {new}")
+    print(format_changes(changes))
+    if options.json:
+        rows = [asdict(change) for change in changes]
+        write_json(options.json, without_nan({"changes": rows, "mean": asdict(total_change(changes))}))
+    if options.figure:
+        from finforce_eval.figures.comparison import draw_comparison
+
+        names = Path(options.before).stem, Path(options.after).stem
+        draw_comparison(changes, names).savefig(options.figure)
+        print(f"Picture: {options.figure}")
+    return WORSE_FOUND if options.strict and any(change.verdict == WORSE for change in changes) else 0
+
+
+def format_changes(changes: Sequence[Change]) -> str:
+    """Return the table of the changes and a sentence about them."""
+    rows = [*changes, total_change(changes)]
+    width = max(len(row.name) for row in rows)
+    head = f"{'':{width}}  before/N  after/N  difference/N  chance/N  answered/%    verdict"
+    lines = [head, "-" * len(head)]
+    for row in rows:
+        chance = f"{row.stddev:8.4f}" if np.isfinite(row.stddev) else "       -"
+        shares = f"{row.answered[0]:5.1f} {row.answered[1]:5.1f}"
+        lines.append(
+            f"{row.name:{width}}  {row.before:8.4f} {row.after:8.4f}  {row.difference:+12.4f}  {chance}  {shares}  "
+            f" {row.verdict}"
+        )
+    counts = {verdict: sum(change.verdict == verdict for change in changes) for verdict in (BETTER, WORSE, SAME)}
+    rest = len(changes) - sum(counts.values())
+    lines.append(
+        f"{counts[BETTER]} better, {counts[WORSE]} worse, {counts[SAME]} the same, {rest} unsure or in one file only. "
+        "chance: one standard deviation of the difference, by how it varies within the recording; better and worse are "
+        "beyond three of them."
+    )
+    return "\n".join(lines).replace("nan", "  -")

@@ -1,0 +1,173 @@
+"""Two evaluations of the same recordings: which got better or worse, and whether that is more than chance.
+
+The same recording is met twice, so that its own difficulty cancels: what counts is the difference of the mean squared
+errors, second by second. Neighbouring seconds err alike; the spread of the mean over blocks of some seconds says by how
+much it would differ in other recordings like it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import inf, nan, sqrt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.results import CaseResult
+
+BETTER, WORSE, SAME, UNSURE, GAINED, LOST = "better", "worse", "same", "unsure", "new", "gone"
+# A difference smaller than this [N] matters to nobody, however sure it is; a surer one than so many deviations counts.
+LEAST, SIGMAS = 0.002, 3.0
+# Seconds that err alike, and blocks without which nothing can be said of chance.
+_BLOCK, _FEWEST = 4, 4
+_SECOND = 1_000_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """What became of one recording.
+
+    Attributes:
+        name: of the recording, or of one of its jaws.
+        before: root mean square error in the first evaluation [N], NaN without.
+        after: in the second [N], NaN without.
+        stddev: of the difference [N]; infinite where nobody can tell.
+        answered: share of the frames to be answered that were, before and after [%].
+        verdict: "better", "worse", "same", "unsure", "new" or "gone".
+    """
+
+    name: str
+    before: float
+    after: float
+    stddev: float
+    answered: tuple[float, float]
+    verdict: str
+
+    @property
+    def difference(self) -> float:
+        """Error after minus error before [N]."""
+        return self.after - self.before
+
+
+def error_blocks(result: CaseResult) -> list[list[float]]:
+    """Return second, mean squared error [N^2] and number of its frames, of every second with counted frames."""
+    counted = result.counted
+    seconds = (result.stamps[counted] - result.stamps[0]) // _SECOND if len(result.stamps) else np.zeros(0, np.int64)
+    squares = result.error[counted] ** 2
+    return [
+        [int(second), float(squares[seconds == second].mean()), int((seconds == second).sum())]
+        for second in np.unique(seconds)
+    ]
+
+
+def read_evaluation(path: str | Path) -> dict[str, Any]:
+    """Return the content of a file that `evaluate --json` wrote.
+
+    Raises:
+        OptionError: it is no such file.
+        OSError: it cannot be read.
+    """
+    text = Path(path).read_text(encoding="utf-8", errors="replace")
+    try:
+        content = json.loads(text)
+        cases = content["cases"]
+        for case in cases.values():
+            case["all"]["rmse_N"], case["record_frames"], case["record_skipped"]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise OptionError(f"{path}: expected what finforce evaluate --json writes: {type(error).__name__}") from error
+    return content
+
+
+def compare_evaluations(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[Change]:
+    """Return what became of each recording that one of two evaluations has, the largest differences first."""
+    names = dict.fromkeys([*before["cases"], *after["cases"]])
+    changes = [_compare(name, before["cases"].get(name), after["cases"].get(name)) for name in names]
+    return sorted(changes, key=lambda change: -abs(np.nan_to_num(change.difference)))
+
+
+def total_change(changes: Sequence[Change]) -> Change:
+    """Return the change of the mean error of the recordings that both evaluations have."""
+    both = [change for change in changes if np.isfinite(change.difference)]
+    if not both:
+        return Change(name="mean", before=nan, after=nan, stddev=inf, answered=(nan, nan), verdict=UNSURE)
+    before, after = (float(np.mean([getattr(change, side) for change in both])) for side in ("before", "after"))
+    stddev = sqrt(sum(change.stddev**2 for change in both)) / len(both)
+    answered = tuple(float(np.mean([change.answered[side] for change in both])) for side in (0, 1))
+    return Change(
+        name="mean",
+        before=before,
+        after=after,
+        stddev=stddev,
+        answered=answered,
+        verdict=_judge(after - before, stddev),
+    )
+
+
+def differing_settings(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """Return the settings that two evaluations do not share, of the first and of the second."""
+    names = dict.fromkeys([*before, *after])
+    pairs = {name: (before.get(name, "-"), after.get(name, "-")) for name in names}
+    return {name: pair for name, pair in pairs.items() if all(isinstance(v, str) for v in pair) and pair[0] != pair[1]}
+
+
+def _compare(name: str, before: Mapping[str, Any] | None, after: Mapping[str, Any] | None) -> Change:
+    """Return what became of one recording."""
+    errors = [_error(case) for case in (before, after)]
+    answered = (_answered(before), _answered(after))
+    if before is None or after is None:
+        verdict = GAINED if before is None else LOST
+        return Change(name=name, before=errors[0], after=errors[1], stddev=inf, answered=answered, verdict=verdict)
+    stddev = _find_stddev(before, after, *errors)
+    verdict = _judge(errors[1] - errors[0], stddev)
+    return Change(name=name, before=errors[0], after=errors[1], stddev=stddev, answered=answered, verdict=verdict)
+
+
+def _error(case: Mapping[str, Any] | None) -> float:
+    value = None if case is None else case["all"]["rmse_N"]
+    return nan if value is None else float(value)
+
+
+def _answered(case: Mapping[str, Any] | None) -> float:
+    """Return the share of the frames to be answered that were [%]."""
+    if case is None or not case["record_frames"]:
+        return nan
+    return 100.0 * (1.0 - case["record_skipped"] / case["record_frames"])
+
+
+def _judge(difference: float, stddev: float) -> str:
+    if not np.isfinite(difference) or not np.isfinite(stddev):
+        return SAME if difference == 0.0 else UNSURE
+    if abs(difference) < LEAST:
+        return SAME
+    if abs(difference) < SIGMAS * stddev:
+        return UNSURE
+    return BETTER if difference < 0.0 else WORSE
+
+
+def _find_stddev(before: Mapping[str, Any], after: Mapping[str, Any], first: float, second: float) -> float:
+    """Return the standard deviation of the difference of two errors [N], infinite where nobody can tell.
+
+    With d the difference of the mean squares, the errors differ by d / (first + second).
+    """
+    blocks = [{row[0]: row[1:] for row in case.get("seconds", ())} for case in (before, after)]
+    common = sorted(blocks[0].keys() & blocks[1].keys())
+    if not first + second > 0.0:
+        return 0.0 if first == second == 0.0 else inf
+    means = _block_means([(blocks[1][key][0] - blocks[0][key][0], blocks[0][key][1]) for key in common])
+    if len(means) < _FEWEST:
+        return inf
+    return float(np.std(means, ddof=1) / sqrt(len(means)) / (first + second))
+
+
+def _block_means(rows: Sequence[tuple[float, int]]) -> NDArray[np.float64]:
+    """Return the means of values with weights over blocks of neighbours."""
+    if not rows:
+        return np.zeros(0)
+    values, weights = np.array(rows, dtype=np.float64).T
+    starts = np.arange(0, len(values), _BLOCK)
+    return np.add.reduceat(values * weights, starts) / np.maximum(np.add.reduceat(weights, starts), 1.0)

@@ -1,0 +1,112 @@
+"""Claims about `finforce compare`: a change that would not come again is called none."""
+
+import json
+
+import numpy as np
+import pytest
+
+from finforce_eval.cli.main import main
+from finforce_eval.evaluation.comparison import compare_evaluations, total_change
+
+
+def evaluation(squares, *, skipped=0, name="a", **about):
+    """An evaluation of one recording with mean squared errors second by second [N^2]."""
+    seconds = [[number, float(value), 30] for number, value in enumerate(squares)]
+    case = {
+        "all": {"rmse_N": float(np.sqrt(np.mean(squares)))},
+        "record_frames": 1000,
+        "record_skipped": skipped,
+        "seconds": seconds,
+    }
+    return {"cases": {name: case}, **about}
+
+
+def only(before, after):
+    (change,) = compare_evaluations(before, after)
+    return change
+
+
+RANDOM = np.random.default_rng(5)
+ERRORS = RANDOM.uniform(0.002, 0.006, 100)
+
+
+def test_what_is_the_same_is_called_so():
+    change = only(evaluation(ERRORS), evaluation(ERRORS))
+    assert (change.verdict, change.difference) == ("same", 0.0)
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(0.7, "better"), (1.4, "worse")])
+def test_a_change_in_every_second_is_one(factor, verdict):
+    change = only(evaluation(ERRORS), evaluation(factor * ERRORS))
+    assert change.verdict == verdict
+    assert change.difference == pytest.approx((np.sqrt(factor) - 1.0) * np.sqrt(ERRORS.mean()))
+
+
+def test_one_bad_second_is_no_change_for_the_worse():
+    after = ERRORS.copy()
+    after[50] += 0.5
+    change = only(evaluation(ERRORS), evaluation(after))
+    assert change.difference > 0.01
+    assert change.verdict == "unsure"
+
+
+@pytest.mark.parametrize("block", [1, 4])
+def test_chance_alone_is_rarely_called_a_change(block):
+    verdicts = []
+    for seed in range(400):
+        random = np.random.default_rng(seed)
+        first, second = np.repeat(random.chisquare(2, (2, 100 // block)) * 0.002, block, axis=1)
+        verdicts.append(only(evaluation(first), evaluation(second)).verdict)
+    assert sum(verdict in ("better", "worse") for verdict in verdicts) < 0.03 * len(verdicts)
+
+
+def test_the_stated_chance_is_that_of_other_recordings():
+    differences, stated = [], []
+    for seed in range(300):
+        random = np.random.default_rng(seed)
+        first, second = random.chisquare(3, (2, 120)) * 0.002
+        change = only(evaluation(first), evaluation(second))
+        differences.append(change.difference)
+        stated.append(change.stddev)
+    assert np.std(differences) == pytest.approx(np.mean(stated), rel=0.15)
+
+
+def test_without_seconds_or_with_few_nothing_is_sure():
+    before, after = evaluation(ERRORS), evaluation(2 * ERRORS)
+    del after["cases"]["a"]["seconds"]
+    assert only(before, after).verdict == "unsure"
+    assert only(evaluation(ERRORS[:8]), evaluation(2 * ERRORS[:8])).verdict == "unsure"
+
+
+def test_recordings_of_one_evaluation_are_named_and_in_no_mean():
+    changes = compare_evaluations(evaluation(ERRORS), evaluation(ERRORS, name="b"))
+    assert {change.name: change.verdict for change in changes} == {"a": "gone", "b": "new"}
+    assert np.isnan(total_change(changes).difference)
+
+
+@pytest.fixture
+def files(tmp_path):
+    paths = tmp_path / "old.json", tmp_path / "new.json"
+    paths[0].write_text(json.dumps(evaluation(ERRORS, solver="reduced")))
+    paths[1].write_text(json.dumps(evaluation(2 * ERRORS, skipped=100, solver="solid")))
+    return [str(path) for path in paths]
+
+
+def test_table_json_and_picture_tell_the_same(files, tmp_path, capsys):
+    out, picture = tmp_path / "out.json", tmp_path / "out.png"
+    assert main(["compare", *files, "--json", str(out), "--figure", str(picture)]) == 0
+    said = capsys.readouterr().out
+    assert "solver: reduced -> solid" in said
+    assert "1 worse" in said and "100.0  90.0" in said
+    assert json.loads(out.read_text())["changes"][0]["verdict"] == "worse"
+    assert picture.stat().st_size > 5000
+    assert main(["compare", *files, "--strict"]) == 1
+    assert main(["compare", files[0], files[0], "--strict"]) == 0
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"cases": 3}', '{"cases": {"a": {}}}', "[" * 5000])
+def test_another_file_is_refused(text, files, tmp_path, capsys):
+    other = tmp_path / "other.json"
+    other.write_text(text)
+    assert main(["compare", files[0], str(other)]) == 2
+    assert "expected what finforce evaluate --json writes" in capsys.readouterr().err
