@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 from finforce_eval.evaluation.setup import version
@@ -13,8 +15,19 @@ _OUTSIDE = ("bags", "out", "engine", "workers", "memory", "address", "shard", "r
 
 
 def describe_options(options: argparse.Namespace) -> dict[str, Any]:
-    """Return all options that forces depend on, and the version."""
-    return {name: value for name, value in vars(options).items() if name not in _OUTSIDE} | {"version": version()}
+    """Return all options that forces depend on, hashes of the files that they name, and the version."""
+    chosen = {name: value for name, value in vars(options).items() if name not in _OUTSIDE}
+    words = [str(word) for value in chosen.values() for word in (value if isinstance(value, list) else [value])]
+    files = {word: sha256(Path(word).read_bytes()).hexdigest() for word in words if _is_file(word)}
+    return chosen | {"files": files, "version": version()}
+
+
+def _is_file(word: str) -> bool:
+    """Say whether an option's word names a file."""
+    try:
+        return bool(word) and Path(word).is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def sides_of(options: argparse.Namespace) -> tuple[str, ...]:

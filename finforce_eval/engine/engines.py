@@ -9,17 +9,18 @@ from typing import Any
 from finforce.errors import FinforceError
 from finforce.optional import import_library
 from finforce_eval.engine.tasks import FAILED, OK, Manifest, Task, run_task
+from finforce_eval.errors import OptionError
 
 SEQUENTIAL, PROCESSES, RAY = ENGINES = ("sequential", "processes", "ray")
 # Tasks that a process does before another one takes its place: what a library leaks stays bounded.
 _TASKS_PER_PROCESS = 50
-_GIGABYTE = 1 << 30
+_GIGABYTE, _LARGEST_MEMORY = 1 << 30, 1e6
 Line = dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
-    """How many tasks are carried out, and where.
+    """How many tasks are carried out, and where; raises OptionError where that cannot be.
 
     Attributes:
         engine: "sequential", "processes" or "ray".
@@ -32,6 +33,12 @@ class EngineOptions:
     workers: int = 0
     memory: float = 4.0
     address: str = ""
+
+    def __post_init__(self) -> None:
+        if self.workers < 0:
+            raise OptionError(f"--workers {self.workers}: expected the number of recordings at once, or 0")
+        if not 0.0 <= self.memory < _LARGEST_MEMORY:
+            raise OptionError(f"--memory {self.memory}: expected gigabytes, or 0")
 
 
 def run_tasks(

@@ -279,3 +279,22 @@ def test_a_run_that_is_killed_again_and_again_loses_nothing_and_does_nothing_twi
     for bag, name in zip(bags, names, strict=True):
         topics = {topic for topic, *_ in messages(bag)}
         assert [entry for entry in messages(out / name) if entry[0] in topics] == messages(bag)
+
+
+@pytest.mark.parametrize("words", [["--workers", "-1"], ["--memory", "nan"], ["--memory=-1"], ["--memory", "inf"]])
+def test_engines_that_cannot_be_are_refused(words, source, tmp_path, capsys):
+    assert annotate(tmp_path, source, "--engine", "processes", *words) == 2
+    assert "expected" in capsys.readouterr().err
+    assert not (tmp_path / source.name).exists()
+
+
+def test_a_changed_calibration_is_another_setting(source, tmp_path, capsys):
+    from importlib.resources import files
+
+    file = tmp_path / "my.yaml"
+    file.write_text((files("finforce_ifea.jaw") / "calibrations" / "bench.yaml").read_text())
+    assert annotate(tmp_path / "out", source, "--calibration", file) == 0
+    assert annotate(tmp_path / "out", source, "--calibration", file) == 0
+    file.write_text(file.read_text() + "\n")
+    assert annotate(tmp_path / "out", source, "--calibration", file) == 2
+    assert "exists already" in capsys.readouterr().err
