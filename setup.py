@@ -66,10 +66,11 @@ setup(
         "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
         "lerobot": ["pyarrow", "av"],  # LeRobot datasets: tables and videos, by the libraries that they are made with
         "ray": ["ray"],  # recordings on a cluster
+        "view": ["rerun-sdk"],  # a viewer of pictures, shapes and curves over time
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
         "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0", "xacro"]
-        + ["cascadio", "ezdxf", "svgelements", "pyarrow", "av", "ray"],
+        + ["cascadio", "ezdxf", "svgelements", "pyarrow", "av", "ray", "rerun-sdk"],
         "lint": ["ruff", "import-linter"],
     },
     entry_points={

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +77,20 @@ class GraspForces:
     torque: NDArray[np.float64]
 
 
+class Shape(NamedTuple):
+    """How a jaw stands in one image: deformed vertices (n, 3) [m], jaw frame, and their triangles (m, 3)."""
+
+    side: str
+    stamp: int
+    vertices: NDArray[np.float64]
+    triangles: NDArray[np.integer]
+
+
 def estimate_forces(
-    recording: Recording, setup: EvaluationSetup, progress: Callable[[int], Any] = lambda images: None
+    recording: Recording,
+    setup: EvaluationSetup,
+    progress: Callable[[int], Any] = lambda images: None,
+    watch: Callable[[Shape], Any] | None = None,
 ) -> dict[str, JawForces]:
     """Return the forces on every jaw of a recording that has key points.
 
@@ -86,6 +98,7 @@ def estimate_forces(
         recording: with key points, recorded or found.
         setup: jaw, settings, calibration and contact.
         progress: called with the number of images done since its last call.
+        watch: called with the shape of the jaw after every image.
 
     Raises:
         FinforceError: the key points are another jaw's, or the contact cannot be known.
@@ -96,7 +109,7 @@ def estimate_forces(
     found = {}
     for side in recording.jaws:
         own = setup.side(side)
-        found[side] = _estimate_jaw(recording, side, own.estimator(both), own.source(recording), progress)
+        found[side] = _estimate_jaw(recording, side, own.estimator(both), own.source(recording), progress, watch)
     return found
 
 
@@ -106,12 +119,16 @@ def _estimate_jaw(
     estimator: Estimator,
     source: ContactSource,
     progress: Callable[[int], Any],
+    watch: Callable[[Shape], Any] | None,
 ) -> JawForces:
     """Return the forces on one jaw; an image that is refused is not answered, and says why."""
     track = recording.jaw(side).keypoints
     log = _Log(side, track.stamps)
     for index in range(len(track.stamps)):
         log.take(index, *_answer(track.observation(index), int(track.stamps[index]), estimator, source))
+        if watch is not None:
+            vertices = np.array(estimator.surface())
+            watch(Shape(side, int(track.stamps[index]), vertices, np.asarray(estimator.surface_triangles)))
         progress(1)
     return log.forces
 

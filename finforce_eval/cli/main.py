@@ -15,6 +15,7 @@ COMMANDS = {
     "evaluate": "run the estimator over recordings offline and score it against the measured force",
     "annotate": "write the forces into recordings that exist: the same messages, and wrenches between them",
     "compare": "say which recordings got better or worse from one evaluation to another, beyond chance",
+    "view": "show a recording with its forces in Rerun: pictures, key points, bending jaws, contact, forces over time",
     "replay": "play a recording through the real nodes in real time and score it",
     "pipeline": "find the grasp force in a camera's images, all stages in one process",
     "trace": "show the way of a recording's images through the stages: who waits for whom, and where time goes",
