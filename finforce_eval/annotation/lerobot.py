@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.files import parse_json, read_json
 from finforce_eval.annotation.forces import JawForces, combine_forces, estimate_forces
 from finforce_eval.annotation.lerobot_features import (
     FeatureNames,
@@ -213,7 +214,7 @@ def write_dataset(folder: Path, parts: Path, target: Path, options: argparse.Nam
     for path in sorted(changed):
         own = [each for each in dataset.episodes if each.data == path]
         add_columns(path, target / path.relative_to(folder), own, columns, names)
-    info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+    info = read_json(folder / INFO)
     add_features(info, names)
     (target / INFO).write_text(json.dumps(info, indent=4) + "\n", encoding="utf-8")
     _write_stats(dataset, target, columns, names)
@@ -238,7 +239,7 @@ def _copy_rest(dataset: Dataset, target: Path, changed: set[Path]) -> None:
 def _write_stats(dataset: Dataset, target: Path, columns: Mapping[int, Columns], names: FeatureNames) -> None:
     """Add the statistics of the new features, of the frames that have a force, where the dataset keeps such."""
     if (target / STATS).is_file():
-        stats = json.loads((target / STATS).read_text(encoding="utf-8"))
+        stats = read_json(target / STATS)
         known = _kinds_of(stats)
         whole = stack_episodes(columns)
         stats |= {feature: describe_column(whole[column], known) for feature, column in names.numeric.items()}
@@ -246,7 +247,7 @@ def _write_stats(dataset: Dataset, target: Path, columns: Mapping[int, Columns],
     if (target / EPISODE_STATS_V2).is_file():
         lines = []
         for text in (target / EPISODE_STATS_V2).read_text(encoding="utf-8").splitlines():
-            line = json.loads(text)
+            line = parse_json(text)
             own, known = columns[line["episode_index"]], _kinds_of(line["stats"])
             line["stats"] |= {name: describe_column(own[column], known) for name, column in names.numeric.items()}
             lines.append(json.dumps(line))

@@ -8,19 +8,20 @@ Source: the formats as LeRobot 0.1 to 0.4 writes and reads them.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from finforce.files import FileError, parse_json, read_json, read_text
 from finforce.optional import import_library
 from finforce_eval.errors import OptionError, RecordingError
 
 INFO, STATS = Path("meta/info.json"), Path("meta/stats.json")
 EPISODES_V2, EPISODE_STATS_V2 = Path("meta/episodes.jsonl"), Path("meta/episodes_stats.jsonl")
 EPISODES_V3 = Path("meta/episodes")
+_LARGEST_LINES = 1 << 28  # bytes; a line per episode
 _VERSIONS = ("v2.0", "v2.1", "v3.0")
 
 
@@ -107,13 +108,13 @@ def open_dataset(folder: Path, camera: str = "") -> Dataset:
 def _read_info(folder: Path) -> dict[str, Any]:
     """Return `meta/info.json` of a layout that is known."""
     try:
-        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+        info = read_json(folder / INFO)
         version = info["codebase_version"]
         is_known = version in _VERSIONS
         sound = isinstance(info["features"], dict) and 0 < float(info["fps"]) < 1e4 and int(info["total_frames"]) >= 0
         paths = [info["data_path"], info.get("video_path") or ""]
         sound = sound and all(isinstance(path, str) for path in paths)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (FileError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{folder.name}: {INFO}: {type(error).__name__}: {error}") from error
     if not is_known:
         raise RecordingError(f"{folder.name}: layout {version}; expected {', '.join(_VERSIONS)}")
@@ -137,10 +138,10 @@ def _choose_camera(info: Mapping[str, Any], camera: str, name: str) -> str:
 def _describe_v2(folder: Path) -> list[dict[str, Any]]:
     """Return number and length of each episode."""
     try:
-        lines = (folder / EPISODES_V2).read_text(encoding="utf-8").splitlines()
-        entries = [json.loads(line) for line in lines if line.strip()]
+        lines = read_text(folder / EPISODES_V2, _LARGEST_LINES).splitlines()
+        entries = [parse_json(line) for line in lines if line.strip()]
         return [{"episode_index": int(each["episode_index"]), "length": int(each["length"])} for each in entries]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (FileError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{folder.name}: {EPISODES_V2}: {type(error).__name__}: {error}") from error
 
 

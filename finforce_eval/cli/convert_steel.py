@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
+from finforce.files import FileError, read_json
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.steel import SHIPPED, recording_from_measurement
 from finforce_eval.recordings.writer import write_recording
@@ -22,9 +22,9 @@ def run(options: argparse.Namespace) -> None:
     """Convert the measurement and write the recording."""
     source = Path(options.source) if options.source else SHIPPED
     try:
-        measurement = json.loads(source.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise RecordingError(f"{source}: not JSON: {error}") from error
+        measurement = read_json(source)
+    except FileError as error:
+        raise RecordingError(f"{source}: {error}") from error
     output = Path(options.output)
     folder = write_recording(recording_from_measurement(measurement), output, storage=options.storage)
     print(f"Recording: {folder}")

@@ -7,7 +7,6 @@ much it would differ in other recordings like it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, nan, sqrt
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.files import FileError, read_json
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.results import CaseResult
 
@@ -70,16 +70,14 @@ def read_evaluation(path: str | Path) -> dict[str, Any]:
 
     Raises:
         OptionError: it is no such file.
-        OSError: it cannot be read.
     """
-    text = Path(path).read_text(encoding="utf-8", errors="replace")
     try:
-        content = json.loads(text)
+        content = read_json(path)
         cases = content["cases"]
         for case in cases.values():
             case["all"]["rmse_N"], case["record_frames"], case["record_skipped"]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise OptionError(f"{path}: expected what finforce evaluate --json writes: {type(error).__name__}") from error
+    except (FileError, KeyError, TypeError, AttributeError) as error:
+        raise OptionError(f"{path}: expected what finforce evaluate --json writes: {error!r}") from error
     return content
 
 

@@ -127,13 +127,27 @@ def bag_source(path: Path) -> Path:
     path = path.resolve()
     if path.is_file() and path.suffix not in (".mcap", ".db3"):
         raise RecordingError(f"{path.name}: not a recording; expected a rosbag2 folder, .mcap or .db3")
-    if path.is_file() or (path / "metadata.yaml").exists():
+    if path.is_file():
+        return path
+    _refuse_pipes(path)
+    if (path / "metadata.yaml").exists():
         return path
     files = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
     if len(files) != 1:
         found = f"no metadata.yaml and {len(files)} bag files" if files else "no metadata.yaml, .mcap or .db3"
         raise RecordingError(f"{path.name}: the folder is no recording: {found} in it")
     return files[0]
+
+
+def _refuse_pipes(folder: Path) -> None:
+    """Refuse a folder with something in place of its files that a reader would wait for.
+
+    Raises:
+        RecordingError: there is such a thing.
+    """
+    for path in [folder / "metadata.yaml", *folder.glob("*.mcap*"), *folder.glob("*.db3*")]:
+        if path.exists() and not path.is_file():
+            raise RecordingError(f"{folder.name}: {path.name} is no plain file")
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import PLUMB_BOB, CameraIntrinsics, decode_depth
 from finforce.errors import MissingDependencyError, PoseError
+from finforce.files import FileError, read_json, read_yaml
 from finforce_contact.reconstruction.paper_alignment import affine_from_generator
 from finforce_eval.errors import OptionError
 
@@ -121,12 +121,10 @@ def _name_numbers(words: Sequence[str]) -> dict[str, Any]:
 
 def _intrinsics_from_file(path: Path) -> dict[str, Any]:
     """Return intrinsics by name; of a ROS camera's file, K and D are taken apart."""
-    import yaml
-
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise OptionError(f"{path.name}: neither JSON nor YAML ({error})") from error
+        content = read_yaml(path)
+    except FileError as error:
+        raise OptionError(f"{path.name}: neither JSON nor YAML: {error}") from error
     if not isinstance(content, Mapping):
         raise OptionError(f"{path.name}: expected {INTRINSICS_FORMS}")
     named = {str(name): value for name, value in content.items()}
@@ -159,7 +157,7 @@ def read_generated_pose(path: Path | str) -> NDArray:
     """
     path = Path(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         if isinstance(content, list):
             content = {"matrix": content}
         for key in ("matrix", "T_camera_object"):

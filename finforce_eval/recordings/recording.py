@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from finforce.errors import ObservationError
+from finforce.files import FileError, read_json
 from finforce.messages import Keypoints, decode_columns, decode_keypoints
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
@@ -252,9 +252,9 @@ def _read_case(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     try:
-        case = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise RecordingError(f"{path.parent.name}/case.json: not JSON: {error}") from error
+        case = read_json(path)
+    except FileError as error:
+        raise RecordingError(f"{path.parent.name}/case.json: {error}") from error
     if not isinstance(case, dict):
         raise RecordingError(f"{path.parent.name}/case.json: expected an object, found {type(case).__name__}")
     return case

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from finforce.files import FileError, read_yaml
 from finforce_ifea.errors import CalibrationError
 from finforce_ifea.jaw.drawing import Band, Drawing
 from finforce_ifea.jaw.jaw import Jaw
@@ -158,9 +159,9 @@ def load_calibration(name_or_path: str | Path) -> Calibration:
     """
     path = _find_file(name_or_path)
     try:
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise CalibrationError(f"{path.name}: {str(error).splitlines()[0]}") from error
+        table = read_yaml(path)
+    except FileError as error:
+        raise CalibrationError(f"{path.name}: {error}") from error
     if not isinstance(table, dict) or "young_modulus" not in table:
         raise CalibrationError(f"{path.name}: expected a mapping with young_modulus, as `finforce calibrate` writes it")
     unknown = set(table) - _KEYS

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
+from finforce.files import FileError, read_yaml
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.drawing import Band, Drawing, Rib
 from finforce_ifea.jaw.face import FaceLine
@@ -21,19 +21,6 @@ from finforce_ifea.jaw.section import Section, join_loops, order_rings, read_loo
 _LARGEST_COUNT = 10_000
 
 
-class _Loader(yaml.SafeLoader):
-    """The safe loader, which also refuses a key that stands twice."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        """Build a mapping and refuse double keys."""
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for number, key in enumerate(keys):
-            if key in keys[:number]:
-                line = node.start_mark.line + 1
-                raise JawFileError(f"the key {key!r} stands twice in the mapping from line {line} on")
-        return super().construct_mapping(node, deep)
-
-
 def read_table(path: Path) -> "Table":
     """Read a YAML file whose content is a mapping.
 
@@ -41,15 +28,9 @@ def read_table(path: Path) -> "Table":
         JawFileError: The file is missing, empty, no YAML, or no mapping.
     """
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except OSError as error:
-        raise JawFileError(f"cannot be read: {error.strerror}") from error
-    except JawFileError:
-        raise
-    except UnicodeDecodeError as error:
-        raise JawFileError("is no text file, expected YAML in UTF-8") from error
-    except (yaml.YAMLError, TypeError, ValueError, RecursionError) as error:
-        raise JawFileError(f"is no valid YAML: {' '.join(str(error).split())}") from error
+        content = read_yaml(path, text_keys=False)
+    except FileError as error:
+        raise JawFileError(str(error)) from error
     if content is None:
         raise JawFileError("is empty, expected drawing or mesh, material, keypoints, candidates")
     if not isinstance(content, dict):

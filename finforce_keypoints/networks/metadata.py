@@ -12,9 +12,9 @@ from reprlib import Repr
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
+from finforce.files import FileError, read_yaml
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.errors import ModelError, NamingError
 from finforce_keypoints.pixel_finder import REFERENCE
@@ -126,11 +126,10 @@ def read_metadata(path: str | Path) -> ModelMetadata:
     """
     path = Path(path)
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
+        content = read_yaml(path, text_keys=False)
+    except FileError as error:
         raise ModelError(
-            f"{path}: cannot be read ({reason}); expected DeepLabCut's {METADATA_FILE} beside the network, which alone "
+            f"{path}: cannot be read ({error}); expected DeepLabCut's {METADATA_FILE} beside the network, which alone "
             "knows the body parts"
         ) from error
     try:

@@ -1,0 +1,163 @@
+"""Small files from anywhere, YAML and JSON, read within bounds.
+
+What is no plain file, too large, nested too deeply or blown up by references is refused before it costs memory or time.
+Links are followed, pipes and devices are not waited for.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from finforce.errors import FinforceError
+
+# Bytes of a file, of one of YAML; levels of nesting; values, those that references stand for counted as often; digits.
+LARGEST, LARGEST_YAML = 16 << 20, 1 << 19
+DEEPEST, MOST_VALUES, MOST_DIGITS = 50, 50_000, 400
+_OPEN = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+
+
+class FileError(FinforceError, ValueError):
+    """A file cannot be read, or holds what no such file does; the message says what, without the file's name."""
+
+
+def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
+    """Return the content of a plain file.
+
+    Raises:
+        FileError: it is missing, no plain file, or larger than `largest` bytes.
+    """
+    try:
+        handle = os.open(path, _OPEN)
+        with os.fdopen(handle, "rb") as file:
+            state = os.fstat(handle)
+            if not stat.S_ISREG(state.st_mode):
+                raise FileError("is no plain file")
+            content = file.read(largest + 1)
+    except (OSError, ValueError) as error:  # a name with a null byte is a ValueError
+        if isinstance(error, FileError):
+            raise
+        raise FileError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if len(content) > largest:
+        raise FileError(f"has more than {largest >> 10} KiB")
+    return content
+
+
+def read_text(path: str | Path, largest: int = LARGEST) -> str:
+    """Return the text of a plain file in UTF-8; raises FileError where it is none, or larger than `largest` bytes."""
+    try:
+        return read_bytes(path, largest).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileError(f"is no text in UTF-8: {error.reason} at byte {error.start}") from error
+
+
+def read_yaml(path: str | Path, *, text_keys: bool = True) -> Any:
+    """Return the content of a YAML file.
+
+    Args:
+        path: of the file.
+        text_keys: whether keys that are no texts are refused.
+
+    Raises:
+        FileError: it cannot be read, is no YAML, or is out of bounds; a key stands twice, or is no text.
+    """
+    return parse_yaml(read_text(path, LARGEST_YAML), text_keys=text_keys)
+
+
+def parse_yaml(text: str, *, text_keys: bool = True) -> Any:
+    """Return the content of a YAML text; see `read_yaml`."""
+    try:
+        loader = _BoundedLoader(text)
+        loader.text_keys = text_keys
+        return loader.get_single_data()
+    except FileError:
+        raise
+    except (yaml.YAMLError, TypeError, ValueError, OverflowError, RecursionError, AttributeError) as error:
+        raise FileError(f"is no valid YAML: {_words(error)}") from error
+
+
+def read_json(path: str | Path) -> Any:
+    """Return the content of a JSON file; raises FileError where it cannot be read, is no JSON, or is out of bounds."""
+    return parse_json(read_text(path))
+
+
+def parse_json(text: str) -> Any:
+    """Return the content of a JSON text; raises FileError where it is none, or out of bounds."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FileError(f"is no valid JSON: {_words(error)}") from error
+
+
+def _words(error: BaseException) -> str:
+    return " ".join(str(error).split())[:300] or type(error).__name__
+
+
+class _BoundedLoader(yaml.SafeLoader):
+    """The safe loader, which counts what it builds and refuses a key that stands twice.
+
+    Attributes:
+        text_keys: whether keys have to be texts.
+    """
+
+    text_keys = True
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth, self._values = 0, 0
+        self._sizes: dict[int, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Build a node; of one that is referred to, as many values as it holds are counted once more."""
+        if self.check_event(yaml.AliasEvent):
+            node = super().compose_node(parent, index)
+            if id(node) not in self._sizes:
+                raise FileError(f"refers to what it is itself part of, in line {self._line()}")
+            self._count(self._sizes[id(node)])
+            return node
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise FileError(f"is nested more than {DEEPEST} deep, in line {self._line()}")
+        before = self._values
+        self._count(1)
+        node = super().compose_node(parent, index)
+        self._sizes[id(node)] = self._values - before
+        self._depth -= 1
+        return node
+
+    def _line(self) -> int:
+        return self.line + 1
+
+    def _count(self, values: int) -> None:
+        self._values += values
+        if self._values > MOST_VALUES:
+            raise FileError(f"has more than {MOST_VALUES} values, those that references repeat included")
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        """Build a mapping and refuse double keys, and such as are no texts."""
+        line = node.start_mark.line + 1
+        keys: set[Hashable] = set()
+        for key_node, _ in node.value:
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                continue
+            key = self.construct_object(key_node, deep=True)
+            if self.text_keys and not isinstance(key, str):
+                raise FileError(f"the key {str(key)[:40]!r} in the mapping from line {line} on is no text")
+            if isinstance(key, Hashable) and key in keys:
+                raise FileError(f"the key {key!r} stands twice in the mapping from line {line} on")
+            if isinstance(key, Hashable):
+                keys.add(key)
+        return super().construct_mapping(node, deep)
+
+    def construct_scalar(self, node: yaml.ScalarNode) -> Any:
+        """Return a scalar; of a number no more digits than one has."""
+        value = super().construct_scalar(node)
+        if node.tag.endswith((":int", ":float")) and len(value) > MOST_DIGITS:
+            raise FileError(f"a number in line {node.start_mark.line + 1} has {len(value)} digits")
+        return value
