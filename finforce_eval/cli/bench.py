@@ -10,6 +10,7 @@ from typing import Any
 
 from finforce.errors import FinforceError
 from finforce_eval.bench.bench import BenchPart, select_parts
+from finforce_eval.cli.parser import picture_file
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.machine import describe_machine, write_figures
 
@@ -24,7 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--parts", metavar="A,B", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     text = "draw the first part, and every other beside it with its name added"
-    parser.add_argument("--figure", metavar="PNG", help=text)
+    parser.add_argument("--figure", type=picture_file, metavar="PNG", help=text)
     parser.add_argument("--quick", action="store_true", help="fewer cases and no slow tier, to try it out")
 
 

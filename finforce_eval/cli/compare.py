@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from finforce_eval.cli.parser import picture_file
 from finforce_eval.evaluation.comparison import (
     BETTER,
     SAME,
@@ -29,7 +30,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("before", metavar="A.json", help="what finforce evaluate --json wrote")
     parser.add_argument("after", metavar="B.json", help="the same of other settings, fingers or versions")
     parser.add_argument("--json", metavar="OUT", help="write the changes as JSON")
-    parser.add_argument("--figure", metavar="PNG", help="draw the error of each recording before and after")
+    parser.add_argument(
+        "--figure", type=picture_file, metavar="PNG", help="draw the error of each recording before and after"
+    )
     parser.add_argument("--strict", action="store_true", help="exit with 1 where a recording got worse beyond chance")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
+    from finforce_eval.cli.parser import picture_file
     from finforce_ifea.jaw.jaw_file import MATERIALS
     from finforce_ifea.jaw.section import UNITS
 
@@ -23,7 +24,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--face-x", type=float, metavar="X", help="x [m] of the inner face in the jaw frame")
     parser.add_argument("--flip", action="store_true", help="base and tip are the other way round")
     parser.add_argument("--other-face", action="store_true", help="the other side is the one that touches objects")
-    parser.add_argument("--picture", type=Path, help="the picture to draw (default: beside the jaw file, .png)")
+    text = "the picture to draw (default: beside the jaw file, .png)"
+    parser.add_argument("--picture", type=lambda name: Path(picture_file(name)), help=text)
 
 
 def run(options: argparse.Namespace) -> None:

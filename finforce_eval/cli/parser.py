@@ -16,6 +16,16 @@ CONTACT_HELP = (
 )
 
 
+PICTURES = (".png", ".jpg", ".svg", ".pdf")
+
+
+def picture_file(text: str) -> str:
+    """Return the name of a picture to be drawn, for `type=` of an option; another ending is refused."""
+    if not text.lower().endswith(PICTURES):
+        raise argparse.ArgumentTypeError(f"{text}: expected a name that ends in {', '.join(PICTURES)}")
+    return text
+
+
 class Parser(argparse.ArgumentParser):
     """A parser whose complaints are one line."""
 

@@ -16,6 +16,7 @@ from finforce_contact.reconstruction.evidence import ImageEvidence, collect_evid
 from finforce_contact.reconstruction.generated import read_generated as read_mesh
 from finforce_contact.reconstruction.reconstruction import FROM_GENERATED, reconstruct
 from finforce_contact.reconstruction.result import GeneratedMesh, Reconstruction
+from finforce_eval.cli.parser import picture_file
 from finforce_eval.errors import OptionError
 from finforce_eval.recordings.image_files import read_depth, read_generated_pose, read_image, read_intrinsics, read_mask
 
@@ -37,7 +38,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     method = "default: robust with a generated mesh; without, a primitive where one fits, else a completion"
     parser.add_argument("--method", choices=("robust", "paper", "primitive", "completion"), help=method)
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="mesh: .stl, .ply or .glb, in metres")
-    parser.add_argument("--picture", metavar="PNG", help="write a picture of the mesh over the depth")
+    parser.add_argument(
+        "--picture", type=picture_file, metavar="PNG", help="write a picture of the mesh over the depth"
+    )
 
 
 def run(options: argparse.Namespace) -> None:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from finforce_eval.cli.parser import add_jaw_options, add_source_options
+from finforce_eval.cli.parser import add_jaw_options, add_source_options, picture_file
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.machine import write_figures
 from finforce_eval.evaluation.setup import make_setup
@@ -23,7 +23,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", metavar="FILE", help="calibration file, or a shipped name")
     parser.add_argument("--apart", action="store_true", help="every stage in a process of its own")
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
-    parser.add_argument("--figure", metavar="PNG", help="draw the way of one image, and how long all took")
+    parser.add_argument(
+        "--figure", type=picture_file, metavar="PNG", help="draw the way of one image, and how long all took"
+    )
 
 
 def run(options: argparse.Namespace) -> None:

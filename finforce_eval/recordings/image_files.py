@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import PLUMB_BOB, CameraIntrinsics, decode_depth
+from finforce.camera import LARGEST_PICTURE, PLUMB_BOB, CameraIntrinsics, decode_depth
 from finforce.errors import MissingDependencyError, PoseError
-from finforce.files import FileError, read_json, read_yaml
+from finforce.files import FileError, read_bytes, read_json, read_yaml
 from finforce_contact.reconstruction.paper_alignment import affine_from_generator
 from finforce_eval.errors import OptionError
 
+_LARGEST_FILE = 1 << 28  # bytes
 FARTHEST = 10.0  # [m] of the median depth; more means that the numbers are no metres
 POSE_FORMS = (
     '{"rotation": [w, x, y, z], "translation": [x, y, z], "scale": s, "axes": "glb" or "canonical"}, '
@@ -27,15 +30,37 @@ def read_image(path: Path | str) -> NDArray:
     """Return the pixels of a picture (h, w) or (h, w, channels), as the file has them.
 
     Raises:
-        OSError: the file is missing or no picture.
+        OptionError: the file is missing, no picture, damaged or too large.
         MissingDependencyError: Pillow is not installed.
     """
     try:
         from PIL import Image
     except ImportError as error:
         raise MissingDependencyError("reading pictures needs Pillow: pip install pillow") from error
-    with Image.open(path) as image:
-        return np.array(image.convert("RGB") if image.mode == "P" else image)
+    path = Path(path)
+    content = _read_file(path)
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            if image.width * image.height > LARGEST_PICTURE:
+                size = f"{image.width} x {image.height}"
+                raise OptionError(f"{path.name}: {size} pixels; expected at most {LARGEST_PICTURE}")
+            return np.array(image.convert("RGB") if image.mode == "P" else image)
+    except OptionError:
+        raise
+    except Exception as error:  # each format has its own classes for damage
+        raise OptionError(f"{path.name}: no picture, or a damaged one: {_words(error)}") from error
+
+
+def _read_file(path: Path) -> bytes:
+    """Return the content of a file; raises OptionError where it is no plain one, or too large."""
+    try:
+        return read_bytes(path, _LARGEST_FILE)
+    except FileError as error:
+        raise OptionError(f"{path.name}: {error}") from error
+
+
+def _words(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def read_depth(path: Path | str) -> NDArray:
@@ -77,11 +102,27 @@ def read_mask(path: Path | str) -> NDArray:
 
 
 def _read_array(path: Path) -> NDArray:
-    """Return the array of an .npy file."""
+    """Return the array of an .npy file, whose header has to agree with its size.
+
+    Raises:
+        OptionError: it is none, or of something else than numbers.
+    """
+    content = _read_file(path)
+    file = io.BytesIO(content)
     try:
-        return np.load(path, allow_pickle=False)
-    except ValueError as error:
-        raise OptionError(f"{path.name}: no .npy file of numbers ({error})") from error
+        version = np.lib.format.read_magic(file)
+        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        shape, turned, dtype = readers[version](file)
+    except Exception as error:  # whatever a header can hold
+        raise OptionError(f"{path.name}: no .npy file of numbers ({_words(error)})") from error
+    begin, wanted = file.tell(), dtype.itemsize * math.prod(shape)
+    if dtype.kind not in "buif" or not math.prod(shape):
+        raise OptionError(f"{path.name}: {dtype} of shape {shape}; expected numbers")
+    if len(content) - begin != wanted:
+        raise OptionError(
+            f"{path.name}: {len(content) - begin} bytes of numbers; expected the {wanted} of {dtype} of shape {shape}"
+        )
+    return np.frombuffer(content, dtype, offset=begin).reshape(shape, order="F" if turned else "C")
 
 
 def read_intrinsics(words: Sequence[str], shape: tuple[int, int]) -> CameraIntrinsics:
@@ -97,13 +138,13 @@ def read_intrinsics(words: Sequence[str], shape: tuple[int, int]) -> CameraIntri
     """
     named = _intrinsics_from_file(Path(words[0])) if len(words) == 1 else _name_numbers(words)
     for name, size in (("height", shape[0]), ("width", shape[1])):
-        if int(named.get(name, size)) != size:
-            raise OptionError(f"intrinsics: {name} {named[name]}, the depth image has {size}")
+        if named.get(name, size) not in (size, str(size)):
+            raise OptionError(f"intrinsics: {name} {str(named[name])[:40]}, the depth image has {size}")
     try:
         values = {name: float(named[name]) for name in ("fx", "fy", "cx", "cy")}
         distortion = np.array(named.get("distortion", []), dtype=float)
         model = str(named.get("distortion_model") or PLUMB_BOB)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise OptionError(f"intrinsics: {error!r} is missing or no number; expected {INTRINSICS_FORMS}") from None
     return CameraIntrinsics(width=shape[1], height=shape[0], **values, distortion=distortion, model=model)
 
@@ -144,7 +185,8 @@ def _find_list(named: Mapping[str, Any], names: Sequence[str]) -> list | None:
         value = named.get(name)
         value = value.get("data") if isinstance(value, Mapping) else value
         if isinstance(value, list):
-            return list(np.ravel(value))
+            rows = [row if isinstance(row, list) else [row] for row in value]
+            return [number for row in rows for number in row]
     return None
 
 
@@ -167,7 +209,7 @@ def read_generated_pose(path: Path | str) -> NDArray:
         return affine_from_generator(*parts, mesh_axes=content.get("axes", "glb"))
     except PoseError:
         raise
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise OptionError(f"{path.name}: {error!r}; expected {POSE_FORMS}") from None
 
 

@@ -1,10 +1,14 @@
+import io
 import json
+import struct
+import zlib
 
 import numpy as np
 import pytest
 from contact_fakes import bare_mesh, distance_mm, make_case
 from PIL import Image
 
+from finforce.errors import FinforceError
 from finforce.optional import import_trimesh
 from finforce_contact.mesh.object_mesh import load_object_mesh, read_triangles
 from finforce_eval.cli.main import main
@@ -181,3 +185,94 @@ def test_generated_mesh_may_be_in_any_unit(files):
     (files / "pose.json").write_text(json.dumps(affine.tolist()))
     assert run(files) == 0
     assert np.ptp(load_object_mesh(files / "out.stl").vertices, axis=0).max() == pytest.approx(0.1, abs=2e-3)
+
+
+def header_of(shape, kind="<f4"):
+    """An .npy file that says it holds an array, and holds eight bytes."""
+    text = repr({"descr": kind, "fortran_order": False, "shape": shape}).encode()
+    text += b" " * (-(len(text) + 11) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(8)
+
+
+def zipped():
+    file = io.BytesIO()
+    np.savez(file, a=np.ones((4, 4)))
+    return file.getvalue()
+
+
+def png_of(width, height):
+    """The head of a PNG of any size."""
+    head = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    chunk = b"IHDR" + head
+    data = struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return b"\x89PNG\r\n\x1a\n" + data + struct.pack(">I", 1000) + b"IDAT" + bytes(60)
+
+
+FILES = {
+    "depth.npy": [
+        b"",
+        b"\x93NUMPY",
+        header_of((10**6, 10**6)),
+        header_of((10**18, 10**18)),
+        header_of((0, 5)),
+        header_of((-1, 5)),
+        header_of(("a", 5)),
+        header_of((2, 1), "|O"),
+        header_of((1,), "<U2"),
+        zipped(),
+        b"no array",
+    ],
+    "depth.png": [
+        b"",
+        b"\x89PNG\r\n\x1a\n",
+        png_of(100_000, 100_000),
+        png_of(0, 5),
+        png_of(640, 480),
+        b"GIF89a" + bytes(9),
+    ],
+    "camera.yaml": [
+        b"fx: [1, [2]]\nfy: 1\ncx: 1\ncy: 1\n",
+        b"fx: a\nfy: 1\ncx: 1\ncy: 1\n",
+        b"fx: .inf\nfy: 1\ncx: 1\ncy: 1\n",
+        b"fx: 1.0e+308\nfy: 1\ncx: 1\ncy: 1\nwidth: .inf\n",
+        b"fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: wide\n",
+        b"K: [1, 2, [3], 4, 5, 6, 7, 8, 9]\n",
+        b"K: [[1, 0], [0]]\n",
+        b"fx: 1\nfy: 1\ncx: 1\ncy: 1\ndistortion: [1, [2, 3], x]\n",
+        b"\xff\xfe",
+        b"- 1\n",
+    ],
+    "pose.json": [
+        b"",
+        b"[[[[",
+        b"[" * 100_000,
+        b"3",
+        b'"matrix"',
+        b'{"matrix": [[1, 2], [3]]}',
+        b'{"matrix": 1e999}',
+        b'{"rotation": 1}',
+    ],
+}
+
+
+@pytest.mark.parametrize(("name", "number"), [(name, n) for name, each in FILES.items() for n in range(len(each))])
+def test_a_file_that_lies_or_is_damaged_ends_with_one_line(name, number, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(FILES[name][number])
+    readers = {
+        "depth.npy": read_depth,
+        "depth.png": read_depth,
+        "camera.yaml": lambda path: read_intrinsics([str(path)], (480, 640)),
+        "pose.json": read_generated_pose,
+    }
+    with pytest.raises(FinforceError):
+        readers[name](path)
+    if name.startswith("depth"):
+        with pytest.raises(FinforceError):
+            read_mask(path)
+
+
+def test_a_picture_of_unknown_ending_is_refused_before_anything_is_read(files, capsys):
+    with pytest.raises(SystemExit):
+        run(files, "--picture", "x.foo")
+    assert "expected a name that ends in .png" in capsys.readouterr().err
