@@ -70,6 +70,9 @@ class Keypoints(NamedTuple):
     stddev: NDArray[np.float64] | None
 
 
+_LARGEST_POINT = 1 << 16  # bytes
+
+
 @lru_cache(maxsize=64)
 def _layout(entries: tuple[tuple[str, int, int, int], ...], point_step: int, big_endian: bool) -> np.dtype:
     """Build the structured dtype of one point; `entries` are (name, offset, datatype, count)."""
@@ -79,7 +82,7 @@ def _layout(entries: tuple[tuple[str, int, int, int], ...], point_step: int, big
         if datatype not in DATATYPES:
             raise ObservationError(f"field '{name}' has the unknown datatype {datatype}; expected 1 to 8")
         scalar = np.dtype(order + DATATYPES[datatype])
-        if offset + scalar.itemsize * max(count, 1) > point_step:
+        if offset < 0 or offset + scalar.itemsize * max(count, 1) > point_step:
             raise ObservationError(f"field '{name}' at offset {offset} leaves a point of {point_step} bytes")
         names.append(name)
         formats.append(scalar if count <= 1 else (scalar, (count,)))
@@ -135,10 +138,13 @@ def decode_cloud(
         ObservationError: a field is missing or leaves the point, or the buffer is too short.
     """
     points = int(width) * int(height)
+    if min(width, height) < 0 or not 0 <= point_step <= _LARGEST_POINT:
+        raise ObservationError(f"{height} rows of {width} points of {point_step} bytes; expected a cloud")
     if points == 0:
         return {name: np.empty(0) for name in names}
-    layout = _layout(_wanted(fields, names, optional), int(point_step), bool(is_bigendian))
+    wanted = _wanted(fields, names, optional)
     rows = _rows(data, int(width), int(height), int(point_step), int(row_step))
+    layout = _layout(wanted, int(point_step), bool(is_bigendian))
     table = rows.view(layout).reshape(points)
     return {
         name: np.ascontiguousarray(table[name], dtype=table[name].dtype.newbyteorder("="))
@@ -238,11 +244,11 @@ def decode_columns(cloud: Any, names: Sequence[str], optional: Sequence[str] = (
     """Return the named columns of any object with the attributes of PointCloud2; see `decode_cloud`.
 
     Raises:
-        ObservationError: a field is missing or leaves the point, or the buffer is too short.
+        ObservationError: a field is missing, leaves the point or has several elements, or the buffer is too short.
     """
     if isinstance(cloud, CloudColumns):
         return cloud.pick(names, optional)
-    return decode_cloud(
+    columns = decode_cloud(
         cloud.fields,
         cloud.data,
         width=cloud.width,
@@ -253,6 +259,10 @@ def decode_columns(cloud: Any, names: Sequence[str], optional: Sequence[str] = (
         names=names,
         optional=optional,
     )
+    several = next((name for name, column in columns.items() if column.ndim != 1), None)
+    if several is not None:
+        raise ObservationError(f"field '{several}' has {columns[several].shape[1]} numbers a point; expected count 1")
+    return columns
 
 
 def decode_keypoints(cloud: Any) -> Keypoints:
