@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from finforce.optional import import_open3d, import_trimesh
 from finforce_contact.errors import ObjectMeshError, to_floats
+from finforce_contact.mesh.glb_check import check_glb
 from finforce_contact.mesh.repair import crosses_itself, repair
 from finforce_contact.mesh.triangles import (
     ObjectMesh,
@@ -74,6 +75,8 @@ def read_triangles(path: Path | str) -> tuple[NDArray, NDArray]:
     if size == 0 or size > FILE_BOUND:
         raise ObjectMeshError(f"{path.name}: got {size} bytes, expected 1 to {FILE_BOUND}; export it again")
     trimesh = import_trimesh()
+    if path.suffix.lower() == ".glb":
+        check_glb(path)
     try:
         mesh = trimesh.load_scene(path, process=False, skip_materials=True).to_mesh()
     except Exception as error:  # a broken file makes the readers stumble over anything
