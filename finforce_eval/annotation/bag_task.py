@@ -15,6 +15,7 @@ from finforce_eval.annotation.bag import ForceMessages, new_folder, write_annota
 from finforce_eval.annotation.forces import JawForces, combine_forces, estimate_forces
 from finforce_eval.annotation.options import describe_options, sides_of
 from finforce_eval.engine.tasks import OK, Task, hash_settings
+from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import EvaluationSetup, make_setup, version
 from finforce_eval.recordings.bags import bag_source
@@ -28,11 +29,13 @@ NOTE = "annotation.json"
 def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace) -> Task:
     """Return the task of annotating a bag; nothing of it is read yet but its place.
 
-    Raises:
-        RecordingError: there is no such recording.
+    Where there is no such recording, it is the task that says so.
     """
-    found = bag_source(source)
-    files = [found] if found.is_file() else [path for path in found.iterdir() if path.is_file()]
+    try:
+        found = bag_source(source)
+        files = [found] if found.is_file() else [path for path in found.iterdir() if path.is_file()]
+    except (RecordingError, OSError):
+        files = []
     key = hash_settings(describe_options(options), files)
     given = {"source": str(source), "target": str(target), "options": vars(options) | {"run": None}, "key": key}
     return Task(name=name, key=key, work=annotate_bag, given=given)

@@ -175,6 +175,15 @@ def test_a_bad_recording_costs_itself_only_and_a_second_run_does_what_is_left(so
     assert [line["name"] for line in lines_of(out)] == [source.name]
 
 
+def test_a_recording_that_is_not_there_costs_itself_only(source, tmp_path, capsys):
+    assert annotate(tmp_path / "out", tmp_path / "nothing", source) == 2
+    assert "nothing: no such recording" in capsys.readouterr().err
+    assert {line["name"]: line["status"] for line in lines_of(tmp_path / "out")} == {
+        "nothing": "failed",
+        source.name: "ok",
+    }
+
+
 def test_a_full_disk_leaves_nothing(source, tmp_path, monkeypatch, capsys):
     def refuse(*_, **__):
         raise OSError(28, "No space left on device")
