@@ -225,7 +225,7 @@ def test_steel_measurement_is_converted(tmp_path, capsys):
     assert (tmp_path / "steel" / "metadata.yaml").exists()
     assert_refused(capsys_cleared(capsys), ["convert-steel", tmp_path / "steel"], "exists already")
     (tmp_path / "bad.json").write_text("{")
-    assert_refused(capsys, ["convert-steel", tmp_path / "x", "--source", tmp_path / "bad.json"], "not JSON")
+    assert_refused(capsys, ["convert-steel", tmp_path / "x", "--source", tmp_path / "bad.json"], "no valid JSON")
 
 
 def capsys_cleared(capsys):
