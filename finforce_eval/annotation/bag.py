@@ -17,7 +17,7 @@ from finforce.errors import FinforceError
 from finforce.messages import read_stamp
 from finforce_eval.annotation.forces import GraspForces, JawForces
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.bags import BagReader, open_bag
+from finforce_eval.recordings.bags import NO_DIGEST, BagReader, open_bag
 from finforce_eval.recordings.recording import CLOUD, WRENCH
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import MARKERS, Entry, MessageFactory
@@ -25,8 +25,6 @@ from finforce_eval.recordings.writer import MARKERS, Entry, MessageFactory
 STATUS = "diagnostic_msgs/msg/DiagnosticArray"
 GRIPPER_FRAME = "gripper_base"
 _OK, _WARN = 0, 1
-# Of a type that was recorded without its definition nothing is known but its name.
-_NO_DIGEST = "RIHS01_" + 64 * "0"
 
 
 class ForceMessages:
@@ -168,7 +166,7 @@ def _copy_connection(writer: Any, connection: Any) -> Any:
         connection.topic,
         connection.msgtype,
         msgdef=connection.msgdef.data or "",
-        rihs01=connection.digest or _NO_DIGEST,
+        rihs01=connection.digest or NO_DIGEST,
         serialization_format=connection.ext.serialization_format,
         offered_qos_profiles=connection.ext.offered_qos_profiles,
     )

@@ -13,8 +13,8 @@ import numpy as np
 
 from finforce_eval.annotation.bag import ForceMessages, new_folder, write_annotated
 from finforce_eval.annotation.forces import JawForces, combine_forces, estimate_forces
-from finforce_eval.annotation.options import describe_options, sides_of
-from finforce_eval.engine.tasks import OK, Task, hash_settings
+from finforce_eval.annotation.options import sides_of
+from finforce_eval.engine.tasks import OK, Task, hash_settings, make_line
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import EvaluationSetup, make_setup, version
@@ -26,17 +26,17 @@ from finforce_eval.recordings.tracks import Recording
 NOTE = "annotation.json"
 
 
-def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace) -> Task:
+def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace, settings: Mapping[str, Any]) -> Task:
     """Return the task of annotating a bag; nothing of it is read yet but its place.
 
-    Where there is no such recording, it is the task that says so.
+    `settings` are what `describe_options` says of the options. Where there is no such recording, the task says so.
     """
     try:
         found = bag_source(source)
         files = [found] if found.is_file() else [path for path in found.iterdir() if path.is_file()]
     except (RecordingError, OSError):
         files = []
-    key = hash_settings(describe_options(options), files)
+    key = hash_settings(settings, files)
     given = {"source": str(source), "target": str(target), "options": vars(options) | {"run": None}, "key": key}
     return Task(name=name, key=key, work=annotate_bag, given=given)
 
@@ -100,5 +100,4 @@ def ended_before(task: Task) -> dict[str, Any] | None:
         return None
     if not isinstance(note, dict) or note.get("key") != task.key:
         return None
-    figures = note.get("figures", {})
-    return {"name": task.name, "key": task.key, "status": OK, "error": "", "figures": figures, "seconds": 0.0}
+    return make_line(task, figures=note.get("figures"))

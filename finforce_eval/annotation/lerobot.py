@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from finforce_eval.annotation.lerobot_layout import (
     read_table,
 )
 from finforce_eval.annotation.options import describe_options, sides_of
-from finforce_eval.engine.tasks import OK, Task, hash_settings
+from finforce_eval.engine.tasks import Task, hash_settings, make_line
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import make_setup
@@ -55,13 +56,13 @@ def episode_tasks(folder: Path, parts: Path, options: argparse.Namespace) -> lis
     dataset = open_dataset(folder, options.images)
     image_size(dataset)
     settings = describe_options(options)
-    given = {"folder": str(folder), "options": vars(options) | {"run": None}}
+    given = {"dataset": replace(dataset, episodes=()), "options": vars(options) | {"run": None}}
     tasks = []
     for episode in dataset.episodes:
         files = [path for path in (episode.video, episode.data) if path is not None and path.is_file()]
         target = part_of(parts, episode.index)
         key = hash_settings(settings | {"episode": episode.index}, files)
-        work = {**given, "index": episode.index, "target": str(target), "key": key}
+        work = {**given, "episode": episode, "target": str(target), "key": key}
         tasks.append(Task(name=f"{dataset.name}/{target.stem}", key=key, work=annotate_episode, given=work))
     return tasks
 
@@ -83,12 +84,14 @@ def image_size(dataset: Dataset) -> tuple[int, int]:
     return (shape[1], shape[2]) if shape[0] == 3 else (shape[0], shape[1])
 
 
-def annotate_episode(folder: str, index: int, target: str, options: Mapping[str, Any], key: str) -> dict[str, Any]:
+def annotate_episode(
+    dataset: Dataset, episode: Episode, target: str, options: Mapping[str, Any], key: str
+) -> dict[str, Any]:
     """Find the forces of one episode, write them and return figures.
 
     Args:
-        folder: of the dataset.
-        index: of the episode.
+        dataset: as described; its other episodes are not needed.
+        episode: of it.
         target: file of the forces.
         options: of the command `annotate`.
         key: of the task, which is kept beside the forces.
@@ -96,10 +99,7 @@ def annotate_episode(folder: str, index: int, target: str, options: Mapping[str,
     Raises:
         FinforceError: its pictures cannot be read, or the jaw not be used.
     """
-    chosen = argparse.Namespace(**options)
-    dataset = open_dataset(Path(folder), chosen.images)
-    episode = next(each for each in dataset.episodes if each.index == index)
-    columns = _find_forces(dataset, episode, chosen)
+    columns = _find_forces(dataset, episode, argparse.Namespace(**options))
     path = Path(target)
     part = path.with_suffix(f".{os.getpid()}.part")
     try:
@@ -121,7 +121,7 @@ def ended_before(task: Task) -> dict[str, Any] | None:
         return None
     if str(columns.pop("key", "")) != task.key:
         return None
-    return {"name": task.name, "key": task.key, "status": OK, "error": "", "figures": {}, "seconds": 0.0}
+    return make_line(task)
 
 
 def read_part(path: Path) -> Columns:

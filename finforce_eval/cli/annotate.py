@@ -15,7 +15,8 @@ from finforce_eval.annotation.bag_task import ended_before as bag_ended_before
 from finforce_eval.annotation.lerobot import ended_before as episode_ended_before
 from finforce_eval.annotation.lerobot import episode_tasks, write_dataset
 from finforce_eval.annotation.lerobot_layout import is_dataset
-from finforce_eval.cli.parser import add_engine_options, add_jaw_options, add_set, add_source_options
+from finforce_eval.annotation.options import describe_options
+from finforce_eval.cli.parser import add_calibration, add_engine_options, add_jaw_options, add_set, add_source_options
 from finforce_eval.engine.engines import EngineOptions, run_tasks
 from finforce_eval.engine.tasks import OK, Manifest, choose_shard
 from finforce_eval.errors import OptionError
@@ -41,8 +42,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--prefix", default="observation", metavar="NAME", help=text)
     add_jaw_options(parser)
     add_source_options(parser)
-    calibration = "calibration file, or a shipped name; without it the jaw file's own material"
-    parser.add_argument("--calibration", metavar="FILE", help=calibration)
+    add_calibration(parser)
     add_set(parser)
     add_engine_options(parser)
 
@@ -90,8 +90,8 @@ def _run_bags(
     named: Sequence[tuple[str, Path]], options: argparse.Namespace, manifest: Manifest
 ) -> list[dict[str, Any]]:
     """Annotate bags and say what became of each."""
-    out = Path(options.out)
-    tasks = choose_shard([bag_task(name, path, out / name, options) for name, path in named], options.shard)
+    out, settings = Path(options.out), describe_options(options)
+    tasks = [bag_task(name, path, out / name, options, settings) for name, path in choose_shard(named, options.shard)]
     lines = run_tasks(tasks, _engine(options), manifest, bag_ended_before)
     for line in lines:
         _say(line)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from finforce_eval.cli.parser import add_jaw_options, add_set, add_source_options
+from finforce_eval.cli.parser import add_calibration, add_jaw_options, add_set, add_source_options
 from finforce_eval.evaluation.machine import write_json
 from finforce_eval.evaluation.setup import evaluate_all, make_setup, read_keypoints
 from finforce_eval.evaluation.tables import evaluation_json, format_table
@@ -15,8 +15,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bags", nargs="+", metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
     add_jaw_options(parser)
     add_source_options(parser)
-    calibration = "calibration file, or a shipped name; without it the jaw file's own material"
-    parser.add_argument("--calibration", metavar="FILE", help=calibration)
+    add_calibration(parser)
     add_set(parser)
     parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
     parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")

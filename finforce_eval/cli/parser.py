@@ -56,6 +56,12 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--extrinsics", metavar="POSE", help=text)
 
 
+def add_calibration(parser: argparse.ArgumentParser) -> None:
+    """Add what names the calibration."""
+    text = "calibration file, or a shipped name; without it the jaw file's own material"
+    parser.add_argument("--calibration", metavar="FILE", help=text)
+
+
 def add_set(parser: argparse.ArgumentParser) -> None:
     """Add changes of single settings."""
     text = "change a setting of the estimator, may be repeated; an unknown NAME lists them"
@@ -64,8 +70,9 @@ def add_set(parser: argparse.ArgumentParser) -> None:
 
 def add_engine_options(parser: argparse.ArgumentParser) -> None:
     """Add what says how many recordings are worked at, and where."""
-    engines = ("sequential", "processes", "ray")
-    parser.add_argument("--engine", default="sequential", choices=engines, help="how recordings are worked at")
+    from finforce_eval.engine.engines import ENGINES
+
+    parser.add_argument("--engine", default=ENGINES[0], choices=ENGINES, help="how recordings are worked at")
     text = "recordings at once; without it one for each processor"
     parser.add_argument("--workers", type=int, default=0, metavar="N", help=text)
     text = "of a task in processes [GB]; 0: any (4)"

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from finforce_eval.annotation.forces import combine_forces, estimate_forces
-from finforce_eval.cli.parser import add_jaw_options, add_set, add_source_options
+from finforce_eval.cli.parser import add_calibration, add_jaw_options, add_set, add_source_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_eval.recordings.tracks import JAWS
@@ -21,8 +21,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jaws", choices=(*JAWS, "both"), help=text)
     add_jaw_options(parser)
     add_source_options(parser)
-    calibration = "calibration file, or a shipped name; without it the jaw file's own material"
-    parser.add_argument("--calibration", metavar="FILE", help=calibration)
+    add_calibration(parser)
     add_set(parser)
 
 

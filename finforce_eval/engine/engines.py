@@ -8,7 +8,7 @@ from typing import Any
 
 from finforce.errors import FinforceError
 from finforce.optional import import_library
-from finforce_eval.engine.tasks import FAILED, OK, Manifest, Task, run_task
+from finforce_eval.engine.tasks import FAILED, OK, Manifest, Task, make_line, run_task
 from finforce_eval.errors import OptionError
 
 SEQUENTIAL, PROCESSES, RAY = ENGINES = ("sequential", "processes", "ray")
@@ -120,8 +120,7 @@ def _run_in_processes(tasks: Sequence[Task], options: EngineOptions) -> Iterator
 
 def _died(task: Task) -> Line:
     """Return the line of a task whose process ended without a word."""
-    error = "the process that was at it died: out of memory, or killed"
-    return {"name": task.name, "key": task.key, "status": FAILED, "error": error, "figures": {}, "seconds": 0.0}
+    return make_line(task, error="the process that was at it died: out of memory, or killed")
 
 
 def _limit_memory(gigabytes: float) -> None:

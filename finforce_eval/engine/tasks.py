@@ -41,14 +41,26 @@ class Task:
 def run_task(task: Task) -> dict[str, Any]:
     """Return the line of the manifest for a task that is carried out here; whatever it raises is its own failure."""
     began = perf_counter()
-    line = {"name": task.name, "key": task.key, "status": OK, "error": "", "figures": {}}
     try:
-        line["figures"] = without_nan(dict(task.work(**task.given)))
+        line = make_line(task, figures=without_nan(dict(task.work(**task.given))))
     except (FinforceError, OSError, MemoryError) as error:
-        line |= {"status": FAILED, "error": _words(error)}
+        line = make_line(task, error=_words(error))
     except Exception as error:  # what nobody foresaw costs this recording alone
-        line |= {"status": FAILED, "error": f"{type(error).__name__}: {_words(error)}"}
-    return {**line, "seconds": round(perf_counter() - began, 3)}
+        line = make_line(task, error=f"{type(error).__name__}: {_words(error)}")
+    return line | {"seconds": round(perf_counter() - began, 3)}
+
+
+def make_line(task: Task, *, figures: Mapping[str, Any] | None = None, error: str = "") -> dict[str, Any]:
+    """Return the line of the manifest for a task that has ended; it has failed where there is an error."""
+    status = FAILED if error else OK
+    return {
+        "name": task.name,
+        "key": task.key,
+        "status": status,
+        "error": error,
+        "figures": dict(figures or {}),
+        "seconds": 0.0,
+    }
 
 
 def _words(error: BaseException) -> str:

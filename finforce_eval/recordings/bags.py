@@ -12,6 +12,9 @@ from finforce.errors import FinforceError, MissingDependencyError
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
 
+# Of a type that was recorded without its definition nothing is known but its name.
+NO_DIGEST = "RIHS01_" + 64 * "0"
+
 
 class BagMessage(NamedTuple):
     """A message and the time [ns] at which the bag received it."""

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 from finforce.errors import MissingDependencyError
 from finforce.optional import import_library
 from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.bags import open_bag
+from finforce_eval.recordings.bags import NO_DIGEST, open_bag
 
 # No record of an mcap file is longer [bytes]: chunks have megabytes, an uncompressed 4K image 25.
 _LONGEST = 1 << 30
@@ -26,7 +26,6 @@ _PIECE = 1 << 12
 # Of an SQLite file: size of a page, and their number. Messages that may share a page; zeros that end a torn one.
 _SQLITE_HEAD, _NEIGHBOURS, _ENDING = struct.Struct(">16xH10xI"), 8, 256
 _LARGEST_BASE = 1 << 42
-_NO_DIGEST = "RIHS01_" + 64 * "0"
 
 
 class _Message(NamedTuple):
@@ -80,7 +79,7 @@ def _copy_good_part(source: Path, target: Path, reason: str) -> tuple[int, float
                 key = (message.topic, message.msgtype)
                 if key not in connections:
                     connections[key] = writer.add_connection(
-                        message.topic, message.msgtype, msgdef=message.definition, rihs01=_NO_DIGEST
+                        message.topic, message.msgtype, msgdef=message.definition, rihs01=NO_DIGEST
                     )
                 writer.write(connections[key], message.time, message.data)
                 times.append(message.time)
