@@ -37,7 +37,7 @@ from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import Phase
 from finforce_eval.bench.bench import row_from_times
-from finforce_eval.evaluation.machine import describe_machine, write_figures
+from finforce_eval.machine import describe_machine, write_figures
 
 STARTED = 10.0  # [s] that the emulator may take
 

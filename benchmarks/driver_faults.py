@@ -37,7 +37,7 @@ from finforce_driver.machine.machine import INHERITED
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_driver.units import GripperScale
-from finforce_eval.evaluation.machine import describe_machine, write_figures
+from finforce_eval.machine import describe_machine, write_figures
 
 PER_RUN = 100
 PERIOD = 0.4  # [s] in which one fault is injected

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_eval.evaluation.machine import describe_machine, write_figures
+from finforce_eval.machine import describe_machine, write_figures
 from finforce_ifea.contact_mechanics.indenter import RoundIndenter
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw

@@ -24,10 +24,10 @@ import numpy as np
 from tqdm import tqdm
 
 from finforce_driver.grasp.settings import GraspPhase
-from finforce_eval.evaluation.machine import describe_machine, write_figures
 from finforce_eval.experiments.grasp_sensors import EstimatorSensor, build_plant
 from finforce_eval.experiments.grasp_world import GraspCase, GraspTrace, NoisySensor, Plant, World, build_spring
 from finforce_eval.figures.figures import BLACK, BLUE, GREY, ORANGE, new_figure, style_axes
+from finforce_eval.machine import describe_machine, write_figures
 from finforce_twin.gripper.pressing import PressedGrasp
 from finforce_twin.scenes.scenarios import build_scenario
 

@@ -39,8 +39,8 @@ from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import hold_force
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
 from finforce_driver.state import GripperState, MoveOutcome, Phase
-from finforce_eval.evaluation.machine import describe_machine, write_figures
 from finforce_eval.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
+from finforce_eval.machine import describe_machine, write_figures
 
 LIMIT = GraspSettings().force_limit  # [N]
 FAULTS_FROM, PERIOD, MOST = 1.2, 0.5, 6  # [s], [s], faults of the line and the gripper

@@ -19,7 +19,7 @@ from finforce.errors import FinforceError
 from finforce_eval.bench.detection import time_product
 from finforce_eval.bench.scenes import FIRST_SEED, UNSEEN, record_unseen
 from finforce_eval.cli.main import main as finforce
-from finforce_eval.evaluation.machine import write_figures
+from finforce_eval.machine import write_figures
 
 SOURCES = ("images", "truth")
 COLUMNS = (

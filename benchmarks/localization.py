@@ -9,7 +9,7 @@ other recordings the meshes are their own.
 import argparse
 
 from finforce_eval.bench.localization import as_json, draw, format_table, measure, measure_methods
-from finforce_eval.evaluation.machine import write_figures
+from finforce_eval.machine import write_figures
 
 
 def main() -> None:

@@ -27,7 +27,7 @@ from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.pose.source import ObjectPose
 from finforce_contact.pose.tracker import PoseTracker
-from finforce_eval.evaluation.machine import write_figures
+from finforce_eval.machine import write_figures
 from finforce_twin.rendering.depth_camera import build_d405
 from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
 from finforce_twin.scenes.pose_sequences import Motion, SequenceImage, render_sequence

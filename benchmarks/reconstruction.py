@@ -27,7 +27,7 @@ from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_contact.reconstruction.paper_alignment import scale_coarsely
 from finforce_contact.reconstruction.reconstruction import METHODS, reconstruct
 from finforce_contact.reconstruction.result import GeneratedMesh
-from finforce_eval.evaluation.machine import write_figures
+from finforce_eval.machine import write_figures
 from finforce_twin.rendering.depth_camera import build_d405
 from finforce_twin.scenes.guesses import GuessError, draw_guess, place_mesh
 from finforce_twin.scenes.objects import OBJECT_NAMES, build_object

@@ -9,7 +9,7 @@ should run meanwhile; the table says what did.
 import argparse
 
 from finforce_eval.bench.skipping import EACH, SETTINGS, as_json, draw, format_each, format_table, measure
-from finforce_eval.evaluation.machine import write_figures
+from finforce_eval.machine import write_figures
 
 
 def main() -> None:

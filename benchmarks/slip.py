@@ -26,9 +26,9 @@ from finforce_contact.mesh.views import MeshView
 from finforce_contact.pose.tracker import PoseTracker
 from finforce_contact.settings import ContactSettings
 from finforce_eval.evaluation.keypoint_source import build_records
-from finforce_eval.evaluation.machine import write_json
 from finforce_eval.experiments.grasp_sensors import observe_found
 from finforce_eval.experiments.tracked_poses import find_pose
+from finforce_eval.machine import write_json
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.settings import EstimatorSettings

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from finforce_eval.bench.cases import HEIGHTS, TRUTH
-from finforce_eval.evaluation.machine import write_figures
 from finforce_eval.evaluation.tables import align_rows
+from finforce_eval.machine import write_figures
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.calibration import load_calibration

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from finforce_eval.evaluation.evaluate import evaluate_recording
-from finforce_eval.evaluation.machine import write_figures
 from finforce_eval.evaluation.places import InnerSurface
 from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
+from finforce_eval.machine import write_figures
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.face import FaceLine

@@ -1,6 +1,17 @@
 """What tests of several packages are given."""
 
+import sys
+
 import pytest
+
+
+@pytest.fixture(autouse=True)
+def nothing_kept_warm():
+    """Estimators that the tasks of a process share are a test's own."""
+    yield
+    warm = sys.modules.get("finforce_eval.evaluation.warm")
+    if warm is not None:
+        warm.close_warm()
 
 
 @pytest.fixture

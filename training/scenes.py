@@ -8,6 +8,7 @@ from the real one's place: its image is the rectified picture.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,10 +17,12 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.optional import import_cv2
+from finforce_eval.cli.parser import add_engine_options, read_engine
+from finforce_eval.engine.engines import EngineOptions
+from finforce_eval.engine.tasks import Task, choose_shard
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.geometry.template import MARK_RADIUS, SideShape, draw_template, fit_grid
 from finforce_twin.rendering.bodies import build_box
@@ -30,6 +33,7 @@ from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
 from training.arguments import one_line_errors
 from training.dataset import MARGIN, TRAIN, VALIDATION, FingerPictures, save_shard
 from training.fingers import BentFinger, Finger, draw_finger, outline
+from training.making import make_all
 
 SEED = 40_000_000_000  # of training's fingers begin here
 STATES = 8  # pictures of a finger
@@ -395,14 +399,27 @@ def _fill_square(image: NDArray) -> NDArray:
     return import_cv2().resize(np.ascontiguousarray(image), (384, 384), interpolation=import_cv2().INTER_AREA)
 
 
-def make_shards(seeds: range, folder: Path, name: str, fingers: int = 32) -> None:
-    """Render the pictures of fingers and write them as `NAME_SEED.npz`, several fingers a file."""
-    waiting: list[FingerPictures] = []
-    for seed in tqdm(seeds, desc=name, unit="finger", disable=None, smoothing=0.0):
-        waiting.append(FingerScenes(seed).draw())
-        if len(waiting) == fingers or seed == seeds[-1]:
-            save_shard(folder / f"{name}_{seed:09d}.npz", FingerPictures.join(waiting))
-            waiting = []
+def write_shard(seeds: Sequence[int], path: str) -> dict[str, int]:
+    """Write the pictures of the fingers with these seeds as one file and return how many fingers they are."""
+    save_shard(Path(path), FingerPictures.join([FingerScenes(seed).draw() for seed in seeds]))
+    return {"fingers": len(seeds)}
+
+
+def make_shards(
+    seeds: range, folder: Path, name: str, engine: EngineOptions, shard: str = "", fingers: int = 32
+) -> None:
+    """Render the pictures of fingers and write them as `NAME_SEED.npz`, several fingers a file.
+
+    Raises:
+        DatasetError: one could not be made or written.
+    """
+    parts = [seeds[begin : begin + fingers] for begin in range(0, len(seeds), fingers)]
+    tasks = []
+    for part in choose_shard(parts, shard):
+        path = str(folder / f"{name}_{part[-1]:09d}.npz")
+        given = {"seeds": list(part), "path": path}
+        tasks.append(Task(name=Path(path).stem, key=str(part), work=write_shard, given=given, output=path))
+    make_all(tasks, engine, folder, shard, "file")
 
 
 def main() -> None:
@@ -412,13 +429,14 @@ def main() -> None:
     parser.add_argument("--fingers", type=int, default=1500, help="for training (1500), 8 pictures each")
     parser.add_argument("--validation", type=int, default=100, help="fingers for validation (100)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first finger, to share the work (0)")
+    add_engine_options(parser)
     options = parser.parse_args()
     with one_line_errors():
-        options.folder.mkdir(parents=True, exist_ok=True)
+        engine = read_engine(options)
         for name, first, count in ((VALIDATION, 10_000_000, options.validation), (TRAIN, 0, options.fingers)):
             if count:
                 start = first + options.first
-                make_shards(range(start, start + count), options.folder, name)
+                make_shards(range(start, start + count), options.folder, name, engine, options.shard)
 
 
 if __name__ == "__main__":

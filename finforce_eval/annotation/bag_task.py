@@ -13,12 +13,13 @@ import numpy as np
 
 from finforce_eval.annotation.bag import ForceMessages, new_folder, write_annotated
 from finforce_eval.annotation.forces import JawForces, combine_forces, estimate_forces
-from finforce_eval.annotation.options import sides_of
+from finforce_eval.engine.settings import sides_of
 from finforce_eval.engine.tasks import OK, Task, hash_settings, make_line
-from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import EvaluationSetup, make_setup, version
-from finforce_eval.recordings.bags import bag_source
+from finforce_eval.evaluation.setup import EvaluationSetup
+from finforce_eval.evaluation.warm import open_warm
+from finforce_eval.machine import version
+from finforce_eval.recordings.bags import bag_source, list_files
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.salvage import sound_source
 from finforce_eval.recordings.tracks import Recording
@@ -31,23 +32,25 @@ def bag_task(name: str, source: Path, target: Path, options: argparse.Namespace,
 
     `settings` are what `describe_options` says of the options. Where there is no such recording, the task says so.
     """
-    try:
-        found = bag_source(source)
-        files = [found] if found.is_file() else [path for path in found.iterdir() if path.is_file()]
-    except (RecordingError, OSError):
-        files = []
-    key = hash_settings(settings, files)
-    given = {"source": str(source), "target": str(target), "options": vars(options) | {"run": None}, "key": key}
-    return Task(name=name, key=key, work=annotate_bag, given=given)
+    key = hash_settings(settings, list_files(source))
+    given = {
+        "source": str(source),
+        "target": str(target),
+        "options": vars(options) | {"run": None},
+        "settings": hash_settings(settings),
+        "key": key,
+    }
+    return Task(name=name, key=key, work=annotate_bag, given=given, output=str(target))
 
 
-def annotate_bag(source: str, target: str, options: Mapping[str, Any], key: str) -> dict[str, Any]:
+def annotate_bag(source: str, target: str, options: Mapping[str, Any], settings: str, key: str) -> dict[str, Any]:
     """Write a recording with forces and return figures of it.
 
     Args:
         source: rosbag2 folder, .mcap or .db3 file.
         target: the new folder.
         options: of the command `annotate`.
+        settings: hash of them and of the files that they name.
         key: of the task, which is kept beside what was written.
 
     Raises:
@@ -55,15 +58,15 @@ def annotate_bag(source: str, target: str, options: Mapping[str, Any], key: str)
         OSError: the folder cannot be written.
     """
     chosen = argparse.Namespace(**options)
-    setup, keypoints = make_setup(chosen), parse_source(chosen)
+    warm, keypoints = open_warm(settings, chosen), parse_source(chosen)
     with sound_source(bag_source(Path(source))) as (sound, damage):
         recording = read_recording(sound, keypoints.pairing, sides_of(chosen))
         recording = replace(recording, name=Path(source).stem)
         recording = keypoints.apply(recording)
-        jaws = estimate_forces(recording, setup)
+        jaws = estimate_forces(recording, warm.setup, build=warm.estimator)
         grasp = combine_forces(recording, jaws)
         figures = _figures(recording, jaws, [*damage, *recording.notes])
-        note = {"key": key, "status": OK, "figures": figures, "settings": _settings(setup), "version": version()}
+        note = {"key": key, "status": OK, "figures": figures, "settings": _settings(warm.setup), "version": version()}
         with new_folder(Path(target)) as folder:
             write_annotated(recording, sound, ForceMessages(jaws, grasp), folder, side_file=chosen.side_file)
             (folder / NOTE).write_text(json.dumps(note, indent=1) + "\n", encoding="utf-8")

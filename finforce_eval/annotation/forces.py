@@ -91,6 +91,7 @@ def estimate_forces(
     setup: EvaluationSetup,
     progress: Callable[[int], Any] = lambda images: None,
     watch: Callable[[Shape], Any] | None = None,
+    build: Callable[[str, bool], Estimator] | None = None,
 ) -> dict[str, JawForces]:
     """Return the forces on every jaw of a recording that has key points.
 
@@ -99,6 +100,7 @@ def estimate_forces(
         setup: jaw, settings, calibration and contact.
         progress: called with the number of images done since its last call.
         watch: called with the shape of the jaw after every image.
+        build: gives an estimator of a side that knows nothing yet, and whether both jaws hold; new ones without.
 
     Raises:
         FinforceError: the key points are another jaw's, or the contact cannot be known.
@@ -109,7 +111,8 @@ def estimate_forces(
     found = {}
     for side in recording.jaws:
         own = setup.side(side)
-        found[side] = _estimate_jaw(recording, side, own.estimator(both), own.source(recording), progress, watch)
+        estimator = build(side, both) if build else own.estimator(both)
+        found[side] = _estimate_jaw(recording, side, estimator, own.source(recording), progress, watch)
     return found
 
 

@@ -35,11 +35,11 @@ from finforce_eval.annotation.lerobot_layout import (
     open_dataset,
     read_table,
 )
-from finforce_eval.annotation.options import describe_options, sides_of
+from finforce_eval.engine.settings import describe_options, sides_of
 from finforce_eval.engine.tasks import Task, hash_settings, make_line
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.evaluation.warm import open_warm
 from finforce_eval.recordings.image_files import read_intrinsics
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording
 
@@ -56,14 +56,17 @@ def episode_tasks(folder: Path, parts: Path, options: argparse.Namespace) -> lis
     dataset = open_dataset(folder, options.images)
     image_size(dataset)
     settings = describe_options(options)
-    given = {"dataset": replace(dataset, episodes=()), "options": vars(options) | {"run": None}}
+    shared = {"options": vars(options) | {"run": None}, "settings": hash_settings(settings)}
+    given = {"dataset": replace(dataset, episodes=()), **shared}
     tasks = []
     for episode in dataset.episodes:
         files = [path for path in (episode.video, episode.data) if path is not None and path.is_file()]
         target = part_of(parts, episode.index)
         key = hash_settings(settings | {"episode": episode.index}, files)
         work = {**given, "episode": episode, "target": str(target), "key": key}
-        tasks.append(Task(name=f"{dataset.name}/{target.stem}", key=key, work=annotate_episode, given=work))
+        tasks.append(
+            Task(name=f"{dataset.name}/{target.stem}", key=key, work=annotate_episode, given=work, output=str(target))
+        )
     return tasks
 
 
@@ -85,7 +88,7 @@ def image_size(dataset: Dataset) -> tuple[int, int]:
 
 
 def annotate_episode(
-    dataset: Dataset, episode: Episode, target: str, options: Mapping[str, Any], key: str
+    dataset: Dataset, episode: Episode, target: str, options: Mapping[str, Any], settings: str, key: str
 ) -> dict[str, Any]:
     """Find the forces of one episode, write them and return figures.
 
@@ -94,12 +97,13 @@ def annotate_episode(
         episode: of it.
         target: file of the forces.
         options: of the command `annotate`.
+        settings: hash of them and of the files that they name.
         key: of the task, which is kept beside the forces.
 
     Raises:
         FinforceError: its pictures cannot be read, or the jaw not be used.
     """
-    columns = _find_forces(dataset, episode, argparse.Namespace(**options))
+    columns = _find_forces(dataset, episode, argparse.Namespace(**options), settings)
     path = Path(target)
     part = path.with_suffix(f".{os.getpid()}.part")
     try:
@@ -145,9 +149,9 @@ def _figures(columns: Columns, dataset: Dataset) -> dict[str, Any]:
     return {"jaws": {"both": jaws}, "span_s": round(len(answered) / dataset.fps, 3), "notes": []}
 
 
-def _find_forces(dataset: Dataset, episode: Episode, options: argparse.Namespace) -> Columns:
+def _find_forces(dataset: Dataset, episode: Episode, options: argparse.Namespace, settings: str) -> Columns:
     """Return the columns of one episode."""
-    setup, keypoints = make_setup(options), parse_source(options)
+    warm, keypoints = open_warm(settings, options), parse_source(options)
     name = f"{dataset.name}/episode_{episode.index:06d}"
     images = EpisodeImages(
         episode=episode,
@@ -161,7 +165,7 @@ def _find_forces(dataset: Dataset, episode: Episode, options: argparse.Namespace
     recording = Recording(name=name, path=dataset.folder, jaws=jaws, images=images)
     try:
         seen = keypoints.apply(recording)
-        found = estimate_forces(seen, setup)
+        found = estimate_forces(seen, warm.setup, build=warm.estimator)
         grasp = combine_forces(seen, found).grasp[:, :1]
     except RecordingError as error:
         if _NO_KEYPOINTS not in str(error):

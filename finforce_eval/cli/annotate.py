@@ -15,12 +15,20 @@ from finforce_eval.annotation.bag_task import ended_before as bag_ended_before
 from finforce_eval.annotation.lerobot import ended_before as episode_ended_before
 from finforce_eval.annotation.lerobot import episode_tasks, write_dataset
 from finforce_eval.annotation.lerobot_layout import is_dataset
-from finforce_eval.annotation.options import describe_options
-from finforce_eval.cli.parser import add_calibration, add_engine_options, add_jaw_options, add_set, add_source_options
-from finforce_eval.engine.engines import EngineOptions, run_tasks
+from finforce_eval.cli.parser import (
+    add_calibration,
+    add_engine_options,
+    add_jaw_options,
+    add_set,
+    add_source_options,
+    read_engine,
+)
+from finforce_eval.engine.engines import run_tasks
+from finforce_eval.engine.settings import describe_options
 from finforce_eval.engine.tasks import OK, Manifest, choose_shard
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import IMAGES
+from finforce_eval.recordings.bags import name_recordings
 from finforce_eval.recordings.tracks import JAWS
 
 
@@ -50,7 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Annotate recordings and print a line for each; 2 where one of them failed."""
     out, manifest = Path(options.out), Manifest(Path(options.out), options.shard)
-    named = _name_recordings(options.bags)
+    named = name_recordings(options.bags, "_")
     if options.source in (None, IMAGES):
         _set_unless_given(options, "threads=1")  # a core for each recording, whatever the engine
     datasets = {name: path for name, path in named if is_dataset(path)}
@@ -92,7 +100,7 @@ def _run_bags(
     """Annotate bags and say what became of each."""
     out, settings = Path(options.out), describe_options(options)
     tasks = [bag_task(name, path, out / name, options, settings) for name, path in choose_shard(named, options.shard)]
-    lines = run_tasks(tasks, _engine(options), manifest, bag_ended_before)
+    lines = run_tasks(tasks, read_engine(options), manifest, bag_ended_before)
     for line in lines:
         _say(line)
     return lines
@@ -105,7 +113,7 @@ def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: M
     if target.exists():
         raise OptionError(f"{target}: exists already; a dataset is written to a new folder")
     parts.mkdir(exist_ok=True)
-    lines = run_tasks(episode_tasks(path, parts, options), _engine(options), manifest, episode_ended_before)
+    lines = run_tasks(episode_tasks(path, parts, options), read_engine(options), manifest, episode_ended_before)
     for line in lines:
         _say(line)
     if any(line["status"] != OK for line in lines):
@@ -116,27 +124,6 @@ def _run_dataset(name: str, path: Path, options: argparse.Namespace, manifest: M
         write_dataset(path, parts, folder, options)
     rmtree(parts)
     return lines
-
-
-def _engine(options: argparse.Namespace) -> EngineOptions:
-    return EngineOptions(engine=options.engine, workers=options.workers, memory=options.memory, address=options.address)
-
-
-def _name_recordings(texts: Sequence[str]) -> list[tuple[str, Path]]:
-    """Return recordings with names of their own, by as much of their paths as that takes.
-
-    Raises:
-        OptionError: one was given twice.
-    """
-    paths = [Path(text).resolve() for text in texts]
-    if len(set(paths)) < len(paths):
-        raise OptionError("a recording was given twice")
-    names = [path.stem if path.is_file() else path.name for path in paths]
-    depth = 1
-    while len(set(names)) < len(names):
-        depth += 1
-        names = ["_".join(path.with_suffix("").parts[-depth:]).strip("/") for path in paths]
-    return list(zip(names, paths, strict=True))
 
 
 def _say(line: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from finforce.errors import FinforceError
 from finforce_eval.bench.bench import BenchPart, select_parts
 from finforce_eval.cli.parser import picture_file
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.machine import describe_machine, write_figures
+from finforce_eval.machine import describe_machine, write_figures
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

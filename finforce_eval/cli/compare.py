@@ -20,7 +20,7 @@ from finforce_eval.evaluation.comparison import (
     read_evaluation,
     total_change,
 )
-from finforce_eval.evaluation.machine import without_nan, write_json
+from finforce_eval.machine import without_nan, write_json
 
 WORSE_FOUND = 1
 

@@ -1,13 +1,25 @@
-"""The subcommands `evaluate`, `calibrate` and `version`: options to records, calls, and print."""
+"""The subcommand `evaluate`: the forces of recordings against what was measured."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from finforce_eval.cli.parser import add_calibration, add_jaw_options, add_set, add_source_options
-from finforce_eval.evaluation.machine import write_json
-from finforce_eval.evaluation.setup import evaluate_all, make_setup, read_keypoints
+from finforce_eval.cli.parser import (
+    add_calibration,
+    add_engine_options,
+    add_jaw_options,
+    add_set,
+    add_source_options,
+    read_engine,
+)
+from finforce_eval.evaluation.many import ManyEvaluated, evaluate_many
+from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
 from finforce_eval.evaluation.tables import evaluation_json, format_table
+from finforce_eval.machine import write_json
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -19,24 +31,38 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_set(parser)
     parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
     parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
+    text = "keep the series of every recording there, and manifest.jsonl: a run that was killed goes on where it was, "
+    text += "and finforce report shows them"
+    parser.add_argument("--out", metavar="DIR", help=text)
+    add_engine_options(parser)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Evaluate recordings: print the table, write JSON and report."""
-    setup = make_setup(options)
-    recordings = read_keypoints(options)
-    evaluation = evaluate_all(recordings, setup)
-    print(format_table(evaluation))
+def run(options: argparse.Namespace) -> int:
+    """Evaluate recordings: print the table, write JSON and report; 2 where one of them failed."""
+    setup, engine = make_setup(options), read_engine(options)
+    with ExitStack() as stack:
+        folder = Path(options.out or stack.enter_context(TemporaryDirectory(prefix="finforce_")))
+        found = evaluate_many(options, engine, folder)
+    for name, error in found.failed.items():
+        print(f"failed: {error if name in error else f'{name}: {error}'}", file=sys.stderr)
+    print(format_table(found.evaluation))
+    _write(found, setup, options)
+    return 2 if found.failed else 0
+
+
+def _write(found: ManyEvaluated, setup: EvaluationSetup, options: argparse.Namespace) -> None:
+    """Write what was asked for."""
     if options.json:
-        write_json(options.json, evaluation_json(evaluation, **setup.about))
+        failed = {"failed": dict(found.failed)} if found.failed else {}
+        write_json(options.json, evaluation_json(found.evaluation, **failed, **setup.about))
     if options.report:
         from finforce_eval.figures.report import write_report
 
         page = write_report(
-            evaluation,
+            found.evaluation,
             options.report,
             keypoint_names=setup.jaw.keypoint_names,
             about=setup.about,
-            recordings=recordings,
+            recordings=found.recordings,
         )
         print(f"Report: {page}")

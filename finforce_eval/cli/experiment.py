@@ -6,7 +6,7 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-from finforce_eval.cli.parser import SOURCES
+from finforce_eval.cli.parser import SOURCES, add_engine_options, read_engine
 from finforce_eval.errors import OptionError
 from finforce_eval.experiments.experiment import PAGE, Experiment, format_tables, run_experiment
 from finforce_eval.experiments.runs import RunOptions
@@ -46,6 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "end-to-end network of training.baseline (the shipped one)"
     parser.add_argument("--network", default="", metavar="FILE", help=text)
     parser.add_argument("--keep", action="store_true", help="keep the twin's recordings, some 20 MB a grasp")
+    add_engine_options(parser)
 
 
 def read_options(options: argparse.Namespace) -> RunOptions:
@@ -78,6 +79,9 @@ def run(options: argparse.Namespace) -> None:
     _, module, kind = EXPERIMENTS[options.name]
     build = getattr(import_module(f"finforce_eval.experiments.{module}"), kind)
     experiment: Experiment = build(options=read_options(options))
-    findings = run_experiment(experiment, Path(options.report))
+    findings = run_experiment(experiment, Path(options.report), read_engine(options), options.shard)
+    if findings is None:
+        print(f"Part {options.shard} is done; without --shard all parts are put on a page")
+        return
     print(format_tables(findings))
     print(f"Page: {Path(options.report) / experiment.name / PAGE}")

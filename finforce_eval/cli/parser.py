@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from finforce_eval.engine.engines import EngineOptions
 
 SOLVERS = ("default", "reduced", "solid", "frame", "plane", "linear", "paper")
 MESHES = ("default", "coarse", "fine")
@@ -80,3 +83,14 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--address", default="", help="of a Ray cluster; without it one of this machine")
     text = "i/n: do the i-th of n parts of the recordings, as a job of a batch system"
     parser.add_argument("--shard", default="", metavar="I/N", help=text)
+
+
+def read_engine(options: argparse.Namespace) -> EngineOptions:
+    """Return what `add_engine_options` added.
+
+    Raises:
+        OptionError: a number is out of its bounds.
+    """
+    from finforce_eval.engine.engines import EngineOptions
+
+    return EngineOptions(engine=options.engine, workers=options.workers, memory=options.memory, address=options.address)

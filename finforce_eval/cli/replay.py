@@ -10,9 +10,9 @@ from dataclasses import asdict
 from finforce_eval.cli.parser import add_jaw_options, add_source_options
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.machine import write_json
 from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
 from finforce_eval.evaluation.tables import evaluation_json, format_table
+from finforce_eval.machine import write_json
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.replay import Playing, Replay, replay
 

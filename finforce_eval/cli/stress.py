@@ -96,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
     Returns:
         0; 1 when a rule is broken by a family that it is asked of.
     """
-    from finforce_eval.evaluation.machine import describe_machine, write_figures
+    from finforce_eval.machine import describe_machine, write_figures
 
     if options.count is not None and options.count < 1:
         raise OptionError(f"--count {options.count}: expected at least 1")

@@ -8,8 +8,8 @@ from tempfile import TemporaryDirectory
 
 from finforce_eval.cli.parser import add_jaw_options, add_source_options, picture_file
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.machine import write_figures
 from finforce_eval.evaluation.setup import make_setup
+from finforce_eval.machine import write_figures
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.replay import Playing, play_to_nodes
 from finforce_eval.replay.trace import Trace, draw_way, format_trace, read_spans, stage_figures

@@ -2,7 +2,7 @@
 
 import argparse
 
-from finforce_eval.evaluation.setup import version
+from finforce_eval.machine import version
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

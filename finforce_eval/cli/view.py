@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> None:
     """Find the forces of a recording and show them with its pictures."""
     from tqdm import tqdm
 
-    from finforce_eval.annotation.options import sides_of
+    from finforce_eval.engine.settings import sides_of
     from finforce_eval.figures.rerun_view import RerunView
 
     if options.save and not options.save.endswith(".rrd"):

@@ -8,7 +8,7 @@ from typing import Any
 
 from finforce.errors import FinforceError
 from finforce.optional import import_library
-from finforce_eval.engine.tasks import FAILED, OK, Manifest, Task, make_line, run_task
+from finforce_eval.engine.tasks import FAILED, Manifest, Task, make_line, run_task
 from finforce_eval.errors import OptionError
 
 SEQUENTIAL, PROCESSES, RAY = ENGINES = ("sequential", "processes", "ray")
@@ -46,6 +46,7 @@ def run_tasks(
     options: EngineOptions,
     manifest: Manifest,
     done: Callable[[Task], Line | None] = lambda task: None,
+    unit: str = "recording",
 ) -> list[Line]:
     """Carry out the tasks that are not done yet, under one progress bar, and return the lines of all in their order.
 
@@ -54,6 +55,7 @@ def run_tasks(
         options: of the engine.
         manifest: where lines are kept; what it holds as done with the same key is not done again.
         done: says what has become of a task that ended just before a run was killed; its line, or None.
+        unit: what a task is, for the bar.
 
     Raises:
         FinforceError: the engine cannot be used.
@@ -64,14 +66,14 @@ def run_tasks(
     before, left = manifest.read(), []
     for task in tasks:
         line = before.get(task.name)
-        known = line if line and line.get("key") == task.key and line.get("status") == OK else None
+        known = line if task.is_done(line) else None
         if known is None and (known := done(task)) is not None:
             manifest.append(known)
         if known is None:
             left.append(task)
         else:
             lines[task.name] = known
-    with tqdm(total=len(tasks), initial=len(lines), unit="recording", disable=None, leave=False) as bar:
+    with tqdm(total=len(tasks), initial=len(lines), unit=unit, disable=None, leave=False) as bar:
         for line in _RUNNERS[options.engine](left, options):
             manifest.append(line)
             lines[line["name"]] = line

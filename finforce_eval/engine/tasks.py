@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import os
@@ -15,7 +16,7 @@ from typing import Any, TypeVar
 
 from finforce.errors import FinforceError
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.machine import without_nan
+from finforce_eval.machine import without_nan
 
 OK, FAILED = "ok", "failed"
 T = TypeVar("T")
@@ -30,23 +31,37 @@ class Task:
         key: hash of all that the outcome depends on.
         work: a function of a module, which another process can import; returns figures.
         given: what `work` is called with.
+        output: file or folder that is there once it is done; "" without one.
     """
 
     name: str
     key: str
     work: Callable[..., Mapping[str, Any]]
     given: Mapping[str, Any] = field(default_factory=dict)
+    output: str = ""
+
+    def is_done(self, line: Mapping[str, Any] | None) -> bool:
+        """Say whether a line of the manifest tells that the task is done, and what it made is still there."""
+        told = line is not None and line.get("status") == OK and line.get("key") == self.key
+        return told and (not self.output or Path(self.output).exists())
 
 
 def run_task(task: Task) -> dict[str, Any]:
     """Return the line of the manifest for a task that is carried out here; whatever it raises is its own failure."""
     began = perf_counter()
+    # what was made before stays, and of what a task makes little is garbage: it is looked for a hundred times less
+    seldom = gc.get_threshold()
+    gc.freeze()
+    gc.set_threshold(100 * seldom[0], *seldom[1:])
     try:
         line = make_line(task, figures=without_nan(dict(task.work(**task.given))))
     except (FinforceError, OSError, MemoryError) as error:
         line = make_line(task, error=_words(error))
     except Exception as error:  # what nobody foresaw costs this recording alone
         line = make_line(task, error=f"{type(error).__name__}: {_words(error)}")
+    finally:
+        gc.set_threshold(*seldom)
+        gc.unfreeze()
     return line | {"seconds": round(perf_counter() - began, 3)}
 
 
@@ -122,15 +137,17 @@ class Manifest:
             yield
 
     def read(self) -> dict[str, dict[str, Any]]:
-        """Return the last line of every task by its name; a line that was cut off is none."""
+        """Return the last line of every task, of any part, by its name; a line that was cut off is none."""
         lines: dict[str, dict[str, Any]] = {}
-        for text in self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else ():
-            try:
-                line = json.loads(text)
-            except ValueError:
-                continue
-            if isinstance(line, dict) and isinstance(line.get("name"), str):
-                lines[line["name"]] = line
+        others = set(self.path.parent.glob("manifest*.jsonl")) - {self.path}
+        for path in (*sorted(others), self.path):
+            for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+                try:
+                    line = json.loads(text)
+                except ValueError:
+                    continue
+                if isinstance(line, dict) and isinstance(line.get("name"), str):
+                    lines[line["name"]] = line
         return lines
 
     def append(self, line: Mapping[str, Any]) -> None:

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as installed
-from pathlib import Path
-from typing import Any
 
 from finforce.errors import FinforceError
 from finforce_eval.errors import OptionError
@@ -18,9 +14,11 @@ from finforce_eval.evaluation.contact_source import ContactChoice, ContactSource
 from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.results import CaseResult, parse_changes
+from finforce_eval.machine import version
+from finforce_eval.recordings.bags import name_recordings
 from finforce_eval.recordings.images import PAIRED
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import Recording
+from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
@@ -59,14 +57,6 @@ class EvaluationSetup:
         return build_source(self.contacts, recording, jaw, self.density)
 
 
-def version() -> str:
-    """Return the version of the installed package."""
-    try:
-        return installed("finforce")
-    except PackageNotFoundError:
-        return "not installed"
-
-
 def read_recordings(paths: Sequence[str], pairing: int = PAIRED, sides: Sequence[str] = ()) -> list[Recording]:
     """Read recordings and give each a name of its own.
 
@@ -79,17 +69,13 @@ def read_recordings(paths: Sequence[str], pairing: int = PAIRED, sides: Sequence
         RecordingError: one of them cannot be read.
         OptionError: one was given twice.
     """
-    if len({Path(path).resolve() for path in paths}) < len(paths):
-        raise OptionError("a recording was given twice")
-    recordings = [read_recording(path, pairing, sides) for path in paths]
-    names = [recording.name for recording in recordings]
-    for recording in recordings:
+    recordings = []
+    for name, path in name_recordings(paths, "/"):
+        recording = replace(read_recording(path, pairing, sides), name=name)
         for note in recording.notes:
             print(f"note: {recording.name}: {note}", file=sys.stderr)
-    return [
-        recording if names.count(recording.name) == 1 else replace(recording, name=_long_name(recording))
-        for recording in recordings
-    ]
+        recordings.append(recording)
+    return recordings
 
 
 def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> list[Recording]:
@@ -110,11 +96,6 @@ def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> li
             print(f"note: {recording.name}: {note}", file=sys.stderr)
         recordings.append(recording)
     return recordings
-
-
-def _long_name(recording: Recording) -> str:
-    """Return the name with the folders above it."""
-    return "/".join(recording.path.resolve().with_suffix("").parts[-3:])
 
 
 def make_setup(options: argparse.Namespace) -> EvaluationSetup:
@@ -159,25 +140,54 @@ def parse_settings(solver: str, mesh: str, changes: Sequence[str]) -> EstimatorS
 
 
 def evaluate_all(recordings: Sequence[Recording], setup: EvaluationSetup) -> Evaluation:
-    """Evaluate every jaw with ground truth of every recording, under one progress bar.
+    """Evaluate every jaw with ground truth of every recording.
 
     Raises:
         FinforceError: one of them cannot be evaluated.
     """
+    results = [result for recording in recordings for result in evaluate_jaws(recording, setup)]
+    return score_results(results, recordings)
+
+
+def evaluate_jaws(
+    recording: Recording,
+    setup: EvaluationSetup,
+    build: Callable[[str, bool], JawEstimator] | None = None,
+    *,
+    shown: bool = True,
+) -> tuple[CaseResult, ...]:
+    """Evaluate every jaw with ground truth of a recording.
+
+    Args:
+        recording: with key points and truth.
+        setup: jaw, settings, calibration and contact.
+        build: gives an estimator of a side that knows nothing yet, and whether both jaws hold; new ones without.
+        shown: under a progress bar.
+
+    Raises:
+        FinforceError: it cannot be evaluated.
+    """
     from tqdm import tqdm
 
-    for recording in recordings:
-        for side in truth_sides(recording):
-            check_keypoint_count(recording, side, setup.jaw)
-            setup.side(side).source(recording)
-    cases = [(recording, side) for recording in recordings for side in truth_sides(recording)]
-    frames = sum(len(recording.jaw(side).keypoints.stamps) for recording, side in cases)
-    results = []
-    with tqdm(total=frames, unit="frame", disable=None, leave=False) as bar:
-        for recording, side in cases:
-            bar.set_description(recording.name)
-            results.append(_evaluate_case(recording, side, setup.side(side), bar.update))
-    return score_results(results, recordings)
+    sides = truth_sides(recording)
+    for side in sides:
+        check_keypoint_count(recording, side, setup.jaw)
+    both, results = len(sides) == len(JAWS), []
+    frames = sum(len(recording.jaw(side).keypoints.stamps) for side in sides)
+    hidden = None if shown else True
+    with tqdm(total=frames, unit="frame", desc=recording.name, disable=hidden, leave=False) as bar:
+        for side in sides:
+            own = setup.side(side)
+            result = evaluate_recording(
+                recording,
+                own.jaw,
+                own.source(recording),
+                side=side,
+                factory=partial(build, side, both) if build else partial(own.estimator, both),
+                progress=bar.update,
+            )
+            results.append(replace(result, name=f"{recording.name}/{side}") if both else result)
+    return tuple(results)
 
 
 def truth_sides(recording: Recording) -> list[str]:
@@ -190,17 +200,3 @@ def truth_sides(recording: Recording) -> list[str]:
     if not sides:
         recording.truth(next(iter(recording.jaws)))
     return sides
-
-
-def _evaluate_case(recording: Recording, side: str, setup: EvaluationSetup, progress: Any) -> CaseResult:
-    """Evaluate one jaw of one recording."""
-    both = len(truth_sides(recording)) == 2
-    result = evaluate_recording(
-        recording,
-        setup.jaw,
-        setup.source(recording),
-        side=side,
-        factory=partial(setup.estimator, both),
-        progress=progress,
-    )
-    return result if not both else replace(result, name=f"{recording.name}/{side}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,12 +11,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from finforce.errors import FinforceError
-from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.machine import without_nan, write_figures
-from finforce_eval.evaluation.setup import version
+from finforce_eval.engine.engines import EngineOptions, run_tasks
+from finforce_eval.engine.tasks import OK, Manifest, Task, choose_shard
 from finforce_eval.evaluation.tables import align_rows
+from finforce_eval.machine import version, write_figures
 
-CASES, PAGE = "cases.jsonl", "README.md"
+PAGE = "README.md"
 EDITION = 1  # of what is kept of a case; another one does not go on where an older one ended
 
 
@@ -96,74 +95,56 @@ class Experiment(Protocol):
         ...
 
 
-class CaseLog:
-    """The cases that are done, in a file of one line each; a line that was cut off is none.
-
-    Args:
-        path: of the file; made when the first case is kept.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._known: dict[str, dict[str, Any]] = {}
-        text = path.read_text(encoding="utf-8") if path.exists() else ""
-        whole = text[: text.rfind("\n") + 1]
-        for line in whole.splitlines():
-            try:
-                row = json.loads(line)
-                self._known[row["case"]] = {"key": row["key"], "figures": row["figures"]}
-            except (ValueError, TypeError, KeyError):
-                raise OptionError(f"{path}: got the line {line[:80]!r}, expected one of this program's") from None
-        if whole != text:
-            path.write_text(whole, encoding="utf-8")
-
-    def find(self, case: Case) -> dict[str, Any] | None:
-        """Return the figures of a case; None where it is still to be run."""
-        row = self._known.get(case.name)
-        return row["figures"] if row is not None and row["key"] == hash_case(case) else None
-
-    def keep(self, case: Case, figures: Mapping[str, Any]) -> None:
-        """Keep the figures of a case; they are on the disk when this returns."""
-        row = {"case": case.name, "key": hash_case(case), "figures": without_nan(figures)}
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row, allow_nan=False) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        self._known[case.name] = row
-
-
 def hash_case(case: Case) -> str:
     """Return what tells a case from one of the same name with other settings, or of another version."""
     content = json.dumps([EDITION, version(), dict(case.settings)], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
-def run_experiment(experiment: Experiment, report: Path) -> Findings:
+def run_case(experiment: Experiment, case: Case, folder: str) -> dict[str, Any]:
+    """Return the figures of a case; files go into the experiment's folder.
+
+    Raises:
+        FinforceError: it has none.
+    """
+    return {**case.settings.get("words", {}), **experiment.run(case, Path(folder))}
+
+
+def run_experiment(
+    experiment: Experiment, report: Path, engine: EngineOptions | None = None, shard: str = ""
+) -> Findings | None:
     """Run what is not done yet of an experiment, and write `NAME.json`, pictures and a page into `report/NAME`.
 
     A case that fails is told of, costs itself only, and is tried again by the next run.
 
+    Args:
+        experiment: what is run.
+        report: folder of all experiments.
+        engine: where the cases are run; here, one after the other, without.
+        shard: "i/n" to run a part of the cases only, without a page.
+
+    Returns:
+        What the cases say together; None of a part of them.
+
     Raises:
         FinforceError: the cases cannot be listed, or none of them gave figures.
     """
-    from tqdm import tqdm
-
     folder = report / experiment.name
     cases = experiment.list_cases()
-    folder.mkdir(parents=True, exist_ok=True)
-    log, failed = CaseLog(folder / CASES), {}
-    with tqdm(total=len(cases), desc=experiment.name, unit="case", disable=None) as bar:
-        for case in cases:
-            if log.find(case) is None:
-                bar.set_postfix_str(case.name)
-                try:
-                    log.keep(case, {**case.settings.get("words", {}), **experiment.run(case, folder)})
-                except FinforceError as error:
-                    failed[case.name] = " ".join(str(error).split())
-                    print(f"failed: {case.name}: {failed[case.name]}", file=sys.stderr)
-            bar.update()
-    figures = {case.name: known for case in cases if (known := log.find(case)) is not None}
+    manifest = Manifest(folder, shard)
+    given = [{"experiment": experiment, "case": case, "folder": str(folder)} for case in cases]
+    tasks = [
+        Task(name=case.name, key=hash_case(case), work=run_case, given=each)
+        for case, each in zip(cases, given, strict=True)
+    ]
+    with manifest.alone():
+        lines = run_tasks(choose_shard(tasks, shard), engine or EngineOptions(), manifest, unit="case")
+    failed = {line["name"]: line["error"] for line in lines if line["status"] != OK}
+    for name, error in failed.items():
+        print(f"failed: {name}: {error}", file=sys.stderr)
+    if shard:
+        return None
+    figures = {line["name"]: line["figures"] for line in lines if line["status"] == OK}
     if not figures:
         raise FinforceError(f"{experiment.name}: not one of {len(cases)} cases gave figures; the first: "
                             f"{next(iter(failed.values()), 'there are none')}")  # fmt: skip

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -140,6 +140,45 @@ def bag_source(path: Path) -> Path:
         found = f"no metadata.yaml and {len(files)} bag files" if files else "no metadata.yaml, .mcap or .db3"
         raise RecordingError(f"{path.name}: the folder is no recording: {found} in it")
     return files[0]
+
+
+def list_files(path: Path) -> list[Path]:
+    """Return the files of a recording; none where there is no such recording."""
+    try:
+        source = bag_source(path)
+        return [source] if source.is_file() else [each for each in source.iterdir() if each.is_file()]
+    except (RecordingError, OSError):
+        return []
+
+
+def name_recordings(texts: Sequence[str | Path], between: str) -> list[tuple[str, Path]]:
+    """Return recordings with names of their own: of their file or folder, and as much of their paths as that takes.
+
+    Args:
+        texts: paths.
+        between: stands between the parts of a name.
+
+    Raises:
+        RecordingError: one was given twice.
+    """
+    paths = [Path(text).resolve() for text in texts]
+    if len(set(paths)) < len(paths):
+        raise RecordingError("a recording was given twice")
+    plain = [_bag_stem(path) for path in paths]
+    most = max((len(path.parts) for path in paths), default=0)
+    for depth in range(1, most + 1):
+        names = [between.join(path.parts[-depth:]) for path in plain]
+        if len(set(names)) == len(names):
+            return list(zip(names, paths, strict=True))
+    return [(between.join(path.parts[1:]), path) for path in paths]
+
+
+def _bag_stem(path: Path) -> Path:
+    """Return the path of a recording without the ending of its file."""
+    with suppress(RecordingError):
+        source = bag_source(path)
+        return source.with_suffix("") if source.is_file() else source
+    return path
 
 
 def _refuse_pipes(folder: Path) -> None:

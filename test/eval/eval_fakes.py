@@ -139,6 +139,10 @@ class FakeEstimator:
     def warm_up(self):
         """Nothing to compile."""
 
+    def forget(self):
+        """Begin again."""
+        self.observations, self.contacts = [], []
+
     def surface(self):
         return BOX + np.array([1e-3 * len(self.observations), 0, 0])
 

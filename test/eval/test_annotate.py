@@ -267,10 +267,10 @@ def test_a_run_that_is_killed_again_and_again_loses_nothing_and_does_nothing_twi
     command = [sys.executable, "-m", "finforce_eval.cli.main", "annotate", *map(str, bags), "--out", str(out)]
     written, kills = {}, 0
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    for _ in range(40):
+    for number in range(40):
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
         try:
-            status = process.wait(timeout=random.uniform(1.5, 3.5))
+            status = process.wait(timeout=random.uniform(1.5, 3.5) * (1.0 + 0.1 * number))
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

@@ -15,7 +15,7 @@ from finforce_eval.bench import bench
 from finforce_eval.bench.bench import PARTS, BenchPart, format_rows, row_from_times, select_parts, time_calls
 from finforce_eval.cli.main import main
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.machine import write_figures
+from finforce_eval.machine import write_figures
 from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.processes import child_processes, resident_bytes

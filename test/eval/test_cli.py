@@ -74,7 +74,7 @@ def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path, exact,
 
 def test_note_about_unknown_types_goes_to_stderr(tmp_path, exact, capsys, monkeypatch):
     noted = replace(bench_recording(), notes=("/odd skipped: unknown type own_msgs/msg/Odd",))
-    monkeypatch.setattr("finforce_eval.evaluation.setup.read_recording", lambda *_: noted)
+    monkeypatch.setattr("finforce_eval.evaluation.many.read_recording", lambda *_: noted)
     assert main(["evaluate", "pressed"]) == 0
     assert capsys.readouterr().err == "note: pressed: /odd skipped: unknown type own_msgs/msg/Odd\n"
 
@@ -113,7 +113,31 @@ def test_recording_of_another_jaw_is_refused(capsys, tmp_path):
 
 
 def test_one_bad_recording_among_good_ones_is_named(capsys, bag, tmp_path, exact):
-    assert_refused(capsys, ["evaluate", bag, tmp_path / "nowhere"], "nowhere")
+    out = tmp_path / "scores.json"
+    assert main(["evaluate", str(bag), str(tmp_path / "nowhere"), "--json", str(out)]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("failed: ") and "nowhere: no such recording" in said.err
+    scores = json.loads(out.read_text())
+    assert list(scores["cases"]) == [Path(bag).name] and list(scores["failed"]) == ["nowhere"]
+
+
+def test_evaluate_goes_on_where_it_was_and_counts_parts_once(capsys, bag, tmp_path, exact):
+    other = write_recording(bench_recording(), tmp_path / "other")
+    kept, scores, again = tmp_path / "kept", tmp_path / "scores.json", tmp_path / "again.json"
+    for part in ("1/2", "2/2"):
+        assert main(["evaluate", str(bag), str(other), "--out", str(kept), "--shard", part]) == 0
+    times = {path: path.stat().st_mtime_ns for path in kept.glob("*.npz")}
+    assert len(times) == 2
+    assert main(["evaluate", str(bag), str(other), "--out", str(kept), "--json", str(scores)]) == 0
+    assert {path: path.stat().st_mtime_ns for path in kept.glob("*.npz")} == times
+    assert main(["evaluate", str(bag), str(other), "--json", str(again)]) == 0
+    resumed, fresh = (json.loads(path.read_text()) for path in (scores, again))
+    assert list(resumed["cases"]) == list(fresh["cases"]) == [Path(bag).name, "other"]
+    for name, case in fresh["cases"].items():
+        assert resumed["cases"][name]["all"] == case["all"]
+    next(iter(times)).unlink()  # what is lost is done again
+    assert main(["evaluate", str(bag), str(other), "--out", str(kept)]) == 0
+    assert len(list(kept.glob("*.npz"))) == 2
 
 
 def test_same_recording_twice_is_refused(capsys, bag):

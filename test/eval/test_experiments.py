@@ -17,7 +17,8 @@ from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.reconstruction.generated import read_generated
 from finforce_contact.reconstruction.result import GeneratedMesh
 from finforce_eval.cli.main import main
-from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.engine.tasks import Manifest
+from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import EstimatedContact
 from finforce_eval.evaluation.manipulation import NetForces
 from finforce_eval.experiments.chip import ChipExperiment
@@ -88,12 +89,12 @@ def test_a_run_that_was_killed_goes_on_where_it_was(tmp_path):
 
 def test_a_line_that_was_cut_off_is_run_again_and_others_stay(tmp_path):
     run_experiment(Counting(), tmp_path)
-    log = tmp_path / "count" / "cases.jsonl"
+    log = tmp_path / "count" / "manifest.jsonl"
     log.write_text(log.read_text()[:-20])
     again = Counting()
     run_experiment(again, tmp_path)
     assert again.ran == ["three"]
-    assert [json.loads(line)["case"] for line in log.read_text().splitlines()] == ["one", "two", "three"]
+    assert list(Manifest(log.parent).read()) == ["one", "two", "three"]
 
 
 def test_other_settings_are_another_case(tmp_path):
@@ -117,11 +118,14 @@ def test_nothing_but_failures_is_an_error(tmp_path):
         run_experiment(Counting(names=("bad",)), tmp_path)
 
 
-def test_a_file_of_something_else_is_refused(tmp_path):
-    (tmp_path / "count").mkdir()
-    (tmp_path / "count" / "cases.jsonl").write_text("hello\n")
-    with pytest.raises(OptionError, match="hello"):
-        run_experiment(Counting(), tmp_path)
+def test_parts_are_put_on_a_page_by_a_run_of_all(tmp_path):
+    first, second, whole = Counting(), Counting(), Counting()
+    assert run_experiment(first, tmp_path, shard="1/2") is None
+    assert not (tmp_path / "count" / "count.json").exists()
+    run_experiment(second, tmp_path, shard="2/2")
+    run_experiment(whole, tmp_path)
+    assert (first.ran, second.ran, whole.ran) == (["one", "three"], ["two"], [])
+    assert json.loads((tmp_path / "count" / "count.json").read_text())["total"] == 11
 
 
 def course(error=0.0, stddev=0.1):

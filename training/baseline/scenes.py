@@ -6,15 +6,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from finforce.errors import FinforceError
+from finforce_eval.cli.parser import add_engine_options, read_engine
+from finforce_eval.engine.engines import EngineOptions
+from finforce_eval.engine.tasks import Task, choose_shard
 from finforce_eval.experiments.force_network import reduce_image
 from finforce_twin.gripper.footage import FINGER, parse_size, set_stage
 from finforce_twin.gripper.gripper import TwinGripper
@@ -23,6 +25,7 @@ from finforce_twin.scenes.scenarios import Scenario, build_scenario
 from training.arguments import one_line_errors
 from training.dataset import save_arrays
 from training.errors import DatasetError
+from training.making import make_all
 
 OBJECTS = ("grasp_cylinder", "grasp_cube")
 PLACES = np.linspace(0.028, 0.054, 14)  # [m] of the object's middle, as many as the letter's
@@ -94,19 +97,27 @@ def load_films(folder: Path, name: str) -> list[GraspFilm]:
     return films
 
 
-def write_films(seeds: Sequence[int], folder: Path, name: str) -> Iterator[int]:
-    """Write a file for each seed that is not there yet, and yield how many images are in it; 0 where no grasp came."""
-    for seed in seeds:
-        path = folder / f"{name}_{seed:09d}.npz"
-        if path.exists():
-            continue
-        try:
-            film = film_grasp(seed)
-        except FinforceError:  # pressed too far: another seed will do
-            yield 0
-            continue
-        save_arrays(path, {"images": film.images, "force": film.force})
-        yield len(film.force)
+def write_film(seed: int, path: str) -> dict[str, int]:
+    """Write the file of a seed and return how many images are in it; none where the jaws cannot be pressed so far."""
+    try:
+        film = film_grasp(seed)
+    except FinforceError:  # another seed will do
+        return {"images": 0}
+    save_arrays(Path(path), {"images": film.images, "force": film.force})
+    return {"images": len(film.force)}
+
+
+def write_films(seeds: Sequence[int], folder: Path, name: str, engine: EngineOptions, shard: str = "") -> int:
+    """Write a file for each seed that is not done yet, and return how many images are in them all.
+
+    Raises:
+        DatasetError: one could not be made or written.
+    """
+    tasks = []
+    for seed in choose_shard(seeds, shard):
+        path = str(folder / f"{name}_{seed:09d}.npz")
+        tasks.append(Task(name=Path(path).stem, key=RENDERED, work=write_film, given={"seed": seed, "path": path}))
+    return sum(line["figures"]["images"] for line in make_all(tasks, engine, folder, shard, "grasp"))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -116,13 +127,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--grasps", type=int, default=400, help="for training (400), some 150 images each")
     parser.add_argument("--validation", type=int, default=24, help="grasps for validation (24)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first grasp, to share the work (0)")
+    add_engine_options(parser)
     options = parser.parse_args(arguments)
     with one_line_errors():
-        options.folder.mkdir(parents=True, exist_ok=True)
+        engine = read_engine(options)
         for name, first, count in ((VALIDATION, 10_000_000, options.validation), (TRAIN, 0, options.grasps)):
             seeds = range(first + options.first, first + options.first + count)
-            total = sum(tqdm(write_films(seeds, options.folder, name), desc=name, unit="grasp", disable=None))
-            print(f"{name}: {total} new images")
+            print(f"{name}: {write_films(seeds, options.folder, name, engine, options.shard)} images")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,8 @@ import platform
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,14 @@ def describe_machine() -> dict[str, Any]:
         **dict(_find_versions()),
         "commit": _commit(),
     }
+
+
+def version() -> str:
+    """Return the version of the installed package."""
+    try:
+        return installed("finforce")
+    except PackageNotFoundError:
+        return "not installed"
 
 
 def write_figures(path: Path | str, figures: Mapping[str, Any]) -> None:
@@ -63,7 +72,7 @@ def _find_versions() -> Iterator[tuple[str, str]]:
     """Yield the installed libraries with their versions."""
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):
-            yield name, version(name)
+            yield name, installed(name)
 
 
 LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh", "small_gicp")

@@ -7,11 +7,11 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from finforce_eval.evaluation.setup import version
+from finforce_eval.machine import version
 from finforce_eval.recordings.tracks import JAWS
 
 # Options that change nothing in the forces of a recording.
-_OUTSIDE = ("bags", "out", "engine", "workers", "memory", "address", "shard", "run", "prefix")
+_OUTSIDE = ("bags", "out", "engine", "workers", "memory", "address", "shard", "run", "prefix", "json", "report")
 
 
 def describe_options(options: argparse.Namespace) -> dict[str, Any]:
