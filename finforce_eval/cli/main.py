@@ -29,6 +29,7 @@ COMMANDS = {
     "bench": "measure run time against error of every solver tier and of what comes before it, and how cost grows",
     "experiment": "run one of the letter's experiments on the twin or on recordings, with a page beside its figures",
     "stress": "give the estimators what no bench does: every answer is right within what it states, or not sure",
+    "report": "put forces over time on one HTML page with plots that zoom",
     "convert-steel": "convert the pictures of the measured steel finger into a recording",
     "reconstruct": "make an object's mesh in metres, and its pose, from a masked depth image",
     "version": "print the version",

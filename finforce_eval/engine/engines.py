@@ -12,7 +12,8 @@ from finforce_eval.engine.tasks import FAILED, Manifest, Task, make_line, run_ta
 from finforce_eval.errors import OptionError
 
 SEQUENTIAL, PROCESSES, RAY = ENGINES = ("sequential", "processes", "ray")
-# Tasks that a process does before another one takes its place: what a library leaks stays bounded.
+# Tasks of a process before another one takes its place: what a library leaks stays bounded. Python's own
+# max_tasks_per_child waits for ever, now and then, once all processes have done that many (3.11 to 3.13).
 _TASKS_PER_PROCESS = 50
 _GIGABYTE, _LARGEST_MEMORY = 1 << 30, 1e6
 Line = dict[str, Any]
@@ -99,9 +100,8 @@ def _run_in_processes(tasks: Sequence[Task], options: EngineOptions) -> Iterator
             mp_context=get_context("spawn"),
             initializer=_limit_memory,
             initargs=(options.memory,),
-            max_tasks_per_child=_TASKS_PER_PROCESS,
         )
-        batch = left[:1] if alone else left
+        batch = left[: 1 if alone else _TASKS_PER_PROCESS * workers]
         try:
             running = {pool.submit(run_task, task): task for task in batch}
             while running:

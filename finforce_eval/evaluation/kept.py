@@ -93,6 +93,8 @@ def load_kept(path: Path) -> Kept:
 def _pack(value: Any, arrays: dict[str, NDArray]) -> Any:
     """Return a value as JSON has it; arrays go into `arrays`, under names that stand in their places."""
     if isinstance(value, np.ndarray):
+        if value.dtype == object:
+            raise TypeError(f"an array of objects cannot be kept: {value.ravel()[:3]}")
         name = f"a{len(arrays)}"
         arrays[name] = value
         return {"array": name}

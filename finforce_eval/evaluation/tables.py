@@ -37,6 +37,11 @@ def score_cells(score: CaseScore, phase: str) -> list[str]:
     ]
 
 
+def table_head() -> list[str]:
+    """Return the names of the columns of `table_rows`."""
+    return ["case", *(f"{phase}: {name}" for phase in PHASES for name in HEADER), "bias/N", "solved/%"]
+
+
 def table_rows(evaluation: Evaluation) -> list[list[str]]:
     """Return one row per case and one for all: name, three numbers for each phase, bias, solved frames."""
     rows = []
@@ -156,8 +161,7 @@ def _per_axis(values: Sequence[float], digits: int) -> str:
 
 def markdown_table(evaluation: Evaluation) -> str:
     """Return the table in Markdown."""
-    head = ["case", *(f"{phase}: {name}" for phase in PHASES for name in HEADER), "bias/N", "solved/%"]
-    return "\n".join(markdown_rows(head, table_rows(evaluation)))
+    return "\n".join(markdown_rows(table_head(), table_rows(evaluation)))
 
 
 def markdown_contact_table(evaluation: Evaluation) -> list[str]:

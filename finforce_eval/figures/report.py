@@ -1,4 +1,4 @@
-"""A folder of pictures with a Markdown page that shows them."""
+"""A folder of pictures with a Markdown page that shows them, and a page whose plots zoom."""
 
 from __future__ import annotations
 
@@ -8,7 +8,15 @@ from pathlib import Path
 
 from finforce_eval.evaluation.evaluate import Evaluation
 from finforce_eval.evaluation.results import CaseResult
-from finforce_eval.evaluation.tables import markdown_contact_table, markdown_sight, markdown_table, summary_lines
+from finforce_eval.evaluation.tables import (
+    markdown_contact_table,
+    markdown_sight,
+    markdown_table,
+    summary_lines,
+    table_head,
+    table_rows,
+)
+from finforce_eval.figures.html_report import ForceCourse, write_html
 from finforce_eval.recordings.tracks import Recording
 
 
@@ -21,7 +29,7 @@ def write_report(
     recordings: Sequence[Recording] = (),
     title: str = "Force from key points",
 ) -> Path:
-    """Write pictures and README.md of an evaluation.
+    """Write pictures, README.md and report.html of an evaluation.
 
     Args:
         evaluation: scores and time series.
@@ -48,10 +56,28 @@ def write_report(
     sections = [_write_images(recording, results, folder, keypoint_names) for recording in recordings]
     sections += [_write_case(result, folder, keypoint_names) for result in results]
     page = folder / "README.md"
-    head = [f"# {title}", "", *(f"- {key}: {value}" for key, value in about.items()), ""]
+    zooming = ["The same over time, to zoom: [report.html](report.html)", ""]
+    head = [f"# {title}", "", *(f"- {key}: {value}" for key, value in about.items()), "", *zooming]
     lines = [*head, *_overview(evaluation), *(line for section in sections for line in section)]
     page.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_page(evaluation, folder / "report.html", about=about, title=title)
     return page
+
+
+def write_page(evaluation: Evaluation, path: Path, *, about: Mapping[str, str], title: str) -> Path:
+    """Write one HTML page with the scores and plots that zoom; it needs nothing beside itself.
+
+    Args:
+        evaluation: scores and time series.
+        path: of the page.
+        about: what was run: solver, jaw, contact, ...
+        title: heading of the page.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    courses = [ForceCourse.of_result(result) for result in evaluation.results.values()]
+    return write_html(courses, path, title=title, about=about, columns=table_head(), rows=table_rows(evaluation))
 
 
 def _overview(evaluation: Evaluation) -> list[str]:

@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from finforce_eval.annotation import bag as annotated_bag
 from finforce_eval.cli.main import main
+from finforce_eval.engine import engines
 from finforce_eval.engine.engines import EngineOptions, run_tasks
 from finforce_eval.engine.tasks import Manifest, Task, choose_shard
 from finforce_eval.evaluation.evaluate import evaluate_recording
@@ -294,6 +295,17 @@ def test_a_run_that_is_killed_again_and_again_loses_nothing_and_does_nothing_twi
     for bag, name in zip(bags, names, strict=True):
         topics = {topic for topic, *_ in messages(bag)}
         assert [entry for entry in messages(out / name) if entry[0] in topics] == messages(bag)
+
+
+def count_letters(word):
+    return {"letters": len(word)}
+
+
+def test_processes_give_way_to_others_and_nothing_waits_for_ever(tmp_path, monkeypatch):
+    monkeypatch.setattr(engines, "_TASKS_PER_PROCESS", 3)
+    tasks = [Task(name=f"t{n}", key="k", work=count_letters, given={"word": n * "x"}) for n in range(14)]
+    lines = run_tasks(tasks, EngineOptions(engine="processes", workers=2), Manifest(tmp_path))
+    assert [line["figures"]["letters"] for line in lines] == list(range(14))
 
 
 @pytest.mark.parametrize("words", [["--workers", "-1"], ["--memory", "nan"], ["--memory=-1"], ["--memory", "inf"]])

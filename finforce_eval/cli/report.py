@@ -1,0 +1,48 @@
+"""The subcommand `report`: forces over time as one HTML page."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.evaluate import score_results
+from finforce_eval.evaluation.kept import load_kept
+from finforce_eval.figures.html_report import write_html
+from finforce_eval.figures.recorded_forces import read_forces
+from finforce_eval.figures.report import write_page
+from finforce_eval.machine import version
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    text = "recordings with forces, as annotate or the nodes write them, or folders of finforce evaluate --out"
+    parser.add_argument("sources", nargs="+", metavar="SOURCE", help=text)
+    parser.add_argument("-o", "--output", default="report.html", metavar="FILE", help="the page (report.html)")
+    parser.add_argument("--title", default="Forces", help="its heading (Forces)")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Write the page and name it.
+
+    Raises:
+        FinforceError: a source holds no forces, or the name of the page is none.
+    """
+    page = Path(options.output)
+    if page.suffix not in (".html", ".htm"):
+        raise OptionError(f"--output {page}: expected a name that ends in .html")
+    kept, courses = [], []
+    for source in map(Path, options.sources):
+        files = sorted(source.glob("*.npz")) if source.is_dir() else []
+        kept += [load_kept(file) for file in files]
+        courses += [] if files else read_forces(source)
+    if kept and courses:
+        raise OptionError("recordings and folders of evaluations: expected the one or the other")
+    if kept:
+        evaluation = score_results(
+            [result for each in kept for result in each.results], [each.recording for each in kept]
+        )
+        write_page(evaluation, page, about=kept[0].about, title=options.title)
+    else:
+        write_html(courses, page, title=options.title, about={"version": version()})
+    print(f"Page: {page}: {len(courses) or len(evaluation.results)} plots")
