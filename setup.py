@@ -70,7 +70,7 @@ setup(
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
         "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0", "xacro"]
-        + ["cascadio", "ezdxf", "svgelements", "pyarrow", "av", "ray", "rerun-sdk"],
+        + ["cascadio", "ezdxf", "svgelements", "pyarrow", "av", "ray", "rerun-sdk", "playwright"],
         "lint": ["ruff", "import-linter"],
     },
     entry_points={

