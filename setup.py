@@ -40,7 +40,7 @@ setup(
         "pyyaml",  # jaw files, calibrations
         "meshio",  # volume mesh files of jaws
         "pillow",  # picture files
-        "rosbags",  # recordings, without ROS
+        "rosbags>=0.11,<0.12",  # recordings, without ROS
         "mcap",  # recordings that were cut off, record by record
         "manifold3d",  # Boolean intersections and outlines of object meshes
         "trimesh",  # object mesh files, surfaces of fingers

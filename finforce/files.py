@@ -19,12 +19,23 @@ from finforce.errors import FinforceError
 
 # Bytes of a file, of one of YAML; levels of nesting; values, those that references stand for counted as often; digits.
 LARGEST, LARGEST_YAML = 16 << 20, 1 << 19
+_MOST_BUDGET = 10_000.0
 DEEPEST, MOST_VALUES, MOST_DIGITS = 50, 50_000, 400
+BUDGET = "FINFORCE_BUDGET"  # of the environment: a factor on what files may cost
 _OPEN = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
 
 class FileError(FinforceError, ValueError):
     """A file cannot be read, or holds what no such file does; the message says what, without the file's name."""
+
+
+def raise_budget(limit: int) -> int:
+    """Return a limit times the factor in FINFORCE_BUDGET, from 1 to 10,000; as it is without one."""
+    try:
+        factor = float(os.environ.get(BUDGET, "1"))
+    except ValueError:
+        factor = 1.0
+    return int(limit * factor) if 1.0 <= factor <= _MOST_BUDGET else limit
 
 
 def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
@@ -39,13 +50,14 @@ def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
             state = os.fstat(handle)
             if not stat.S_ISREG(state.st_mode):
                 raise FileError("is no plain file")
-            content = file.read(largest + 1)
+            allowed = raise_budget(largest)
+            content = file.read(allowed + 1)
     except (OSError, ValueError) as error:  # a name with a null byte is a ValueError
         if isinstance(error, FileError):
             raise
         raise FileError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if len(content) > largest:
-        raise FileError(f"has more than {largest >> 10} KiB")
+    if len(content) > allowed:
+        raise FileError(f"has more than {allowed >> 10} KiB; {BUDGET}=10 would allow ten times as many")
     return content
 
 

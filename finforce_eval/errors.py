@@ -7,5 +7,13 @@ class RecordingError(FinforceError, ValueError):
     """A recording cannot be read, or lacks what the command needs."""
 
 
+class DamagedError(RecordingError):
+    """A recording breaks off, or part of it is no longer what was written."""
+
+
+class OutOfBoundsError(RecordingError):
+    """A recording would take more memory or time than one of its size does."""
+
+
 class OptionError(FinforceError, ValueError):
     """A command-line option has a value that means nothing here."""

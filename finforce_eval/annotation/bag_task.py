@@ -21,7 +21,6 @@ from finforce_eval.evaluation.warm import open_warm
 from finforce_eval.machine import version
 from finforce_eval.recordings.bags import bag_source, list_files
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.salvage import sound_source
 from finforce_eval.recordings.tracks import Recording
 
 NOTE = "annotation.json"
@@ -59,17 +58,16 @@ def annotate_bag(source: str, target: str, options: Mapping[str, Any], settings:
     """
     chosen = argparse.Namespace(**options)
     warm, keypoints = open_warm(settings, chosen), parse_source(chosen)
-    with sound_source(bag_source(Path(source))) as (sound, damage):
-        recording = read_recording(sound, keypoints.pairing, sides_of(chosen))
-        recording = replace(recording, name=Path(source).stem)
-        recording = keypoints.apply(recording)
-        jaws = estimate_forces(recording, warm.setup, build=warm.estimator)
-        grasp = combine_forces(recording, jaws)
-        figures = _figures(recording, jaws, [*damage, *recording.notes])
-        note = {"key": key, "status": OK, "figures": figures, "settings": _settings(warm.setup), "version": version()}
-        with new_folder(Path(target)) as folder:
-            write_annotated(recording, sound, ForceMessages(jaws, grasp), folder, side_file=chosen.side_file)
-            (folder / NOTE).write_text(json.dumps(note, indent=1) + "\n", encoding="utf-8")
+    recording = read_recording(source, keypoints.pairing, sides_of(chosen), strict=keypoints.strict)
+    recording = keypoints.apply(replace(recording, name=Path(source).stem))
+    jaws = estimate_forces(recording, warm.setup, build=warm.estimator)
+    grasp = combine_forces(recording, jaws)
+    figures = _figures(recording, jaws, list(recording.notes))
+    note = {"key": key, "status": OK, "figures": figures, "settings": _settings(warm.setup), "version": version()}
+    with new_folder(Path(target)) as folder:
+        messages, bag = ForceMessages(jaws, grasp), bag_source(recording.source)
+        write_annotated(recording, bag, messages, folder, side_file=chosen.side_file)
+        (folder / NOTE).write_text(json.dumps(note, indent=1) + "\n", encoding="utf-8")
     return figures
 
 

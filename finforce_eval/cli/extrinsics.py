@@ -65,7 +65,7 @@ def read_at_rest(options: argparse.Namespace) -> tuple[KeypointSource, Recording
         raise OptionError(f"--images {options.images}: expected at least 5, the mean of which is taken")
     source = parse_source(options)
     sides = JAWS if options.jaws == "both" else (options.jaws,)
-    (recording,) = read_recordings(options.bags, source.pairing, sides=sides)
+    (recording,) = read_recordings(options.bags, source.pairing, sides, strict=source.strict)
     recording = first_images(recording, options.images)
     return source, replace(recording, jaws={side: recording.jaws[side] for side in sides})
 

@@ -57,6 +57,8 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
     text = "the camera in the gripper: robot, bench, or x,y,z,qx,qy,qz,qw; without it that of the case.json, else robot"
     parser.add_argument("--extrinsics", metavar="POSE", help=text)
+    text = "refuse a recording that is cut off or damaged; without it, it is read as far as it is good"
+    parser.add_argument("--strict", action="store_true", help=text)
 
 
 def add_calibration(parser: argparse.ArgumentParser) -> None:

@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> None:
         rate=options.rate, sim_time=options.sim_time, domain=options.domain, parameter_file=options.params
     )
     keypoints, calibration = parse_source(options), options.calibration or ""
-    recording = read_recording(options.bag, keypoints.pairing)
+    recording = read_recording(options.bag, keypoints.pairing, strict=keypoints.strict)
     result = replay(recording, setup, calibration_file=calibration, playing=playing, keypoints=keypoints)
     print(format_replay(result))
     _write(result, setup, options)

@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
         FinforceError: an option, the recording or a node fails.
     """
     keypoints = parse_source(options)
-    recording = read_recording(options.bag, keypoints.pairing)
+    recording = read_recording(options.bag, keypoints.pairing, strict=keypoints.strict)
     with TemporaryDirectory() as folder:
         playing = Playing(composed=not options.apart, trace=folder)
         log = play_to_nodes(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,8 @@ def save_kept(path: Path, kept: Kept) -> None:
     Raises:
         OSError: it cannot be written.
     """
+    if kept.recording.copy is not None:  # which goes with this process, and its images with it
+        kept = replace(kept, recording=replace(kept.recording, copy=None, images=None))
     arrays: dict[str, NDArray] = {}
     tree = json.dumps(_pack(kept, arrays))
     part = path.with_name(f".{path.name}.{os.getpid()}.part")

@@ -59,11 +59,13 @@ class KeypointSource:
         source: "images", "keypoints", "truth", or "" for key points where they were recorded, else images.
         jaw_file: of the jaws.
         parameters: parameters of the detector node that differ from its defaults, by their ROS names.
+        strict: refuse recordings that are damaged.
     """
 
     source: str = ""
     jaw_file: str = "bench"
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    strict: bool = False
 
     def source_of(self, recording: Recording) -> str:
         """Return "images", "keypoints" or "truth" for a recording.
@@ -214,7 +216,8 @@ def parse_source(options: argparse.Namespace) -> KeypointSource:
         parameters = _parse_parameters(changes)
     if extrinsics:
         parameters["T_gripper_camera"] = _parse_extrinsics(extrinsics)
-    return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters)
+    strict = bool(getattr(options, "strict", False))
+    return KeypointSource(source=source, jaw_file=options.jaw, parameters=parameters, strict=strict)
 
 
 def _parse_parameters(texts: Sequence[str]) -> dict[str, Any]:

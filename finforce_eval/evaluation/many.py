@@ -104,7 +104,7 @@ def evaluate_task(
     chosen = argparse.Namespace(**options)
     warm, source = open_warm(settings, chosen), parse_source(chosen)
     try:
-        read = replace(read_recording(path, source.pairing), name=name)
+        read = replace(read_recording(path, source.pairing, strict=source.strict), name=name)
         recording = source.apply(read)
         results = evaluate_jaws(recording, warm.setup, warm.estimator, shown=shown)
     except FinforceError as error:

@@ -57,13 +57,16 @@ class EvaluationSetup:
         return build_source(self.contacts, recording, jaw, self.density)
 
 
-def read_recordings(paths: Sequence[str], pairing: int = PAIRED, sides: Sequence[str] = ()) -> list[Recording]:
+def read_recordings(
+    paths: Sequence[str], pairing: int = PAIRED, sides: Sequence[str] = (), *, strict: bool = False
+) -> list[Recording]:
     """Read recordings and give each a name of its own.
 
     Args:
         paths: of the recordings.
         pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
         sides: jaws that are in the images, whether or not a topic tells of them.
+        strict: refuse recordings that are damaged.
 
     Raises:
         RecordingError: one of them cannot be read.
@@ -71,7 +74,7 @@ def read_recordings(paths: Sequence[str], pairing: int = PAIRED, sides: Sequence
     """
     recordings = []
     for name, path in name_recordings(paths, "/"):
-        recording = replace(read_recording(path, pairing, sides), name=name)
+        recording = replace(read_recording(path, pairing, sides, strict=strict), name=name)
         for note in recording.notes:
             print(f"note: {recording.name}: {note}", file=sys.stderr)
         recordings.append(recording)
@@ -90,7 +93,7 @@ def read_keypoints(options: argparse.Namespace, sides: Sequence[str] = ()) -> li
     """
     source = parse_source(options)
     recordings = []
-    for read in read_recordings(options.bags, source.pairing, sides):
+    for read in read_recordings(options.bags, source.pairing, sides, strict=source.strict):
         recording = source.apply(read)
         for note in recording.notes[len(read.notes) :]:
             print(f"note: {recording.name}: {note}", file=sys.stderr)

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 from finforce.errors import FinforceError, MissingDependencyError
 from finforce.stamps import NANOSECONDS
-from finforce_eval.errors import RecordingError
+from finforce_eval.errors import DamagedError, OutOfBoundsError, RecordingError
+from finforce_eval.recordings.bounded import make_reader
 
 # Of a type that was recorded without its definition nothing is known but its name.
 NO_DIGEST = "RIHS01_" + 64 * "0"
@@ -94,13 +95,12 @@ def open_bag(source: Path, name: str) -> Iterator[BagReader]:
         MissingDependencyError: rosbags is not installed.
     """
     try:
-        from rosbags.rosbag2 import Reader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise MissingDependencyError("reading a recording needs rosbags: pip install rosbags") from error
     # not AnyReader: it registers every definition in the bag and ends at a foreign one it cannot parse
     types = get_typestore(Stores.ROS2_JAZZY)
-    with damage_reported(name), Reader(source) as reader:
+    with damage_reported(name), make_reader(source) as reader:
         if reader.message_count == 0:
             raise RecordingError(f"{name}: the recording is empty: it holds no messages")
         yield BagReader(reader, types, name)
@@ -194,14 +194,16 @@ def _refuse_pipes(folder: Path) -> None:
 
 @contextmanager
 def damage_reported(name: str) -> Iterator[None]:
-    """Turn whatever a bag reader raises on damaged bytes into one RecordingError."""
+    """Turn whatever a bag reader raises on damaged bytes into one DamagedError."""
     try:
         yield
+    except OutOfBoundsError as error:
+        raise OutOfBoundsError(f"{name}: {str(error).removeprefix(f'{name}: ')}") from error
     except (FinforceError, KeyboardInterrupt):
         raise
     except Exception as error:  # struct, sqlite3, zstd, lz4, yaml, ... each has its own classes
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise RecordingError(f"{name}: truncated or damaged: {reason}") from error
+        raise DamagedError(f"{name}: truncated or damaged: {reason}") from error
 
 
 def restamp(data: bytes | memoryview, stamp: int) -> bytes:

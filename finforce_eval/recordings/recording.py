@@ -12,9 +12,11 @@ from finforce.errors import ObservationError
 from finforce.files import FileError, read_json
 from finforce.messages import Keypoints, decode_columns, decode_keypoints
 from finforce.stamps import NANOSECONDS
-from finforce_eval.errors import RecordingError
+from finforce_eval.errors import DamagedError, RecordingError
 from finforce_eval.recordings.bags import BagMessage, bag_source, check_types, open_bag
+from finforce_eval.recordings.bounded import check_messages
 from finforce_eval.recordings.images import PAIRED, ImageTrack, find_images
+from finforce_eval.recordings.salvage import SalvagedCopy
 from finforce_eval.recordings.tracks import (
     JAWS,
     DetectionTruth,
@@ -45,6 +47,9 @@ for _side in JAWS:
 DEMO = Path(__file__).parents[1] / "data" / "bench_cyl25_middle"  # a loading cycle of the bench
 
 
+_CHECKED = 10_000  # messages after which their number is looked at
+
+
 class _Content(NamedTuple):
     """What lies in a bag: messages by topic, images, and notes on what was left aside."""
 
@@ -53,25 +58,38 @@ class _Content(NamedTuple):
     notes: list[str]
 
 
-def read_recording(path: str | Path, pairing: int = PAIRED, sides: Sequence[str] = ()) -> Recording:
+def read_recording(
+    path: str | Path, pairing: int = PAIRED, sides: Sequence[str] = (), *, strict: bool = False
+) -> Recording:
     """Read a rosbag2 folder or a single .mcap / .db3 file, with the `case.json` beside it.
 
     Topics that are not ours are not decoded; those of unknown type are named in `notes`. Images are not read yet; a
-    recording with images may do without key points, its tracks of them are empty then.
+    recording with images may do without key points, its tracks of them are empty then. One that is damaged is read as
+    far as it is good; how much was lost stands in `notes`.
 
     Args:
         path: the folder or the file.
         pairing: greatest distance between the stamps of a colour and a depth image that belong together [ns].
         sides: jaws that are in the images, whether or not a topic tells of them.
+        strict: refuse a recording that is damaged.
 
     Raises:
-        RecordingError: nothing there, damaged, empty, without key points and images, or with malformed content.
+        RecordingError: nothing there, nothing in it that is whole, out of bounds, empty, without key points and images,
+            or with malformed content.
         MissingDependencyError: rosbags is not installed.
     """
     source = bag_source(Path(path))
     folder = source if source.is_dir() else source.parent
     name = source.name if source.is_dir() else source.stem
-    samples, images, notes = _read_samples(source, name, pairing)
+    copy = None
+    try:
+        samples, images, notes = _read_samples(source, name, pairing)
+    except DamagedError as error:
+        if strict:
+            raise
+        copy = SalvagedCopy(source, str(error))
+        samples, images, notes = _read_samples(copy.path, name, pairing)
+        notes.append(copy.note.removeprefix(f"{name}: "))
     known = [side for side in JAWS if _has_jaw(samples, side, images is not None) or (images and side in sides)]
     jaws = {side: _jaw_track(samples, side, name) for side in known}
     if not jaws:
@@ -87,6 +105,7 @@ def read_recording(path: str | Path, pairing: int = PAIRED, sides: Sequence[str]
         case=_read_case(folder / "case.json"),
         notes=tuple(notes),
         images=images,
+        copy=copy,
     )
 
 
@@ -112,7 +131,9 @@ def _read_samples(source: Path, name: str, pairing: int) -> _Content:
     samples: dict[str, list[BagMessage]] = {}
     with open_bag(source, name) as bag:
         check_types(bag.connections, {topic: (kind,) for topic, kind in TOPICS.items()}, name)
-        for raw in bag.raw(TOPICS):
+        for number, raw in enumerate(bag.raw(TOPICS)):
+            if not number % _CHECKED:
+                check_messages(number, source)
             samples.setdefault(raw.topic, []).append(BagMessage(raw.time, bag.decode(raw)))
         notes = bag.foreign_notes()
         try:

@@ -1,4 +1,4 @@
-"""Recordings that were cut off, as when a robot's computer lost power: read up to the damage."""
+"""Recordings that were cut off, as when a robot's computer lost power, or damaged: read as far as they are good."""
 
 from __future__ import annotations
 
@@ -8,18 +8,25 @@ import sqlite3
 import struct
 from collections import deque
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, NamedTuple
+from zlib import crc32
 
 from finforce.errors import MissingDependencyError
 from finforce.optional import import_library
-from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.bags import NO_DIGEST, open_bag
+from finforce_eval.errors import OutOfBoundsError, RecordingError
+from finforce_eval.recordings.bags import NO_DIGEST
+from finforce_eval.recordings.bounded import check_chunks, import_zstd, refuse_computed, unpack_lz4, unpack_zstd
 
 # No record of an mcap file is longer [bytes]: chunks have megabytes, an uncompressed 4K image 25.
 _LONGEST = 1 << 30
+# Of a record: opcode, length. Of those that are read, that end the data, and of all.
+_MAGIC, _HEAD = 8, struct.Struct("<BQ")
+_READ_OPCODES, _END_OPCODES, _OPCODES = (0x03, 0x04, 0x05), (0x02, 0x0F), range(0x01, 0x10)
+_CHUNK_HEAD = struct.Struct("<QQQII")
 # Of a chunk: opcode, length, first and last time, uncompressed size, checksum, length of the compression's name.
 _CHUNK, _CHUNK_OPCODE = struct.Struct("<BQQQQII"), 0x06
 _PIECE = 1 << 12
@@ -38,35 +45,60 @@ class _Message(NamedTuple):
     data: bytes
 
 
-@contextmanager
-def sound_source(source: Path) -> Iterator[tuple[Path, list[str]]]:
-    """Yield a bag that can be read to its end, and what was lost: the bag itself, or a copy of its good part.
+class SalvagedCopy:
+    """The good part of a damaged recording as a bag of its own, which goes with this object.
 
-    Args:
-        source: as `bag_source` returned it.
-
-    Raises:
-        RecordingError: nothing of it can be read.
-        MissingDependencyError: the library that reads what was cut off is not installed.
+    Attributes:
+        path: of the bag.
+        note: what was lost.
     """
-    name = source.stem
-    try:
-        with open_bag(source, name) as bag:
-            for _ in bag.messages():
-                pass
-    except RecordingError as error:
-        reason = str(error)
-    else:
-        yield source, []
-        return
-    with TemporaryDirectory(prefix="finforce_") as folder:
-        target = Path(folder) / name
-        count, seconds = _copy_good_part(source, target, reason)
-        yield target, [f"{reason}; read up to the damage: {count} messages of {seconds:.1f} s"]
+
+    def __init__(self, source: Path, reason: str) -> None:
+        """Copy what can be read.
+
+        Args:
+            source: as `bag_source` returned it.
+            reason: why it is not read as it is.
+
+        Raises:
+            RecordingError: not one message of it is whole.
+            MissingDependencyError: the library that reads what was cut off is not installed.
+        """
+        self._folder = TemporaryDirectory(prefix="finforce_")
+        self.path = Path(self._folder.name) / source.stem
+        loss = _Loss()
+        count, seconds = _copy_good_part(source, self.path, reason, loss)
+        self.note = f"{reason}; read as far as it is good: {count} messages of {seconds:.1f} s{loss.words()}"
 
 
-def _copy_good_part(source: Path, target: Path, reason: str) -> tuple[int, float]:
-    """Write the messages before the damage as a new bag; return their number, and the time that they span [s]."""
+@dataclass
+class _Loss:
+    """What could not be read.
+
+    Attributes:
+        count: parts of files.
+        size: of them [bytes].
+    """
+
+    count: int = 0
+    size: int = 0
+
+    def add(self, size: int) -> None:
+        """Count a part."""
+        self.count += 1
+        self.size += size
+
+    def words(self) -> str:
+        """Return what to say of it, "" of nothing."""
+        if not self.count:
+            return ""
+        parts = "one part" if self.count == 1 else f"{self.count} parts"
+        size = f" of {self.size / 1e3:.1f} kB" if self.size else ""
+        return f", {parts}{size} lost"
+
+
+def _copy_good_part(source: Path, target: Path, reason: str, loss: _Loss) -> tuple[int, float]:
+    """Write the messages that are whole as a new bag; return their number, and the time that they span [s]."""
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     files = _bag_files(source)
@@ -75,7 +107,7 @@ def _copy_good_part(source: Path, target: Path, reason: str) -> tuple[int, float
     times: list[int] = []
     with Writer(target, version=9, storage_plugin=StoragePlugin.SQLITE3 if is_sqlite else StoragePlugin.MCAP) as writer:
         for path in files:
-            for message in _read_sqlite(path) if is_sqlite else _read_mcap(path):
+            for message in _read_sqlite(path, loss) if is_sqlite else _read_mcap(path, loss):
                 key = (message.topic, message.msgtype)
                 if key not in connections:
                     connections[key] = writer.add_connection(
@@ -100,7 +132,7 @@ def _bag_files(source: Path) -> list[Path]:
     return sorted(found, key=lambda path: (len(path.name), path.name))
 
 
-def _read_mcap(path: Path) -> Iterator[_Message]:
+def _read_mcap(path: Path, loss: _Loss) -> Iterator[_Message]:
     """Yield the messages of an mcap file that are whole."""
     try:
         from mcap.records import Channel, Message, Schema
@@ -109,7 +141,7 @@ def _read_mcap(path: Path) -> Iterator[_Message]:
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}
     with path.open("rb") as file:
-        for record in _read_records(file):
+        for record in _walk_records(file, path.stat().st_size, loss):
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
@@ -122,66 +154,129 @@ def _read_mcap(path: Path) -> Iterator[_Message]:
                     yield _Message(channel.topic, schema.name, text, record.log_time, record.data)
 
 
-def _read_records(file: BinaryIO, *, skip_magic: bool = False) -> Iterator[Any]:
-    """Yield the records of a file that are whole, those of a chunk that was cut off, too."""
+def _walk_records(file: BinaryIO, size: int, loss: _Loss) -> Iterator[Any]:
+    """Yield the records of a file that are whole; after what is not, go on with the next chunk that the index names."""
+    known, place, unpacked = _indexed_chunks(file), _MAGIC, 0
+    while place + _HEAD.size <= size:
+        file.seek(place)
+        head = file.read(_HEAD.size)
+        opcode, length = _HEAD.unpack(head)
+        end = place + _HEAD.size + length
+        after = next((other for other in known if other > place), size)
+        is_torn = end > size or (opcode == _CHUNK_OPCODE and end > after)
+        if is_torn or opcode not in _OPCODES:
+            if opcode == _CHUNK_OPCODE and after == size:  # the last one: its beginning may be good
+                file.seek(place)
+                yield from _parse_records(_read_torn_chunk(file))
+            loss.add(after - place)
+            place = after
+            continue
+        if opcode == _CHUNK_OPCODE:
+            content = _unpack_chunk(file.read(length))
+            unpacked += len(content or b"")
+            check_chunks([unpacked], size)
+            if content is None:
+                loss.add(length)
+            else:
+                yield from _parse_records(content, loss)
+        elif opcode in _READ_OPCODES:
+            yield from _parse_records(head + file.read(length), loss)
+        elif opcode in _END_OPCODES:
+            return
+        place = end
+
+
+def _indexed_chunks(file: BinaryIO) -> list[int]:
+    """Return where chunks begin, rising, as the index at a file's end says; none where it is gone."""
+    from mcap.reader import SeekingReader
+
+    try:
+        summary = SeekingReader(file, record_size_limit=_LONGEST).get_summary()
+    except Exception:  # it, too, may be damaged in any way
+        return []
+    return sorted(each.chunk_start_offset for each in summary.chunk_indexes) if summary else []
+
+
+def _unpack_chunk(content: bytes) -> bytes | None:
+    """Return the records of a chunk; None where they are not what was written."""
+    if len(content) < _CHUNK_HEAD.size:
+        return None
+    _, _, size, checksum, length = _CHUNK_HEAD.unpack_from(content)
+    begin = _CHUNK_HEAD.size + length + 8
+    compression, data = content[_CHUNK_HEAD.size : begin - 8], content[begin:]
+    check_chunks([size], len(content))
+    unpackers = {b"": lambda plain, _: plain, b"lz4": unpack_lz4, b"zstd": unpack_zstd}
+    if compression not in unpackers:
+        return None
+    try:
+        found = unpackers[compression](data, size)
+    except OutOfBoundsError:
+        raise
+    except Exception:  # each decompressor has its own classes
+        return None
+    return found if len(found) == size and (not checksum or crc32(found) == checksum) else None
+
+
+def _parse_records(content: bytes, loss: _Loss | None = None) -> Iterator[Any]:
+    """Yield the records in some bytes up to the first that is not whole."""
     from mcap.stream_reader import StreamReader
 
-    records = iter(StreamReader(file, skip_magic=skip_magic, record_size_limit=_LONGEST).records)
-    begin = 0
+    stream = io.BytesIO(content)
+    records = iter(StreamReader(stream, skip_magic=True, record_size_limit=_LONGEST).records)
     while True:
+        begin = stream.tell()
         try:
             record = next(records)
         except StopIteration:
             return
-        except Exception:  # each decompressor has its own classes for damage
-            break
-        # records of one chunk come one after the other while the file stands behind it
-        begin = file.tell()
+        except Exception:  # of a record's fields, anything
+            if loss is not None and begin < len(content):
+                loss.add(len(content) - begin)
+            return
         yield record
-    if not skip_magic:
-        file.seek(begin)
-        yield from _read_records(io.BytesIO(_read_torn_chunk(file)), skip_magic=True)
 
 
 def _read_torn_chunk(file: BinaryIO) -> bytes:
-    """Return what is left of the records of the chunk at which a file is; nothing of another record."""
+    """Return what is left of the records of the chunk at which a file is."""
     head = file.read(_CHUNK.size)
     if len(head) < _CHUNK.size:
         return b""
-    opcode, _, _, _, _, _, length = _CHUNK.unpack(head)
-    if opcode != _CHUNK_OPCODE or length > len("none"):
+    _, _, _, _, size, _, length = _CHUNK.unpack(head)
+    if length > len("none"):
         return b""
     compression = file.read(length).decode(errors="replace")
     file.read(8)
-    torn = file.read(_LONGEST)
-    if compression == "":
-        return torn
-    return _decompress(torn, compression)
+    check_chunks([size], 0)
+    torn = file.read(min(size, _LONGEST))
+    return torn if compression == "" else _decompress(torn, compression, size)
 
 
-def _decompress(torn: bytes, compression: str) -> bytes:
-    """Return the beginning of compressed bytes of which the end is missing."""
+def _decompress(torn: bytes, compression: str, size: int) -> bytes:
+    """Return the beginning of compressed bytes of which the end is missing; of the whole, at most `size` [bytes]."""
     if compression == "lz4":
         decompressor = import_library("lz4.frame", "reading a recording", "lz4").LZ4FrameDecompressor()
     elif compression == "zstd":
-        decompressor = import_library("zstandard", "reading a recording").ZstdDecompressor().decompressobj()
+        decompressor = import_zstd().ZstdDecompressor()
     else:
         return b""
-    found = []
+    found, left = [], size
     for begin in range(0, len(torn), _PIECE):
         try:
-            found.append(decompressor.decompress(torn[begin : begin + _PIECE]))
+            found.append(decompressor.decompress(torn[begin : begin + _PIECE], max_length=left))
         except Exception:  # what follows is damaged; each decompressor has its own classes
+            break
+        left -= len(found[-1])
+        if left <= 0 or decompressor.eof:
             break
     return b"".join(found)
 
 
-def _read_sqlite(path: Path) -> Iterator[_Message]:
+def _read_sqlite(path: Path, loss: _Loss) -> Iterator[_Message]:
     """Yield the messages of a db3 file that are whole."""
     with TemporaryDirectory(prefix="finforce_") as folder:
         copy = _pad_sqlite(path, Path(folder) / path.name)
         last: deque[_Message] = deque()
-        for message in _read_rows(copy or path):
+        for message in _read_rows(copy or path, loss):
             last.append(message)
             if len(last) > _NEIGHBOURS:
                 yield last.popleft()
@@ -192,17 +287,36 @@ def _read_sqlite(path: Path) -> Iterator[_Message]:
             yield message
 
 
-def _read_rows(path: Path) -> Iterator[_Message]:
-    """Yield the messages of a db3 file in the order in which they were written, up to the first damage."""
+def _read_rows(path: Path, loss: _Loss) -> Iterator[_Message]:
+    """Yield the messages of a db3 file in the order in which they were written, without those on damaged pages."""
     with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro&immutable=1", uri=True)) as base:
         try:
+            refuse_computed(path)
             topics = {row[0]: row[1:] for row in base.execute("SELECT id, name, type FROM topics")}
-            for topic, time, data in base.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"):
-                if topic in topics and isinstance(data, bytes):
-                    name, msgtype = topics[topic]
-                    yield _Message(name, msgtype, "", time, data)
-        except sqlite3.DatabaseError:
+        except (sqlite3.DatabaseError, ValueError):
             return
+        begin, step = -(1 << 62), 1
+        while step < _MOST_ROWS:
+            try:
+                rows = base.execute(_ROWS, (begin,))
+                for number, topic, time, data in rows:
+                    begin, step = number + 1, 1
+                    if topic in topics and isinstance(data, bytes) and isinstance(time, int):
+                        name, msgtype = topics[topic]
+                        yield _Message(name, msgtype, "", time, data)
+                return
+            except sqlite3.DatabaseError:
+                # rows on a page that cannot be read are passed over, ever more of them
+                if begin < 0:
+                    begin = 0
+                if step == 1:
+                    loss.add(0)
+                begin += step
+                step *= 2
+
+
+_ROWS = "SELECT rowid, topic_id, timestamp, data FROM messages WHERE rowid >= ? ORDER BY rowid"
+_MOST_ROWS = 1 << 24
 
 
 def _pad_sqlite(path: Path, copy: Path) -> Path | None:

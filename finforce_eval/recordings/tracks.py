@@ -15,6 +15,7 @@ from finforce_ifea.observation import Observation
 
 if TYPE_CHECKING:
     from finforce_eval.recordings.images import ImageTrack
+    from finforce_eval.recordings.salvage import SalvagedCopy
 
 JAWS = ("left", "right")
 DIRECTIONS = ("load", "unload")
@@ -178,6 +179,7 @@ class Recording:
         case: content of `case.json`, empty without it.
         notes: what was left aside on reading, one sentence each.
         images: its RGB-D images, read one by one; None without any.
+        copy: of what could be read of it, where it is damaged; None where it is whole.
     """
 
     name: str
@@ -188,6 +190,12 @@ class Recording:
     case: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     images: ImageTrack | None = None
+    copy: SalvagedCopy | None = field(default=None, compare=False)
+
+    @property
+    def source(self) -> Path:
+        """What can be read to its end: the recording itself, or the copy of its good part."""
+        return self.path if self.copy is None else self.copy.path
 
     def jaw(self, side: str) -> JawTrack:
         """Return what was recorded of the jaw `side`.

@@ -146,7 +146,7 @@ def play_to_nodes(
     sides, from_images = tuple(recording.jaws), keypoints.source_of(recording) == IMAGES
     with ExitStack() as stack:
         recording = _choose_keypoints(recording, setup.jaw, keypoints, stack)
-        messages = read_playback(recording.path, without=_results_of(sides) | _unplayed(sides, from_images))
+        messages = read_playback(recording.source, without=_results_of(sides) | _unplayed(sides, from_images))
         options = _graph_options(recording, setup, calibration_file, playing)
         processes = replay_processes(replace(options, images=from_images, composed=False), Path())
         processes, log = _for_scores(processes, recording, keypoints), ReplayLog(sides)

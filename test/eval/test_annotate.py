@@ -142,7 +142,7 @@ def test_a_recording_that_was_cut_off_is_read_up_to_the_damage(tmp_path, capsys,
     content = file.read_bytes()
     file.write_bytes(content[: int(share * len(content))])
     assert annotate(tmp_path / "out", source) == 0
-    assert "read up to the damage" in capsys.readouterr().err
+    assert "read as far as it is good" in capsys.readouterr().err
     after = messages(tmp_path / "out" / "cut")
     own = [entry for entry in after if entry[0] == "/left/keypoints"]
     assert own == [entry for entry in whole if entry[0] == "/left/keypoints"][: len(own)]

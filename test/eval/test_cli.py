@@ -74,7 +74,7 @@ def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path, exact,
 
 def test_note_about_unknown_types_goes_to_stderr(tmp_path, exact, capsys, monkeypatch):
     noted = replace(bench_recording(), notes=("/odd skipped: unknown type own_msgs/msg/Odd",))
-    monkeypatch.setattr("finforce_eval.evaluation.many.read_recording", lambda *_: noted)
+    monkeypatch.setattr("finforce_eval.evaluation.many.read_recording", lambda *_, **__: noted)
     assert main(["evaluate", "pressed"]) == 0
     assert capsys.readouterr().err == "note: pressed: /odd skipped: unknown type own_msgs/msg/Odd\n"
 
@@ -88,11 +88,12 @@ def test_empty_folder_is_refused(capsys, tmp_path):
     assert_refused(capsys, ["evaluate", tmp_path], "the folder is no recording")
 
 
-def test_truncated_recording_is_refused(capsys, bag):
+def test_a_recording_of_which_nothing_is_left_is_refused(capsys, bag):
     file = bag / "pressed.mcap"
     file.write_bytes(file.read_bytes()[:5000])
-    assert_refused(capsys, ["evaluate", bag], "truncated or damaged")
-    assert_refused(capsys, ["evaluate", file], "truncated or damaged")
+    assert_refused(capsys, ["evaluate", bag, "--strict"], "truncated or damaged")
+    file.write_bytes(file.read_bytes()[:500])
+    assert_refused(capsys, ["evaluate", file], "not one message is whole")
 
 
 def test_empty_recording_is_refused(capsys, tmp_path):

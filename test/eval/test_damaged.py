@@ -1,0 +1,171 @@
+"""Claims about damaged recordings: what is good is read as it was, with a word of the rest; --strict refuses them."""
+
+import struct
+
+import numpy as np
+import pytest
+from eval_fakes import make_recording
+
+from finforce_eval.errors import DamagedError, OutOfBoundsError, RecordingError
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.writer import write_recording
+
+KINDS = [("mcap", ""), ("mcap", "lz4"), ("mcap", "zstd"), ("sqlite3", "")]
+CHUNK = 0x06
+
+
+def write(folder, storage="mcap", compression="", frames=1500):
+    """A recording of several chunks, and its one file."""
+    recording = make_recording(frames=frames)
+    if storage == "mcap":
+        path = write_mcap(recording, folder, compression)
+    else:
+        path = next(write_recording(recording, folder / "plain", storage=storage).glob("*.db3"))
+    return recording, path
+
+
+def write_mcap(recording, folder, compression):
+    """An mcap file as rosbag2 writes them: chunks with checksums, of some 64 kB."""
+    from mcap.writer import CompressionType, Writer
+    from rosbags.rosbag2 import Reader
+
+    kinds = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
+    bag = write_recording(recording, folder / "plain")
+    path = folder / "bag.mcap"
+    with Reader(bag) as reader, path.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 16, compression=kinds[compression])
+        writer.start("ros2", "test")
+        channels = {}
+        for connection in reader.connections:
+            schema = writer.register_schema(connection.msgtype, "ros2msg", connection.msgdef.data.encode())
+            channels[connection.id] = writer.register_channel(connection.topic, "cdr", schema)
+        for connection, time, data in reader.messages():
+            writer.add_message(channels[connection.id], time, bytes(data), time)
+        writer.finish()
+    return path
+
+
+def chunk_places(content):
+    """Where the chunks of an mcap file begin, and how long they are."""
+    place, found = 8, []
+    while place + 9 <= len(content):
+        opcode, length = struct.unpack_from("<BQ", content, place)
+        if opcode == CHUNK:
+            found.append((place, 9 + length))
+        place += 9 + length
+    return found
+
+
+def is_part_of(read, whole):
+    """Every image that was read is one of the whole recording, as it was."""
+    mine, theirs = read.jaws["left"].keypoints, whole.jaws["left"].keypoints
+    rows = np.searchsorted(theirs.stamps, mine.stamps)
+    assert np.array_equal(theirs.stamps[rows], mine.stamps)
+    assert np.allclose(theirs.points[rows], mine.points, atol=1e-6, equal_nan=True)
+    return len(mine.stamps) / len(theirs.stamps)
+
+
+@pytest.mark.parametrize(("storage", "compression"), KINDS)
+@pytest.mark.parametrize("share", [0.4, 0.9, 0.999])
+def test_what_was_cut_off_is_read_up_to_the_end(tmp_path, storage, compression, share):
+    whole, path = write(tmp_path, storage, compression)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(DamagedError, match="truncated or damaged"):
+        read_recording(path, strict=True)
+    read = read_recording(path)
+    found = is_part_of(read, whole)
+    assert found > 0.4 * share and (share < 0.95 or found > 0.8)
+    assert any("read as far as it is good" in note for note in read.notes)
+
+
+@pytest.mark.parametrize("compression", ["", "lz4", "zstd"])
+def test_a_bad_chunk_in_the_middle_costs_itself(tmp_path, compression):
+    whole, path = write(tmp_path, "mcap", compression)
+    content = bytearray(path.read_bytes())
+    places = chunk_places(content)
+    assert len(places) >= 3
+    begin, length = places[len(places) // 2]
+    for offset in range(200, length - 1, 997):
+        content[begin + offset] ^= 0x55
+    path.write_bytes(content)
+    read = read_recording(path)
+    share = is_part_of(read, whole)
+    assert 1.0 - 2.5 / len(places) < share < 1.0
+    last = whole.jaws["left"].keypoints.stamps[-1]
+    assert read.jaws["left"].keypoints.stamps[-1] == last
+    assert any("one part of" in note and "lost" in note for note in read.notes), read.notes
+    with pytest.raises(DamagedError):
+        read_recording(path, strict=True)
+
+
+def test_a_chunk_whose_length_is_wrong_is_passed_over_by_the_index(tmp_path):
+    whole, path = write(tmp_path, "mcap", "zstd")
+    content = bytearray(path.read_bytes())
+    begin, _ = chunk_places(content)[1]
+    struct.pack_into("<Q", content, begin + 1, 1 << 40)
+    struct.pack_into("<Q", content, begin + 9 + 32 + 4, 1 << 40)
+    content[begin + 60] ^= 0xFF
+    path.write_bytes(content)
+    read = read_recording(path)
+    assert 0.3 < is_part_of(read, whole) < 1.0
+    assert read.jaws["left"].keypoints.stamps[-1] == whole.jaws["left"].keypoints.stamps[-1]
+
+
+def test_a_file_without_an_index_is_read_whole(tmp_path):
+    whole, path = write(tmp_path, "mcap", "zstd")
+    content = path.read_bytes()
+    begin, length = chunk_places(content)[-1]
+    path.write_bytes(content[: begin + length])
+    read = read_recording(path)
+    assert is_part_of(read, whole) == 1.0 and read.notes
+
+
+def test_bad_pages_in_the_middle_of_a_database_cost_what_is_on_them(tmp_path):
+    whole, path = write(tmp_path, "sqlite3")
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2 // 4096 * 4096
+    content[middle : middle + 8192] = bytes(8192)
+    path.write_bytes(content)
+    read = read_recording(path)
+    assert 0.5 < is_part_of(read, whole) < 1.0
+    assert any("lost" in note for note in read.notes)
+
+
+def test_damaged_recordings_are_annotated_and_evaluated_with_a_word(tmp_path, capsys):
+    from finforce_eval.cli.main import main
+    from finforce_eval.recordings.recording import DEMO
+
+    path = tmp_path / "cut.mcap"
+    content = next(DEMO.glob("*.mcap")).read_bytes()
+    path.write_bytes(content[: len(content) * 2 // 3])
+    options = [str(path), "--contact", "fixed:42", "--calibration", "bench"]
+    assert main(["evaluate", *options]) == 0
+    assert "read as far as it is good" in capsys.readouterr().err
+    assert main(["evaluate", *options, "--strict"]) == 2
+    assert main(["annotate", *options, "--out", str(tmp_path / "out"), "--strict"]) == 2
+    capsys.readouterr()
+    assert main(["annotate", *options, "--out", str(tmp_path / "out")]) == 0
+    assert "read as far as it is good" in capsys.readouterr().err
+
+
+def test_a_chunk_that_says_more_than_it_may_is_refused_and_names_the_way_out(tmp_path, monkeypatch):
+    from finforce_eval.recordings import bounded
+
+    monkeypatch.setattr(bounded, "LARGEST_CHUNK", 1 << 12)
+    _, path = write(tmp_path, "mcap", "zstd")
+    with pytest.raises(OutOfBoundsError, match="FINFORCE_BUDGET=10"):
+        read_recording(path)
+    monkeypatch.setenv("FINFORCE_BUDGET", "100")
+    assert len(read_recording(path).jaws["left"].keypoints.stamps) == 1500
+
+
+def test_more_messages_than_a_file_can_hold_are_refused(tmp_path, monkeypatch):
+    from finforce_eval.recordings import bounded, recording
+
+    monkeypatch.setattr(bounded, "MOST_MESSAGES", 100)
+    monkeypatch.setattr(bounded, "BYTES_PER_MESSAGE", 1 << 20)
+    monkeypatch.setattr(recording, "_CHECKED", 50)
+    _, path = write(tmp_path)
+    with pytest.raises(RecordingError, match="more than 100 messages"):
+        read_recording(path)
