@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from finforce.caches import cache_folder
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.fem.frame import FrameModel
 from finforce_ifea.fem.plane import PlaneModel
@@ -48,14 +49,6 @@ def hash_parts(*parts: NDArray | str | float) -> str:
         if array is not None:
             digest.update(array.tobytes())
     return digest.hexdigest()[:32]
-
-
-def cache_folder() -> Path:
-    """Returns the folder of the cache, which may not exist yet."""
-    named = os.environ.get("FINFORCE_CACHE")
-    if named:
-        return Path(named)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "finforce"
 
 
 def fetch_manifold(key: str, build: Callable[[], Manifold]) -> Manifold:

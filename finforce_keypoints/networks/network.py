@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from finforce.optional import import_onnxruntime
 from finforce.processors import places_of_helpers
 from finforce_keypoints.errors import DetectionError, ModelError
+from finforce_keypoints.networks.trial import try_network
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -93,7 +94,7 @@ def open_session(path: Path, threads: int, providers: Sequence[str]) -> Inferenc
     """Return an onnxruntime session of a network file.
 
     Raises:
-        ModelError: there is no such provider, no thread, or the file cannot be loaded.
+        ModelError: there is no such provider, no thread, or the file cannot be loaded and run within bounds.
         MissingDependencyError: onnxruntime is not installed.
     """
     runtime = import_onnxruntime()
@@ -103,6 +104,7 @@ def open_session(path: Path, threads: int, providers: Sequence[str]) -> Inferenc
             f"got providers {list(providers)} and {threads} threads, expected at least one thread and providers "
             f"among {runtime.get_available_providers()}"
         )
+    try_network(path, runtime.__version__)
     options = runtime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 3  # errors, which are raised anyway

@@ -72,7 +72,7 @@ def test_both_files_are_needed(tmp_path):
     with pytest.raises(ModelError, match=r"no fine\.onnx"):
         SideNetwork(tmp_path)
     (tmp_path / FINE).write_bytes(b"no network")
-    with pytest.raises(ModelError, match="cannot load"):
+    with pytest.raises(ModelError, match="expected an ONNX network"):
         SideNetwork(tmp_path)
     shutil.copy(ANY_FINGER / COARSE, tmp_path / FINE)
     with pytest.raises(ModelError, match=r"fine\.onnx: a network of pictures, templates, points.*expected pieces"):
