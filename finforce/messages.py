@@ -444,8 +444,17 @@ def mask_from_image(image: Any, frame: str) -> NDArray[np.bool_]:
     return unpack_rows("mask", image.data, np.dtype(np.uint8), layout_of(image)) != 0
 
 
+_STAMPED = 12  # bytes: the encapsulation's four, and the stamp's eight
+
+
 def read_stamp(data: bytes) -> int:
-    """Return the stamp [ns] of a message with a header from its CDR bytes, of which nothing else is read."""
+    """Return the stamp [ns] of a message with a header from its CDR bytes, of which nothing else is read.
+
+    Raises:
+        ObservationError: the bytes are too few.
+    """
+    if len(data) < _STAMPED:
+        raise ObservationError(f"{len(data)} bytes are no message with a header")
     seconds, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return NANOSECONDS * seconds + rest
 

@@ -79,23 +79,27 @@ class ContactEstimatorNode(Node):
 
     def on_jaw_pose(self, side: str, unread: ros.Unread) -> None:
         """Find the contact of an image, unless it may be passed over."""
-        began, stamp = perf_counter(), unread.stamp
+        with self._refusals((side,)):
+            self._find_contact(side, unread, unread.stamp)
+
+    def _find_contact(self, side: str, unread: ros.Unread, stamp: int) -> None:
+        """Find the contact of an image [ns], unless it may be passed over."""
+        began = perf_counter()
         self.health[side].arrive()
         # poses of the object that came while the image was looked at
         for message in ros.take_waiting(self.objects):
             self.on_object(message)
-        with self._refusals((side,)):
-            if self.idling[side].passes(stamp):
-                self.skips.count(IDLE)
-                self.session.pass_over(side, stamp, unread.read)
-                return
-            if self.gates[side].enter(stamp, self._now()):
-                self.session.restart(side)
-                self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
-            message = unread.read()
-            self._read_late(side)
-            self._send(side, began, self.session.take_jaw_pose(side, message))
-            self._rest(side, stamp)
+        if self.idling[side].passes(stamp):
+            self.skips.count(IDLE)
+            self.session.pass_over(side, stamp, unread.read)
+            return
+        if self.gates[side].enter(stamp, self._now()):
+            self.session.restart(side)
+            self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
+        message = unread.read()
+        self._read_late(side)
+        self._send(side, began, self.session.take_jaw_pose(side, message))
+        self._rest(side, stamp)
 
     def _read_late(self, side: str) -> None:
         """Read what a jaw's solver said while images were passed over."""
@@ -124,12 +128,12 @@ class ContactEstimatorNode(Node):
 
         Of an image that is passed over it is read when the next contact is looked for, if nothing newer came.
         """
-        began, stamp = perf_counter(), unread.stamp
-        if self.idling[side].passes(stamp):
-            self.unread[side][kind] = partial(self.on_jaw, side, kind, take, unread)
-            return
-        self.unread[side].pop(kind, None)
+        began = perf_counter()
         with self._refusals((side,)):
+            if self.idling[side].passes(unread.stamp):
+                self.unread[side][kind] = partial(self.on_jaw, side, kind, take, unread)
+                return
+            self.unread[side].pop(kind, None)
             message = unread.read()
             self._check_ahead(message)
             self._send(side, began, take(side, message))

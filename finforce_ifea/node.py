@@ -112,6 +112,11 @@ class IfeaSolverNode(Node):
 
     def _on_keypoints(self, unread: ros.Unread) -> None:
         """Take the newest image, to be solved with its contact, or the one before where that takes too long."""
+        with self._refusals():
+            self._take_keypoints(unread)
+
+    def _take_keypoints(self, unread: ros.Unread) -> None:
+        """Take an image, or the newest behind it."""
         began, overtaken = perf_counter(), 0
         if self.skips.allows(LATE):
             unread, overtaken = ros.take_newest(self.keypoints, unread)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from finforce.errors import FinforceError
@@ -21,6 +20,7 @@ from finforce.health import Health, Outcome, Report
 from finforce.messages import stamp_of
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
+from finforce.ros.pipeline import read_message
 from finforce.ros.raw_image import read_image, read_picture
 from finforce.skipping import IDLE, LATE, UNHEARD, Skips
 from finforce.stamps import Idling, StampGate
@@ -129,7 +129,7 @@ class KeypointDetectorNode(Node):
         if (said := data[STAMPED:]) == self.info:
             return
         with self._refusals():
-            self.feed.take_info(deserialize_message(data, CameraInfo))
+            self.feed.take_info(read_message(data, CameraInfo))
             self.info = said
 
     def _on_color(self, topic: str, data: bytes) -> None:

@@ -384,9 +384,8 @@ def take_newest(subscription: Subscription | Port, message: Any) -> tuple[Any, i
         data, passed = take_newest(subscription, message.data)
         return Unread(data, message.kind), passed
     passed = 0
-    with (handle := subscription.handle):
-        while (taken := handle.take_message(subscription.msg_type, subscription.raw)) is not None:
-            message, passed = taken[0], passed + 1
+    for taken in _take_all(subscription):
+        message, passed = taken, passed + 1
     return message, passed
 
 
@@ -396,8 +395,22 @@ def take_waiting(subscription: Subscription | Port) -> Iterator[Any]:
         subscription = subscription.outside
     if subscription is None:
         return  # it is of the same process, where nothing waits
+    yield from _take_all(subscription)
+
+
+_MOST_WAITING = 1000  # messages, more than any queue keeps
+
+
+def _take_all(subscription: Subscription) -> Iterator[Any]:
+    """Yield the messages that wait in a subscription; bytes that are none are passed over."""
     with (handle := subscription.handle):
-        while (taken := handle.take_message(subscription.msg_type, subscription.raw)) is not None:
+        for _ in range(_MOST_WAITING):
+            try:
+                taken = handle.take_message(subscription.msg_type, subscription.raw)
+            except RuntimeError:  # the middleware's error of bytes that it cannot read; they are taken all the same
+                continue
+            if taken is None:
+                return
             yield taken[0]
 
 

@@ -16,6 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
+from finforce.errors import ObservationError
 from finforce.messages import read_stamp, stamp_of
 from finforce.ros.messages import pack
 
@@ -36,12 +37,24 @@ class Unread:
 
     @property
     def stamp(self) -> int:
-        """Its stamp [ns]."""
+        """Its stamp [ns]; raises ObservationError where the bytes are too few for one."""
         return read_stamp(self.data)
 
     def read(self) -> Any:
-        """Return the message."""
-        return deserialize_message(self.data, self.kind)
+        """Return the message; raises ObservationError where the bytes are none of its type."""
+        return read_message(self.data, self.kind)
+
+
+def read_message(data: bytes, kind: type) -> Any:
+    """Return a message of its bytes.
+
+    Raises:
+        ObservationError: they are none of this type.
+    """
+    try:
+        return deserialize_message(data, kind)
+    except Exception as error:  # of the middleware, which has its own classes
+        raise ObservationError(f"{len(data)} bytes are no {kind.__name__}: {type(error).__name__}") from error
 
 
 class Handed:

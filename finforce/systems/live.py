@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
+from finforce.files import FileError, read_yaml
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.systems.processes import (
     BenchOptions,
@@ -264,9 +263,16 @@ def camera_pose(options: SolverOptions) -> Sequence[float]:
 
 
 def _parameters_of(file: str, node: str) -> Mapping[str, Any]:
-    """Return the parameters that a file gives to a node."""
-    sections = yaml.safe_load(Path(file).read_text(encoding="utf-8")) or {}
-    found = {}
-    for name in ("/**", node, f"/{node}"):
-        found |= (sections.get(name) or {}).get("ros__parameters") or {}
+    """Return the parameters that a file gives to a node.
+
+    Raises:
+        ValueError: the file cannot be read, or is none of parameters.
+    """
+    found: dict[str, Any] = {}
+    try:
+        sections = read_yaml(file) or {}
+        for name in ("/**", node, f"/{node}"):
+            found |= (sections.get(name) or {}).get("ros__parameters") or {}
+    except (FileError, AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"{file}: {error}; expected ROS parameters: node, ros__parameters, names") from error
     return found

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from finforce.files import read_yaml
 from finforce.optional import import_library
 from finforce.systems.processes import Process, emulated_port, given
 
@@ -72,12 +71,13 @@ def moveit_processes(options: StackOptions, share: Path) -> list[Process]:
 
     Raises:
         MissingDependencyError: the description is a xacro file, and xacro is not installed.
+        FileError: the file of controllers cannot be read.
     """
     folder = share / "config" / "moveit"
     model = describe(options.description or share / "urdf" / "finray_gripper.urdf")
     semantics = describe(options.semantics or folder / "finray_gripper.srdf")
-    controllers = yaml.safe_load(Path(options.controllers or folder / "controllers.yaml").read_text(encoding="utf-8"))
-    limits = yaml.safe_load((folder / "joint_limits.yaml").read_text(encoding="utf-8"))
+    controllers = read_yaml(options.controllers or folder / "controllers.yaml")
+    limits = read_yaml(folder / "joint_limits.yaml")
     parameters = {
         "robot_description": model,
         "robot_description_semantic": semantics,

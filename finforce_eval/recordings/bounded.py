@@ -10,13 +10,14 @@ import io
 import os
 import sqlite3
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, BinaryIO
 
 from finforce.errors import MissingDependencyError
 from finforce.files import FileError, parse_yaml, raise_budget, read_text
+from finforce.optional import import_library
 from finforce_eval.errors import OutOfBoundsError
 
 MEGABYTE = 1 << 20
@@ -188,10 +189,9 @@ def _take_plain(data: bytes, size: int) -> bytes:
 
 def unpack_lz4(data: bytes, size: int) -> bytes:
     """Return what a chunk unpacks to: as many bytes as it says, or an error after one more."""
-    from lz4.frame import LZ4FrameDecompressor
-
+    lz4 = import_library("lz4.frame", "reading a recording", "lz4")
     check_chunks([size], len(data))
-    found = LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+    found = lz4.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
     if len(found) > size:
         raise OutOfBoundsError(f"compressed data unpack to more than {size} bytes; {_HINT}")
     return found
@@ -215,13 +215,9 @@ def unpack_zstd(data: bytes, size: int) -> bytes:
 
 def import_zstd() -> Any:
     """Return the module that rosbags has for zstd."""
-    with suppress(ImportError):
-        from compression import zstd
+    from rosbags.rosbag2 import storage_mcap
 
-        return zstd
-    from backports import zstd
-
-    return zstd
+    return storage_mcap.zstd
 
 
 class _OpenZstd:

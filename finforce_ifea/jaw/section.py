@@ -1,6 +1,5 @@
 """The section of a finger, extruded along its width: polygons, where they are held, and the file of both."""
 
-import json
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -9,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from finforce.files import parse_json, read_text
 from finforce_ifea.errors import JawFileError
 
 UNITS = {"m": 1.0, "mm": 1e-3, "inch": 25.4e-3}
@@ -148,10 +148,8 @@ def read_loops(path: Path) -> tuple[list[NDArray], float | None]:
     """
     if not path.is_file():
         raise JawFileError(f"there is no section file {path.name}; the path is relative to the jaw file")
-    if path.stat().st_size > _LARGEST_FILE:
-        raise JawFileError(f"{path.name}: {path.stat().st_size} bytes, expected at most {_LARGEST_FILE}")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(read_text(path, _LARGEST_FILE))
         unit = UNITS[content["unit"]]
         loops = [np.array(loop, float) * unit for loop in content["loops"]]
         width = content.get("width", content["width_mm"] * 1e-3 / unit if "width_mm" in content else None)
