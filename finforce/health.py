@@ -66,7 +66,8 @@ class Health:
         self._latency: deque[float] = deque(maxlen=window)
         self._age: deque[float] = deque(maxlen=window)
         self._refused: Counter[str] = Counter()
-        self._recent: list[Outcome] = []
+        # the last of each kind: however many are refused between two reports
+        self._recent: dict[tuple[Level, str], Outcome] = {}
         self._last: Outcome | None = None
         self._arrived = self._published = 0
 
@@ -86,7 +87,7 @@ class Health:
     def refuse(self, outcome: Outcome) -> None:
         """Count a message of which nothing was published."""
         self._refused[outcome.reason] += 1
-        self._recent.append(outcome)
+        self._recent[outcome.level, outcome.reason] = outcome
         self._last = outcome
 
     def report(self, alarms: Sequence[Outcome] = (), values: Mapping[str, str] | None = None) -> Report:
@@ -99,7 +100,7 @@ class Health:
             values: further values to be shown.
         """
         level, text = self._state()
-        troubles = [*alarms, *self._recent]
+        troubles = [*alarms, *self._recent.values()]
         if any(trouble.level == Level.ERROR for trouble in troubles):
             level = Level.ERROR
         elif troubles:

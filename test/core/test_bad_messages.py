@@ -4,7 +4,6 @@ import random
 import struct
 from pathlib import Path
 
-import numpy as np
 import pytest
 from contact_node_fakes import start_contact_estimator
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -84,7 +83,8 @@ def test_images_that_announce_more_than_they_hold_are_refused(probe):
     info = CameraInfo(header=seen, width=20_000, height=20_000, k=[9e9, 0.0, 1e4, 0.0, 9e9, 1e4, 0.0, 0.0, 1.0])
     node._on_info(bytes(serialize_message(info)))
     assert len(refused) == 1 and "20000x20000" in refused[0]
-    sane = CameraInfo(header=seen, width=640, height=480, k=[430.0, 0.0, 320.0, 0.0, 430.0, 240.0, 0.0, 0.0, 1.0])
+    k = [430.0, 0.0, 320.0, 0.0, 430.0, 240.0, 0.0, 0.0, 1.0]
+    sane = CameraInfo(header=seen, width=640, height=480, k=k)
     node._on_info(bytes(serialize_message(sane)))
     huge = Image(header=seen, height=20_000, width=20_000, encoding="rgb8", step=60_000, data=bytes(12))
     with_step = Image(header=seen, height=2**31, width=2**31, encoding="16UC1", step=2**32 - 1, data=bytes(12))
@@ -115,8 +115,7 @@ def test_memory_after_many_bad_messages_is_what_it_was(probe, sides):
             detector._on_color(f"{CAMERA}/color/image_raw", mutate(image, number, rng))
             detector._on_depth(mutate(image, number, rng))
 
-    send(2000)
+    send(4000)
     before = memory()
     send(8000)
-    assert memory() - before < 4e6
-    assert np.isfinite(before)
+    assert memory() - before < 2e6
