@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from finforce.files import FileError, parse_json
 from finforce_contact.errors import ObjectMeshError
@@ -57,6 +57,7 @@ def _read_chunks(path: Path) -> tuple[Mapping[str, Any], int]:
         if len(text) < length:
             raise _GlbError(f"a description of {length} bytes in a file that has {len(text)} of it")
         following = file.read(_CHUNK.size)
+        _walk_chunks(file, _HEAD.size + _CHUNK.size + length, path.stat().st_size)
     described = parse_json(text.decode("utf-8", errors="replace"))
     if not isinstance(described, dict):
         raise _GlbError("a description that is no object")
@@ -65,6 +66,16 @@ def _read_chunks(path: Path) -> tuple[Mapping[str, Any], int]:
     if kind == _BIN and announced > max(there, 0):
         raise _GlbError(f"{announced} bytes of numbers are announced, {max(there, 0)} are there")
     return described, announced if kind == _BIN else 0
+
+
+def _walk_chunks(file: BinaryIO, place: int, size: int) -> None:
+    """Refuse a chunk, from a place of a file [bytes] on, that says to be longer than what is left."""
+    while place + _CHUNK.size <= size:
+        file.seek(place)
+        announced, _ = _CHUNK.unpack(file.read(_CHUNK.size))
+        place += _CHUNK.size + announced
+        if place > size:
+            raise _GlbError(f"{announced} bytes are announced, {size - place + announced} are there")
 
 
 def _check_content(described: Mapping[str, Any], binary: int) -> None:

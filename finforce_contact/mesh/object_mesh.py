@@ -79,12 +79,14 @@ def read_triangles(path: Path | str) -> tuple[NDArray, NDArray]:
         check_glb(path)
     try:
         mesh = trimesh.load_scene(path, process=False, skip_materials=True).to_mesh()
+        vertices = np.array(mesh.vertices, dtype=float).reshape(-1, 3)
+        triangles = np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
     except Exception as error:  # a broken file makes the readers stumble over anything
         raise ObjectMeshError(
             f"{path.name}: cannot be read ({type(error).__name__}: {error}), expected a whole {path.suffix} file; "
             "export it again"
         ) from error
-    return np.array(mesh.vertices, dtype=float).reshape(-1, 3), np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
+    return vertices, triangles
 
 
 def _is_file(path: Path) -> bool:

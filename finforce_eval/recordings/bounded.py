@@ -122,8 +122,14 @@ def _bound_reader() -> type:
 
         def open(self) -> None:
             """Open it, unless something in place of a table would be computed."""
-            refuse_computed(Path(self.path))
-            super().open()
+            path = Path(self.path)
+            refuse_computed(path)
+            hooks, limit = storage_sqlite3.apsw.connection_hooks, step_limit(path)
+            hooks.append(lambda base: base.set_progress_handler(limit, STEPS))
+            try:
+                super().open()
+            finally:
+                hooks.pop()
 
     plugins = {"mcap": BoundedMcap, "sqlite3": BoundedSqlite}
 
@@ -256,6 +262,24 @@ def _bound_qos(parse: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return parse(value)
 
     return parse_bounded
+
+
+STEPS = 100_000  # of SQLite's machine, between two looks at how many there were
+_MOST_STEPS, _STEPS_PER_BYTE = 50_000_000, 4
+
+
+def step_limit(path: Path) -> Callable[[], bool]:
+    """Return what says, asked every `STEPS` steps, that a db3 file takes more of them than one of its size does.
+
+    Pages that are damaged may lead back to one another, and be read for ever.
+    """
+    left = [raise_budget(_MOST_STEPS + _STEPS_PER_BYTE * path.stat().st_size) // STEPS]
+
+    def is_spent() -> bool:
+        left[0] -= 1
+        return left[0] < 0
+
+    return is_spent
 
 
 def refuse_computed(path: Path) -> None:

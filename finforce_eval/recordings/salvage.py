@@ -7,7 +7,7 @@ import shutil
 import sqlite3
 import struct
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,15 @@ from finforce.errors import MissingDependencyError
 from finforce.optional import import_library
 from finforce_eval.errors import OutOfBoundsError, RecordingError
 from finforce_eval.recordings.bags import NO_DIGEST
-from finforce_eval.recordings.bounded import check_chunks, import_zstd, refuse_computed, unpack_lz4, unpack_zstd
+from finforce_eval.recordings.bounded import (
+    STEPS,
+    check_chunks,
+    import_zstd,
+    refuse_computed,
+    step_limit,
+    unpack_lz4,
+    unpack_zstd,
+)
 
 # No record of an mcap file is longer [bytes]: chunks have megabytes, an uncompressed 4K image 25.
 _LONGEST = 1 << 30
@@ -138,10 +146,12 @@ def _read_mcap(path: Path, loss: _Loss) -> Iterator[_Message]:
         from mcap.records import Channel, Message, Schema
     except ImportError as error:
         raise MissingDependencyError("reading a recording that was cut off needs mcap: pip install mcap") from error
-    schemas: dict[int, Any] = {}
-    channels: dict[int, Any] = {}
     with path.open("rb") as file:
-        for record in _walk_records(file, path.stat().st_size, loss):
+        summary = _read_summary(file, path.stat().st_size)
+        schemas: dict[int, Any] = dict(summary.schemas) if summary else {}
+        channels: dict[int, Any] = dict(summary.channels) if summary else {}
+        known = sorted(each.chunk_start_offset for each in summary.chunk_indexes) if summary else []
+        for record in _walk_records(file, path.stat().st_size, known, loss):
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
@@ -154,9 +164,9 @@ def _read_mcap(path: Path, loss: _Loss) -> Iterator[_Message]:
                     yield _Message(channel.topic, schema.name, text, record.log_time, record.data)
 
 
-def _walk_records(file: BinaryIO, size: int, loss: _Loss) -> Iterator[Any]:
-    """Yield the records of a file that are whole; after what is not, go on with the next chunk that the index names."""
-    known, place, unpacked = _indexed_chunks(file), _MAGIC, 0
+def _walk_records(file: BinaryIO, size: int, known: Sequence[int], loss: _Loss) -> Iterator[Any]:
+    """Yield the records of a file that are whole; after what is not, go on with the next of the known chunks."""
+    place, unpacked = _MAGIC, 0
     while place + _HEAD.size <= size:
         file.seek(place)
         head = file.read(_HEAD.size)
@@ -186,15 +196,14 @@ def _walk_records(file: BinaryIO, size: int, loss: _Loss) -> Iterator[Any]:
         place = end
 
 
-def _indexed_chunks(file: BinaryIO) -> list[int]:
-    """Return where chunks begin, rising, as the index at a file's end says; none where it is gone."""
+def _read_summary(file: BinaryIO, size: int) -> Any:
+    """Return what the end of a file [bytes] says of its topics, and where chunks begin; None where it is gone."""
     from mcap.reader import SeekingReader
 
     try:
-        summary = SeekingReader(file, record_size_limit=_LONGEST).get_summary()
+        return SeekingReader(file, record_size_limit=min(size, _LONGEST)).get_summary()
     except Exception:  # it, too, may be damaged in any way
-        return []
-    return sorted(each.chunk_start_offset for each in summary.chunk_indexes) if summary else []
+        return None
 
 
 def _unpack_chunk(content: bytes) -> bytes | None:
@@ -222,7 +231,7 @@ def _parse_records(content: bytes, loss: _Loss | None = None) -> Iterator[Any]:
     from mcap.stream_reader import StreamReader
 
     stream = io.BytesIO(content)
-    records = iter(StreamReader(stream, skip_magic=True, record_size_limit=_LONGEST).records)
+    records = iter(StreamReader(stream, skip_magic=True, record_size_limit=len(content)).records)
     while True:
         begin = stream.tell()
         try:
@@ -295,11 +304,13 @@ def _read_rows(path: Path, loss: _Loss) -> Iterator[_Message]:
             topics = {row[0]: row[1:] for row in base.execute("SELECT id, name, type FROM topics")}
         except (sqlite3.DatabaseError, ValueError):
             return
+        base.set_progress_handler(step_limit(path), STEPS)
         begin, step = -(1 << 62), 1
         while step < _MOST_ROWS:
             try:
-                rows = base.execute(_ROWS, (begin,))
-                for number, topic, time, data in rows:
+                for number, topic, time, data in base.execute(_ROWS, (begin,)):
+                    if number < begin:  # pages lead back to one another
+                        raise sqlite3.DatabaseError
                     begin, step = number + 1, 1
                     if topic in topics and isinstance(data, bytes) and isinstance(time, int):
                         name, msgtype = topics[topic]
@@ -307,11 +318,9 @@ def _read_rows(path: Path, loss: _Loss) -> Iterator[_Message]:
                 return
             except sqlite3.DatabaseError:
                 # rows on a page that cannot be read are passed over, ever more of them
-                if begin < 0:
-                    begin = 0
+                begin = max(begin, 0) + step
                 if step == 1:
                     loss.add(0)
-                begin += step
                 step *= 2
 
 

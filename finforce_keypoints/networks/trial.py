@@ -99,7 +99,9 @@ def main(arguments: Sequence[str]) -> int:
 
     import onnxruntime
 
-    limit = raise_budget(MEMORY)
+    limit, hard = raise_budget(MEMORY), resource.getrlimit(resource.RLIMIT_DATA)[1]
+    if hard != resource.RLIM_INFINITY:
+        limit = min(limit, hard)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
