@@ -168,7 +168,7 @@ def _demo_part() -> Any:
 def _make_mcap(compression: str) -> Callable[[Path], list[Path]]:
     def make(folder: Path) -> list[Path]:
         bag = _write_plain(folder)
-        return [_pack_mcap(bag, folder / "bag.mcap", compression)]
+        return [pack_mcap(bag, folder / "bag.mcap", compression)]
 
     return make
 
@@ -182,7 +182,7 @@ def _write_plain(folder: Path, storage: str = "mcap") -> Path:
     return target
 
 
-def _pack_mcap(bag: Path, path: Path, compression: str) -> Path:
+def pack_mcap(bag: Path, path: Path, compression: str) -> Path:
     """Write the messages of a bag as rosbag2 does: chunks with checksums."""
     from mcap.writer import CompressionType, Writer
     from rosbags.rosbag2 import Reader

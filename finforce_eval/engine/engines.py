@@ -141,29 +141,83 @@ def _count_processors() -> int:
 
 
 def _run_on_ray(tasks: Sequence[Task], options: EngineOptions) -> Iterator[Line]:
-    """Yield lines as a cluster ends its tasks."""
-    ray = import_library("ray", "--engine ray", "'finforce[ray]'")
+    """Yield lines as a cluster ends its tasks.
+
+    Ray ends the process that it runs in where its cluster is lost: it runs in one of its own.
+    """
+    import_library("ray", "--engine ray", "'finforce[ray]'")
     if not tasks:
         return
+    _check_reachable(options.address)
+    from multiprocessing import get_context
+
+    context, left = get_context("spawn"), len(tasks)
+    mine, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_drive_ray, args=(theirs, list(tasks), options))
+    process.start()
+    theirs.close()
+    try:
+        while left:
+            line = mine.recv()
+            if isinstance(line, str):
+                raise FinforceError(line)
+            left -= 1
+            yield line
+    except (EOFError, OSError) as error:
+        raise FinforceError("the Ray cluster has gone; start again to go on where this run was") from error
+    finally:
+        mine.close()
+        process.join(timeout=_PATIENCE if not left else 0.0)
+        process.kill()
+        process.join()
+
+
+_PATIENCE = 20.0  # [s] in which a cluster of this machine ends, and one elsewhere answers
+
+
+def _check_reachable(address: str) -> None:
+    """Refuse an address at which nobody listens; Ray itself would try for minutes.
+
+    Raises:
+        FinforceError: nobody does.
+    """
+    import re
+    import socket
+
+    found = re.fullmatch(r"(?:ray://)?\[?([^\[\]/]+?)\]?:(\d{1,5})", address)
+    if not found:
+        return
+    try:
+        socket.create_connection((found[1], int(found[2])), _PATIENCE / 4).close()
+    except (OSError, OverflowError) as error:
+        raise FinforceError(f"--address {address}: no Ray cluster: {error}") from error
+
+
+def _drive_ray(results: Any, tasks: Sequence[Task], options: EngineOptions) -> None:
+    """Send lines as a cluster ends its tasks, or what is wrong with the cluster."""
+    import os
+
+    import ray
+
+    # what Ray says of a lost cluster, at length, is said in one line by the process that waits for this one
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     where = {"address": options.address} if options.address else {"num_cpus": options.workers or _count_processors()}
     try:
-        ray.init(log_to_driver=False, logging_level="ERROR", **where)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise FinforceError(f"--address {options.address}: no Ray cluster: {error}") from error
-    try:
-        remote = ray.remote(run_task).options(num_cpus=1, max_retries=1)
-        running = {remote.remote(task): task for task in tasks}
-        while running:
-            (ready,), _ = ray.wait(list(running), num_returns=1)
-            task = running.pop(ready)
-            try:
-                yield ray.get(ready)
-            except ray.exceptions.WorkerCrashedError:
-                yield _died(task)
-    except (ray.exceptions.RaySystemError, ConnectionError) as error:
-        raise FinforceError(f"the Ray cluster has gone: {error}; start again to go on where this run was") from error
-    finally:
-        ray.shutdown()
+        ray.init(log_to_driver=False, logging_level="CRITICAL", **where)
+    except (Exception, SystemExit) as error:
+        words = " ".join(str(error).split())
+        results.send(f"--address {options.address}: no Ray cluster: {words}" if options.address else f"Ray: {words}")
+        return
+    remote = ray.remote(run_task).options(num_cpus=1, max_retries=1)
+    running = {remote.remote(task): task for task in tasks}
+    while running:
+        (ready,), _ = ray.wait(list(running), num_returns=1)
+        task = running.pop(ready)
+        try:
+            results.send(ray.get(ready))
+        except ray.exceptions.WorkerCrashedError:
+            results.send(_died(task))
+    ray.shutdown()
 
 
 _RUNNERS: dict[str, Callable[[Sequence[Task], EngineOptions], Iterator[Line]]] = {

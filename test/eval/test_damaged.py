@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from eval_fakes import make_recording
 
+from benchmarks.fuzz_files import pack_mcap
 from finforce_eval.errors import DamagedError, OutOfBoundsError, RecordingError
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
@@ -18,31 +19,10 @@ def write(folder, storage="mcap", compression="", frames=1500):
     """A recording of several chunks, and its one file."""
     recording = make_recording(frames=frames)
     if storage == "mcap":
-        path = write_mcap(recording, folder, compression)
+        path = pack_mcap(write_recording(recording, folder / "plain"), folder / "bag.mcap", compression)
     else:
         path = next(write_recording(recording, folder / "plain", storage=storage).glob("*.db3"))
     return recording, path
-
-
-def write_mcap(recording, folder, compression):
-    """An mcap file as rosbag2 writes them: chunks with checksums, of some 64 kB."""
-    from mcap.writer import CompressionType, Writer
-    from rosbags.rosbag2 import Reader
-
-    kinds = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
-    bag = write_recording(recording, folder / "plain")
-    path = folder / "bag.mcap"
-    with Reader(bag) as reader, path.open("wb") as file:
-        writer = Writer(file, chunk_size=1 << 16, compression=kinds[compression])
-        writer.start("ros2", "test")
-        channels = {}
-        for connection in reader.connections:
-            schema = writer.register_schema(connection.msgtype, "ros2msg", connection.msgdef.data.encode())
-            channels[connection.id] = writer.register_channel(connection.topic, "cdr", schema)
-        for connection, time, data in reader.messages():
-            writer.add_message(channels[connection.id], time, bytes(data), time)
-        writer.finish()
-    return path
 
 
 def chunk_places(content):

@@ -1,0 +1,87 @@
+"""Claims about the engine under evaluate, experiment and training data: its results do not depend on where."""
+
+import json
+
+import pytest
+from test_experiments import Counting
+
+from finforce_eval.cli.main import main
+from finforce_eval.engine.engines import EngineOptions
+from finforce_eval.engine.tasks import Task
+from finforce_eval.experiments.experiment import run_experiment
+from finforce_eval.recordings.recording import DEMO, read_recording
+from finforce_eval.recordings.writer import write_recording
+from training.errors import DatasetError
+from training.making import make_all
+
+
+def without_times(content):
+    """Figures without what the machine's mood decides."""
+    if isinstance(content, dict):
+        return {name: without_times(value) for name, value in content.items() if "_ms" not in name}
+    return [without_times(value) for value in content] if isinstance(content, list) else content
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory):
+    folder, whole = tmp_path_factory.mktemp("bags"), read_recording(DEMO)
+    begin = int(whole.jaws["left"].keypoints.stamps[0])
+    made = []
+    for number in range(3):
+        part = whole.between(begin, begin + (8 + number) * 10**9)
+        made.append(str(write_recording(part, folder / f"part{number}")))
+    return made
+
+
+def evaluate(bags, out, *words):
+    assert main(["evaluate", *bags, "--contact", "fixed:42", "--calibration", "bench", "--json", str(out), *words]) == 0
+    return without_times(json.loads(out.read_text()))
+
+
+@pytest.mark.parametrize("engine", ["processes", "ray"])
+def test_evaluations_agree(engine, bags, tmp_path, capsys):
+    if engine == "ray":
+        pytest.importorskip("ray")
+    here = evaluate(bags, tmp_path / "here.json")
+    there = evaluate(bags, tmp_path / "there.json", "--engine", engine, "--workers", "2")
+    assert there == here
+    assert list(here["cases"]) == ["part0", "part1", "part2"]
+
+
+def test_an_experiment_goes_to_processes(tmp_path):
+    findings = run_experiment(Counting(), tmp_path, EngineOptions(engine="processes", workers=2))
+    assert findings.figures["total"] == 11
+
+
+def write_number(number, path):
+    if number == 3:
+        raise DatasetError("three cannot be made")
+    with open(path, "w", encoding="utf-8") as file:
+        file.write(str(number))
+    return {"numbers": 1}
+
+
+def test_files_of_a_data_set_are_made_once_and_what_fails_is_named(tmp_path):
+    def tasks(numbers):
+        paths = {number: str(tmp_path / f"{number}.txt") for number in numbers}
+        return [
+            Task(name=str(number), key="k", work=write_number, given={"number": number, "path": path}, output=path)
+            for number, path in paths.items()
+        ]
+
+    engine = EngineOptions(engine="processes", workers=2)
+    with pytest.raises(DatasetError, match="1 of 5 failed, 3 with: three cannot be made"):
+        make_all(tasks(range(5)), engine, tmp_path, "", "file")
+    before = (tmp_path / "2.txt").stat().st_mtime_ns
+    (tmp_path / "1.txt").unlink()
+    lines = make_all(tasks((0, 1, 2, 4)), engine, tmp_path, "", "file")
+    assert sum(line["figures"]["numbers"] for line in lines) == 4
+    assert (tmp_path / "2.txt").stat().st_mtime_ns == before and (tmp_path / "1.txt").exists()
+
+
+def test_a_cluster_that_is_not_there_is_one_line(bags, tmp_path, capsys):
+    pytest.importorskip("ray")
+    words = ["annotate", bags[0], "--contact", "fixed:42", "--out", str(tmp_path / "out")]
+    assert main([*words, "--engine", "ray", "--address", "127.0.0.1:9"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert said.count("\n") == 0 and "127.0.0.1:9" in said
