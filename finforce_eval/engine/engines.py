@@ -205,7 +205,10 @@ def _drive_ray(results: Any, tasks: Sequence[Task], options: EngineOptions) -> N
     try:
         ray.init(log_to_driver=False, logging_level="CRITICAL", **where)
     except (Exception, SystemExit) as error:
-        words = " ".join(str(error).split())
+        cause: BaseException = error
+        while (deeper := cause.__cause__ or cause.__context__) is not None:
+            cause = deeper
+        words = " ".join(str(cause).split()).rpartition("ray.exceptions.")[2][:200]
         results.send(f"--address {options.address}: no Ray cluster: {words}" if options.address else f"Ray: {words}")
         return
     remote = ray.remote(run_task).options(num_cpus=1, max_retries=1)
