@@ -127,6 +127,7 @@ def work(kind: Kind, good: Sequence[Path]) -> None:
     warnings.simplefilter("ignore")
     logging.disable(logging.CRITICAL)
     known = [kind.read(path) for path in good]
+    _is_wrong(_damage(known[0]), known)  # what judges is compiled before its time counts
     grown = _data_size() + MEMORY
     resource.setrlimit(resource.RLIMIT_DATA, (grown, grown))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -186,6 +187,14 @@ def _is_wrong(found: Any, known: Sequence[Any]) -> bool:
         if not same and _is_force_wrong(side, stamps, points, (theirs, right)):
             return True
     return False
+
+
+def _damage(found: Any) -> Any:
+    """Return what a recording gives with its last image left out; of other files, what they give."""
+    if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], dict)):
+        return found
+    jaws, notes = found
+    return {side: (stamps[:-1], 1.0001 * points[:-1]) for side, (stamps, points) in jaws.items()}, notes
 
 
 def _is_force_wrong(side: str, stamps: NDArray, points: NDArray, good: tuple[NDArray, NDArray]) -> bool:

@@ -4,7 +4,10 @@ from finforce.errors import FinforceError
 
 
 class RecordingError(FinforceError, ValueError):
-    """A recording cannot be read, or lacks what the command needs."""
+    """A recording cannot be read, or lacks what the command needs; in one line, whatever names are in it."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(" ".join(text.split()))
 
 
 class DamagedError(RecordingError):

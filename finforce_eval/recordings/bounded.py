@@ -69,7 +69,7 @@ def make_reader(source: Path) -> Any:
     """
     if source.is_dir():
         try:
-            parse_yaml(read_text(source / "metadata.yaml", LARGEST_METADATA), text_keys=False)
+            _check_yaml(read_text(source / "metadata.yaml", LARGEST_METADATA))
         except FileError as error:
             raise ValueError(f"metadata.yaml: {error}") from error
     return _bound_reader()(source)
@@ -253,12 +253,25 @@ class _OpenZstd:
         return data
 
 
+def _check_yaml(text: str) -> None:
+    """Refuse a YAML text that would take more than its length; only one with references or much nesting could.
+
+    Raises:
+        FileError: it would.
+    """
+    if "&" in text or "*" in text or text.count("[") + text.count("{") > _FEW_BRACKETS:
+        parse_yaml(text, text_keys=False)
+
+
+_FEW_BRACKETS = 1000
+
+
 def _bound_qos(parse: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Return rosbags' parser of QoS for texts that are no YAML bombs."""
 
     def parse_bounded(value: Any) -> Any:
         if isinstance(value, str):
-            parse_yaml(value, text_keys=False)
+            _check_yaml(value)
         return parse(value)
 
     return parse_bounded
