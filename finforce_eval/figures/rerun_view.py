@@ -18,7 +18,7 @@ from finforce_ifea.marker_style import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, 
 TIMELINE = "recording"
 _QUALITY = 80  # of the pictures, JPEG
 _USED, _REFUSED = (25, 204, 51), (230, 51, 25)
-_COLOURS = {"left": (0, 114, 178), "right": (213, 94, 0), "grasp": (0, 158, 115), "truth": (34, 34, 34)}
+_COLOURS = {"left": (0, 114, 178), "right": (213, 94, 0), "grasp": (0, 158, 115), "truth": (204, 204, 204)}
 
 
 class RerunView:
@@ -91,6 +91,10 @@ class RerunView:
 
     def show_poses(self, recording: Recording) -> None:
         """Send where the jaws are in the camera's frame, as far as that is known."""
+        axes = self._rr.ViewCoordinates
+        is_placed = any(track.pose is not None for track in recording.jaws.values())
+        # the camera's frame is shown as it looks, that of a jaw with its tip down
+        self._stream.log("jaws", axes.RDF if is_placed else axes.RIGHT_HAND_Z_DOWN, static=True)
         for side, track in recording.jaws.items():
             pose = track.pose
             for row, stamp in enumerate(pose.stamps.tolist() if pose is not None else ()):

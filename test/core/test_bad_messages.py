@@ -1,11 +1,12 @@
 """Claims about messages that are none: each costs itself, the node goes on, and its memory stays what it was."""
 
+import os
 import random
 import struct
 from pathlib import Path
 
 import pytest
-from contact_node_fakes import start_contact_estimator
+from contact_node_fakes import ContactBench, cylinder_before_jaw, start_contact_estimator
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from keypoint_node_fakes import start_detector
 from node_fakes import keypoint_cloud, start_solver
@@ -14,6 +15,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 
+from finforce.health import Level
 from finforce.ros.pipeline import Unread
 
 CAMERA = "/camera/camera"
@@ -95,6 +97,14 @@ def test_images_that_announce_more_than_they_hold_are_refused(probe):
     assert all("20000" in text or "4294967295" in text or "bytes" in text or "encoding" in text for text in refused), (
         refused
     )
+
+
+def test_a_mesh_that_is_a_pipe_is_not_waited_for(probe, tmp_path):
+    pipe = tmp_path / "object.stl"
+    os.mkfifo(pipe)
+    bench = ContactBench(probe, object_mesh=str(pipe))
+    bench.image(cylinder_before_jaw())
+    bench.diagnosis(level=Level.ERROR, word="there is no such file")
 
 
 def memory():
