@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.optional import import_cv2
-from finforce_eval.cli.parser import add_engine_options, read_engine
+from finforce_eval.cli.parser import add_engine_options, read_engine, whole_number
 from finforce_eval.engine.engines import EngineOptions
 from finforce_eval.engine.tasks import Task, choose_shard
 from finforce_keypoints.geometry.side_picture import PlaneGrid
@@ -426,9 +426,13 @@ def main() -> None:
     """Render a data set."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="where the files are written")
-    parser.add_argument("--fingers", type=int, default=1500, help="for training (1500), 8 pictures each")
-    parser.add_argument("--validation", type=int, default=100, help="fingers for validation (100)")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first finger, to share the work (0)")
+    parser.add_argument(
+        "--fingers", type=whole_number(0, 10**9), default=1500, help="for training (1500), 8 pictures each"
+    )
+    parser.add_argument("--validation", type=whole_number(0, 10**9), default=100, help="fingers for validation (100)")
+    parser.add_argument(
+        "--first", type=whole_number(0, 10**9), default=0, help="seed of the first finger, to share the work (0)"
+    )
     add_engine_options(parser)
     options = parser.parse_args()
     with one_line_errors():

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from tqdm import tqdm
 
 from finforce_eval.cli.extrinsics import read_at_rest
+from finforce_eval.cli.parser import whole_number
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS
 from finforce_eval.evaluation.check import FAULT, check_recording
@@ -33,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "change a parameter of the key point detector, as depth=none; repeatable"
     parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
     text = "how many images at the beginning show the jaws open, still and unloaded (30)"
-    parser.add_argument("--images", type=int, default=30, metavar="N", help=text)
+    parser.add_argument("--images", type=whole_number(1, 100_000), default=30, metavar="N", help=text)
     parser.add_argument("--report", default=".", metavar="DIR", help=f"where {PICTURE} is written (here)")
 
 

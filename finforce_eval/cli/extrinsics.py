@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from finforce.camera import ImageError, decode_picture
 from finforce.transforms import pose_numbers, rotation_between
+from finforce_eval.cli.parser import whole_number
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.at_rest import ROUNDS, approach, first_images
 from finforce_eval.evaluation.keypoint_source import KeypointSource, build_records, choose_images, parse_source
@@ -37,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     text = "change a parameter of the key point detector, as model=FOLDER; repeatable"
     parser.add_argument("--detector", action="append", default=[], metavar="NAME=VALUE", help=text)
     text = "how many images at the beginning show the jaws at rest (45)"
-    parser.add_argument("--images", type=int, default=45, metavar="N", help=text)
+    parser.add_argument("--images", type=whole_number(1, 100_000), default=45, metavar="N", help=text)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import re
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
@@ -59,6 +61,18 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--extrinsics", metavar="POSE", help=text)
     text = "refuse a recording that is cut off or damaged; without it, it is read as far as it is good"
     parser.add_argument("--strict", action="store_true", help=text)
+
+
+def whole_number(least: int, most: int) -> Callable[[str], int]:
+    """Return what reads an option as a whole number within bounds."""
+
+    def read(text: str) -> int:
+        digits = text.strip()
+        if not re.fullmatch(r"-?\d{1,30}", digits) or not least <= int(digits) <= most:
+            raise argparse.ArgumentTypeError(f"{text[:40]!r}: expected a whole number from {least} to {most}")
+        return int(digits)
+
+    return read
 
 
 def add_calibration(parser: argparse.ArgumentParser) -> None:

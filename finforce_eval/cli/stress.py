@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from finforce_eval.cli.parser import MESHES, SOLVERS
+from finforce_eval.cli.parser import MESHES, SOLVERS, whole_number
 from finforce_eval.errors import OptionError
 from finforce_eval.stress.stress import (
     Family,
@@ -30,8 +30,13 @@ WORST = 5
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
     parser.add_argument("--families", metavar="A,B", help="families of trials, all without; a wrong one lists them")
-    parser.add_argument("--count", type=int, metavar="N", help="trials per family; without, as many as each takes")
-    parser.add_argument("--seed", type=int, default=0, help="of everything that is drawn (0)")
+    parser.add_argument(
+        "--count",
+        type=whole_number(1, 10_000_000),
+        metavar="N",
+        help="trials per family; without, as many as each takes",
+    )
+    parser.add_argument("--seed", type=whole_number(0, 2**32), default=0, help="of everything that is drawn (0)")
     parser.add_argument("--solver", default="default", choices=SOLVERS, help="model and objective")
     parser.add_argument("--mesh", default="default", choices=MESHES, help="mesh density")
     text = "shipped jaw or jaw file of the families about key points and places (bench)"
@@ -98,10 +103,6 @@ def run(options: argparse.Namespace) -> int:
     """
     from finforce_eval.machine import describe_machine, write_figures
 
-    if options.count is not None and options.count < 1:
-        raise OptionError(f"--count {options.count}: expected at least 1")
-    if options.seed < 0:
-        raise OptionError(f"--seed {options.seed}: expected zero or above")
     families = choose_families(options.families, find_families())
     plan = Plan(seed=options.seed, solver=options.solver, mesh=options.mesh, count=options.count, jaw=options.jaw)
     trials = run_families(families, plan)

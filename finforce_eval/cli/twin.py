@@ -7,7 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from finforce_eval.cli.parser import Parser
+from finforce_eval.cli.parser import Parser, whole_number
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.results import parse_changes
 from finforce_eval.recordings.twin_writer import PREVIEW, RecordingForm, record_scene
@@ -23,11 +23,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     record = actions.add_parser("record", help="render a scene and write it", description="render a scene and write it")
     record.add_argument("scene", metavar="SCENE", help="a name that `finforce twin list` prints")
     record.add_argument("-o", "--output", required=True, metavar="BAG", help="recording to be written, a new folder")
-    record.add_argument("--seed", type=int, default=0, help="of textures, light and noise (0)")
+    record.add_argument("--seed", type=whole_number(0, 2**32), default=0, help="of textures, light and noise (0)")
     finger = "seed of the jaws' material; calibration twin is of finger 0 (0)"
     steps = "of the depth in mm: 1 as the ROS driver gives it, 0.1 as the camera itself does (1)"
     record.add_argument("--depth-step", type=float, default=1.0, choices=(1.0, 0.1), help=steps)
-    record.add_argument("--finger", type=int, default=0, metavar="SEED", help=finger)
+    record.add_argument("--finger", type=whole_number(0, 2**32), default=0, metavar="SEED", help=finger)
     record.add_argument("--light", metavar="WORD", help="bright, dim or any; without it that of the scene")
     record.add_argument("--object", metavar="NAME", help="shape by name, or mesh file; without it that of the scene")
     record.add_argument("--jaw", metavar="NAME", help="shipped jaw or jaw file; without it that of the scene, bench")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from finforce_eval.cli.parser import add_engine_options, read_engine
+from finforce_eval.cli.parser import add_engine_options, read_engine, whole_number
 from finforce_eval.engine.engines import EngineOptions
 from finforce_eval.engine.tasks import Task, choose_shard
 from finforce_eval.experiments.force_network import reduce_image
@@ -124,9 +124,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Render a data set; what is there already stays."""
     parser = argparse.ArgumentParser(prog="python -m training.baseline.scenes", description=__doc__)
     parser.add_argument("folder", type=Path, help="where the files are written")
-    parser.add_argument("--grasps", type=int, default=400, help="for training (400), some 150 images each")
-    parser.add_argument("--validation", type=int, default=24, help="grasps for validation (24)")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first grasp, to share the work (0)")
+    parser.add_argument(
+        "--grasps", type=whole_number(0, 10**9), default=400, help="for training (400), some 150 images each"
+    )
+    parser.add_argument("--validation", type=whole_number(0, 10**9), default=24, help="grasps for validation (24)")
+    parser.add_argument(
+        "--first", type=whole_number(0, 10**9), default=0, help="seed of the first grasp, to share the work (0)"
+    )
     add_engine_options(parser)
     options = parser.parse_args(arguments)
     with one_line_errors():
