@@ -217,7 +217,10 @@ def test_command_ends_with_one_when_a_rule_is_broken(one_family, capsys):
     assert "broken: made: 0.0 % of the sure answers" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("options", [["--count", "0"], ["--count", "1e20"], ["--seed", "-1"], ["--families", "nothing"]])
+WRONG = [("--count", "0"), ("--count", "1e20"), ("--seed", "-1"), ("--families", "nothing")]
+
+
+@pytest.mark.parametrize("options", WRONG)
 def test_command_refuses_what_it_cannot_do(options, capsys):
     try:
         status = main(["stress", *options])
