@@ -8,6 +8,7 @@ import platform
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as installed
 from pathlib import Path
@@ -24,7 +25,7 @@ def describe_machine() -> dict[str, Any]:
         "system": platform.platform(),
         "python": platform.python_version(),
         **dict(_find_versions()),
-        "commit": _commit(),
+        "commit": commit(),
     }
 
 
@@ -49,14 +50,22 @@ def _processor() -> str:
     return names[0] if names else platform.processor()
 
 
-def _commit() -> str:
-    """Return the commit of the sources, with a mark when they were changed since."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
-    folder = Path(__file__).parent
+@cache
+def commit() -> str:
+    """Return the commit of the sources, with a mark when they were changed since; "unknown" of what is installed."""
+    here = Path(__file__)
+    commands = (
+        ["git", "ls-files", "--error-unmatch", here.name],  # a package in somebody's repository is not of it
+        ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+    )
     try:
-        return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
+        said = [
+            subprocess.run(command, cwd=here.parent, capture_output=True, text=True, check=True).stdout.strip()
+            for command in commands
+        ]
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+    return said[-1]
 
 
 def without_nan(content: Any) -> Any:

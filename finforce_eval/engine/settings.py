@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from finforce_eval.machine import version
+from finforce_eval.machine import commit, version
 from finforce_eval.recordings.tracks import JAWS
 
 # Options that change nothing in the forces of a recording.
@@ -15,11 +15,11 @@ _OUTSIDE = ("bags", "out", "engine", "workers", "memory", "address", "shard", "r
 
 
 def describe_options(options: argparse.Namespace) -> dict[str, Any]:
-    """Return all options that forces depend on, hashes of the files that they name, and the version."""
+    """Return all options that forces depend on, hashes of the files that they name, version and commit."""
     chosen = {name: value for name, value in vars(options).items() if name not in _OUTSIDE}
     words = [str(word) for value in chosen.values() for word in (value if isinstance(value, list) else [value])]
     files = {word: sha256(Path(word).read_bytes()).hexdigest() for word in words if _is_file(word)}
-    return chosen | {"files": files, "version": version()}
+    return chosen | {"files": files, "version": version(), "commit": commit()}
 
 
 def _is_file(word: str) -> bool:

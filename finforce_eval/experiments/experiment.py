@@ -14,7 +14,7 @@ from finforce.errors import FinforceError
 from finforce_eval.engine.engines import EngineOptions, run_tasks
 from finforce_eval.engine.tasks import OK, Manifest, Task, choose_shard
 from finforce_eval.evaluation.tables import align_rows
-from finforce_eval.machine import version, write_figures
+from finforce_eval.machine import commit, version, write_figures
 
 PAGE = "README.md"
 EDITION = 1  # of what is kept of a case; another one does not go on where an older one ended
@@ -97,7 +97,7 @@ class Experiment(Protocol):
 
 def hash_case(case: Case) -> str:
     """Return what tells a case from one of the same name with other settings, or of another version."""
-    content = json.dumps([EDITION, version(), dict(case.settings)], sort_keys=True)
+    content = json.dumps([EDITION, version(), commit(), dict(case.settings)], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
