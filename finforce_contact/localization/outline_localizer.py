@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -56,17 +57,22 @@ class InnerFace:
                 f"a deformed surface of shape {surface.shape}, expected {self.mesh.nodes.shape}, the jaw's mesh; "
                 "give both sides the same jaw file, calibration and mesh setting (coarse, default or fine)"
             )
-        if not np.isfinite(surface).all():
-            raise MeshError("a deformed surface with vertices that are not finite; drop it at its source")
-        moved, most = np.abs(surface - self.mesh.nodes).max(), _MOST_BENT * np.ptp(self.mesh.nodes, axis=0).max()
-        if moved > most:
+        moved, most = np.abs(surface - self.mesh.nodes).max(), self._most_bent
+        if not moved <= most:  # neither is what is not a number
+            if not np.isfinite(surface).all():
+                raise MeshError("a deformed surface with vertices that are not finite; drop it at its source")
             raise MeshError(
                 f"a deformed surface with a vertex {1e3 * moved:.3g} mm from its place at rest, expected "
                 f"{1e3 * most:.0f} mm at most; is it in metres, in the frame of the jaw and in the order of the mesh?"
             )
         return surface
 
-    @property
+    @cached_property
+    def _most_bent(self) -> float:
+        """How far a vertex may be from its place at rest [m]."""
+        return _MOST_BENT * float(np.ptp(self.mesh.nodes, axis=0).max())
+
+    @cached_property
     def front(self) -> float:
         """Where the undeformed surface stands out most, x [m]."""
         return float(self.x.max())
