@@ -19,3 +19,8 @@ class PoseError(FinforceError, ValueError):
 
 class ServiceError(FinforceError, RuntimeError):
     """A service of a node is not there, does not answer, or could not do what was asked; the message says which."""
+
+
+def one_line(error: BaseException, longest: int = 1000) -> str:
+    """Return what an error says as one line of so many characters, or its class where it says nothing."""
+    return " ".join(str(error).split())[:longest] or type(error).__name__

@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from finforce.errors import FinforceError
+from finforce.errors import FinforceError, one_line
 
 # Bytes of a file, of one of YAML; levels of nesting; values, those that references stand for counted as often; digits.
 LARGEST, LARGEST_YAML = 16 << 20, 1 << 19
@@ -91,7 +91,7 @@ def parse_yaml(text: str, *, text_keys: bool = True) -> Any:
     except FileError:
         raise
     except (yaml.YAMLError, TypeError, ValueError, OverflowError, RecursionError, AttributeError) as error:
-        raise FileError(f"is no valid YAML: {_words(error)}") from error
+        raise FileError(f"is no valid YAML: {one_line(error)}") from error
 
 
 def read_json(path: str | Path) -> Any:
@@ -104,11 +104,7 @@ def parse_json(text: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise FileError(f"is no valid JSON: {_words(error)}") from error
-
-
-def _words(error: BaseException) -> str:
-    return " ".join(str(error).split())[:300] or type(error).__name__
+        raise FileError(f"is no valid JSON: {one_line(error)}") from error
 
 
 class _BoundedLoader(yaml.SafeLoader):

@@ -7,6 +7,7 @@ from threading import Lock
 from time import monotonic
 from typing import Any
 
+from finforce.errors import one_line
 from finforce.optional import import_library
 from finforce_driver.can.bus import LARGEST_DATA, LARGEST_ID, Bus, CanMessage
 from finforce_driver.errors import LinkError
@@ -124,7 +125,7 @@ class PythonCanBus(Bus):
         """Return what failed and what would help, in one line."""
         fallback = "check interface, channel and cables"
         advice = _ADVICE.get(self._interface, fallback).format(channel=self._channel, bit_rate=self._bit_rate)
-        return f"CAN interface {self._interface} {self._channel}: {' '.join(str(error).split())}: {advice}"
+        return f"CAN interface {self._interface} {self._channel}: {one_line(error)}: {advice}"
 
     @property
     def counts(self) -> dict[str, int]:

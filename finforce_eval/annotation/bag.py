@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.errors import FinforceError
+from finforce.errors import FinforceError, one_line
 from finforce.messages import read_stamp
 from finforce_eval.annotation.forces import GraspForces, JawForces
 from finforce_eval.errors import RecordingError
@@ -197,7 +197,7 @@ def new_folder(target: Path) -> Iterator[Path]:
     except (FinforceError, OSError, KeyboardInterrupt):
         raise
     except Exception as error:  # sqlite3 has its own classes for a full disk
-        raise OSError(f"{target}: cannot be written: {' '.join(str(error).split())}") from error
+        raise OSError(f"{target}: cannot be written: {one_line(error)}") from error
     finally:
         with suppress(OSError):
             shutil.rmtree(part)

@@ -12,9 +12,9 @@ from typing import Any
 from finforce_eval.annotation.bag import new_folder
 from finforce_eval.annotation.bag_task import bag_task
 from finforce_eval.annotation.bag_task import ended_before as bag_ended_before
-from finforce_eval.annotation.lerobot import ended_before as episode_ended_before
-from finforce_eval.annotation.lerobot import episode_tasks, write_dataset
-from finforce_eval.annotation.lerobot_layout import is_dataset
+from finforce_eval.annotation.lerobot.dataset import ended_before as episode_ended_before
+from finforce_eval.annotation.lerobot.dataset import episode_tasks, write_dataset
+from finforce_eval.annotation.lerobot.layout import is_dataset
 from finforce_eval.cli.parser import (
     add_calibration,
     add_engine_options,

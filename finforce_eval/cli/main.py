@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from finforce.errors import one_line
 from finforce_eval.cli.parser import Parser
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -70,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         options = parse(sys.argv[1:] if argv is None else argv)
         return options.run(options) or 0
     except (FinforceError, OSError) as error:
-        print(f"finforce: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"finforce: {one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

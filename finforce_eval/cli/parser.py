@@ -94,7 +94,7 @@ def add_engine_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--engine", default=ENGINES[0], choices=ENGINES, help="how recordings are worked at")
     text = "recordings at once; without it one for each processor"
     parser.add_argument("--workers", type=int, default=0, metavar="N", help=text)
-    text = "of a task in processes [GB]; 0: any (4)"
+    text = "of a task in processes or on Ray [GB]; 0: any (4)"
     parser.add_argument("--memory", type=float, default=4.0, metavar="GB", help=text)
     parser.add_argument("--address", default="", help="of a Ray cluster; without it one of this machine")
     text = "i/n: do the i-th of n parts of the recordings, as a job of a batch system"

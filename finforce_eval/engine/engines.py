@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from finforce.errors import FinforceError
+from finforce.errors import FinforceError, one_line
 from finforce.optional import import_library
 from finforce_eval.engine.tasks import FAILED, Manifest, Task, make_line, run_task
 from finforce_eval.errors import OptionError
@@ -26,7 +26,7 @@ class EngineOptions:
     Attributes:
         engine: "sequential", "processes" or "ray".
         workers: at once; 0: one for each processor.
-        memory: that a task of "processes" may have [GB]; 0: any.
+        memory: that a task of "processes" or "ray" may have [GB]; 0: any.
         address: of a Ray cluster; "": one of this machine alone.
     """
 
@@ -172,6 +172,12 @@ def _run_on_ray(tasks: Sequence[Task], options: EngineOptions) -> Iterator[Line]
         process.join()
 
 
+def _run_limited(task: Task, gigabytes: float) -> Line:
+    """Return the line of a task that is carried out here, where it may have so much memory."""
+    _limit_memory(gigabytes)
+    return run_task(task)
+
+
 _PATIENCE = 20.0  # [s] in which a cluster of this machine ends, and one elsewhere answers
 
 
@@ -197,8 +203,7 @@ def _drive_ray(results: Any, tasks: Sequence[Task], options: EngineOptions) -> N
     """Send lines as a cluster ends its tasks, or what is wrong with the cluster."""
     import os
 
-    import ray
-
+    ray = import_library("ray", "--engine ray", "'finforce[ray]'")
     # what Ray says of a lost cluster, at length, is said in one line by the process that waits for this one
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     where = {"address": options.address} if options.address else {"num_cpus": options.workers or _count_processors()}
@@ -208,11 +213,11 @@ def _drive_ray(results: Any, tasks: Sequence[Task], options: EngineOptions) -> N
         cause: BaseException = error
         while (deeper := cause.__cause__ or cause.__context__) is not None:
             cause = deeper
-        words = " ".join(str(cause).split()).rpartition("ray.exceptions.")[2][:200]
+        words = one_line(cause, 10_000).rpartition("ray.exceptions.")[2][:200]
         results.send(f"--address {options.address}: no Ray cluster: {words}" if options.address else f"Ray: {words}")
         return
-    remote = ray.remote(run_task).options(num_cpus=1, max_retries=1)
-    running = {remote.remote(task): task for task in tasks}
+    remote = ray.remote(_run_limited).options(num_cpus=1, max_retries=1)
+    running = {remote.remote(task, options.memory): task for task in tasks}
     while running:
         (ready,), _ = ray.wait(list(running), num_returns=1)
         task = running.pop(ready)

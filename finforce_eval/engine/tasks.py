@@ -14,9 +14,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, TypeVar
 
-from finforce.errors import FinforceError
+from finforce.errors import FinforceError, one_line
 from finforce_eval.errors import OptionError
-from finforce_eval.machine import without_nan
+from finforce_eval.machine import version, without_nan
 
 OK, FAILED = "ok", "failed"
 T = TypeVar("T")
@@ -56,9 +56,9 @@ def run_task(task: Task) -> dict[str, Any]:
     try:
         line = make_line(task, figures=without_nan(dict(task.work(**task.given))))
     except (FinforceError, OSError, MemoryError) as error:
-        line = make_line(task, error=_words(error))
+        line = make_line(task, error=one_line(error))
     except Exception as error:  # what nobody foresaw costs this recording alone
-        line = make_line(task, error=f"{type(error).__name__}: {_words(error)}")
+        line = make_line(task, error=f"{type(error).__name__}: {one_line(error)}")
     finally:
         gc.set_threshold(*seldom)
         gc.unfreeze()
@@ -74,12 +74,9 @@ def make_line(task: Task, *, figures: Mapping[str, Any] | None = None, error: st
         "status": status,
         "error": error,
         "figures": dict(figures or {}),
+        "version": version(),
         "seconds": 0.0,
     }
-
-
-def _words(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def hash_settings(settings: Mapping[str, Any], files: Sequence[Path] = ()) -> str:

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import EQUIDISTANT, CameraIntrinsics, ImageError
-from finforce.errors import FinforceError
+from finforce.errors import FinforceError, one_line
 from finforce.gripper_frames import HALF_TURN, OpeningRange, jaw_in_camera
 from finforce.optional import import_cv2
 from finforce.transforms import invert_pose, move_pose, pose_numbers, rotation_between
@@ -358,4 +358,4 @@ def _count(jaw: SeenJaw) -> int:
 
 
 def _trim(error: Exception) -> str:
-    return " ".join(str(error).split())
+    return one_line(error)

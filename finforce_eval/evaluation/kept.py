@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics
+from finforce.errors import one_line
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.results import CaseResult, ContactSeries, DetectionErrors, Snapshot
 from finforce_eval.recordings.images import ImageTrack
@@ -84,9 +85,7 @@ def load_kept(path: Path) -> Kept:
         with np.load(path, allow_pickle=False) as stored:
             kept = _unpack(json.loads(str(stored[_TREE])), stored)
     except Exception as error:  # numpy, zip and their decompressors each have their own classes
-        raise RecordingError(
-            f"{path}: {' '.join(str(error).split())}; expected what finforce evaluate keeps"
-        ) from error
+        raise RecordingError(f"{path}: {one_line(error)}; expected what finforce evaluate keeps") from error
     if not isinstance(kept, Kept):
         raise RecordingError(f"{path}: expected what finforce evaluate keeps")
     return kept

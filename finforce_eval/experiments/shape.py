@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import deproject
+from finforce.errors import one_line
 from finforce.optional import import_trimesh
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.mesh.chamfer import compute_chamfer, sample_surface
@@ -96,7 +97,7 @@ class ShapeExperiment:
                 found = reconstruct(evidence, generated, method)
                 figures[f"{method}_mm"] = _distance(place_mesh(found.mesh, found.T_camera_object), true)
             except ReconstructionError as error:
-                figures[f"{method}_mm"], figures[f"{method}_refused"] = None, " ".join(str(error).split())
+                figures[f"{method}_mm"], figures[f"{method}_refused"] = None, one_line(error)
         return figures
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:

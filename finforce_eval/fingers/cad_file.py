@@ -10,6 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from shapely.ops import polygonize, unary_union
 
+from finforce.errors import one_line
 from finforce.optional import import_library
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.section import UNITS, check_loops, join_loops, read_loops
@@ -104,7 +105,7 @@ def _load_surface(path: Path, suffix: str) -> trimesh.Trimesh:
     try:
         mesh = trimesh.load(path, file_type=suffix[1:], force="mesh", process=True)
     except Exception as error:  # trimesh has no base error
-        reason = " ".join(str(error).split())[:120]
+        reason = one_line(error, 120)
         raise JawFileError(f"cannot be read as {suffix[1:].upper()} ({type(error).__name__}: {reason})") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise JawFileError(f"holds no triangles, expected the surface of a finger as {suffix[1:].upper()}")
@@ -322,7 +323,7 @@ def _read_dxf(path: Path) -> tuple[list[NDArray], str | None]:
     try:
         document = ezdxf.readfile(path)
     except (OSError, ezdxf.DXFError, UnicodeError, ValueError) as error:
-        raise JawFileError(f"cannot be read as DXF ({' '.join(str(error).split())[:120]})") from error
+        raise JawFileError(f"cannot be read as DXF ({one_line(error, 120)})") from error
     lines = []
     for entity in document.modelspace():
         try:

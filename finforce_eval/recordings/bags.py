@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from finforce.errors import FinforceError, MissingDependencyError
+from finforce.errors import FinforceError, MissingDependencyError, one_line
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import DamagedError, OutOfBoundsError, RecordingError
 from finforce_eval.recordings.bounded import make_reader
@@ -202,7 +202,7 @@ def damage_reported(name: str) -> Iterator[None]:
     except (FinforceError, KeyboardInterrupt):
         raise
     except Exception as error:  # struct, sqlite3, zstd, lz4, yaml, ... each has its own classes
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = one_line(error)
         raise DamagedError(f"{name}: truncated or damaged: {reason}") from error
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import LARGEST_PICTURE, PLUMB_BOB, CameraIntrinsics, decode_depth
-from finforce.errors import MissingDependencyError, PoseError
+from finforce.errors import MissingDependencyError, PoseError, one_line
 from finforce.files import FileError, read_bytes, read_json, read_yaml
 from finforce_contact.reconstruction.paper_alignment import affine_from_generator
 from finforce_eval.errors import OptionError
@@ -48,7 +48,7 @@ def read_image(path: Path | str) -> NDArray:
     except OptionError:
         raise
     except Exception as error:  # each format has its own classes for damage
-        raise OptionError(f"{path.name}: no picture, or a damaged one: {_words(error)}") from error
+        raise OptionError(f"{path.name}: no picture, or a damaged one: {one_line(error)}") from error
 
 
 def _read_file(path: Path) -> bytes:
@@ -57,10 +57,6 @@ def _read_file(path: Path) -> bytes:
         return read_bytes(path, _LARGEST_FILE)
     except FileError as error:
         raise OptionError(f"{path.name}: {error}") from error
-
-
-def _words(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def read_depth(path: Path | str) -> NDArray:
@@ -114,7 +110,7 @@ def _read_array(path: Path) -> NDArray:
         readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
         shape, turned, dtype = readers[version](file)
     except Exception as error:  # whatever a header can hold
-        raise OptionError(f"{path.name}: no .npy file of numbers ({_words(error)})") from error
+        raise OptionError(f"{path.name}: no .npy file of numbers ({one_line(error)})") from error
     begin, wanted = file.tell(), dtype.itemsize * math.prod(shape)
     if dtype.kind not in "buif" or not math.prod(shape):
         raise OptionError(f"{path.name}: {dtype} of shape {shape}; expected numbers")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.errors import one_line
 from finforce.optional import import_onnxruntime
 from finforce.processors import places_of_helpers
 from finforce_keypoints.errors import DetectionError, ModelError
@@ -115,9 +116,7 @@ def open_session(path: Path, threads: int, providers: Sequence[str]) -> Inferenc
     try:
         return runtime.InferenceSession(str(path), options, providers=list(providers))
     except Exception as error:  # onnxruntime has no base class of its errors
-        raise ModelError(
-            f"{path}: onnxruntime cannot load it ({_on_one_line(error)}); expected an ONNX network"
-        ) from error
+        raise ModelError(f"{path}: onnxruntime cannot load it ({one_line(error)}); expected an ONNX network") from error
 
 
 def find_network(path: str | Path) -> Path:
@@ -181,7 +180,7 @@ class Network:
             outputs = self._session.run(None, {self.input.name: tensor})
         except Exception as error:  # as above
             raise DetectionError(
-                f"the network cannot be computed for an input of {tensor.shape}: {_on_one_line(error)}"
+                f"the network cannot be computed for an input of {tensor.shape}: {one_line(error)}"
             ) from error
         strange = [
             name
@@ -275,10 +274,6 @@ def _refuse_other_ranks(shapes: Sequence[tuple[str, tuple[int, ...]]]) -> None:
     raise ModelError(
         f"outputs {list(shapes)}: {hint}expected heatmaps (batch, parts, h, w); export a network with a heatmap head"
     )
-
-
-def _on_one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
 
 
 def _frozen(size: int | str | None) -> int | None:

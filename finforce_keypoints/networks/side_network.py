@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.errors import one_line
 from finforce.optional import import_cv2
 from finforce_keypoints.errors import DetectionError, ModelError
 from finforce_keypoints.geometry.shapes import fit_shapes, trust
@@ -229,7 +230,7 @@ class SideNetwork:
         try:
             return session.run(None, dict(zip(names, inputs, strict=True)))
         except Exception as error:  # onnxruntime has no base class of its errors
-            shapes, text = [part.shape for part in inputs], " ".join(str(error).split())
+            shapes, text = [part.shape for part in inputs], one_line(error)
             raise DetectionError(f"the network cannot be computed for {shapes}: {text}") from error
 
     def _cut(self, picture: NDArray, centres: NDArray) -> NDArray[np.uint8]:

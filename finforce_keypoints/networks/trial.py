@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from finforce.caches import cache_folder
+from finforce.errors import one_line
 from finforce.files import BUDGET, raise_budget
 from finforce_keypoints.errors import ModelError
 from finforce_keypoints.networks.graph_check import check_network
@@ -110,7 +111,7 @@ def main(arguments: Sequence[str]) -> int:
         session = onnxruntime.InferenceSession(arguments[0], options, providers=["CPUExecutionProvider"])
         given = {item.name: _make_input(item.shape, item.type) for item in session.get_inputs()}
     except (Exception, MemoryError) as error:  # onnxruntime has no base class of its errors
-        print(" ".join(str(error).split())[:300] or "out of memory", file=sys.stderr)
+        print(one_line(error, 300) or "out of memory", file=sys.stderr)
         return 1
     try:
         session.run(None, given)

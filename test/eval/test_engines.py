@@ -18,7 +18,8 @@ from training.making import make_all
 def without_times(content):
     """Figures without what the machine's mood decides."""
     if isinstance(content, dict):
-        return {name: without_times(value) for name, value in content.items() if "_ms" not in name}
+        timed = [name for name in content if "_ms" in name or "delay" in name]  # a delay counts what a step took
+        return {name: without_times(value) for name, value in content.items() if name not in timed}
     return [without_times(value) for value in content] if isinstance(content, list) else content
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from finforce.camera import MILLIMETRE, CameraIntrinsics, ImageError
 from finforce.optional import import_library
 from finforce.stamps import NANOSECONDS
-from finforce_eval.annotation.lerobot_layout import Episode, import_arrow, read_table
+from finforce_eval.annotation.lerobot.layout import Episode, import_arrow, read_table
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import StampedImage
 from finforce_keypoints.images import RgbdImage, check_image

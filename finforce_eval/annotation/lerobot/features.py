@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.annotation.lerobot_images import rows_of
-from finforce_eval.annotation.lerobot_layout import Episode, import_arrow, read_table
+from finforce_eval.annotation.lerobot.images import rows_of
+from finforce_eval.annotation.lerobot.layout import Episode, import_arrow, read_table
 from finforce_eval.errors import RecordingError
 
 _AXES = ["x", "y", "z"]

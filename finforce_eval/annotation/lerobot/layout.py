@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from finforce.errors import one_line
 from finforce.files import FileError, parse_json, read_json, read_text
 from finforce.optional import import_library
 from finforce_eval.errors import OptionError, RecordingError
@@ -193,7 +194,7 @@ def read_table(path: Path, names: list[str] | None = None) -> Any:
     try:
         return parquet.ParquetFile(path).read(columns=names)
     except (OSError, pyarrow.ArrowException, KeyError) as error:
-        raise RecordingError(f"{path.parent.name}/{path.name}: {' '.join(str(error).split())}") from error
+        raise RecordingError(f"{path.parent.name}/{path.name}: {one_line(error)}") from error
 
 
 def import_arrow(module: str = "pyarrow") -> ModuleType:

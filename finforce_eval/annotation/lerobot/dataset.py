@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from finforce.files import parse_json, read_json
 from finforce_eval.annotation.forces import JawForces, combine_forces, estimate_forces
-from finforce_eval.annotation.lerobot_features import (
+from finforce_eval.annotation.lerobot.features import (
     FeatureNames,
     add_columns,
     add_features,
     describe_column,
     stack_episodes,
 )
-from finforce_eval.annotation.lerobot_images import EpisodeImages
-from finforce_eval.annotation.lerobot_layout import (
+from finforce_eval.annotation.lerobot.images import EpisodeImages
+from finforce_eval.annotation.lerobot.layout import (
     EPISODE_STATS_V2,
     EPISODES_V3,
     INFO,

@@ -1,0 +1,1 @@
+"""LeRobot datasets: their layouts, videos and features, and the dataset written anew with forces."""
