@@ -24,7 +24,7 @@ from finforce_ifea.tracking.place_update import Residuals
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # Frames that make a memory, and over which its changes are averaged.
-_REMEMBERED, _AVERAGED = 15, 5.0
+_REMEMBERED, _AVERAGED = 15, 2.0
 # A hold has ended once the object is so much deeper or higher [m]: a weight that goes over from one jaw to the other
 # moves the object by a millimetre. Standard deviation of what the mechanics errs by on the way there, as a share of it.
 _DEEPER, _HIGHER, _BEYOND = 2.5e-3, 1.5e-3, 0.05
@@ -36,7 +36,7 @@ _SETTLES, _WEIGHT = 0.05, 0.7
 _SLIDES, _TILTED, _ARM = 0.3, 0.05, 0.01
 # The errors of so many successive frames count for one. An object is lifted from a change of so many standard
 # deviations on.
-_ALIKE, _SURE = 4.0, 2.5
+_ALIKE, _SURE = 1.6, 2.5
 # Fewer points than these say nothing.
 _FEWEST = 6
 
@@ -51,8 +51,10 @@ class HeldFrame(NamedTuple):
         lean: of the force, with which the residuals were found, beyond that with which it has nothing along [-].
         moved: the place that was found minus the reference (3,).
         place: that was found (3,).
-        aside: motion of the key points in x and z by a force across the finger (K, 2) [m/N].
-        across: force with which the residuals were found [N].
+        aside: what the residuals show of a force across the finger, along x, y and z (K, 3) [m/N].
+        across: force with which they were found [N].
+        twist: what the residuals show of a moment that twists the finger (K, 3) [m/(N m)].
+        arm: standard deviation of the place along y at which the normal force acts [m].
     """
 
     data: Residuals
@@ -63,6 +65,8 @@ class HeldFrame(NamedTuple):
     place: NDArray
     aside: NDArray
     across: float
+    twist: NDArray
+    arm: float
 
 
 class HeldWeight:
@@ -81,15 +85,15 @@ class HeldWeight:
 
     def reset(self) -> None:
         """Forgets the object."""
-        self.force, self.stddev, self._before = 0.0, np.inf, 0.0
+        self.force, self.stddev = 0.0, np.inf
         self.across, self.across_stddev = 0.0, np.inf
         self._begin()
 
     def _begin(self) -> None:
         """Starts to remember."""
         self._frames, self._place = 0, np.zeros(3)
-        self._information, self._vector = np.zeros((4, 4)), np.zeros(4)
-        self._before, self._changed, self._led = self.force, False, np.zeros(2)
+        self._information, self._vector = np.zeros((5, 5)), np.zeros(5)
+        self._before, self._changed, self._led = (self.force, self.across), False, np.zeros(2)
 
     def lead(self, way: NDArray) -> None:
         """Takes the object for one whose shape and height (2,) have changed by `way`: what that moves is no force."""
@@ -97,7 +101,7 @@ class HeldWeight:
             self._begin()
             return
         self._led += way
-        self._information, self._vector = np.zeros((4, 4)), np.zeros(4)
+        self._information, self._vector = np.zeros((5, 5)), np.zeros(5)
 
     def update(self, frame: HeldFrame, prior: NDArray) -> float:
         """Takes one frame of something that presses and returns the force along the finger [N].
@@ -114,7 +118,7 @@ class HeldWeight:
             self._begin()
         if not self._frames:
             self._place, away = frame.place.copy(), np.zeros(3)
-            self._memory, self._counts = np.zeros((len(frame.data.weights), 2)), np.zeros(len(frame.data.weights))
+            self._memory, self._counts = np.zeros((len(frame.data.weights), 3)), np.zeros(len(frame.data.weights))
         if self._frames < _REMEMBERED:
             self._frames += 1
             left, seen = _find_left(frame, away, self._before), frame.data.weights > 0.0
@@ -132,32 +136,35 @@ class HeldWeight:
         left = _find_left(frame, away, self._before) - self._memory
         beyond = _BEYOND**2 * (away[DEPTH] ** 2 + away[2] ** 2 + (_ARM * self._led[0]) ** 2)
         _accumulate(frame, left, known, beyond, self._information, self._vector)
-        settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2, _WEIGHT**2])
+        settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2, _WEIGHT**2, (frame.arm * frame.normal + 1e-6) ** 2])
         settles[:2] += (_SLIDES * self._led) ** 2
         spread = np.linalg.inv(self._information / _ALIKE + np.diag(1.0 / settles))
         asked = self._vector / _ALIKE
         asked[:2] += self._led / settles[:2]
-        changes, self.stddev = spread[2:] @ asked, float(np.sqrt(spread[2, 2]))
+        changes, self.stddev = spread[2:4] @ asked, float(np.sqrt(spread[2, 2]))
         aside = float(np.sqrt(spread[3, 3]))
         self._changed |= abs(changes[0]) > _SURE * self.stddev or abs(changes[1]) > _SURE * aside
         if self._changed:
-            self.force, self.across, self.across_stddev = self._before + changes[0], float(changes[1]), aside
+            self.force, self.across = (float(b + c) for b, c in zip(self._before, changes, strict=True))
+            self.across_stddev = aside
 
 
 @njit(**_OPTIONS)
 def _find_left(frame, away, before):
-    """Returns the residuals (K, 2) [m] at the place of the memory with the force along the finger that there was.
+    """Returns the residuals (K, 3) [m] at the place of the memory with the forces along and across that there were.
 
     Their depth is the one that was found.
     """
-    left = frame.data.r.copy()
+    left = np.empty((len(frame.data.r), 3))
     for k in range(len(left)):
+        left[k, 0], left[k, 1], left[k, 2] = frame.data.r[k, 0], frame.data.off[k], frame.data.r[k, 1]
+        for a in range(3):
+            left[k, a] += frame.aside[k, a] * (frame.across - before[1])
         for a in range(2):
-            left[k, a] += frame.modes[k, a, 3] * (frame.lean - before / frame.normal)
-            left[k, a] += frame.aside[k, a] * frame.across
-            left[k, a] -= frame.modes[k, a, 0] * frame.moved[0]
+            left[k, 2 * a] += frame.modes[k, a, 3] * (frame.lean - before[0] / frame.normal)
+            left[k, 2 * a] -= frame.modes[k, a, 0] * frame.moved[0]
             for i in range(1, 3):
-                left[k, a] += frame.modes[k, a, i] * (away[i] - frame.moved[i])
+                left[k, 2 * a] += frame.modes[k, a, i] * (away[i] - frame.moved[i])
     return left
 
 
@@ -167,8 +174,8 @@ def _accumulate(frame, left, weights, beyond, information, vector):
 
     `beyond` is the variance of each coordinate of a key point that comes on top of its noise [m^2].
     """
-    A, g = np.zeros((5, 5)), np.zeros(5)
-    rows = np.zeros((5, 2))
+    A, g = np.zeros((6, 6)), np.zeros(6)
+    rows = np.zeros((6, 2))
     for k in range(len(weights)):
         if weights[k] <= 0.0:
             continue
@@ -178,13 +185,22 @@ def _accumulate(frame, left, weights, beyond, information, vector):
         w00, w11, w01 = weights[k] * n11 / det, weights[k] * n00 / det, -weights[k] * noise[0, 1] / det
         for a in range(2):
             rows[0, a], rows[1, a], rows[2, a] = frame.modes[k, a, 0], frame.modes[k, a, 1], frame.modes[k, a, 2]
-            rows[3, a], rows[4, a] = frame.modes[k, a, 3] / frame.normal, frame.aside[k, a]
-        for i in range(5):
+            rows[3, a], rows[4, a] = frame.modes[k, a, 3] / frame.normal, frame.aside[k, 2 * a]
+            rows[5, a] = frame.twist[k, 2 * a]
+        for i in range(6):
             q0, q1 = w00 * rows[i, 0] + w01 * rows[i, 1], w01 * rows[i, 0] + w11 * rows[i, 1]
-            g[i] += q0 * left[k, 0] + q1 * left[k, 1]
-            for j in range(5):
+            g[i] += q0 * left[k, 0] + q1 * left[k, 2]
+            for j in range(6):
                 A[i, j] += q0 * rows[j, 0] + q1 * rows[j, 1]
-    for i in range(4):
+        certain = weights[k] / (frame.data.off_noise[k] + beyond)
+        h0, h1 = frame.aside[k, 1], frame.twist[k, 1]
+        A[4, 4] += certain * h0 * h0
+        A[4, 5] += certain * h0 * h1
+        A[5, 4] += certain * h0 * h1
+        A[5, 5] += certain * h1 * h1
+        g[4] += certain * h0 * left[k, 1]
+        g[5] += certain * h1 * left[k, 1]
+    for i in range(5):
         vector[i] += (g[i + 1] - A[i + 1, 0] * g[0] / A[0, 0]) - vector[i] / _AVERAGED
-        for j in range(4):
+        for j in range(5):
             information[i, j] += (A[i + 1, j + 1] - A[i + 1, 0] * A[0, j + 1] / A[0, 0]) - information[i, j] / _AVERAGED

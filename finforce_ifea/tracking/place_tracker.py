@@ -7,7 +7,7 @@ averaged over the last frames, so that their priors count once and errors of the
 
 from collections.abc import Callable
 from functools import partial
-from math import sqrt
+from math import hypot, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,13 +62,15 @@ _WIDEST_FORECAST = 1e-3
 _STRANGE, _BACK = 1.0, 0.8
 # What is held by the jaws alone does not slide out: of the force along the finger its weight is left, as far as
 # friction can. From image to image the lean goes this share of its way there.
-_LARGEST_LEAN, _HELD_GAIN = 0.9, 0.5
+_LARGEST_LEAN, _HELD_GAIN = 0.9, 1.0
 # What of the friction the mechanics does not follow, and a lean of the force that is never excluded [-].
 _UNFOLLOWED, _LEAN = 0.25, 0.08
 # What is kept of the averaged residuals where an object slides.
 _KEPT = 0.5
 # Of a weight that nobody knows, as a share of the normal force, and the least normal force that counts [N].
 _WEIGHT, _LEAST_NORMAL = 0.15, 0.1
+# Where along y a lifted object comes to press, as a share of half the finger's width.
+_ARM = 0.5
 
 
 class _Level(NamedTuple):
@@ -199,7 +201,7 @@ class PlaceTracker:
         forecast, noise = self._predict(dt), tare.point_noise(stddev)
         place = forecast.place
         q = self.q + self._modes @ (self._reachable(place) - self._reached)
-        measured, unseen = points - tare.offsets - self._width.motions, self.settings.offset_stddev
+        measured, unseen = points - tare.offsets - self._move_across(), self.settings.offset_stddev
         chance = self._expect_errors(noise, tare.offset_variance(unseen) + noise.standing, forecast)
         update, settled, iteration, share, last = None, False, 0, 1.0, np.zeros(3)
         far, in_vain = np.inf, 0
@@ -230,13 +232,18 @@ class PlaceTracker:
             return self._lose()
         self._keep(q, place, update, state.modes[:, :3])
         if settled and self._is_known:
-            self._learn_friction(state, data, update, forecast)
+            self._learn_friction(state, data, update, forecast, chance.gain)
         track = self._report(state, place, moved, data, update, iteration, settled)
         if self._is_known:
             variances, aside = (chance.width_variance, chance.offset_variance), points[:, 1] - tare.offsets[:, 1]
+            aside = aside - self._width.sideways[:, 1] * self._held.across
             self._width.update(aside - self._rest[:, 1], data, variances, track.force, track.pressure_place[2])
         self._change_level(state.extrapolation)
         return track
+
+    def _move_across(self) -> NDArray:
+        """Returns what acts across the finger moves the key points by (K, 3) [m]."""
+        return self._width.motions + self._width.sideways * self._held.across
 
     def _bound(self, asked: NDArray, place: NDArray, share: float) -> NDArray:
         """Returns the place asked for, within a share of where the linearisation about the present one holds."""
@@ -281,8 +288,13 @@ class PlaceTracker:
         """Whether the object is known by its outline."""
         return self._outline is self.contact.indenter
 
-    def _learn_friction(self, state: PressedState, data: Residuals, update: PlaceUpdate, forecast: Forecast) -> None:
-        """Learns how the object leans where it is held; what slides is followed by `learn`."""
+    def _learn_friction(
+        self, state: PressedState, data: Residuals, update: PlaceUpdate, forecast: Forecast, gain: NDArray
+    ) -> None:
+        """Learns how the object leans where it is held; what slides is followed by `learn`.
+
+        `gain` (K, 2) is the regression of the noise along x and z on that along y.
+        """
         if self._reached[DEPTH] - self._find_touch(self._reached) < _LOADED_DEPTH or self._jumped:
             return
         normal, moved = float(np.hypot(*state.force[::2])), update.place - forecast.place
@@ -297,8 +309,10 @@ class PlaceTracker:
                 lean=rubbing.lean - upright,
                 moved=moved,
                 place=update.place,
-                aside=width.sideways[:, ::2],
-                across=width.across.force,
+                aside=see_aside(width.sideways, gain),
+                across=self._held.across,
+                twist=see_aside(width.twisting, gain),
+                arm=_ARM * width.half_width,
             )
             wanted = upright + self._held.update(frame, self._prior_variance) / normal
             rubbing.lean += _HELD_GAIN * (min(max(wanted, -_LARGEST_LEAN), _LARGEST_LEAN) - rubbing.lean)
@@ -495,8 +509,8 @@ class PlaceTracker:
         seen, held = self._width.across, self._held
         if self.settings.held != "yes" or not held.across_stddev < np.inf:
             return seen
-        doubt = max(held.across_stddev, abs(held.across - seen.force)) / max(normal, _LEAST_NORMAL)
-        return AcrossFinger(seen.place, seen.place_stddev, seen.force, max(seen.lean_stddev, doubt))
+        doubt = held.across_stddev / max(normal, _LEAST_NORMAL)
+        return AcrossFinger(seen.place, seen.place_stddev, seen.force + held.across, hypot(seen.lean_stddev, doubt))
 
     def _describe_lean(self, normal: float) -> float:
         """Returns the standard deviation of the lean of a force [N] along the finger that friction leaves [-]."""
@@ -517,6 +531,21 @@ def _attach(contact: RollingContact, keypoints: NDArray) -> _Level:
     """Returns the mechanics of a contact with key points (K, 3) [m]; raises MeshError when one is off the jaw."""
     probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
     return _Level(contact, probe, contact.model.positions(probe, np.zeros(contact.model.size)))
+
+
+def see_aside(sideways: NDArray, gain: NDArray) -> NDArray:
+    """Returns what residuals show of motions across the finger (K, 3): those in x and z are taken as if y were known.
+
+    A residual in the plane is what is left once the residual along y has told of noise that they share, which is most
+    of what is seen along a line of sight that is aslant.
+
+    Args:
+        sideways: motions (K, 3).
+        gain: regression of the noise along x and z on that along y (K, 2).
+    """
+    seen = sideways.copy()
+    seen[:, ::2] -= gain * sideways[:, 1:2]
+    return seen
 
 
 def find_upright_lean(force: NDArray, lean: float) -> float:

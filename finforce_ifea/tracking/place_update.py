@@ -464,6 +464,8 @@ class Residuals(NamedTuple):
         weights: (K,) from 0 to 1, agreement times trust.
         noise: of each point, in plane, in a frame as noisy as this one (K, 2, 2) [m^2].
         bias: variance that no averaging removes (K,) [m^2].
+        off: residuals along y (K,) [m], zero where unused.
+        off_noise: variance of these in a frame as noisy as this one (K,) [m^2].
         used: number of points with a weight.
         known: number of points that were measured.
         jump: median of the depths that the points ask for one by one, about the model's own place [m].
@@ -475,6 +477,8 @@ class Residuals(NamedTuple):
     weights: NDArray
     noise: NDArray
     bias: NDArray
+    off: NDArray
+    off_noise: NDArray
     used: int
     known: int
     jump: float
@@ -550,8 +554,9 @@ def weigh_residuals(
             used += 1
         else:
             r[k, 0] = r[k, 1] = 0.0
+    off = np.where(weights > 0.0, off, 0.0)
     agreed = int((weights >= _BELIEVED * trust).sum())
-    return Residuals(r, modes, weights, noise * level, bias, used, known, jump, agreed)
+    return Residuals(r, modes, weights, noise * level, bias, off, width_variance * level, used, known, jump, agreed)
 
 
 @njit(**_OPTIONS)

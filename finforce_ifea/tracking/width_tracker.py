@@ -60,11 +60,16 @@ class WidthTracker:
         self._expected = (0.0, MIDDLE_STDDEV)
         self.reset()
 
+    @property
+    def half_width(self) -> float:
+        """Of the inner face [m]; 0 where nobody knows."""
+        return self._torsion.half_width if self._torsion else 0.0
+
     def reset(self) -> None:
         """Forgets what was seen; where the object is expected stays."""
         count = self._count
         self._means = _Means(np.zeros(count), np.zeros((count, 2)), np.zeros(count))
-        self.motions, self.sideways = np.zeros((count, 3)), np.zeros((count, 3))
+        self.motions, self.sideways, self.twisting = (np.zeros((count, 3)) for _ in range(3))
         self.across = AcrossFinger(*self._expected, 0.0, self._lean)
 
     def expect(self, place: float, stddev: float) -> None:
@@ -89,7 +94,7 @@ class WidthTracker:
             return
         frame = (points, data.weights, variances[0], variances[1], force)
         answers = torsion.at(height)
-        self.sideways = answers[1]
+        self.twisting, self.sideways = answers[:2]
         self.across, self.motions = _update(
             self._means, frame, answers, self.across, self._expected, torsion.half_width
         )
