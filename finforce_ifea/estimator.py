@@ -315,6 +315,7 @@ class JawEstimator:
             place_stddev=track.place_stddev,
             across=track.across or AcrossFinger(0.0, MIDDLE_STDDEV, 0.0, unseen),
             along=unseen if track.lean_stddev is None else track.lean_stddev,
+            leak=track.lean_leak,
         )
         numbers = find_numbers(evidence, share, _LEAN)
         return Solution(

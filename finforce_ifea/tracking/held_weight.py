@@ -7,10 +7,12 @@ residual is remembered from when the hold began, and the change since then is ex
 
     depth of the object, free,
     shape and height, by which a lifted object settles a little,
-    a force T along the finger and a force S across it.
+    a force T along the finger, a force S across it, and a moment M that twists it, for what is held by two flat faces
+    does not roll with either,
 
-Once a change is beyond chance the object is lifted, and every change counts until the hold ends. Where the jaws move on
-far, or the object slides, the memory begins anew, and T is what it was.
+where T and S rise or fall steadily over the images that are averaged. Once a
+change of T or S is beyond chance the object is lifted, and every change counts until the hold ends. Where the jaws move
+on far, or the object slides, the memory begins anew, and T and S are what they were.
 """
 
 from typing import NamedTuple
@@ -23,22 +25,27 @@ from finforce_ifea.contact_mechanics.indenter import DEPTH
 from finforce_ifea.tracking.place_update import Residuals
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
-# Frames that make a memory, and over which its changes are averaged.
-_REMEMBERED, _AVERAGED = 15, 2.0
+# Frames that make a memory, time over which changes since are averaged [s], and how fast forces change meanwhile [N/s].
+_REMEMBERED, _AVERAGED, _RISES = 24, 0.25, 1.0
 # A hold has ended once the object is so much deeper or higher [m]: a weight that goes over from one jaw to the other
 # moves the object by a millimetre. Standard deviation of what the mechanics errs by on the way there, as a share of it.
 _DEEPER, _HIGHER, _BEYOND = 2.5e-3, 1.5e-3, 0.05
+# What is seen of a force across is off by this share of it: the finger's side turns before the camera.
+_TURNED = 0.1
 # Standard deviations of how a lifted object settles, as a share of what shape and height were expected to be off, and
 # of the weight [N].
 _SETTLES, _WEIGHT = 0.05, 0.7
 # And of how far it has slid or tilted, as a share of what its pose says. A tilt [rad] after which a hold begins anew,
 # and how far from its axis a tilted object presses [m].
 _SLIDES, _TILTED, _ARM = 0.3, 0.05, 0.01
-# The errors of so many successive frames count for one. An object is lifted from a change of so many standard
-# deviations on.
-_ALIKE, _SURE = 1.6, 2.5
+# [N m], keeps the moment's variance above zero where nobody knows the finger's width.
+_LEAST_MOMENT = 1e-6
+# The errors of so many successive frames count for one. A change of so many standard deviations is no chance.
+_ALIKE, _SURE = 1.5, 2.5
 # Fewer points than these say nothing.
 _FEWEST = 6
+# What changes: shape, height, T, S, M, and the speeds of T and S.
+_T, _S, _UNKNOWN = 2, 3, 7
 
 
 class HeldFrame(NamedTuple):
@@ -75,6 +82,7 @@ class HeldWeight:
     Attributes:
         force: along the finger [N].
         stddev: of it [N]; infinite before there is a memory.
+        leverage: depth of the object that such a force is taken for, as long as nobody knows of it [m/N].
         across: force across the finger [N].
         across_stddev: of it [N]; infinite before anything is lifted.
     """
@@ -85,14 +93,14 @@ class HeldWeight:
 
     def reset(self) -> None:
         """Forgets the object."""
-        self.force, self.stddev = 0.0, np.inf
+        self.force, self.stddev, self.leverage = 0.0, np.inf, 0.0
         self.across, self.across_stddev = 0.0, np.inf
         self._begin()
 
     def _begin(self) -> None:
         """Starts to remember."""
         self._frames, self._place = 0, np.zeros(3)
-        self._information, self._vector = np.zeros((5, 5)), np.zeros(5)
+        self._information, self._vector = np.zeros((_UNKNOWN, _UNKNOWN)), np.zeros(_UNKNOWN)
         self._before, self._changed, self._led = (self.force, self.across), False, np.zeros(2)
 
     def lead(self, way: NDArray) -> None:
@@ -101,20 +109,21 @@ class HeldWeight:
             self._begin()
             return
         self._led += way
-        self._information, self._vector = np.zeros((5, 5)), np.zeros(5)
+        self._information, self._vector = np.zeros((_UNKNOWN, _UNKNOWN)), np.zeros(_UNKNOWN)
 
-    def update(self, frame: HeldFrame, prior: NDArray) -> float:
+    def update(self, frame: HeldFrame, prior: NDArray, dt: float) -> float:
         """Takes one frame of something that presses and returns the force along the finger [N].
 
         Args:
             frame: see `HeldFrame`.
             prior: variance of shape and height (2,).
+            dt: time since the last one [s].
         """
         away = frame.place - self._place
         has_slid = abs(away[2]) > _HIGHER or abs(self._led[0]) > _TILTED
         if self._frames and (abs(away[DEPTH]) > _DEEPER or has_slid):
             if has_slid and self._frames == _REMEMBERED:
-                self._compare(frame, away, prior)
+                self._compare(frame, away, prior, dt)
             self._begin()
         if not self._frames:
             self._place, away = frame.place.copy(), np.zeros(3)
@@ -125,28 +134,38 @@ class HeldWeight:
             self._counts += seen
             self._memory += np.where(seen[:, None], left - self._memory, 0.0) / np.maximum(self._counts, 1.0)[:, None]
         else:
-            self._compare(frame, away, prior)
+            self._compare(frame, away, prior, dt)
         return self.force
 
-    def _compare(self, frame: HeldFrame, away: NDArray, prior: NDArray) -> None:
+    def _compare(self, frame: HeldFrame, away: NDArray, prior: NDArray, dt: float) -> None:
         """Explains what has changed since the memory, at a place that is `away` (3,) from there."""
         known = np.where(self._counts > 0.5 * _REMEMBERED, frame.data.weights, 0.0)
         if np.count_nonzero(known) < _FEWEST:
             return
         left = _find_left(frame, away, self._before) - self._memory
         beyond = _BEYOND**2 * (away[DEPTH] ** 2 + away[2] ** 2 + (_ARM * self._led[0]) ** 2)
-        _accumulate(frame, left, known, beyond, self._information, self._vector)
-        settles = np.array([*(_SETTLES**2 * prior), _WEIGHT**2, _WEIGHT**2, (frame.arm * frame.normal + 1e-6) ** 2])
-        settles[:2] += (_SLIDES * self._led) ** 2
+        self._information, self._vector = _age(self._information, self._vector, dt)
+        self.leverage = _accumulate(frame, left, known, beyond, self._information, self._vector)
+        settles = np.array([0.0, 0.0, _WEIGHT, _WEIGHT, frame.arm * frame.normal + _LEAST_MOMENT, _RISES, _RISES]) ** 2
+        settles[:2] = _SETTLES**2 * prior + (_SLIDES * self._led) ** 2
         spread = np.linalg.inv(self._information / _ALIKE + np.diag(1.0 / settles))
         asked = self._vector / _ALIKE
         asked[:2] += self._led / settles[:2]
-        changes, self.stddev = spread[2:4] @ asked, float(np.sqrt(spread[2, 2]))
-        aside = float(np.sqrt(spread[3, 3]))
-        self._changed |= abs(changes[0]) > _SURE * self.stddev or abs(changes[1]) > _SURE * aside
+        changes, stddev = (spread @ asked)[_T : _S + 1], np.sqrt(np.diag(spread))[_T : _S + 1]
+        self._changed |= bool((np.abs(changes) > _SURE * stddev).any())
+        self.stddev = float(stddev[0])
         if self._changed:
-            self.force, self.across = (float(b + c) for b, c in zip(self._before, changes, strict=True))
-            self.across_stddev = aside
+            self.force, self.across = float(self._before[0] + changes[0]), float(self._before[1] + changes[1])
+            self.across_stddev = float(stddev[1])
+
+
+@njit(**_OPTIONS)
+def _age(information, vector, dt):
+    """Returns information (7, 7) and vector (7,) as they are a time later, when T and S have gone on at their speeds."""
+    back, kept = np.eye(len(vector)), np.exp(-dt / _AVERAGED)
+    for force in range(2):
+        back[_T + force, _UNKNOWN - 2 + force] = -dt
+    return kept * (back.T @ information @ back), kept * (back.T @ vector)
 
 
 @njit(**_OPTIONS)
@@ -170,9 +189,10 @@ def _find_left(frame, away, before):
 
 @njit(**_OPTIONS)
 def _accumulate(frame, left, weights, beyond, information, vector):
-    """Adds one frame, its depth eliminated, to information (4, 4) and vector (4,) on shape, height, T and S.
+    """Adds one frame, its depth eliminated, to information (7, 7) and vector (7,) on what changes.
 
-    `beyond` is the variance of each coordinate of a key point that comes on top of its noise [m^2].
+    `beyond` is the variance of each coordinate of a key point that comes on top of its noise [m^2]. Returns the depth
+    that a force along the finger is taken for [m/N].
     """
     A, g = np.zeros((6, 6)), np.zeros(6)
     rows = np.zeros((6, 2))
@@ -180,7 +200,8 @@ def _accumulate(frame, left, weights, beyond, information, vector):
         if weights[k] <= 0.0:
             continue
         noise = frame.data.noise[k]
-        n00, n11 = noise[0, 0] + beyond, noise[1, 1] + beyond
+        turned = _TURNED**2 * frame.across**2 * (frame.aside[k] ** 2).sum()
+        n00, n11 = noise[0, 0] + beyond + turned, noise[1, 1] + beyond + turned
         det = n00 * n11 - noise[0, 1] ** 2
         w00, w11, w01 = weights[k] * n11 / det, weights[k] * n00 / det, -weights[k] * noise[0, 1] / det
         for a in range(2):
@@ -192,7 +213,7 @@ def _accumulate(frame, left, weights, beyond, information, vector):
             g[i] += q0 * left[k, 0] + q1 * left[k, 2]
             for j in range(6):
                 A[i, j] += q0 * rows[j, 0] + q1 * rows[j, 1]
-        certain = weights[k] / (frame.data.off_noise[k] + beyond)
+        certain = weights[k] / (frame.data.off_noise[k] + beyond + turned)
         h0, h1 = frame.aside[k, 1], frame.twist[k, 1]
         A[4, 4] += certain * h0 * h0
         A[4, 5] += certain * h0 * h1
@@ -201,6 +222,7 @@ def _accumulate(frame, left, weights, beyond, information, vector):
         g[4] += certain * h0 * left[k, 1]
         g[5] += certain * h1 * left[k, 1]
     for i in range(5):
-        vector[i] += (g[i + 1] - A[i + 1, 0] * g[0] / A[0, 0]) - vector[i] / _AVERAGED
+        vector[i] += g[i + 1] - A[i + 1, 0] * g[0] / A[0, 0]
         for j in range(5):
-            information[i, j] += (A[i + 1, j + 1] - A[i + 1, 0] * A[0, j + 1] / A[0, 0]) - information[i, j] / _AVERAGED
+            information[i, j] += A[i + 1, j + 1] - A[i + 1, 0] * A[0, j + 1] / A[0, 0]
+    return A[0, 3] / A[0, 0]

@@ -232,7 +232,7 @@ class PlaceTracker:
             return self._lose()
         self._keep(q, place, update, state.modes[:, :3])
         if settled and self._is_known:
-            self._learn_friction(state, data, update, forecast, chance.gain)
+            self._learn_friction(state, data, update, forecast, chance.gain, dt)
         track = self._report(state, place, moved, data, update, iteration, settled)
         if self._is_known:
             variances, aside = (chance.width_variance, chance.offset_variance), points[:, 1] - tare.offsets[:, 1]
@@ -289,11 +289,11 @@ class PlaceTracker:
         return self._outline is self.contact.indenter
 
     def _learn_friction(
-        self, state: PressedState, data: Residuals, update: PlaceUpdate, forecast: Forecast, gain: NDArray
+        self, state: PressedState, data: Residuals, update: PlaceUpdate, forecast: Forecast, gain: NDArray, dt: float
     ) -> None:
         """Learns how the object leans where it is held; what slides is followed by `learn`.
 
-        `gain` (K, 2) is the regression of the noise along x and z on that along y.
+        `gain` (K, 2) is the regression of the noise along x and z on that along y, `dt` the time since the last frame [s].
         """
         if self._reached[DEPTH] - self._find_touch(self._reached) < _LOADED_DEPTH or self._jumped:
             return
@@ -314,7 +314,7 @@ class PlaceTracker:
                 twist=see_aside(width.twisting, gain),
                 arm=_ARM * width.half_width,
             )
-            wanted = upright + self._held.update(frame, self._prior_variance) / normal
+            wanted = upright + self._held.update(frame, self._prior_variance, dt) / normal
             rubbing.lean += _HELD_GAIN * (min(max(wanted, -_LARGEST_LEAN), _LARGEST_LEAN) - rubbing.lean)
             return
         self._unlearnt = partial(self._follow_slide, normal, moved, data, update)
@@ -472,10 +472,10 @@ class PlaceTracker:
         pressed = place[DEPTH] - self._find_touch(place)
         if pressed < _LEAST_DEPTH:
             force = force * max(0.0, pressed / _LEAST_DEPTH)
+        normal = float(np.hypot(*force[::2]))
         covariance = update.covariance * max(1.0, update.misfit**2)
         covariance[DEPTH, DEPTH] += update.depth_variance * max(1.0, update.misfit**2)
         finite = np.isfinite(force.sum() + update.covariance.sum() + self.q.sum())
-        normal = float(np.hypot(*force[::2]))
         return Track(
             covariance=covariance,
             force=force,
@@ -492,6 +492,7 @@ class PlaceTracker:
             bearable=self._levels[0].contact.bearable,
             across=self._describe_across(normal) if self._is_known else None,
             lean_stddev=self._describe_lean(normal) if self._is_known else None,
+            lean_leak=self._find_leak(state, normal) if self._is_known else 0.0,
             ambiguity=0.0 if settled else float(np.linalg.norm(state.force_modes[:, :3] @ moved)),
             sound=bool(finite and state.smallest_det > 0),
             quiet=bool(pressed < _TOUCH_DEPTH),
@@ -511,6 +512,12 @@ class PlaceTracker:
             return seen
         doubt = held.across_stddev / max(normal, _LEAST_NORMAL)
         return AcrossFinger(seen.place, seen.place_stddev, seen.force + held.across, hypot(seen.lean_stddev, doubt))
+
+    def _find_leak(self, state: PressedState, normal: float) -> float:
+        """Returns by how much a held object's force [N] along the finger changes that along x [-]."""
+        if self.settings.held != "yes" or normal < _LEAST_NORMAL:
+            return 0.0
+        return float(state.force_modes[0, 3] / normal - state.force_modes[0, DEPTH] * self._held.leverage)
 
     def _describe_lean(self, normal: float) -> float:
         """Returns the standard deviation of the lean of a force [N] along the finger that friction leaves [-]."""

@@ -60,6 +60,7 @@ class Track:
         bearable: force beyond which no equilibrium is believed [N].
         across: what acts across the finger, None where nobody knows.
         lean_stddev: standard deviation of the lean of the force along the finger [-], None where nobody knows.
+        lean_leak: change of the force along x by one along the finger [-].
         ambiguity: change of the force by the last iteration where that has not converged [N].
         sound: whether the mesh is in order and the numbers are finite.
         quiet: whether nothing seems to press.
@@ -92,6 +93,7 @@ class Track:
     bearable: float = np.inf
     across: AcrossFinger | None = None
     lean_stddev: float | None = None
+    lean_leak: float = 0.0
 
 
 def compute_magnitude_stddev(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
@@ -239,6 +241,7 @@ class ForceEvidence(NamedTuple):
         place_stddev: of its height [m].
         across: what acts across the finger.
         along: standard deviation of the lean along the finger [-].
+        leak: by which such a lean shows along x, too [-].
     """
 
     force: NDArray
@@ -250,6 +253,7 @@ class ForceEvidence(NamedTuple):
     place_stddev: float
     across: AcrossFinger
     along: float
+    leak: float
 
 
 @njit(**_OPTIONS)
@@ -261,7 +265,7 @@ def find_numbers(evidence: ForceEvidence, share: float, lean: float) -> Solution
         share: relative standard deviation of the mechanics; it errs in the direction as in the magnitude.
         lean: share of a force that nobody has seen along z.
     """
-    force, elastic, modes, covariance, pressure, place, place_stddev, across, along = evidence
+    force, elastic, modes, covariance, pressure, place, place_stddev, across, along, leak = evidence
     y, y_stddev, _, lean_across = across
     fit, magnitude = measure_along(elastic, modes, covariance), np.sqrt((force * force).sum())
     stddev = np.zeros(3)
@@ -269,7 +273,7 @@ def find_numbers(evidence: ForceEvidence, share: float, lean: float) -> Solution
         for i in range(modes.shape[1]):
             for j in range(modes.shape[1]):
                 stddev[a] += modes[a, i] * covariance[i, j] * modes[a, j]
-    stddev[0] += (share * magnitude) ** 2
+    stddev[0] += (share * magnitude) ** 2 + (leak * along * magnitude) ** 2
     stddev[2] += (share * magnitude) ** 2
     stddev[1] += (lean_across * magnitude) ** 2
     stddev[2] += (along * magnitude) ** 2
@@ -290,5 +294,5 @@ def find_numbers(evidence: ForceEvidence, share: float, lean: float) -> Solution
         normal = force / magnitude
     else:
         arm, undeformed, normal = np.full(3, np.nan), np.full(3, np.nan), np.full(3, np.nan)
-    spread = np.hypot(fit, share * magnitude)
+    spread = np.sqrt(fit**2 + (share * magnitude) ** 2 + (leak * along * magnitude) ** 2)
     return SolutionNumbers(magnitude, spread, torque, stddev, torque_stddev, arm, undeformed, normal)

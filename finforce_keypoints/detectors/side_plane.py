@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 SAME_PLACE = 1e-3  # [m] by which a jaw may move before its picture is mapped anew; places are exact all the same
 SEARCH_STEP = 24.0  # [px] between the places where a lost jaw is looked for; the network finds one half as far away
 LEAST_SCORE = 0.35  # mean likelihood of a jaw's points, below which it is not there
+# Shifts of the grid from picture to picture [px]. Where in its picture a point lies decides by how much a network puts
+# it beside its place: in pictures two pixels apart those errors are hardly alike, so that they average out over time.
+STRAIGHT = np.zeros(2)
+SHIFTS = 6.0 * (np.outer(np.arange(8), [0.7549, 0.5698]) % 1.0) - 3.0
 
 
 class SideLocator(Protocol):
@@ -44,10 +48,15 @@ class SideLocator(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
-    """One picture to be looked at: its jaw, where that is taken to be, and the map that makes the picture."""
+    """One picture to be looked at: its jaw, where that is taken to be, its grid, and the map that makes the picture.
+
+    `shift` (2,) [px] is that of the grid from the locator's own.
+    """
 
     side: str
     T_camera_jaw: NDArray
+    grid: PlaneGrid
+    shift: NDArray
     mapping: NDArray
 
 
@@ -78,7 +87,8 @@ class PlaneFinder:
             check_camera_side(jaw, T_gripper_camera)
         self._planes = {side: find_side(jaw) for side, jaw in jaws.items()}
         self._rest = {side: find_rest(jaw) for side, jaw in jaws.items()}
-        self._kept: dict[str, _View] = {}
+        self._kept: dict[tuple[str, int], _View] = {}
+        self._turn = 0
         self._camera: CameraIntrinsics | None = None
         self._moves: dict[str, NDArray] = {}
 
@@ -87,6 +97,7 @@ class PlaneFinder:
         if image.camera is not self._camera:
             self._kept, self._camera, self._moves = {}, image.camera, {}
         self._moves = {side: moves for side, moves in self._moves.items() if expected.get(side) is not None}
+        self._turn = (self._turn + 1) % len(SHIFTS)
         views = [view for side, pose in expected.items() for view in self._views_of(side, pose)]
         if not views:
             return {}
@@ -108,7 +119,8 @@ class PlaneFinder:
 
     def _locate(self, image: RgbdImage, views: Sequence[_View]) -> Places:
         pictures = np.stack([take_picture(image.color, view.mapping) for view in views])
-        starts = [self._moves.get(view.side) for view in views]
+        moves = [self._moves.get(view.side) for view in views]
+        starts = [None if move is None else move - view.shift for move, view in zip(moves, views, strict=True)]
         return self._locator.locate(pictures, [view.side for view in views], starts)
 
     def _views_of(self, side: str, pose: NDArray | None) -> list[_View]:
@@ -116,19 +128,20 @@ class PlaneFinder:
         if pose is None:
             step = SEARCH_STEP * self._locator.grids[side].scale
             return [self._view(side, place) for place in self._opening.place_jaw(self._T_gripper_camera, side, step)]
-        kept = self._kept.get(side)
+        kept = self._kept.get((side, self._turn))
         if kept is None or np.abs(kept.T_camera_jaw - pose).max() > SAME_PLACE:
-            kept = self._kept[side] = self._view(side, pose)
+            kept = self._kept[side, self._turn] = self._view(side, pose, SHIFTS[self._turn])
         return [kept]
 
-    def _view(self, side: str, pose: NDArray) -> _View:
-        mapping = map_picture(self._locator.grids[side], self._planes[side], pose, self._camera)
-        return _View(side=side, T_camera_jaw=pose, mapping=mapping)
+    def _view(self, side: str, pose: NDArray, shift: NDArray = STRAIGHT) -> _View:
+        grid = self._locator.grids[side].shifted(shift)
+        mapping = map_picture(grid, self._planes[side], pose, self._camera)
+        return _View(side=side, T_camera_jaw=pose, grid=grid, shift=shift, mapping=mapping)
 
     def _centre(self, view: _View, places: Places, number: int) -> NDArray:
         """Return the pose of a jaw whose reference point, or else base, was seen beside its place."""
         jaw, rest = view.T_camera_jaw.copy(), self._rest[view.side]
-        moved = self._locator.grids[view.side].places(places.pixels[number])
+        moved = view.grid.places(places.pixels[number])
         sure = places.likelihood[number] >= 0.5
         weight = np.where(sure, 1.0 / (rest[:, 1] - rest[:, 1].min() + 0.01), 0.0)
         if weight.sum() > 0.0:
@@ -139,8 +152,8 @@ class PlaneFinder:
     def _describe(self, view: _View, places: Places, number: int) -> PixelFinding:
         """Return the finding of one picture, in pixels of the image; the next one begins where its points are."""
         if places.moves is not None and places.likelihood[number].mean() >= LEAST_SCORE:
-            self._moves[view.side] = places.moves[number]
-        plane, grid, camera = self._planes[view.side], self._locator.grids[view.side], self._camera
+            self._moves[view.side] = places.moves[number] + view.shift
+        plane, grid, camera = self._planes[view.side], view.grid, self._camera
         on_plane = grid.places(places.pixels[number])
         pixels = project_plane(on_plane, plane, view.T_camera_jaw, camera)
         beside = [project_plane(on_plane + step, plane, view.T_camera_jaw, camera) for step in np.eye(2) * 1e-3]

@@ -6,7 +6,7 @@ c and the row r of the picture are x = x_0 + c s and z = z_0 + r s on it; left a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,6 +48,10 @@ class PlaneGrid:
             width=self.width + 2 * margin,
             height=self.height + 2 * margin,
         )
+
+    def shifted(self, shift: NDArray) -> PlaneGrid:
+        """Return the grid that begins `shift` (2,) [px] later along columns and rows."""
+        return replace(self, x=self.x + float(shift[0]) * self.scale, z=self.z + float(shift[1]) * self.scale)
 
     def places(self, pixels: NDArray) -> NDArray:
         """Return x and z (n, 2) [m] of pixels (n, 2) of the picture, column and row."""

@@ -51,7 +51,7 @@ class Assembly:
         material = jaws["left"].material
         # always of both jaws: the bench's is the same left one
         self.material: PrintedMaterial = draw_material(material, ("left", "right"), np.random.default_rng(seed))
-        lateral = bool(scenario.mass and scenario.turn_angle)
+        lateral = bool(scenario.mass and (scenario.turn_angle or scenario.pitch))
         self._jaws = {
             side: PressedJaw(jaw, self.material.elastic[side], density, lateral=lateral) for side, jaw in jaws.items()
         }

@@ -56,6 +56,8 @@ class Scenario:
     turn_angle: float = setting(0.0, "by which the wrist turns with the object", "rad", -2.0 * np.pi, 2.0 * np.pi)
     turn_rate: float = setting(0.8, "at which it does", "rad/s", 0.05, 10.0)
     turn_heading: float = setting(0.0, "of the wrist's axis in the x-y plane, from x to y", "rad", -np.pi, np.pi)
+    turn_tilt: float = setting(0.0, "of the wrist's axis out of that plane, to z", "rad", -0.5 * np.pi, 0.5 * np.pi)
+    pitch: float = setting(0.0, "of a gripper that does not look down, about its x", "rad", -np.pi, np.pi)
     slide: float = setting(0.0, "by which a hand draws the held object along z, and back", "m", -0.03, 0.03)
     rock: float = setting(0.0, "by which a hand tilts the held object from x to z, and back", "rad", -0.4, 0.4)
     shift_time: float = setting(1.5, "which each way of that takes", "s", 0.1, 60.0)
@@ -145,7 +147,7 @@ def _fit_jaw(scenario: Scenario, overrides: dict[str, Any]) -> dict[str, float]:
 
 RATE = 30.0  # [Hz] of the images
 GRAVITY = 9.81  # [m/s^2]
-_DOWN = np.array([0.0, 0.0, 1.0])  # the gripper looks down at first
+_DOWN = np.array([0.0, 0.0, 1.0])  # of a gripper that looks down
 _LIFT_TIME = 0.6
 _TARE_RECORD = 0.5
 
@@ -208,8 +210,10 @@ def write_script(scenario: Scenario) -> Script:
     # an image between two steps belongs to the later one, whatever the rounding
     running = np.clip(np.searchsorted(ends, stamps + 1e-9) - 1, 0, len(steps) - 1)
     postures = tuple(Posture(**dict(zip(vars(start), row, strict=True))) for row in np.stack(courses, axis=1).tolist())
-    heading = np.array([np.cos(scenario.turn_heading), np.sin(scenario.turn_heading), 0.0])
-    gravity = Rotation.from_rotvec(np.outer([posture.turn for posture in postures], heading)).apply(_DOWN)
+    heading, tilt = scenario.turn_heading, scenario.turn_tilt
+    axis = np.array([np.cos(tilt) * np.cos(heading), np.cos(tilt) * np.sin(heading), np.sin(tilt)])
+    begin = Rotation.from_rotvec([scenario.pitch, 0.0, 0.0]).apply(_DOWN)
+    gravity = Rotation.from_rotvec(np.outer([posture.turn for posture in postures], axis)).apply(begin)
     lifted = np.array([posture.lifted for posture in postures])
     return Script(
         stamps=stamps,
