@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_keypoints.detectors.side_plane import find_rest
+from finforce_keypoints.detectors.side_plane import STRAIGHT, find_rest
 from finforce_keypoints.errors import ModelError
 from finforce_keypoints.geometry.shapes import find_motions, span_shapes
 from finforce_keypoints.geometry.side_picture import PlaneGrid
@@ -23,6 +23,11 @@ if TYPE_CHECKING:
     from finforce_keypoints.networks.side_network import SideNetwork, Template
 
 
+# Where in its picture a point lies decides by how much a network of heat maps puts it beside its place: in pictures two
+# pixels apart those errors are hardly alike, so that they average out over time.
+SHIFTS = 6.0 * (np.outer(np.arange(8), [0.7549, 0.5698]) % 1.0) - 3.0  # [px]
+
+
 class AnyFinger:
     """The network of any finger, which is told what a finger looks like at rest.
 
@@ -30,6 +35,8 @@ class AnyFinger:
         network: that compares pictures with templates.
         jaws: by side.
     """
+
+    shifts = STRAIGHT
 
     def __init__(self, network: SideNetwork, jaws: Mapping[str, Jaw]) -> None:
         self._network = network
@@ -56,6 +63,8 @@ class OneFinger:
     Raises:
         ModelError: names or plane of the metadata do not fit.
     """
+
+    shifts = SHIFTS
 
     def __init__(self, model: KeypointModel, jaws: Mapping[str, Jaw]) -> None:
         self._model = model

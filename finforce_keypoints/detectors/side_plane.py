@@ -24,16 +24,19 @@ if TYPE_CHECKING:
 SAME_PLACE = 1e-3  # [m] by which a jaw may move before its picture is mapped anew; places are exact all the same
 SEARCH_STEP = 24.0  # [px] between the places where a lost jaw is looked for; the network finds one half as far away
 LEAST_SCORE = 0.35  # mean likelihood of a jaw's points, below which it is not there
-# Shifts of the grid from picture to picture [px]. Where in its picture a point lies decides by how much a network puts
-# it beside its place: in pictures two pixels apart those errors are hardly alike, so that they average out over time.
-STRAIGHT = np.zeros(2)
-SHIFTS = 6.0 * (np.outer(np.arange(8), [0.7549, 0.5698]) % 1.0) - 3.0
+STRAIGHT = np.zeros((1, 2))  # pictures of a locator's own grid alone
 
 
 class SideLocator(Protocol):
-    """A network that finds the points of jaws in pictures of their sides."""
+    """A network that finds the points of jaws in pictures of their sides.
+
+    Attributes:
+        grids: of its pictures, by side.
+        shifts: of the grids from picture to picture (n, 2) [px], over and over again.
+    """
 
     grids: Mapping[str, PlaneGrid]
+    shifts: NDArray
 
     def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
         """Return where the points are: of each picture the jaw's key points, then its reference point.
@@ -97,7 +100,7 @@ class PlaneFinder:
         if image.camera is not self._camera:
             self._kept, self._camera, self._moves = {}, image.camera, {}
         self._moves = {side: moves for side, moves in self._moves.items() if expected.get(side) is not None}
-        self._turn = (self._turn + 1) % len(SHIFTS)
+        self._turn = (self._turn + 1) % len(self._locator.shifts)
         views = [view for side, pose in expected.items() for view in self._views_of(side, pose)]
         if not views:
             return {}
@@ -130,10 +133,10 @@ class PlaneFinder:
             return [self._view(side, place) for place in self._opening.place_jaw(self._T_gripper_camera, side, step)]
         kept = self._kept.get((side, self._turn))
         if kept is None or np.abs(kept.T_camera_jaw - pose).max() > SAME_PLACE:
-            kept = self._kept[side, self._turn] = self._view(side, pose, SHIFTS[self._turn])
+            kept = self._kept[side, self._turn] = self._view(side, pose, self._locator.shifts[self._turn])
         return [kept]
 
-    def _view(self, side: str, pose: NDArray, shift: NDArray = STRAIGHT) -> _View:
+    def _view(self, side: str, pose: NDArray, shift: NDArray = STRAIGHT[0]) -> _View:
         grid = self._locator.grids[side].shifted(shift)
         mapping = map_picture(grid, self._planes[side], pose, self._camera)
         return _View(side=side, T_camera_jaw=pose, grid=grid, shift=shift, mapping=mapping)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,7 @@ from finforce.camera import project
 from finforce.gripper_frames import HALF_TURN, ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import pose_from_quaternion
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.detectors.locators import AnyFinger, OneFinger, grid_from_metadata
+from finforce_keypoints.detectors.locators import SHIFTS, AnyFinger, OneFinger, grid_from_metadata
 from finforce_keypoints.detectors.side_plane import PlaneFinder
 from finforce_keypoints.errors import GeometryError, ModelError
 from finforce_keypoints.geometry.side_picture import PlaneGrid
@@ -81,6 +82,33 @@ def test_pixels_are_those_of_the_image_wherever_the_jaw_was_expected(off):
         # half a pixel of 0.45 mm is about 0.6 px of the image here, more or less with the distance
         assert ((found[side].stddev > 0.3) & (found[side].stddev < 1.2)).all()
     assert network.batches == [2]
+
+
+def test_successive_pictures_are_shifted_and_what_is_found_in_them_is_not():
+    jaws, network = load_jaws("bench"), ShadeNetwork()
+    locator, locate, seen = AnyFinger(network, jaws), network.locate, []
+    locator.shifts = SHIFTS
+    finder = PlaneFinder(locator, jaws, ROBOT_CAMERA)
+
+    def watch(pictures, templates, starts=()):
+        places = locate(pictures, templates, starts)
+        moves = places.pixels - templates[0].points
+        seen.append((moves[0], None if starts[0] is None else starts[0]))
+        return replace(places, moves=moves)
+
+    network.locate = watch
+    image, expected = paint(jaws, {"left": -0.035}), {"left": jaw_in_camera(ROBOT_CAMERA, "left", -0.035)}
+    errors = [
+        finder.find(image, expected)["left"].pixels - true_pixels(jaws["left"], "left", -0.035)
+        for _ in range(len(SHIFTS) + 1)
+    ]
+    assert np.linalg.norm(errors, axis=2).max() < 0.6
+    in_pictures = np.array([moves.mean(axis=0) for moves, _ in seen])
+    assert (np.ptp(in_pictures, axis=0) > 4.0).all()
+    np.testing.assert_allclose(in_pictures[-1], in_pictures[0])  # from then on again
+    # each search begins where the points of the last picture are in this one
+    for moves, start in seen[1:]:
+        assert np.abs(start - moves).max() < 1.0
 
 
 def test_another_finger_is_looked_at_on_a_grid_of_its_own():

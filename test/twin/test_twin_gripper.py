@@ -216,6 +216,18 @@ def test_sliding_object_moves_the_place_of_the_force_along():
     assert max(height) - min(height) == pytest.approx(0.012, abs=2e-3)
 
 
+def test_a_level_gripper_that_rolls_carries_its_weight_from_jaw_to_jaw():
+    roll = {"pitch": 0.5 * np.pi, "turn_tilt": 0.5 * np.pi, "turn_angle": np.pi, "turn_rate": 3.0}
+    _, states = play("weight_turn", **roll)
+    carried = [state for state in states if np.linalg.norm(net_of(state)) > 0.78]
+    gravity = np.array([state.gravity for state in carried])
+    np.testing.assert_allclose(gravity[0], (0.0, -1.0, 0.0), atol=0.06)
+    np.testing.assert_allclose(gravity[:, 2], 0.0, atol=1e-9)
+    assert np.ptp(gravity[:, 0]) > 0.9 and np.ptp(gravity[:, 1]) > 1.9
+    for state in carried:
+        np.testing.assert_allclose(net_of(state), 0.08 * 9.81 * state.gravity, atol=1e-2)
+
+
 def test_rocking_turns_the_pose_from_x_to_z():
     _, states = play("rocking", shift_time=0.4)
     turned = [state.T_gripper_object[2, 0] for state in states]
