@@ -25,34 +25,60 @@ def quantize_network(folder: Path, pictures: FingerPictures) -> None:
         folder: of the network.
         pictures: to measure the ranges of activations with.
     """
+    for name, inputs in zip((COARSE, FINE), _record_inputs(folder, pictures), strict=True):
+        quantize_file(folder / name, folder / name, inputs, KEPT)
+
+
+def quantize_file(source: Path, target: Path, inputs: Sequence[dict[str, NDArray]], kept: Sequence[str]) -> None:
+    """Write a network with bytes where another one has floats.
+
+    Args:
+        source: the network's file.
+        target: that is written; may be the same.
+        inputs: by which the ranges of the activations are measured, by the names of the network's inputs.
+        kept: parts of the names of convolutions that stay as they are.
+    """
     from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
     onnx = import_onnx()
-    for name, inputs in zip((COARSE, FINE), _record_inputs(folder, pictures), strict=True):
-        path = folder / name
-        said = list(onnx.load(str(path)).metadata_props)
-        with tempfile.TemporaryDirectory() as scratch:
-            plain = str(Path(scratch) / name)
-            quant_pre_process(str(path), plain, skip_symbolic_shape=True)
-            nodes = [node.name for node in onnx.load(plain).graph.node if node.op_type == "Conv"]
-            quantize_static(
-                plain,
-                str(path),
-                _Inputs(inputs),
-                quant_format=QuantFormat.QDQ,
-                op_types_to_quantize=["Conv"],
-                per_channel=True,
-                reduce_range=True,  # of weights to 7 bits: sums of 8 saturate on processors without VNNI
-                activation_type=QuantType.QUInt8,
-                weight_type=QuantType.QInt8,
-                nodes_to_exclude=[node for node in nodes if any(part in node for part in KEPT)],
-            )
-        content = onnx.load(str(path))
-        del content.metadata_props[:]
-        content.metadata_props.extend(said)
-        content.producer_name, content.producer_version, content.doc_string = "finforce", "", ""
-        onnx.save(content, str(path))
+    said = list(onnx.load(str(source)).metadata_props)
+    with tempfile.TemporaryDirectory() as scratch:
+        plain = str(Path(scratch) / source.name)
+        quant_pre_process(str(source), plain, skip_symbolic_shape=True)
+        nodes = [node.name for node in onnx.load(plain).graph.node if node.op_type == "Conv"]
+        quantize_static(
+            plain,
+            str(target),
+            _Inputs(inputs),
+            quant_format=QuantFormat.QDQ,
+            op_types_to_quantize=["Conv"],
+            per_channel=True,
+            reduce_range=True,  # of weights to 7 bits: sums of 8 saturate on processors without VNNI
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            nodes_to_exclude=[node for node in nodes if any(part in node for part in kept)],
+        )
+    content = onnx.load(str(target))
+    del content.metadata_props[:]
+    content.metadata_props.extend(said)
+    content.producer_name, content.producer_version, content.doc_string = "finforce", "", ""
+    onnx.save(content, str(target))
+
+
+def find_ends(path: Path) -> list[str]:
+    """Return the names of a network's first and last convolutions: those with none before, or none after them."""
+    graph = import_onnx().load(str(path)).graph
+    nodes = list(graph.node)
+    maker = {name: number for number, node in enumerate(nodes) for name in node.output}
+    follows = {number: {maker[name] for name in node.input if name in maker} for number, node in enumerate(nodes)}
+    convolutions = {number for number, node in enumerate(nodes) if node.op_type == "Conv"}
+    below: dict[int, set[int]] = {}  # convolutions on the way to each node; nodes are sorted as they are computed
+    for number in range(len(nodes)):
+        before = follows[number]
+        below[number] = set().union(*(below[other] for other in before), before & convolutions)
+    inner = set().union(*(below[number] for number in convolutions)) if convolutions else set()
+    return [nodes[number].name for number in sorted(convolutions) if not below[number] or number not in inner]
 
 
 def _record_inputs(folder: Path, pictures: FingerPictures) -> tuple[list[dict[str, NDArray]], list[dict[str, NDArray]]]:

@@ -194,7 +194,7 @@ def test_the_twin_has_27_grasps_with_seeds_of_their_own():
     cases = GraspExperiment(options=RunOptions()).list_cases()
     assert len({case.name for case in cases}) == 27
     assert len({case.settings["seed"] for case in cases}) == 27
-    assert len(ManipulationExperiment(options=RunOptions()).list_cases()) == 8
+    assert len(ManipulationExperiment(options=RunOptions()).list_cases()) == 12
     assert len(ChipExperiment(options=RunOptions()).list_cases()) == 60
     assert len(BenchExperiment(options=RunOptions()).list_cases()) == 9
 
