@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import Field, fields
 from functools import partial
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 
 import rclpy
@@ -398,6 +400,7 @@ def take_waiting(subscription: Subscription | Port) -> Iterator[Any]:
     yield from _take_all(subscription)
 
 
+_GLANCE = 0.1  # [s] between looks at whether a node that is being built is still wanted
 _MOST_WAITING = 1000  # messages, more than any queue keeps
 
 
@@ -429,6 +432,29 @@ def spin(nodes: Sequence[Node], executor: Executor) -> None:
         executor.spin_once()
 
 
+@contextmanager
+def _ending_with_context() -> Iterator[None]:
+    """End the process as soon as a signal has shut the context down, within the `with` block.
+
+    A node that is being built may compile for a minute; it has nothing yet that wants an end of its own, and what it
+    keeps in caches is written whole or not at all.
+    """
+    built = Event()
+
+    def watch() -> None:
+        while not built.wait(_GLANCE):
+            if not rclpy.ok():
+                sys.stdout.flush()
+                sys.stderr.flush()
+                os._exit(0)
+
+    Thread(target=watch, name="context", daemon=True).start()
+    try:
+        yield
+    finally:
+        built.set()
+
+
 def run_nodes(
     name: str, build: Callable[[], Sequence[Node]], args: Sequence[str] | None, work: Callable[..., None] = spin
 ) -> int:
@@ -441,7 +467,8 @@ def run_nodes(
     # an executor that is made after a signal cannot be taken down quietly; a node takes long to build
     executor, nodes = KeepingExecutor(), ()
     try:
-        nodes = build()
+        with _ending_with_context():
+            nodes = build()
         executor.obey(nodes)
         work(nodes, executor)
     except (KeyboardInterrupt, ExternalShutdownException):

@@ -8,7 +8,8 @@ What is left of the key points' residuals at the expected place is explained by
     c,     a tangential force that errors of the tare look like,
 
 with the depth of each frame free. m changes its sign when the motion does, b and c do not: loops tell mu from them.
-Either the object is as smooth as those that the finger was calibrated on, or mu is anything about the expected one.
+What goes with m in the residuals without being a lean is no chance that frames average out: where it is larger than
+chance would leave it, those frames say less by as much. Either the object is as smooth as those that the finger was calibrated on, or mu is anything about the expected one.
 """
 
 from typing import NamedTuple
@@ -61,6 +62,22 @@ class FrictionFrame(NamedTuple):
     away: NDArray
 
 
+class _Means(NamedTuple):
+    """What goes with m in the frames, as regressions on it.
+
+    Attributes:
+        left: residuals (K, 2) [m].
+        rows: their derivatives by depth, shape, height, mu, b and c (K, 6, 2).
+        counts: sum of m^2 over the frames (K,).
+        noise: of the key points in a frame (K, 2, 2) [m^2].
+    """
+
+    left: NDArray
+    rows: NDArray
+    counts: NDArray
+    noise: NDArray
+
+
 class FrictionEstimate:
     """Learns the coefficient of friction of one object.
 
@@ -77,20 +94,33 @@ class FrictionEstimate:
     def reset(self) -> None:
         """Starts with an object of which nothing is known."""
         self._information, self._vector = np.zeros((5, 5)), np.zeros(5)
+        self._means: _Means | None = None
         self._prior = np.ones(2)
         self.coefficient = self._judge(np.inf, 0.0)
 
     def update(self, frame: "FrictionFrame", prior: NDArray) -> Coefficient:
         """Takes one frame and returns the coefficient; `prior` is the variance of shape and height (2,)."""
         self._prior = prior
-        _accumulate(frame, self._information, self._vector)
-        self.coefficient = self._judge(*_solve(self._information, self._vector, prior))
+        count = len(frame.data.weights)
+        if self._means is None or len(self._means.counts) != count:
+            self._means = _Means(
+                np.zeros((count, 2)), np.zeros((count, 6, 2)), np.zeros(count), np.zeros((count, 2, 2))
+            )
+        _accumulate(frame, self._information, self._vector, self._means)
+        self.coefficient = self._judge(*self._see())
         return self.coefficient
+
+    def _see(self) -> tuple[float, float]:
+        """Returns variance and mean of the coefficient by the key points alone."""
+        variance, mean, found = _solve(self._information, self._vector, self._prior)
+        if self._means is None or not np.isfinite(variance):
+            return variance, mean
+        return variance * _find_excess(self._means, found), mean
 
     @property
     def seen(self) -> Coefficient:
         """What the key points alone say of the coefficient; its deviation is infinite where they say nothing."""
-        variance, mean = _solve(self._information, self._vector, self._prior)
+        variance, mean = self._see()
         return Coefficient(mean, float(np.sqrt(variance)))
 
     def _judge(self, variance: float, mean: float) -> Coefficient:
@@ -131,7 +161,7 @@ def _explain(frame, k, row, left):
 
 
 @njit(**_OPTIONS)
-def _accumulate(frame, information, vector):
+def _accumulate(frame, information, vector, means):
     """Adds one frame, its depth eliminated, to information (5, 5) and vector (5,) on shape, height, mu, b and c."""
     data = frame.data
     A, g = np.zeros((6, 6)), np.zeros(6)
@@ -144,6 +174,13 @@ def _accumulate(frame, information, vector):
         det = n00 * n11 - n01 * n01
         p00, p11, p01 = w * n11 / det, w * n00 / det, -w * n01 / det
         _explain(frame, k, row, left)
+        m = frame.mobilised
+        means.counts[k] = (1.0 - 1.0 / _MEMORY) * means.counts[k] + w * m * m
+        if means.counts[k] > 0.0:
+            share = w * m / means.counts[k]
+            means.left[k] += share * (left - m * means.left[k])
+            means.rows[k] += share * (row - m * means.rows[k])
+            means.noise[k] += m * share * (data.noise[k] - means.noise[k])
         for i in range(6):
             q0, q1 = p00 * row[i, 0] + p01 * row[i, 1], p01 * row[i, 0] + p11 * row[i, 1]
             g[i] += q0 * left[0] + q1 * left[1]
@@ -160,7 +197,7 @@ def _accumulate(frame, information, vector):
 
 @njit(**_OPTIONS)
 def _solve(information, vector, prior):
-    """Returns variance and mean of mu by the key points alone; infinite where they say nothing."""
+    """Returns variance and mean of mu by the key points alone (infinite where they say nothing), and all unknowns (5,)."""
     A = information.copy()
     A[0, 0] += 1.0 / prior[0]
     A[1, 1] += 1.0 / prior[1]
@@ -173,7 +210,43 @@ def _solve(information, vector, prior):
         for j in range(4):
             B[i, j] = A[others[i], others[j]]
     known = np.linalg.solve(B, np.stack((v, a), axis=1))
-    left = A[2, 2] - a @ np.ascontiguousarray(known[:, 1])
+    left, found = A[2, 2] - a @ np.ascontiguousarray(known[:, 1]), np.zeros(5)
     if not left > 1e-9:
-        return np.inf, 0.0
-    return 1.0 / left, (vector[2] - a @ np.ascontiguousarray(known[:, 0])) / left
+        return np.inf, 0.0, found
+    found[2] = (vector[2] - a @ np.ascontiguousarray(known[:, 0])) / left
+    for i in range(4):
+        found[others[i]] = known[i, 0] - known[i, 1] * found[2]
+    return 1.0 / left, found[2], found
+
+
+@njit(**_OPTIONS)
+def _find_excess(means, found):
+    """Returns how much larger what goes with m is than chance would leave it, squared, at least 1.
+
+    They are those that the unknowns (5,) and one common depth leave, over their standard deviations.
+    """
+    count, unknown, rest = 0, 6, np.zeros(2)
+    top, low = 0.0, 0.0
+    for turn in range(2):
+        depth = top / low if turn else 0.0
+        square = 0.0
+        for k in range(len(means.counts)):
+            if means.counts[k] < 1.0:
+                continue
+            for a in range(2):
+                rest[a] = means.left[k, a] - means.rows[k, 0, a] * depth
+                for i in range(5):
+                    rest[a] -= means.rows[k, i + 1, a] * found[i]
+            noise, number = means.noise[k], means.counts[k] / _ALIKE
+            det = (noise[0, 0] * noise[1, 1] - noise[0, 1] ** 2) / number
+            h0, h1 = means.rows[k, 0, 0], means.rows[k, 0, 1]
+            p0, p1 = noise[1, 1] * rest[0] - noise[0, 1] * rest[1], noise[0, 0] * rest[1] - noise[0, 1] * rest[0]
+            if turn:
+                square += (rest[0] * p0 + rest[1] * p1) / det
+                count += 2
+            else:
+                top += (h0 * p0 + h1 * p1) / det
+                low += (h0 * h0 * noise[1, 1] - 2.0 * h0 * h1 * noise[0, 1] + h1 * h1 * noise[0, 0]) / det
+        if not low > 0.0:
+            return 1.0
+    return max(1.0, square / max(count - unknown, 1))

@@ -161,7 +161,7 @@ class HeldWeight:
 
 @njit(**_OPTIONS)
 def _age(information, vector, dt):
-    """Returns information (7, 7) and vector (7,) as they are a time later, when T and S have gone on at their speeds."""
+    """Returns information (7, 7) and vector (7,) a time later, when T and S have gone on at their speeds."""
     back, kept = np.eye(len(vector)), np.exp(-dt / _AVERAGED)
     for force in range(2):
         back[_T + force, _UNKNOWN - 2 + force] = -dt

@@ -293,7 +293,7 @@ class PlaceTracker:
     ) -> None:
         """Learns how the object leans where it is held; what slides is followed by `learn`.
 
-        `gain` (K, 2) is the regression of the noise along x and z on that along y, `dt` the time since the last frame [s].
+        `gain` (K, 2) is the regression of the noise along x and z on that along y, `dt` the time since the last [s].
         """
         if self._reached[DEPTH] - self._find_touch(self._reached) < _LOADED_DEPTH or self._jumped:
             return

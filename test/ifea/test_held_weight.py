@@ -164,4 +164,6 @@ def test_a_weight_stays_what_it_was_while_the_object_slides():
     follow(held, [frame(0.6) for _ in range(40)])
     for step in range(1, 30):
         held.lead(np.array([0.0, 0.4e-3]))
-        assert held.update(frame(0.6, place=(3e-3, 0.0, 0.04 + 0.4e-3 * step)), PRIOR, DT) == pytest.approx(0.6, abs=0.1)
+        assert held.update(frame(0.6, place=(3e-3, 0.0, 0.04 + 0.4e-3 * step)), PRIOR, DT) == pytest.approx(
+            0.6, abs=0.1
+        )
