@@ -9,7 +9,8 @@ What is left of the key points' residuals at the expected place is explained by
 
 with the depth of each frame free. m changes its sign when the motion does, b and c do not: loops tell mu from them.
 What goes with m in the residuals without being a lean is no chance that frames average out: where it is larger than
-chance would leave it, those frames say less by as much. Either the object is as smooth as those that the finger was calibrated on, or mu is anything about the expected one.
+chance would leave it, those frames say less by as much. Either the object is as smooth as those that the finger was
+calibrated on, or mu is anything about the expected one.
 """
 
 from typing import NamedTuple
@@ -197,7 +198,7 @@ def _accumulate(frame, information, vector, means):
 
 @njit(**_OPTIONS)
 def _solve(information, vector, prior):
-    """Returns variance and mean of mu by the key points alone (infinite where they say nothing), and all unknowns (5,)."""
+    """Returns variance and mean of mu by the key points alone, infinite where they say nothing, and all unknowns."""
     A = information.copy()
     A[0, 0] += 1.0 / prior[0]
     A[1, 1] += 1.0 / prior[1]
