@@ -33,7 +33,7 @@ class PointNoise(NamedTuple):
         gain: regression of x and z on y in this image (K, 2).
         width_variance: along y in this image (K,) [m^2].
         trust: variance in the tare over that in this image (K,), at most 1.
-        standing: variance that was stated in the tare beyond what its images scattered (K,) [m^2].
+        standing: variance that is stated in this image beyond what those of the tare scattered (K,) [m^2].
     """
 
     plane: NDArray
@@ -100,13 +100,13 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
     growth = np.fmax(1.0, stddev / usual.stddev)
     across, along = growth[:, [0, 2]], growth[:, 1]
     own = np.einsum("kaa->ka", plane)
-    stated = (usual.stddev[:, [0, 2]] ** 2).sum(axis=1)
+    stated = ((usual.stddev[:, [0, 2]] * across) ** 2).sum(axis=1)
     return PointNoise(
         plane=plane,
         gain=gain * across / along[:, None],
         width_variance=width_variance * along**2,
         trust=own.sum(axis=1) / (own * across**2).sum(axis=1),
-        standing=np.maximum(0.0, 0.5 * stated - np.einsum("kaa->k", usual.covariance[:, ::2, ::2])),
+        standing=0.5 * stated,
     )
 
 

@@ -106,7 +106,8 @@ def score_weight(net: NetForces) -> dict[str, Any]:
     down = net.true.force[held] / size[held, None]
     error = (net.found.force - net.true.force)[held]
     along = np.einsum("ij,ij->i", error, down)
-    sigma = None if net.stated is None else np.sqrt(np.einsum("ij,ij->i", net.stated[held] ** 2, down**2))
+    known = net.stated is not None and bool(held.any())
+    sigma = np.sqrt(np.einsum("ij,ij->i", net.stated[held] ** 2, down**2)) if known else None
     # the plane in which gravity turns: the two main directions of what it was
     plane = np.linalg.svd(down, full_matrices=False)[2][:2] if held.any() else np.zeros((2, 3))
     angle = np.unwrap(np.arctan2(*(down @ plane.T).T[::-1])) if held.any() else np.zeros(0)
@@ -116,7 +117,7 @@ def score_weight(net: NetForces) -> dict[str, Any]:
         "along_bias_N": float(along.mean()) if held.any() else float("nan"),
         "across_rmse_N": rms(np.linalg.norm(error - along[:, None] * down, axis=1)),
         **{f"{axis}_rmse_N": rms(error[:, row]) for row, axis in enumerate("xyz")},
-        "within_3_sigma_pct": float("nan") if sigma is None else 100.0 * float((np.abs(along) <= 3.0 * sigma).mean()),
+        "within_3_sigma_pct": 100.0 * float((np.abs(along) <= 3.0 * sigma).mean()) if known else float("nan"),
         "answered_pct": net.answered_pct,
         "course": {
             "angle": np.round(angle, 4).tolist(),

@@ -41,7 +41,7 @@ _SLIDES, _TILTED, _ARM = 0.3, 0.05, 0.01
 # [N m], keeps the moment's variance above zero where nobody knows the finger's width.
 _LEAST_MOMENT = 1e-6
 # The errors of so many successive frames count for one. A change of so many standard deviations is no chance.
-_ALIKE, _SURE = 1.5, 2.5
+_ALIKE, _SURE = 1.5, 3.0
 # Fewer points than these say nothing.
 _FEWEST = 6
 # What changes: shape, height, T, S, M, and the speeds of T and S.
