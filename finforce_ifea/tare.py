@@ -33,7 +33,7 @@ class PointNoise(NamedTuple):
         gain: regression of x and z on y in this image (K, 2).
         width_variance: along y in this image (K,) [m^2].
         trust: variance in the tare over that in this image (K,), at most 1.
-        standing: variance that is stated in this image beyond what those of the tare scattered (K,) [m^2].
+        standing: variance of an error of this image less one of the tare, as far as these do not scatter (K,) [m^2].
     """
 
     plane: NDArray
@@ -106,7 +106,7 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
         gain=gain * across / along[:, None],
         width_variance=width_variance * along**2,
         trust=own.sum(axis=1) / (own * across**2).sum(axis=1),
-        standing=0.5 * stated,
+        standing=np.maximum(0.0, stated - np.einsum("kaa->k", usual.covariance[:, ::2, ::2])),
     )
 
 
