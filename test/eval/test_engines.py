@@ -16,10 +16,15 @@ from training.making import make_all
 
 
 def without_times(content):
-    """Figures without what the machine's mood decides."""
+    """Figures without what the machine's mood decides: times, and the last digits.
+
+    A process that has compiled a kernel itself and one that has loaded it may differ in these.
+    """
     if isinstance(content, dict):
         timed = [name for name in content if "_ms" in name or "delay" in name]  # a delay counts what a step took
         return {name: without_times(value) for name, value in content.items() if name not in timed}
+    if isinstance(content, float):
+        return float(f"{content:.9g}") if abs(content) > 1e-12 else 0.0
     return [without_times(value) for value in content] if isinstance(content, list) else content
 
 
