@@ -15,7 +15,7 @@ from finforce_contact.settings import ContactSettings
 from finforce_eval.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, SessionStep, judge, noise_of, update
 from finforce_eval.stress.stress import Family, Plan, Trial, attempt
 from finforce_ifea.contact_mechanics.forward_press import PressState, press_jaw
-from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
+from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Solution
@@ -43,7 +43,7 @@ class PressedOutline:
 
     def _place(self, depth: float, height: float) -> NDArray:
         place = np.array([0.0, 0.0, height])
-        place[0] = depth + self._indenter.find_touch(place, 0.0, self._length)
+        place[0] = depth + self._indenter.find_touch(place, flat_profile(0.0, self._length))
         return place
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact
+from finforce_ifea.contact_mechanics.penalty import PenaltyContact, Touch
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 
@@ -51,7 +51,11 @@ class LeaningContact:
 
     def rub(self, contact: PenaltyContact, points: NDArray, stiffness: NDArray, origin: NDArray) -> RubbedContact:
         """Returns the contact with its tangential forces; see `Friction.rub`."""
-        return _lean(contact.forces, contact.springs, contact.by_shape, self.lean)
+        return _rub_all(contact, points, stiffness, self.describe(origin))
+
+    def describe(self, origin: NDArray) -> "Rubbing":
+        """Returns what acts along the surface with the object's origin (x, z) [m]."""
+        return Rubbing(self.lean, -1.0, *_NO_HISTORY)
 
 
 class Friction:
@@ -86,9 +90,12 @@ class Friction:
             stiffness: of each point (p,) [N/m].
             origin: of the object (x, z) [m].
         """
-        before, start = self._before or (points, origin)
-        parts = (contact.forces, contact.springs, contact.by_shape)
-        return _rub(parts, points, before, self._shear, stiffness, origin - start, self.coefficient)
+        return _rub_all(contact, points, stiffness, self.describe(origin))
+
+    def describe(self, origin: NDArray) -> "Rubbing":
+        """Returns what acts along the surface with the object's origin (x, z) [m]."""
+        before, start = self._before or (_NO_HISTORY[1], origin)
+        return Rubbing(0.0, self.coefficient, self._shear, before, origin - start)
 
     def settle(self, contact: PenaltyContact, points: NDArray, stiffness: NDArray, origin: NDArray) -> float:
         """Remembers an equilibrium; arguments as for `rub`. Returns how far the cone is used, from -1 to 1."""
@@ -97,65 +104,101 @@ class Friction:
         return rubbed.mobilised
 
 
-@njit(**_OPTIONS)
-def _change(forces, springs, by_shape):
-    """Returns the derivatives (p, 3, 4) of normal forces and by their lean; see `RubbedContact`."""
-    changes = np.zeros((len(forces), 3, 4))
-    for p in range(len(forces)):
-        for a in range(0, 3, 2):
-            changes[p, a, 0], changes[p, a, 1], changes[p, a, 2] = -springs[p, a, 0], by_shape[p, a], springs[p, a, 2]
-        changes[p, 0, 3], changes[p, 2, 3] = forces[p, 2], -forces[p, 0]
-    return changes
+class Rubbing(NamedTuple):
+    """What acts along the surface while an object presses.
+
+    Attributes:
+        lean: that all forces have [-], where friction is not followed.
+        coefficient: of friction; below zero where it is not followed.
+        shear: of each point before (p,) [N].
+        before: where each point was then (p, 3) [m]; none of them where nothing has moved yet.
+        moved: of the object since then (x, z) [m].
+    """
+
+    lean: float
+    coefficient: float
+    shear: NDArray
+    before: NDArray
+    moved: NDArray
+
+
+_NO_HISTORY = np.zeros(0), np.zeros((0, 3)), np.zeros(2)
+_FORCE, _SPRING, _CHANGE = 0, 1, 3
+# What `rub_point` writes of each point: force, two columns of springs, four of changes, along x and z.
+POINT_SHAPE = (2, 7)
+
+
+def _rub_all(contact: PenaltyContact, points: NDArray, stiffness: NDArray, rubbing: Rubbing) -> RubbedContact:
+    """Returns the contact of all points with what acts along the surface."""
+    return _rub((contact.forces, contact.springs, contact.by_shape), points, stiffness, rubbing)
 
 
 @njit(**_OPTIONS)
-def _add_lean(lean, springs, stiff, changes):
-    """Adds what a lean of one point's force makes of its springs (3, 3) and derivatives (3, 4), in place."""
-    for b in range(0, 3, 2):
-        stiff[0, b] += lean * springs[2, b]
-        stiff[2, b] -= lean * springs[0, b]
-    for i in range(3):
-        ahead, aside = changes[0, i], changes[2, i]
-        changes[0, i], changes[2, i] = ahead + lean * aside, aside - lean * ahead
+def _add_lean(lean, touch, out):
+    """Adds what a lean of one point's force makes of its springs and of its derivatives by the place, in place."""
+    out[0, _SPRING] += lean * touch.kxz
+    out[0, _SPRING + 1] += lean * touch.kzz
+    out[1, _SPRING] -= lean * touch.kxx
+    out[1, _SPRING + 1] -= lean * touch.kxz
+    for i in range(_CHANGE, _CHANGE + 3):
+        ahead, aside = out[0, i], out[1, i]
+        out[0, i], out[1, i] = ahead + lean * aside, aside - lean * ahead
 
 
 @njit(**_OPTIONS)
-def _lean(forces, springs, by_shape, lean):
-    """Returns the contact with a lean of all its forces."""
-    out, stiff, changes = forces.copy(), springs.copy(), _change(forces, springs, by_shape)
-    for p in range(len(forces)):
-        out[p, 0] += lean * forces[p, 2]
-        out[p, 2] -= lean * forces[p, 0]
-        _add_lean(lean, springs[p], stiff[p], changes[p])
-    return RubbedContact(out, stiff, changes, np.zeros(len(forces)), 0.0)
+def rub_point(rubbing, touch, p, x, z, stiffness, out):
+    """Writes point p, at x and z [m], with what acts along the surface to out (2, 7); see `POINT_SHAPE`.
+
+    Returns:
+        Its shear, and the most that the cone allows; zero where friction is not followed [N].
+    """
+    fx, fz = touch.fx, touch.fz
+    out[0, 0], out[0, 1], out[0, 2] = fx, touch.kxx, touch.kxz
+    out[1, 0], out[1, 1], out[1, 2] = fz, touch.kxz, touch.kzz
+    out[0, 3], out[0, 4], out[0, 5], out[0, 6] = -touch.kxx, touch.bx, touch.kxz, fz
+    out[1, 3], out[1, 4], out[1, 5], out[1, 6] = -touch.kxz, touch.bz, touch.kzz, -fx
+    if rubbing.coefficient < 0.0:
+        _add_lean(rubbing.lean, touch, out)
+        out[0, 0] += rubbing.lean * fz
+        out[1, 0] -= rubbing.lean * fx
+        return 0.0, 0.0
+    normal = np.hypot(fx, fz)
+    if normal <= 0.0:
+        return 0.0, 0.0
+    tx, tz = fz / normal, -fx / normal
+    slip, before = 0.0, rubbing.before
+    if len(before) > 0:
+        slip = tx * (x - before[p, 0] - rubbing.moved[0]) + tz * (z - before[p, 2] - rubbing.moved[1])
+    shear, limit = rubbing.shear[p] - stiffness * slip, rubbing.coefficient * normal
+    if abs(shear) > limit:
+        shear = limit if shear > 0.0 else -limit
+        _add_lean(shear / normal, touch, out)
+    else:
+        for a, ta in ((0, tx), (1, tz)):
+            out[a, _SPRING] += stiffness * ta * tx
+            out[a, _SPRING + 1] += stiffness * ta * tz
+            out[a, _CHANGE] -= stiffness * ta * tx
+            out[a, _CHANGE + 2] += stiffness * ta * tz
+    out[0, 0] += shear * tx
+    out[1, 0] += shear * tz
+    return shear, limit
 
 
 @njit(**_OPTIONS)
-def _rub(contact, points, before, shear_before, stiffness, moved, coefficient):
-    """Returns the contact (forces, springs, by_shape) with friction, the object moved by `moved` (x, z) [m]."""
+def _rub(contact, points, stiffness, rubbing):
+    """Returns the contact (forces, springs, by_shape) at all points with what acts along the surface."""
     forces, springs, by_shape = contact
-    out, stiff, changes = forces.copy(), springs.copy(), _change(forces, springs, by_shape)
-    shear, total, allowed = np.zeros(len(points)), 0.0, 0.0
-    for p in range(len(points)):
-        normal = np.hypot(forces[p, 0], forces[p, 2])
-        if normal <= 0.0:
-            continue
-        tx, tz = forces[p, 2] / normal, -forces[p, 0] / normal
-        slip = tx * (points[p, 0] - before[p, 0] - moved[0]) + tz * (points[p, 2] - before[p, 2] - moved[1])
-        shear[p] = shear_before[p] - stiffness[p] * slip
-        limit = coefficient * normal
-        if abs(shear[p]) > limit:
-            shear[p] = limit if shear[p] > 0.0 else -limit
-            _add_lean(shear[p] / normal, springs[p], stiff[p], changes[p])
-        else:
-            held = stiffness[p]
-            for a, ta in ((0, tx), (2, tz)):
-                stiff[p, a, 0] += held * ta * tx
-                stiff[p, a, 2] += held * ta * tz
-                changes[p, a, 0] -= held * ta * tx
-                changes[p, a, 2] += held * ta * tz
-        out[p, 0] += shear[p] * tx
-        out[p, 2] += shear[p] * tz
+    count = len(points)
+    pushed, stiff, changes = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3, 4))
+    shear, total, allowed, out = np.zeros(count), 0.0, 0.0, np.zeros(POINT_SHAPE)
+    for p in range(count):
+        xz = springs[p, 0, 2]
+        parts = forces[p, 0], forces[p, 2], springs[p, 0, 0], xz, springs[p, 2, 2], by_shape[p, 0], by_shape[p, 2]
+        shear[p], limit = rub_point(rubbing, Touch(*parts), p, points[p, 0], points[p, 2], stiffness[p], out)
         total += shear[p]
         allowed += limit
-    return RubbedContact(out, stiff, changes, shear, total / allowed if allowed > 0.0 else 0.0)
+        for a in range(2):
+            pushed[p, 2 * a] = out[a, _FORCE]
+            stiff[p, 2 * a, 0], stiff[p, 2 * a, 2] = out[a, _SPRING], out[a, _SPRING + 1]
+            changes[p, 2 * a] = out[a, _CHANGE:]
+    return RubbedContact(pushed, stiff, changes, shear, total / allowed if allowed > 0.0 else 0.0)

@@ -6,26 +6,151 @@ logarithmic radius, of a known outline its tilt.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.penalty import (
     CELL,
     DistanceField,
     PenaltyContact,
+    Touch,
     build_distance_field,
     find_leading,
     press_cylinder,
     press_field,
-    read_depth,
+    read_value,
+    touch_cylinder,
+    touch_field,
 )
 from finforce_ifea.observation import Contact, ObjectOutline, are_same_polygons
 from finforce_ifea.settings import EstimatorSettings
 
 DEPTH, SHAPE, HEIGHT = 0, 1, 2
 _OTHER_SIZE = 3.0
+# What leads by more [m] is beside the heights.
+_BESIDE = 1.0
+
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+
+
+class PressedObject(NamedTuple):
+    """An indenter for compiled code.
+
+    Attributes:
+        is_round: whether it is a cylinder, of which the rest tells nothing.
+        coefficients: of an outline's distance field (a, b) [m].
+        low: x and z of the first coefficient (2,) [m].
+        front: distance from the origin to the leading point, against x [m].
+        segments: of the side that faces the jaw (s, 4) [m].
+    """
+
+    is_round: bool
+    coefficients: NDArray
+    low: NDArray
+    front: float
+    segments: NDArray
+
+
+class FaceProfile(NamedTuple):
+    """An undeformed inner surface for compiled code.
+
+    Attributes:
+        points: its x and z, rising (p, 2) [m]; of a flat one the first and the last suffice.
+        is_flat: whether all x are the same.
+        x: of the inner face, from which depths count [m].
+    """
+
+    points: NDArray
+    is_flat: bool
+    x: float
+
+
+class ObjectPose(NamedTuple):
+    """Where an object of a place (depth, shape, height) is.
+
+    Attributes:
+        x: of a cylinder's axis or an outline's origin [m].
+        z: the same [m].
+        radius: of a cylinder, 0 of an outline [m].
+        c: cosine of an outline's tilt.
+        s: its sine.
+    """
+
+    x: float
+    z: float
+    radius: float
+    c: float
+    s: float
+
+
+@njit(**_OPTIONS)
+def pose_object(pressed, face_x, place):
+    """Returns the `ObjectPose` at a place (3,)."""
+    if pressed.is_round:
+        radius = np.exp(place[1])
+        return ObjectPose(face_x + radius - place[0], place[2], radius, 1.0, 0.0)
+    return ObjectPose(face_x + pressed.front - place[0], place[2], 0.0, np.cos(place[1]), np.sin(place[1]))
+
+
+@njit(**_OPTIONS)
+def touch_object(pressed, pose, x, z, stiffness, weights):
+    """Returns the `Touch` of one point at x and z [m], derivatives by the place's shape; `weights` is (6, 4)."""
+    if pressed.is_round:
+        touch = touch_cylinder(x, z, stiffness, pose.x, pose.z, pose.radius)
+        bx, bz = pose.radius * (touch.bx + touch.kxx), pose.radius * (touch.bz + touch.kxz)
+        return Touch(touch.fx, touch.fz, touch.kxx, touch.kxz, touch.kzz, bx, bz)
+    field = pressed.coefficients, pressed.low, CELL
+    return touch_field(x, z, stiffness, *field, pose.x, pose.z, pose.c, pose.s, weights)
+
+
+@njit(**_OPTIONS)
+def measure_gap(pressed, pose, points):
+    """Returns the least distance [m] of points (p, 3) [m] from an object, negative inside."""
+    least, weights = np.inf, np.zeros((6, 4))
+    for p in range(len(points)):
+        dx, dz = points[p, 0] - pose.x, points[p, 2] - pose.z
+        if pressed.is_round:
+            gap = np.sqrt(dx * dx + dz * dz) - pose.radius
+        else:
+            x, z = pose.c * dx + pose.s * dz, pose.c * dz - pose.s * dx
+            gap = -read_value(pressed.coefficients, pressed.low, CELL, x, z, weights)[0]
+        least = min(least, gap)
+    return least
+
+
+@njit(**_OPTIONS)
+def find_first_touch(pressed, face, place):
+    """Returns the depth [m] at which an object of a place (3,) first touches an undeformed `FaceProfile`."""
+    points = face.points
+    if pressed.is_round:
+        radius = np.exp(place[1])
+        least = 0.0 if face.is_flat else radius
+        for p in range(0 if face.is_flat else len(points)):
+            beside = points[p, 1] - place[2]
+            if abs(beside) < radius:
+                least = min(least, face.x + radius - np.sqrt(radius * radius - beside * beside) - points[p, 0])
+        return least
+    c, s = np.cos(place[1]), np.sin(place[1])
+    if face.is_flat:
+        low, high = points[0, 1] - place[2], points[-1, 1] - place[2]
+        least = find_leading(pressed.segments, c, s, low, high)
+        return least + pressed.front if least < _BESIDE else 0.0
+    least = np.inf
+    for p in range(len(points)):
+        z = points[p, 1] - place[2]
+        lead = find_leading(pressed.segments, c, s, z, z)
+        if lead < _BESIDE:
+            least = min(least, face.x + lead - points[p, 0])
+    return least + pressed.front if np.isfinite(least) else 0.0
+
+
+def flat_profile(low: float, high: float, x: float = 0.0) -> FaceProfile:
+    """Returns a plane inner surface x = const between two heights [m]."""
+    return FaceProfile(np.array([[x, low], [x, high]]), True, x)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +166,7 @@ class ShapeRange:
 class Indenter(Protocol):
     """A rigid object, endless along y; one with corners may rock between them."""
 
+    pressed: PressedObject
     shape_range: ShapeRange
     has_corners: bool
 
@@ -52,12 +178,8 @@ class Indenter(Protocol):
         """Returns the least distance [m] of points (p, 3) [m] from the object, negative inside."""
         ...
 
-    def find_touch(self, place: NDArray, low: float, high: float) -> float:
-        """Returns the depth [m] of first touch with a plane undeformed surface between two heights [m]."""
-        ...
-
-    def find_touch_at(self, points: NDArray, face_x: float, place: NDArray) -> float:
-        """Returns the depth [m] of first touch with an undeformed surface of points (p, 2), x and z [m]."""
+    def find_touch(self, place: NDArray, face: FaceProfile) -> float:
+        """Returns the depth [m] of first touch with an undeformed surface."""
         ...
 
 
@@ -69,6 +191,7 @@ class RoundIndenter:
         low=float(np.log(3e-3)), high=float(np.log(0.2)), largest_change=0.15, settled_change=5e-2
     )
     has_corners: bool = False
+    pressed: PressedObject = PressedObject(True, np.zeros((1, 1)), np.zeros(2), 0.0, np.zeros((0, 4)))
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, place: NDArray) -> PenaltyContact:
         """See `Indenter`; a larger radius moves the axis away, so that the depth stays."""
@@ -79,20 +202,11 @@ class RoundIndenter:
 
     def find_gap(self, points: NDArray, face_x: float, place: NDArray) -> float:
         """See `Indenter`."""
-        radius = float(np.exp(place[SHAPE]))
-        centre = np.array([face_x + radius - place[DEPTH], place[HEIGHT]])
-        return float(np.sqrt(((points[:, [0, 2]] - centre) ** 2).sum(1)).min() - radius)
+        return _find_gap(self.pressed, points, face_x, place)
 
-    def find_touch(self, place: NDArray, low: float, high: float) -> float:
-        """See `Indenter`; a round object touches at once."""
-        return 0.0
-
-    def find_touch_at(self, points: NDArray, face_x: float, place: NDArray) -> float:
-        """See `Indenter`."""
-        radius, beside = float(np.exp(place[SHAPE])), points[:, 1] - place[HEIGHT]
-        met = np.abs(beside) < radius
-        behind = face_x + radius - np.sqrt(radius**2 - beside[met] ** 2) - points[met, 0]
-        return float(behind.min(initial=radius))
+    def find_touch(self, place: NDArray, face: FaceProfile) -> float:
+        """See `Indenter`; a round object touches a plane surface at once."""
+        return find_first_touch(self.pressed, face, place)
 
 
 class OutlineIndenter:
@@ -105,6 +219,8 @@ class OutlineIndenter:
         """Builds the distance field of the polygons (n, 2) [m]; raises ContactError for one that is too small."""
         self.polygons = polygons
         self.field: DistanceField = build_distance_field(polygons)
+        field = self.field
+        self.pressed = PressedObject(False, field.coefficients, field.low, field.front, field.segments)
 
     def describes(self, outline: ObjectOutline) -> bool:
         """Whether an outline has this object's polygons."""
@@ -121,32 +237,19 @@ class OutlineIndenter:
 
     def find_gap(self, points: NDArray, face_x: float, place: NDArray) -> float:
         """See `Indenter`."""
-        c, s = np.cos(place[SHAPE]), np.sin(place[SHAPE])
-        local = (points[:, [0, 2]] - self._origin(face_x, place)) @ np.array([[c, -s], [s, c]])
-        return -float(read_depth(self.field.coefficients, self.field.low, CELL, local)[:, 0].max())
+        return _find_gap(self.pressed, points, face_x, place)
 
-    def find_touch(self, place: NDArray, low: float, high: float) -> float:
-        """See `Indenter`; an outline that is beside the heights touches with its leading point all the same."""
-        c, s = np.cos(place[SHAPE]), np.sin(place[SHAPE])
-        least = find_leading(self.field.segments, c, s, low - place[HEIGHT], high - place[HEIGHT])
-        return least + self.field.front if least < 1.0 else 0.0
-
-    def find_touch_at(self, points: NDArray, face_x: float, place: NDArray) -> float:
-        """See `Indenter`; as `find_touch` where the outline is beside all points."""
-        c, s = np.cos(place[SHAPE]), np.sin(place[SHAPE])
-        turn = np.array([[c, s], [-s, c]])
-        begin, end = self.field.segments[:, :2] @ turn, self.field.segments[:, 2:] @ turn
-        z = points[:, 1, None] - place[HEIGHT]
-        rise = end[:, 1] - begin[:, 1]
-        share = (z - begin[:, 1]) / np.where(rise == 0.0, np.inf, rise)
-        across = (share >= 0.0) & (share <= 1.0) & (rise != 0.0)
-        lead = np.where(across, begin[:, 0] + share * (end[:, 0] - begin[:, 0]), np.inf).min(axis=1)
-        behind = face_x + lead - points[:, 0]
-        nearest = float(behind.min())
-        return nearest + self.field.front if np.isfinite(nearest) else 0.0
+    def find_touch(self, place: NDArray, face: FaceProfile) -> float:
+        """See `Indenter`; an outline beside a plane surface touches with its leading point all the same."""
+        return find_first_touch(self.pressed, face, place)
 
     def _origin(self, face_x: float, place: NDArray) -> NDArray:
         return np.array([face_x + self.field.front - place[DEPTH], place[HEIGHT]])
+
+
+def _find_gap(pressed: PressedObject, points: NDArray, face_x: float, place: NDArray) -> float:
+    """Returns the gap of points (p, 3) [m]; see `measure_gap`."""
+    return float(measure_gap(pressed, pose_object(pressed, face_x, place), np.ascontiguousarray(points)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -6,6 +6,7 @@ not make the contact rattle.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -105,54 +106,56 @@ def _weigh(t, value, slope, bend):
 
 
 @njit(**_OPTIONS)
+def read_value(coefficients, low, cell, x, z, weights):
+    """Returns the depth [m] at one point, -1 mm beyond the grid, and fills in weights (6, 4) of x and z there."""
+    rows, columns = coefficients.shape
+    a, b = (x - low[0]) / cell, (z - low[1]) / cell
+    i, j = int(np.floor(a)), int(np.floor(b))
+    if i < 1 or j < 1 or i > rows - 3 or j > columns - 3:
+        return -1e-3, i, j
+    _weigh(a - i, weights[0], weights[1], weights[2])
+    _weigh(b - j, weights[3], weights[4], weights[5])
+    depth = 0.0
+    for k in range(4):
+        for m in range(4):
+            depth += coefficients[i - 1 + k, j - 1 + m] * weights[0, k] * weights[3, m]
+    return depth, i, j
+
+
+@njit(**_OPTIONS)
+def _read_slopes(coefficients, cell, i, j, weights):
+    """Returns gradient (x, z) and second derivatives (xx, xz, zz) where `read_value` has read the depth."""
+    gx, gz, gxx, gxz, gzz = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(4):
+        for m in range(4):
+            c = coefficients[i - 1 + k, j - 1 + m]
+            gx += c * weights[1, k] * weights[3, m] / cell
+            gz += c * weights[0, k] * weights[4, m] / cell
+            gxx += c * weights[2, k] * weights[3, m] / cell**2
+            gxz += c * weights[1, k] * weights[4, m] / cell**2
+            gzz += c * weights[0, k] * weights[5, m] / cell**2
+    return gx, gz, gxx, gxz, gzz
+
+
+@njit(**_OPTIONS)
 def read_depth(coefficients, low, cell, points):
     """Returns depth, gradient (x, z) and second derivatives (xx, xz, zz) at points (p, 2) [m] as (p, 6).
 
     Beyond the grid the depth is that of a point a millimetre outside.
     """
-    out = np.zeros((len(points), 6))
-    u, du, ddu = np.empty(4), np.empty(4), np.empty(4)
-    v, dv, ddv = np.empty(4), np.empty(4), np.empty(4)
-    rows, columns = coefficients.shape
+    out, weights = np.zeros((len(points), 6)), np.zeros((6, 4))
     for p in range(len(points)):
-        a, b = (points[p, 0] - low[0]) / cell, (points[p, 1] - low[1]) / cell
-        i, j = int(np.floor(a)), int(np.floor(b))
-        if i < 1 or j < 1 or i > rows - 3 or j > columns - 3:
-            out[p, 0] = -1e-3
-            continue
-        _weigh(a - i, u, du, ddu)
-        _weigh(b - j, v, dv, ddv)
-        for k in range(4):
-            for m in range(4):
-                c = coefficients[i - 1 + k, j - 1 + m]
-                out[p, 0] += c * u[k] * v[m]
-                out[p, 1] += c * du[k] * v[m] / cell
-                out[p, 2] += c * u[k] * dv[m] / cell
-                out[p, 3] += c * ddu[k] * v[m] / cell**2
-                out[p, 4] += c * du[k] * dv[m] / cell**2
-                out[p, 5] += c * u[k] * ddv[m] / cell**2
+        out[p, 0], i, j = read_value(coefficients, low, cell, points[p, 0], points[p, 1], weights)
+        if out[p, 0] != -1e-3:
+            out[p, 1:] = _read_slopes(coefficients, cell, i, j, weights)
     return out
-
-
-@njit(**_OPTIONS)
-def _read_one(coefficients, low, cell, x, z, u, v, rest):
-    """Returns the depth [m] at one point on the grid."""
-    a, b = (x - low[0]) / cell, (z - low[1]) / cell
-    i, j = int(np.floor(a)), int(np.floor(b))
-    _weigh(a - i, u, rest, rest)
-    _weigh(b - j, v, rest, rest)
-    depth = 0.0
-    for k in range(4):
-        for m in range(4):
-            depth += coefficients[i - 1 + k, j - 1 + m] * u[k] * v[m]
-    return depth
 
 
 @njit(**_OPTIONS)
 def _trace_front(coefficients, low, cell, steps):
     """Returns the first x [m] of depth zero at each height (n, 2) [m]; NaN where the object is not met."""
     rows, columns = coefficients.shape
-    u, v, rest = np.empty(4), np.empty(4), np.empty(4)
+    weights = np.zeros((6, 4))
     count = (columns - 4) * steps
     front = np.full((count, 2), np.nan)
     for n in range(count):
@@ -160,12 +163,12 @@ def _trace_front(coefficients, low, cell, steps):
         front[n, 1] = z
         for i in range(1, rows - 3):
             x = low[0] + cell * (i + 1)
-            if i + 1 > rows - 3 or _read_one(coefficients, low, cell, x, z, u, v, rest) <= 0.0:
+            if i + 1 > rows - 3 or read_value(coefficients, low, cell, x, z, weights)[0] <= 0.0:
                 continue
             outside, inside = x - cell, x
             for _ in range(_HALVINGS):
                 middle = 0.5 * (outside + inside)
-                if _read_one(coefficients, low, cell, middle, z, u, v, rest) > 0.0:
+                if read_value(coefficients, low, cell, middle, z, weights)[0] > 0.0:
                     inside = middle
                 else:
                     outside = middle
@@ -210,7 +213,7 @@ class PenaltyContact:
     by_shape: NDArray
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**_OPTIONS)
 def _resist(depth, stiffness):
     """Returns force [N] and its derivative [N/m] at a depth above zero [m]."""
     if depth < _SMOOTH_DEPTH:
@@ -218,25 +221,58 @@ def _resist(depth, stiffness):
     return stiffness * (depth - 0.5 * _SMOOTH_DEPTH), stiffness
 
 
-@njit(cache=True, error_model="numpy")
+class Touch(NamedTuple):
+    """What an object does to one surface point.
+
+    Attributes:
+        fx: force along x [N].
+        fz: along z [N].
+        kxx: negative derivative of the force along x by the point's x [N/m].
+        kxz: of either by the other [N/m].
+        kzz: of the force along z by z [N/m].
+        bx: derivative of the force along x by the object's size [N/m], its centre held, or by its tilt [N/rad].
+        bz: of that along z.
+    """
+
+    fx: float
+    fz: float
+    kxx: float
+    kxz: float
+    kzz: float
+    bx: float
+    bz: float
+
+
+@njit(**_OPTIONS)
+def touch_cylinder(x, z, stiffness, centre_x, centre_z, radius):
+    """Returns the `Touch` of a cylinder on a point at x and z [m]; see `press_cylinder`."""
+    dx, dz = x - centre_x, z - centre_z
+    r = np.sqrt(dx * dx + dz * dz)
+    depth = radius - r
+    if depth <= 0.0 or r < 1e-12:
+        return Touch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    nx, nz = dx / r, dz / r
+    push, slope = _resist(depth, stiffness)
+    side = push / r
+    xx, xz = slope * nx * nx - side * nz * nz, (slope + side) * nx * nz
+    return Touch(push * nx, push * nz, xx, xz, slope * nz * nz - side * nx * nx, slope * nx, slope * nz)
+
+
+@njit(**_OPTIONS)
 def _press_cylinder(points, stiffness, centre_x, centre_z, radius):
     count = len(points)
     forces, springs, by_shape = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3))
     for p in range(count):
-        dx, dz = points[p, 0] - centre_x, points[p, 2] - centre_z
-        r = np.sqrt(dx * dx + dz * dz)
-        depth = radius - r
-        if depth <= 0.0 or r < 1e-12:
-            continue
-        nx, nz = dx / r, dz / r
-        push, slope = _resist(depth, stiffness[p])
-        forces[p, 0], forces[p, 2] = push * nx, push * nz
-        by_shape[p, 0], by_shape[p, 2] = slope * nx, slope * nz
-        side = push / r
-        springs[p, 0, 0] = slope * nx * nx - side * nz * nz
-        springs[p, 2, 2] = slope * nz * nz - side * nx * nx
-        springs[p, 0, 2] = springs[p, 2, 0] = (slope + side) * nx * nz
+        touch = touch_cylinder(points[p, 0], points[p, 2], stiffness[p], centre_x, centre_z, radius)
+        _write_touch(touch, forces[p], springs[p], by_shape[p])
     return forces, springs, by_shape
+
+
+@njit(**_OPTIONS)
+def _write_touch(touch, force, spring, by_shape):
+    """Writes the touch of one point to its force (3,), springs (3, 3) and derivatives (3,)."""
+    force[0], force[2], by_shape[0], by_shape[2] = touch.fx, touch.fz, touch.bx, touch.bz
+    spring[0, 0], spring[2, 2], spring[0, 2], spring[2, 0] = touch.kxx, touch.kzz, touch.kxz, touch.kxz
 
 
 def measure_penalty_energy(forces: NDArray, stiffness: NDArray) -> float:
@@ -270,7 +306,7 @@ def press_cylinder(
     return PenaltyContact(forces=forces, springs=springs, by_shape=by_shape)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**_OPTIONS)
 def _press_box(points, stiffness, centre_x, centre_z, half_x, half_z, edge):
     count = len(points)
     forces, springs = np.zeros((count, 3)), np.zeros((count, 3, 3))
@@ -313,32 +349,33 @@ def press_box(
     return PenaltyContact(forces=forces, springs=springs, by_shape=np.zeros_like(forces))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(**_OPTIONS)
+def touch_field(x, z, stiffness, coefficients, low, cell, origin_x, origin_z, c, s, weights):
+    """Returns the `Touch` of an outline turned by (cos, sin) of its tilt; see `press_field`. `weights` is (6, 4)."""
+    rx, rz = x - origin_x, z - origin_z
+    depth, i, j = read_value(coefficients, low, cell, c * rx + s * rz, c * rz - s * rx, weights)
+    if depth <= 0.0:
+        return Touch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    hx, hz, a, b, d = _read_slopes(coefficients, cell, i, j, weights)
+    push, slope = _resist(depth, stiffness)
+    gx, gz = c * hx - s * hz, s * hx + c * hz
+    hxx = c * c * a - 2.0 * c * s * b + s * s * d
+    hzz = s * s * a + 2.0 * c * s * b + c * c * d
+    hxz = c * s * (a - d) + (c * c - s * s) * b
+    fx, fz = -push * gx, -push * gz
+    xx, xz, zz = slope * gx * gx + push * hxx, slope * gx * gz + push * hxz, slope * gz * gz + push * hzz
+    # the object turns: its force turns along, and the point slides against it
+    return Touch(fx, fz, xx, xz, zz, -fz - xx * rz + xz * rx, fx - xz * rz + zz * rx)
+
+
+@njit(**_OPTIONS)
 def _press_field(points, stiffness, coefficients, low, cell, origin, c, s):
-    count = len(points)
+    count, weights = len(points), np.zeros((6, 4))
     forces, springs, by_tilt = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3))
-    local = np.empty((count, 2))
     for p in range(count):
-        rx, rz = points[p, 0] - origin[0], points[p, 2] - origin[1]
-        local[p, 0], local[p, 1] = c * rx + s * rz, c * rz - s * rx
-    field = read_depth(coefficients, low, cell, local)
-    for p in range(count):
-        if field[p, 0] <= 0.0:
-            continue
-        push, slope = _resist(field[p, 0], stiffness[p])
-        gx, gz = c * field[p, 1] - s * field[p, 2], s * field[p, 1] + c * field[p, 2]
-        a, b, d = field[p, 3], field[p, 4], field[p, 5]
-        hxx = c * c * a - 2.0 * c * s * b + s * s * d
-        hzz = s * s * a + 2.0 * c * s * b + c * c * d
-        hxz = c * s * (a - d) + (c * c - s * s) * b
-        forces[p, 0], forces[p, 2] = -push * gx, -push * gz
-        springs[p, 0, 0] = slope * gx * gx + push * hxx
-        springs[p, 2, 2] = slope * gz * gz + push * hzz
-        springs[p, 0, 2] = springs[p, 2, 0] = slope * gx * gz + push * hxz
-        # the object turns: its force turns along, and the point slides against it
-        rx, rz = points[p, 0] - origin[0], points[p, 2] - origin[1]
-        by_tilt[p, 0] = -forces[p, 2] - springs[p, 0, 0] * rz + springs[p, 0, 2] * rx
-        by_tilt[p, 2] = forces[p, 0] - springs[p, 2, 0] * rz + springs[p, 2, 2] * rx
+        x, z = points[p, 0], points[p, 2]
+        touch = touch_field(x, z, stiffness[p], coefficients, low, cell, origin[0], origin[1], c, s, weights)
+        _write_touch(touch, forces[p], springs[p], by_tilt[p])
     return forces, springs, by_tilt
 
 

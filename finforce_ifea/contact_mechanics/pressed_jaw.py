@@ -10,13 +10,13 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact, RubbedContact
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, Indenter, RoundIndenter
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, FaceProfile, Indenter, RoundIndenter
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import Across, JawModel
@@ -50,8 +50,7 @@ _TOUCH = 2e-5
 _MEANT_STIFFNESS = 435.0
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PressedState:
+class PressedState(NamedTuple):
     """Linearised equilibrium of one state of jaw and object.
 
     Attributes:
@@ -114,9 +113,12 @@ class RollingContact:
 
     def find_touch(self, place: NDArray) -> float:
         """Returns the depth [m] at which the object at a place (3,) first touches the undeformed jaw."""
-        if self.face.is_flat:
-            return self.indenter.find_touch(place, *self.surface.ends)
-        return self.indenter.find_touch_at(self.surface.points[:: self.surface.across, [0, 2]], self.face_x, place)
+        return self.indenter.find_touch(place, self.profile)
+
+    @cached_property
+    def profile(self) -> FaceProfile:
+        """The undeformed surface, for objects to touch."""
+        return profile_surface(self.surface, self.face)
 
     def rub(self, points: NDArray, place: NDArray) -> RubbedContact:
         """Returns the contact of surface points (p, 3) [m] with the object at a place (3,)."""
@@ -251,10 +253,10 @@ class ContactSurface:
     low: NDArray
     high: NDArray
 
-    @cached_property
-    def ends(self) -> tuple[float, float]:
-        """The lowest and the highest of the heights [m]."""
-        return float(self.heights[0]), float(self.heights[-1])
+
+def profile_surface(surface: ContactSurface, face: FaceLine) -> FaceProfile:
+    """Returns the undeformed surface of a face, for objects to touch."""
+    return FaceProfile(np.ascontiguousarray(surface.points[:: surface.across, [0, 2]]), face.is_flat, face.plane)
 
 
 def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across: Across) -> ContactSurface:

@@ -6,14 +6,22 @@ rigid object it is the same as `RollingContact`, at the price of a look-up.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact
-from finforce_ifea.contact_mechanics.indenter import Indenter, RoundIndenter
+from finforce_ifea.contact_mechanics.friction import POINT_SHAPE, Friction, LeaningContact, Rubbing, rub_point
+from finforce_ifea.contact_mechanics.indenter import (
+    DEPTH,
+    HEIGHT,
+    Indenter,
+    PressedObject,
+    RoundIndenter,
+    pose_object,
+    touch_object,
+)
 from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, PressedState, RollingContact
 from finforce_ifea.fem.factorisation import Factor
 from finforce_ifea.fem.model import LARGEST_MOVE, Across, JawModel, Linearization
@@ -224,17 +232,29 @@ class ReducedContact(RollingContact):
         shares = share_rows(model.manifold.heights, surface.heights)
         upper = np.clip(np.searchsorted(model.manifold.heights, surface.heights) - 1, 0, shares.shape[1] - 1)
         share = shares[np.arange(len(upper)), upper]
-        self._rows = FaceRows(surface.points, upper - 1, share, model.manifold.rods)
         length = surface.heights[-1] - surface.heights[0]
         # the rest alone is stored on purpose where no rod was pressed in
-        self._farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
+        farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
         x, z = (model.loads[:, :, axis::2].sum(axis=2) for axis in (0, 1))
-        self.bearable = _BEARABLE * float(np.hypot(x, z).max()) if np.isfinite(self._farthest) else np.inf
-        self._tables = (model.manifold.moves, model.compliance, model.loads)
+        self.bearable = _BEARABLE * float(np.hypot(x, z).max()) if np.isfinite(farthest) else np.inf
+        self.jaw = ReducedJaw(
+            moves=model.manifold.moves,
+            compliance=model.compliance,
+            loads=model.loads,
+            points=surface.points,
+            low=upper - 1,
+            share=share,
+            rods=model.manifold.rods,
+            stiffness=surface.stiffness,
+            face_points=self.profile.points,
+            is_flat=self.profile.is_flat,
+            face_x=self.profile.x,
+            farthest=farthest,
+        )
 
     def place_points(self, q: NDArray) -> NDArray:
         """See `RollingContact`."""
-        return place_contact(self._rows, self.model.moves(q))
+        return place_contact(self.jaw.points, self.jaw.low, self.jaw.share, self.model.moves(q))
 
     def begin(self, height: float) -> NDArray:
         """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
@@ -244,49 +264,8 @@ class ReducedContact(RollingContact):
 
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
         """Linearises the equilibrium with the object at a place (depth, shape, height); see `RollingContact`."""
-        moves = self.model.moves(q)
-        points = place_contact(self._rows, moves)
-        contact = self.rub(points, place)
-        parts = (contact.forces, contact.springs, contact.changes)
-        step = step_contact(q, self._tables, self._rows, moves, points, parts)
-        correction, force = step.correction, step.force
-        if step.touches and step.size > _LARGE_STEP and not correction[-2:].any():
-            share = self._find_share(q, points, correction, place)
-            correction = share * correction
-            force = share * force + (1.0 - share) * np.array([q[:-2:2].sum(), 0.0, q[1:-2:2].sum()])
-        return PressedState(
-            touches=step.touches,
-            correction=correction,
-            modes=step.modes,
-            force=force,
-            force_modes=step.force_modes,
-            pressure_point=step.pressure_point,
-            pressure_place=step.pressure_place,
-            smallest_det=1.0,
-            size=step.size,
-            extrapolation=step.away / self._farthest,
-        )
-
-    def _find_share(self, q: NDArray, points: NDArray, step: NDArray, place: NDArray) -> float:
-        """Returns the share of a step up to which the energy of jaw and object falls; corners make it rise again.
-
-        Along a step of the loads that moves the rows by du and contact points (p, 3) by dx, it changes by
-        (lambda - p)^T du, all as far as the step has gone.
-        """
-        after = self.model.moves(q + step)
-        motion, moved = place_contact(self._rows, after) - points, after - self.model.moves(q)
-
-        def change_energy(share: float) -> float:
-            contact = self.rub(points + share * motion, place)
-            return float((q[:-2] + share * step[:-2]) @ moved - (contact.forces * motion).sum())
-
-        share, low, high = 1.0, 0.0, 1.0
-        if change_energy(1.0) <= _TOO_FAR * abs(change_energy(0.0)):
-            return 1.0
-        for _ in range(_BISECTIONS):
-            share = 0.5 * (low + high)
-            low, high = (low, share) if change_energy(share) > 0.0 else (share, high)
-        return share
+        rubbing = self.rubbing.describe(np.array([-place[DEPTH], place[HEIGHT]]))
+        return _linearize(tuple(self.jaw), tuple(self.indenter.pressed), tuple(rubbing), q, place)
 
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -297,46 +276,58 @@ _CALM = 0.15
 SHALLOW = 0.5
 
 
-class FaceRows(NamedTuple):
-    """The contact points of the inner face on the rows that move them.
+class ReducedJaw(NamedTuple):
+    """A reduced model and its contact surface for compiled code.
 
     Attributes:
-        points: undeformed (p, 3) [m].
+        moves: of the rows at the stored equilibria (T, Z, 2 n) [m].
+        compliance: of the rows (T, Z, 2 n, 2 n) [m/N].
+        loads: stored (T, Z, 2 n) [N].
+        points: contact points, undeformed (p, 3) [m].
         low: the row below each point (p,), -1 for the clamp.
         share: of the row above in each point (p,).
         rods: heights of the grid (Z,) [m].
+        stiffness: penalty of each point (p,) [N/m].
+        face_points: of the undeformed surface, x and z (h, 2) [m].
+        is_flat: whether that is a plane.
+        face_x: from which depths count [m].
+        farthest: distance of a shape from the stored ones that these are good for [m].
     """
 
+    moves: NDArray
+    compliance: NDArray
+    loads: NDArray
     points: NDArray
     low: NDArray
     share: NDArray
     rods: NDArray
+    stiffness: NDArray
+    face_points: NDArray
+    is_flat: bool
+    face_x: float
+    farthest: float
 
 
-class ContactStep(NamedTuple):
-    """One linearised equilibrium; see `finforce_ifea.contact_mechanics.pressed_jaw.PressedState`.
+class _Gathered(NamedTuple):
+    """Contact at the rows; see `_gather`.
 
     Attributes:
-        correction: of the unknowns (2 n + 2,).
-        modes: (2 n + 2, 4).
-        force: (3,) [N].
-        force_modes: (3, 4).
-        pressure_point: (3,) [m], NaN without contact.
-        pressure_place: (3,) [m], NaN without contact.
-        size: of the whole correction, as a share of what is allowed at once.
-        away: root mean square distance of the shape from the nearest stored one [m].
-        touches: whether any point is in contact.
+        loads: now, and by what changes the contact (2 n, 5) [N].
+        stiffness: band with the entries i - 3 ... i + 3 of each line i (2 n, 7) [N/m].
+        held: what the clamp takes of the contact, now and by what changes it (2, 5) [N].
+        grip: springs between the clamp and the first row (2, 2) [N/m].
+        size: sum of the sizes of the forces [N].
+        point: pressure centre (3,) [m], NaN without contact.
+        place: the same on the undeformed surface (3,) [m].
     """
 
-    correction: NDArray
-    modes: NDArray
-    force: NDArray
-    force_modes: NDArray
-    pressure_point: NDArray
-    pressure_place: NDArray
+    loads: NDArray
+    stiffness: NDArray
+    held: NDArray
+    grip: NDArray
     size: float
-    away: float
-    touches: bool
+    point: NDArray
+    place: NDArray
 
 
 @njit(**_OPTIONS)
@@ -381,22 +372,21 @@ def move_points(compliance, q, modes):
 
 
 @njit(**_OPTIONS)
-def place_contact(face, moves):
-    """Returns the contact points (p, 3) [m], moved by the rows beside them, whose motions are (2 n,) [m]."""
-    points = face.points.copy()
+def place_contact(points, low, share, moves):
+    """Returns contact points (p, 3) [m], moved by the rows beside them, whose motions are (2 n,) [m]."""
+    placed = points.copy()
     for p in range(len(points)):
-        low, share = face.low[p], face.share[p]
         for a in range(2):
-            move = share * moves[2 * (low + 1) + a]
-            if low >= 0:
-                move += (1.0 - share) * moves[2 * low + a]
-            points[p, 2 * a] += move
-    return points
+            move = share[p] * moves[2 * (low[p] + 1) + a]
+            if low[p] >= 0:
+                move += (1.0 - share[p]) * moves[2 * low[p] + a]
+            placed[p, 2 * a] += move
+    return placed
 
 
 @njit(**_OPTIONS)
-def _add_springs(spring, weight, row, low, share, stiffness):
-    """Adds a point's springs (3, 3), seen from a row with a weight, to the band stiffness (2 n, 7)."""
+def _add_springs(out, weight, row, low, share, stiffness):
+    """Adds a point's springs, see `rub_point`, seen from a row with a weight, to the band stiffness (2 n, 7)."""
     for j in range(2):
         other = low + j
         if other < 0:
@@ -404,29 +394,43 @@ def _add_springs(spring, weight, row, low, share, stiffness):
         w = weight * (share if j else 1.0 - share)
         for a in range(2):
             for b in range(2):
-                stiffness[2 * row + a, 3 + 2 * (other - row) + b - a] += w * spring[2 * a, 2 * b]
+                stiffness[2 * row + a, 3 + 2 * (other - row) + b - a] += w * out[a, 1 + b]
 
 
 @njit(**_OPTIONS)
-def _gather(face, contact, loads, stiffness):
-    """Adds contact at points (forces, springs, changes) to the rows: loads (2 n, 5), band stiffness (2 n, 7).
-
-    Columns of loads: now, and by what changes the contact. The band holds entries i - 3 ... i + 3 of each line i.
-    """
-    forces, springs, changes = contact
-    for p in range(len(forces)):
-        if springs[p, 0, 0] == 0.0 and springs[p, 2, 2] == 0.0:
+def _gather(jaw, pressed, pose, rubbing, points):
+    """Returns the contact of an object with contact points (p, 3) [m] at the rows."""
+    count = jaw.loads.shape[2]
+    loads, stiffness, held, grip = np.zeros((count, 5)), np.zeros((count, 7)), np.zeros((2, 5)), np.zeros((2, 2))
+    total, point, place = 0.0, np.zeros(3), np.zeros(3)
+    out, weights = np.zeros(POINT_SHAPE), np.zeros((6, 4))
+    for p in range(len(points)):
+        x, z = points[p, 0], points[p, 2]
+        touch = touch_object(pressed, pose, x, z, jaw.stiffness[p], weights)
+        if touch.kxx == 0.0 and touch.kzz == 0.0:
             continue
+        rub_point(rubbing, touch, p, x, z, jaw.stiffness[p], out)
+        size = np.hypot(out[0, 0], out[1, 0])
+        total += size
+        for a in range(3):
+            point[a] += size * points[p, a]
+            place[a] += size * jaw.points[p, a]
+        low, share = jaw.low[p], jaw.share[p]
         for i in range(2):
-            row, w = face.low[p] + i, (face.share[p] if i else 1.0 - face.share[p])
+            row, w = low + i, (share if i else 1.0 - share)
             if row < 0:
+                for a in range(2):
+                    held[a, 0] += w * out[a, 0]
+                    held[a, 1:] += w * out[a, 3:]
+                    for b in range(2):
+                        grip[a, b] += w * share * out[a, 1 + b]
                 continue
             for a in range(2):
-                k = 2 * row + a
-                loads[k, 0] += w * forces[p, 2 * a]
-                for c in range(changes.shape[2]):
-                    loads[k, c + 1] += w * changes[p, 2 * a, c]
-            _add_springs(springs[p], w, row, face.low[p], face.share[p], stiffness)
+                loads[2 * row + a, 0] += w * out[a, 0]
+                for c in range(4):
+                    loads[2 * row + a, c + 1] += w * out[a, 3 + c]
+            _add_springs(out, w, row, low, share, stiffness)
+    return _Gathered(loads, stiffness, held, grip, total, point / total, place / total)
 
 
 @njit(**_OPTIONS)
@@ -459,81 +463,132 @@ def _solve_rows(q, compliance, loads, stiffness):
 
 
 @njit(**_OPTIONS)
-def _hold_base(q, compliance, face, contact, steps):
-    """Returns what of the contact force the clamp holds below the first row, and its derivatives (2, 5) [N]."""
-    forces, springs, changes = contact
-    columns = changes.shape[2] + 1
-    out, moved = np.zeros((2, columns)), np.zeros((2, columns))
-    if not ((face.low < 0) & (springs[:, 0, 0] + springs[:, 2, 2] > 0.0)).any():
-        return out
-    rows = np.empty((2, len(steps)))
-    blend(compliance, q[len(steps) :], 0, 2, 0, len(steps), rows)
-    moved = rows @ steps
-    for p in range(len(forces)):
-        held, spring = 1.0 - face.share[p], springs[p]
-        if face.low[p] >= 0:
-            continue
-        for a in range(2):
-            out[a, 0] += held * forces[p, 2 * a]
-            for c in range(1, columns):
-                out[a, c] += held * changes[p, 2 * a, c - 1]
-            for c in range(columns):
-                share = spring[2 * a, 0] * moved[0, c] + spring[2 * a, 2] * moved[1, c]
-                out[a, c] -= held * face.share[p] * share
-    return out
+def _change_energy(jaw, pressed, pose, rubbing, points, motion, share, work):
+    """Returns by how much the energy changes along a step of which a share has been made; see `_find_share`."""
+    out, weights, change = np.zeros(POINT_SHAPE), np.zeros((6, 4)), work[0] + share * work[1]
+    for p in range(len(points)):
+        x, z = points[p, 0] + share * motion[p, 0], points[p, 2] + share * motion[p, 2]
+        touch = touch_object(pressed, pose, x, z, jaw.stiffness[p], weights)
+        if touch.kxx != 0.0 or touch.kzz != 0.0:
+            rub_point(rubbing, touch, p, x, z, jaw.stiffness[p], out)
+            change -= out[0, 0] * motion[p, 0] + out[1, 0] * motion[p, 2]
+    return change
 
 
 @njit(**_OPTIONS)
-def step_contact(
-    q: NDArray, tables: tuple[NDArray, NDArray, NDArray], face: FaceRows, moves: NDArray, points: NDArray, contact: Any
-) -> ContactStep:
-    """Returns one linearised equilibrium with an object; see `ContactStep`.
+def _find_share(jaw, pressed, pose, rubbing, points, moves, q, step):
+    """Returns the share of a step up to which the energy of jaw and object falls; corners make it rise again.
+
+    Along a step of the loads that moves the rows by du and contact points (p, 3) by dx, it changes by
+    (lambda - p)^T du, all as far as the step has gone.
+    """
+    moved = follow(jaw.moves, jaw.compliance, jaw.loads, q + step)
+    motion = place_contact(jaw.points, jaw.low, jaw.share, moved) - points
+    work = np.zeros(2)
+    for k in range(len(moves)):
+        work[0] += q[k] * (moved[k] - moves[k])
+        work[1] += step[k] * (moved[k] - moves[k])
+    parts = (jaw, pressed, pose, rubbing, points, motion)
+    share, low, high = 1.0, 0.0, 1.0
+    if _change_energy(*parts, 1.0, work) <= _TOO_FAR * abs(_change_energy(*parts, 0.0, work)):
+        return 1.0
+    for _ in range(_BISECTIONS):
+        share = 0.5 * (low + high)
+        if _change_energy(*parts, share, work) > 0.0:
+            high = share
+        else:
+            low = share
+    return share
+
+
+@njit(**_OPTIONS)
+def _step_grid(jaw, q, moves, steps, size, contact):
+    """Returns the step (2,) of the grid coordinates after a step of the loads, and the distance from the grid [m].
 
     Args:
+        jaw: see `ReducedJaw`.
         q: unknowns (2 n + 2,).
-        tables: motions of the rows at the stored equilibria (T, Z, 2 n) [m], their compliance (T, Z, 2 n, 2 n) and
-            their loads (T, Z, 2 n) [N].
-        face: the contact points on the rows.
         moves: of the rows now (2 n,) [m].
-        points: contact points now (p, 3) [m].
-        contact: forces (p, 3), springs (p, 3, 3) and changes (p, 3, 4); see `RubbedContact`.
+        steps: of the loads, and their derivatives (2 n, 5).
+        size: of the step, as a share of what is allowed at once.
+        contact: see `_Gathered`.
     """
-    count, columns = len(moves), contact[2].shape[2]
-    loads, stiffness = np.zeros((count, columns + 1)), np.zeros((count, 7))
-    _gather(face, contact, loads, stiffness)
-    total, point, place = 0.0, np.zeros(3), np.zeros(3)
-    for p in range(len(points)):
-        size = np.hypot(contact[0][p, 0], contact[0][p, 2])
-        if size > 0.0:
-            total += size
-            point += size * points[p]
-            place += size * face.points[p]
-    point, place = point / total, place / total
-    steps, moved = _solve_rows(q, tables[1], loads, stiffness)
-    size = moved / LARGEST_MOVE
-    if total > 0.0 and size > 1.0:
-        steps[:, 0] /= size
-    correction, modes = np.zeros(count + 2), np.zeros((count + 2, columns))
-    correction[:count], modes[:count] = steps[:, 0], steps[:, 1:]
-    after = moves.copy()
-    first, last = find_ends(correction[:count])
-    add_product(tables[1], q[count:], correction[:count], first, last, WATCHED, after)
-    nearest = find_grid_step(tables[0], after, q[count:])
+    count, tables = len(moves), (jaw.moves, jaw.compliance, jaw.loads)
+    after, change = moves.copy(), np.ascontiguousarray(steps[:, 0])
+    first, last = find_ends(change)
+    add_product(jaw.compliance, q[count:], change, first, last, WATCHED, after)
+    nearest = find_grid_step(jaw.moves, after, q[count:])
     if size <= _CALM:
-        approach_grid(tables, q[:count] + correction[:count], q[count:], nearest)
-    correction[count:] = nearest[:2]
-    if q[count] < SHALLOW and total > 0.0:
-        step = np.array([correction[count], np.interp(place[2], face.rods, np.arange(len(face.rods))) - q[count + 1]])
-        correction[count:] = bound_grid_step(step, q[count:], tables[0])
-    turned = np.abs(correction[count:]).max() / LARGEST_GRID_STEP
-    if size > _CALM:
-        correction[count:] = 0.0
+        approach_grid(tables, q[:count] + change, q[count:], nearest)
+    if q[count] < SHALLOW and contact.size > 0.0:
+        nearest[1] = read_grid(jaw.rods, contact.place[2]) - q[count + 1]
+        bound_grid_step(nearest, q[count:], jaw.moves)
+    return nearest
+
+
+@njit(**_OPTIONS)
+def read_grid(rods, height):
+    """Returns the grid coordinate of a height [m] among rising ones (Z,) [m]."""
+    last = len(rods) - 1
+    if not height > rods[0]:
+        return 0.0
+    for k in range(last):
+        if height < rods[k + 1]:
+            return k + (height - rods[k]) / (rods[k + 1] - rods[k])
+    return float(last)
+
+
+@njit(**_OPTIONS)
+def linearize_reduced(jaw, pressed, rubbing, q, place):
+    """Returns one linearised equilibrium of a `ReducedJaw` with a `PressedObject`, rubbed, as `PressedState`."""
+    count = jaw.loads.shape[2]
+    moves = follow(jaw.moves, jaw.compliance, jaw.loads, q)
+    points, pose = place_contact(jaw.points, jaw.low, jaw.share, moves), pose_object(pressed, jaw.face_x, place)
+    contact = _gather(jaw, pressed, pose, rubbing, points)
+    touches = contact.size > 0.0
+    steps, moved = _solve_rows(q, jaw.compliance, contact.loads, contact.stiffness)
+    size = moved / LARGEST_MOVE
+    if touches and size > 1.0:
+        steps[:, 0] /= size
+    nearest = _step_grid(jaw, q, moves, steps, size, contact)
+    correction, modes = np.zeros(count + 2), np.zeros((count + 2, 4))
+    correction[:count], modes[:count] = steps[:, 0], steps[:, 1:]
+    turned = max(abs(nearest[0]), abs(nearest[1])) / LARGEST_GRID_STEP
+    if size <= _CALM:
+        correction[count:] = nearest[:2]
     size = max(size, turned)
-    held = _hold_base(q, tables[1], face, contact, steps)
-    force, force_modes = np.zeros(3), np.zeros((3, columns))
-    force[::2], force_modes[::2] = held[:, 0], held[:, 1:]
+    force, force_modes = np.zeros(3), np.zeros((3, 4))
+    _hold_base(jaw, q, contact, steps, force, force_modes)
     for k in range(count):
         axis = 2 * (k % 2)
         force[axis] += q[k] + correction[k]
         force_modes[axis] += modes[k]
-    return ContactStep(correction, modes, force, force_modes, point, place, size, nearest[2], total > 0.0)
+    if touches and size > _LARGE_STEP and correction[count] == 0.0 and correction[count + 1] == 0.0:
+        share = _find_share(jaw, pressed, pose, rubbing, points, moves, q, correction)
+        correction *= share
+        for axis in range(0, 3, 2):
+            force[axis] = share * force[axis] + (1.0 - share) * q[axis // 2 : count : 2].sum()
+    away = nearest[2] / jaw.farthest
+    return PressedState(
+        touches, correction, modes, force, force_modes, contact.point, contact.place, 1.0, size, away
+    )
+
+
+@njit(**_OPTIONS)
+def _hold_base(jaw, q, contact, steps, force, force_modes):
+    """Adds what of the contact force the clamp holds below the first row to force (3,) and derivatives (3, 4) [N]."""
+    if not (contact.grip[0, 0] + contact.grip[1, 1] > 0.0):
+        return
+    count = len(steps)
+    rows = np.empty((2, count))
+    blend(jaw.compliance, q[count:], 0, 2, 0, count, rows)
+    held = contact.held - contact.grip @ (rows @ steps)
+    for a in range(2):
+        force[2 * a] += held[a, 0]
+        force_modes[2 * a] += held[a, 1:]
+
+
+@njit(**_OPTIONS)
+def _linearize(jaw, pressed, rubbing, q, place):
+    """Returns `linearize_reduced` of plain tuples, which are handed over several times as fast as named ones."""
+    return linearize_reduced(ReducedJaw(*jaw), PressedObject(*pressed), Rubbing(*rubbing), q, place)

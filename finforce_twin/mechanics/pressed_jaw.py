@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
+from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact, press_field
-from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface
+from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface, profile_surface
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.drawing import MeshDensity
@@ -101,10 +101,10 @@ class PressedJaw:
         """Returns the x [m] of an outline's origin at the given height [m] where it first touches the jaw at rest."""
         place = np.array([0.0, tilt, height])
         if self.jaw.face.is_flat:
-            depth = self._indenter.find_touch(place, float(self.surface.low[1]), float(self.surface.high[1]))
+            profile = flat_profile(float(self.surface.low[1]), float(self.surface.high[1]), self.jaw.inner_face_x)
         else:
-            points = self.surface.points[:: self.surface.across, [0, 2]]
-            depth = self._indenter.find_touch_at(points, self.jaw.inner_face_x, place)
+            profile = profile_surface(self.surface, self.jaw.face)
+        depth = self._indenter.find_touch(place, profile)
         return self.jaw.inner_face_x + self._indenter.field.front - depth
 
     def find_pressure(self, q: NDArray, load: Load) -> NDArray:

@@ -12,7 +12,7 @@ from mechanics_fakes import BENCH, MODULUS, bench_mechanics
 from scipy.interpolate import PchipInterpolator
 
 from finforce_ifea.contact_mechanics.forward_press import press_jaw
-from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
+from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
@@ -177,7 +177,7 @@ class Pressed:
 
     def press(self, points, stiffness, face_x, depth, height):
         place = np.array([0.0, self.tilt, height])
-        place[0] = depth + self.indenter.find_touch(place, 0.0, 0.08)
+        place[0] = depth + self.indenter.find_touch(place, flat_profile(0.0, 0.08))
         return self.indenter.press(points, stiffness, face_x, place)
 
 

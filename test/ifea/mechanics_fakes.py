@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
+from finforce_ifea.contact_mechanics.indenter import flat_profile
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.fem.solid import find_mirror_nodes
 from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
@@ -135,7 +136,7 @@ def settle(contact, q, place):
 def press(contact, indenter, shape, height, depths):
     """Unknowns and linearisations at rising depths [m] below first touch."""
     contact.indenter = indenter
-    touch = indenter.find_touch(np.array([0.0, shape, height]), *contact.surface.heights[[0, -1]])
+    touch = indenter.find_touch(np.array([0.0, shape, height]), flat_profile(*contact.surface.heights[[0, -1]]))
     q, state, reached, results = contact.begin(height), None, 0.0, []
     for depth in depths:
         for deeper in np.linspace(reached, depth, max(1, round((depth - reached) / STEP)) + 1)[1:]:

@@ -21,7 +21,7 @@ from mechanics_fakes import BENCH, bench_mechanics
 from test_tracking import settle
 
 from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder, press_jaw
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, flat_profile
 from finforce_ifea.contact_mechanics.penalty import CELL, build_distance_field, press_field, read_depth
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import ObjectOutline
@@ -127,7 +127,7 @@ def test_modes_are_the_derivatives_of_the_equilibrium_by_depth_tilt_and_height(n
     contact.indenter = OutlineIndenter(SHAPES[name])
     try:
         place = np.array([0.0, 0.08, 0.036])
-        place[DEPTH] = contact.indenter.find_touch(place, 0.0, 0.08) + 0.5e-3
+        place[DEPTH] = contact.indenter.find_touch(place, flat_profile(0.0, 0.08)) + 0.5e-3
         q = np.zeros(contact.model.size)
         for depth in np.linspace(0, 2e-3, 9)[1:]:
             q, state = settle(contact, q, place + [depth, 0.0, 0.0])
@@ -148,7 +148,7 @@ def test_modes_are_the_derivatives_of_the_equilibrium_by_depth_tilt_and_height(n
 def test_first_touch_is_where_contact_begins(name, tilt):
     indenter = OutlineIndenter(SHAPES[name])
     place = np.array([0.0, tilt, 0.041])
-    touch = indenter.find_touch(place, 0.0, 0.08)
+    touch = indenter.find_touch(place, flat_profile(0.0, 0.08))
     face = np.stack([np.full(8001, FACE), np.zeros(8001), np.linspace(0, 0.08, 8001)], axis=1)
     for beyond, sign in ((-20e-6, 1), (20e-6, -1)):
         place[DEPTH] = touch + beyond
@@ -158,7 +158,7 @@ def test_first_touch_is_where_contact_begins(name, tilt):
 def test_first_touch_leaves_out_what_overhangs_the_jaw():
     """The wedge's leading corner at its lower end stands below the clamp."""
     indenter = OutlineIndenter(WEDGE)
-    over, beside = (indenter.find_touch(np.array([0.0, 0.0, z]), 0.0, 0.08) for z in (0.04, -0.004))
+    over, beside = (indenter.find_touch(np.array([0.0, 0.0, z]), flat_profile(0.0, 0.08)) for z in (0.04, -0.004))
     assert over == pytest.approx(0.0, abs=1e-6)
     assert beside > 0.5e-3
 
