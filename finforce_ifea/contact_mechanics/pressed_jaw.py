@@ -44,8 +44,8 @@ def measure_stiffness(model: JawModel, surface: ContactSurface) -> float:
     return float(1.0 / np.einsum("ij,ij->j", pushes, motions).mean())
 
 
-_BISECTIONS = 10
-_TOUCH = 2e-5
+BISECTIONS = 10
+TOUCH = 2e-5
 # Stiffness [N/m] of the finger that the surface's penalty is meant for: the bench finger's, about that of strips too.
 _MEANT_STIFFNESS = 435.0
 
@@ -188,9 +188,9 @@ class RollingContact:
 def find_share_that_meets(find_gap: Callable[[float], float]) -> float:
     """Returns the share from 0 to 1 of a step at which the gap [m] to an object closes, by bisection."""
     low, high = 0.0, 1.0
-    for _ in range(_BISECTIONS):
+    for _ in range(BISECTIONS):
         share = 0.5 * (low + high)
-        if find_gap(share) < -_TOUCH:
+        if find_gap(share) < -TOUCH:
             high = share
         else:
             low = share

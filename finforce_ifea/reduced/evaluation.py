@@ -250,6 +250,7 @@ class ReducedContact(RollingContact):
             is_flat=self.profile.is_flat,
             face_x=self.profile.x,
             farthest=farthest,
+            reach=model.reach,
         )
 
     def place_points(self, q: NDArray) -> NDArray:
@@ -292,6 +293,7 @@ class ReducedJaw(NamedTuple):
         is_flat: whether that is a plane.
         face_x: from which depths count [m].
         farthest: distance of a shape from the stored ones that these are good for [m].
+        reach: largest change of each unknown at once (2 n + 2,).
     """
 
     moves: NDArray
@@ -306,6 +308,7 @@ class ReducedJaw(NamedTuple):
     is_flat: bool
     face_x: float
     farthest: float
+    reach: NDArray
 
 
 class _Gathered(NamedTuple):
@@ -569,9 +572,7 @@ def linearize_reduced(jaw, pressed, rubbing, q, place):
         for axis in range(0, 3, 2):
             force[axis] = share * force[axis] + (1.0 - share) * q[axis // 2 : count : 2].sum()
     away = nearest[2] / jaw.farthest
-    return PressedState(
-        touches, correction, modes, force, force_modes, contact.point, contact.place, 1.0, size, away
-    )
+    return PressedState(touches, correction, modes, force, force_modes, contact.point, contact.place, 1.0, size, away)
 
 
 @njit(**_OPTIONS)

@@ -13,50 +13,35 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, expect_object
-from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, PressedState, RollingContact, limit_step
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, OutlineIndenter, RoundIndenter, expect_object
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact
 from finforce_ifea.contact_mechanics.torsion import Torsion
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tare import PointNoise, Tare
+from finforce_ifea.tare import Tare
 from finforce_ifea.tracking.friction_estimate import SMOOTH, Coefficient, FrictionEstimate, FrictionFrame
 from finforce_ifea.tracking.held_weight import HeldFrame, HeldWeight
 from finforce_ifea.tracking.influence import measure_influence
-from finforce_ifea.tracking.place_update import (
-    Average,
-    Forecast,
-    PlaceUpdate,
-    Residuals,
-    Uncertainty,
-    forecast_place,
-    update_place,
-    weigh_residuals,
+from finforce_ifea.tracking.place_search import (
+    LOADED_DEPTH,
+    TOUCH_DEPTH,
+    FoundPlace,
+    PlaceFrame,
+    PlaceRules,
+    PlaceState,
+    find_place,
+    reach_place,
 )
+from finforce_ifea.tracking.place_update import Average
 from finforce_ifea.tracking.slip_history import SlipHistory, leave_play
 from finforce_ifea.tracking.track import UNSEEN_LEAN, AcrossFinger, Track, explain_offsets
 from finforce_ifea.tracking.width_tracker import WidthTracker
 
-# The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
-_LEAST_DEPTH = 3e-5
-_TOUCH_DEPTH = 0.15e-3
-_LOADED_DEPTH = 0.5e-3
-_DEPTH_DRIFT = 0.01e-3
-_LARGEST_MOVE = 0.7e-3
-# A leap only has to come near. One that leaves the points as far as they were by all but this is in vain [m].
-_LARGEST_LEAP, _LEAST_APPROACH = 2e-3, 0.1e-3
-_LARGEST_SHIFT = 0.3e-3
-_SETTLED_MOVE = 1e-4
-# Of the model's reach, 0.1 mm.
-_SETTLED_CORRECTION = 0.05
-_UNDECIDED = 0.2
 _FRAMES_RELEASED = 15
 _LOST_STDDEV = 1e-3
 # The height may leave what was given by this many of its standard deviations; beyond, the contact is another one.
 _FARTHEST_HEIGHT = 8.0
-# Fewer points in agreement with the forecast than this share call for a leap; a forecast is never wider than this [m].
-_LEAST_AGREEMENT = 0.6
-_WIDEST_FORECAST = 1e-3
 # Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
 # object has gone back to this share of its depth.
 _STRANGE, _BACK = 1.0, 0.8
@@ -148,7 +133,7 @@ class PlaceTracker:
         Args:
             extrapolation: of the shape that was found; see `PressedState`.
         """
-        before, pressed = self.contact, float(self._motion[0])
+        before, pressed = self.contact, float(self._state.motion[0])
         if self._level == 0 and extrapolation > _STRANGE and len(self._levels) > 1:
             self._left = (self.q, _BACK * pressed)
             q = before.model.expand(self.q)
@@ -160,7 +145,7 @@ class PlaceTracker:
             return
         self.contact.set_indenter(before.indenter)
         self.contact.rubbing.lean = before.rubbing.lean
-        self.q, self._modes = q, np.zeros((self.contact.model.size, 3))
+        self._state = self._state._replace(q=q, modes=np.zeros((self.contact.model.size, 3)))
 
     def vertices(self) -> NDArray:
         """Returns the deformed mesh vertices (n, 3) [m], in mesh order."""
@@ -170,6 +155,11 @@ class PlaceTracker:
         """Returns the key points (K, 3) [m] of the deformed jaw."""
         return self.contact.model.positions(self.probe, self.q)
 
+    @property
+    def q(self) -> NDArray:
+        """The jaw's unknowns (size,)."""
+        return self._state.q
+
     def give_shape(self) -> NDArray:
         """Returns the shape (size,) for another tracker to begin with."""
         return self.q if self._level == 0 else self._left[0]
@@ -177,96 +167,85 @@ class PlaceTracker:
     def _begin(self) -> None:
         """Starts with the undeformed jaw and an object that just touches."""
         self._stand_on(0)
-        self.q = self.contact.begin(self._prior[1])
-        self._motion = np.array([self._find_touch(np.r_[0.0, self._prior]), 0.0])
-        self._motion_covariance = np.diag([0.1e-3, 1e-3]) ** 2
-        self._modes, self._reached = np.zeros((self.contact.model.size, 3)), np.zeros(3)
+        touch = self.contact.find_touch(np.r_[0.0, self._prior])
+        self._state = PlaceState(
+            self.contact.begin(self._prior[1]),
+            np.zeros((self.contact.model.size, 3)),
+            np.zeros(3),
+            np.array([touch, 0.0]),
+            np.diag([0.1e-3, 1e-3]) ** 2,
+            self._prior.copy(),
+            *_blank_average(len(self._rest)),
+            False,
+        )
+        self._led = self._prior.copy()
         self.slips.reset()
         self._held.reset()
         self._width.reset()
-        self._released, self._jumped = 0, False
+        self._released = 0
         self._unlearnt: Callable[[], None] | None = None
-        self._forget_place()
 
     def _forget_place(self) -> None:
-        self._slow, self._led = self._prior.copy(), self._prior.copy()
-        count = len(self._rest)
-        self._average = Average(np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros(count))
+        """Expects any object again, as the next one may be."""
+        residuals, by_place, count = _blank_average(len(self._rest))
+        slow, self._led = self._prior.copy(), self._prior.copy()
+        self._state = self._state._replace(slow=slow, residuals=residuals, by_place=by_place, count=count)
 
     def update(self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None) -> Track | None:
         """Takes the key points (K, 3) [m], NaN where unused, dt [s] after the last; None when too few agree.
 
         `stddev` (K, 3) [m] are their stated standard deviations.
         """
-        forecast, noise = self._predict(dt), tare.point_noise(stddev)
-        place = forecast.place
-        q = self.q + self._modes @ (self._reachable(place) - self._reached)
-        measured, unseen = points - tare.offsets - self._move_across(), self.settings.offset_stddev
-        chance = self._expect_errors(noise, tare.offset_variance(unseen) + noise.standing, forecast)
-        update, settled, iteration, share, last = None, False, 0, 1.0, np.zeros(3)
-        far, in_vain = np.inf, 0
-        while not settled and iteration < self.settings.iterations and in_vain < 2:
-            iteration += 1
-            mechanical = self._reachable(place)
-            state = self.contact.linearize(q, mechanical)
-            if not state.touches:
-                q = q + self.contact.approach(q, state.correction, mechanical)
-                continue
-            q = q + state.correction
-            data = self._weigh(q, state, measured, place - forecast.place, place, chance)
-            if data.used < max(self.settings.minimum_keypoints, _LEAST_AGREEMENT * data.known):
-                place, q = self._leap(q, state, mechanical, place, data)
-                in_vain = in_vain + 1 if abs(data.jump) > far - _LEAST_APPROACH else 0
-                far = abs(data.jump)
-                continue
-            update = self._update_place(data, forecast)
-            aim = self._bound(update.place, place, share)
-            # between two corners of an object the linearisation changes its mind: meet in the middle
-            rocks = self.contact.indenter.has_corners and last[1:] @ (aim - place)[1:] < 0
-            share *= 0.5 if rocks else 1.0
-            missing = update.place - aim if share > _UNDECIDED else np.zeros(3)
-            last, moved, place = aim - place, self._reachable(aim) - mechanical, aim
-            q = q + limit_step(self.contact.model, state.modes[:, :3] @ moved)
-            settled = self._is_settled(state, moved, missing)
-        if update is None or not state.touches:
+        noise, unseen = tare.point_noise(stddev), self.settings.offset_stddev
+        frame = PlaceFrame(
+            measured=points - tare.offsets - self._move_across(),
+            rest=self._rest,
+            noise=noise.plane,
+            gain=noise.gain,
+            width_variance=noise.width_variance,
+            trust=noise.trust,
+            offset_variance=tare.offset_variance(unseen) + noise.standing,
+            dt=dt,
+        )
+        found = find_place(self.contact, self.probe, self._state, frame, self._rules())
+        if found is None:
             return self._lose()
-        self._keep(q, place, update, state.modes[:, :3])
-        if settled and self._is_known:
-            self._learn_friction(state, data, update, forecast, chance.gain, dt)
-        track = self._report(state, place, moved, data, update, iteration, settled)
+        self._keep(found)
+        if found.settled and self._is_known:
+            self._learn_friction(found, noise.gain, dt)
+        track = self._report(found)
         if self._is_known:
-            variances, aside = (chance.width_variance, chance.offset_variance), points[:, 1] - tare.offsets[:, 1]
+            variances, aside = (frame.width_variance, frame.offset_variance), points[:, 1] - tare.offsets[:, 1]
             aside = aside - self._width.sideways[:, 1] * self._held.across
-            self._width.update(aside - self._rest[:, 1], data, variances, track.force, track.pressure_place[2])
-        self._change_level(state.extrapolation)
+            self._width.update(aside - self._rest[:, 1], found.data, variances, track.force, track.pressure_place[2])
+        self._change_level(found.extrapolation)
         return track
+
+    def _rules(self) -> PlaceRules:
+        """Returns what is expected of the object and allowed to the search."""
+        settings, indenter = self.settings, self.contact.indenter
+        shapes = indenter.shape_range
+        return PlaceRules(
+            self._prior,
+            self._prior_variance,
+            shapes.low,
+            shapes.high,
+            shapes.largest_change,
+            shapes.settled_change,
+            indenter.has_corners,
+            _FARTHEST_HEIGHT * settings.height_stddev,
+            settings.acceleration,
+            float(settings.memory),
+            settings.model_error,
+            settings.gate,
+            settings.iterations,
+            settings.minimum_keypoints,
+            self._stiffness or 0.0,
+        )
 
     def _move_across(self) -> NDArray:
         """Returns what acts across the finger moves the key points by (K, 3) [m]."""
         return self._width.motions + self._width.sideways * self._held.across
-
-    def _bound(self, asked: NDArray, place: NDArray, share: float) -> NDArray:
-        """Returns the place asked for, within a share of where the linearisation about the present one holds."""
-        bounds, reach = self.contact.indenter.shape_range, _FARTHEST_HEIGHT * self.settings.height_stddev
-        change = np.array([_LARGEST_MOVE, share * bounds.largest_change, share * _LARGEST_SHIFT])
-        aim = np.minimum(np.maximum(asked, place - change), place + change)
-        aim[SHAPE] = min(max(aim[SHAPE], bounds.low), bounds.high)
-        aim[HEIGHT] = min(max(aim[HEIGHT], self._prior[1] - reach), self._prior[1] + reach)
-        return aim
-
-    def _is_settled(self, state: PressedState, moved: NDArray, missing: NDArray) -> bool:
-        """Whether the last iteration changed nothing that matters."""
-        change = (_SETTLED_MOVE, self.contact.indenter.shape_range.settled_change, _SETTLED_MOVE)
-        small = all(max(abs(m), abs(k)) < c for m, k, c in zip(moved, missing, change, strict=True))
-        return small and state.size < _SETTLED_CORRECTION
-
-    def _find_touch(self, place: NDArray) -> float:
-        """Returns the depth [m] at which the object of a place (3,) first touches the undeformed jaw."""
-        return self.contact.find_touch(place)
-
-    def _reachable(self, place: NDArray) -> NDArray:
-        """Returns the place (3,) at which the mechanics stands for `place`."""
-        return np.array([max(place[DEPTH], self._find_touch(place) + _LEAST_DEPTH), place[SHAPE], place[HEIGHT]])
 
     def significance(self, tare: Tare, stddev: float) -> float:
         """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
@@ -275,7 +254,7 @@ class PlaceTracker:
     def rest_modes(self) -> NDArray:
         """Returns how the key points of the undeformed jaw move in x and z by the depth (K, 2) [m/m]."""
         q = np.zeros(self.contact.model.size)
-        state = self.contact.linearize(q, self._reachable(np.r_[-1.0, self._prior]))
+        state = self.contact.linearize(q, reach_place(self.contact, np.r_[-1.0, self._prior]))
         return self.contact.model.project(self.probe, q, state.modes)[:, [0, 2], DEPTH]
 
     def forget(self) -> None:
@@ -288,27 +267,26 @@ class PlaceTracker:
         """Whether the object is known by its outline."""
         return self._outline is self.contact.indenter
 
-    def _learn_friction(
-        self, state: PressedState, data: Residuals, update: PlaceUpdate, forecast: Forecast, gain: NDArray, dt: float
-    ) -> None:
+    def _learn_friction(self, found: FoundPlace, gain: NDArray, dt: float) -> None:
         """Learns how the object leans where it is held; what slides is followed by `learn`.
 
         `gain` (K, 2) is the regression of the noise along x and z on that along y, `dt` the time since the last [s].
         """
-        if self._reached[DEPTH] - self._find_touch(self._reached) < _LOADED_DEPTH or self._jumped:
+        reached = found.reached[DEPTH] - self.contact.find_touch(found.reached)
+        if reached < LOADED_DEPTH or found.update.jumped:
             return
-        normal, moved = float(np.hypot(*state.force[::2])), update.place - forecast.place
+        normal = hypot(found.pressing[0], found.pressing[2])
         if self.settings.held == "yes":
             rubbing = self.contact.rubbing
-            upright = find_upright_lean(state.force, rubbing.lean)
+            upright = find_upright_lean(found.pressing, rubbing.lean)
             width = self._width
             frame = HeldFrame(
-                data=data,
-                modes=self._motions[:, ::2],
+                data=found.data,
+                modes=found.motions[:, ::2],
                 normal=normal,
                 lean=rubbing.lean - upright,
-                moved=moved,
-                place=update.place,
+                moved=found.moved,
+                place=found.update.place,
                 aside=see_aside(width.sideways, gain),
                 across=self._held.across,
                 twist=see_aside(width.twisting, gain),
@@ -317,7 +295,7 @@ class PlaceTracker:
             wanted = upright + self._held.update(frame, self._prior_variance, dt) / normal
             rubbing.lean += _HELD_GAIN * (min(max(wanted, -_LARGEST_LEAN), _LARGEST_LEAN) - rubbing.lean)
             return
-        self._unlearnt = partial(self._follow_slide, normal, moved, data, update)
+        self._unlearnt = partial(self._follow_slide, normal, found)
 
     def learn(self) -> None:
         """Learns what the last frame says of friction, which its force did not wait for."""
@@ -325,21 +303,24 @@ class PlaceTracker:
         if unlearnt is not None:
             unlearnt()
 
-    def _follow_slide(self, normal: float, moved: NDArray, data: Residuals, update: PlaceUpdate) -> None:
-        """Follows how an object slides that presses with a normal force [N] and has moved (3,)."""
-        expected = np.array([self._reached[DEPTH], self._prior[0], self._prior[1]])
+    def _follow_slide(self, normal: float, found: FoundPlace) -> None:
+        """Follows how an object slides that presses with a normal force [N]."""
+        update = found.update
+        expected = np.array([self._state.reached[DEPTH], self._prior[0], self._prior[1]])
         before, known = self.slips.mobilised, self.roughness.coefficient.mean
         self.slips.set_indenter(self.contact.indenter)
         mobilised = self.slips.follow(self.give_shape(), expected, float(np.sqrt(update.depth_variance)), known)
         away = update.place[1:] - self._prior
-        frame = FrictionFrame(data, self._motions[:, ::2], normal, before, self.contact.rubbing.lean, moved, away)
+        frame = FrictionFrame(
+            found.data, found.motions[:, ::2], normal, before, self.contact.rubbing.lean, found.moved, away
+        )
         found = self.roughness.update(frame, self._prior_variance)
         self.contact.rubbing.lean = found.mean * mobilised
 
     def resume(self, q: NDArray) -> None:
         """Starts anew from the shape (size,) that another tracker has found."""
         self.reset()
-        self.q = q.copy()
+        self._state = self._state._replace(q=q.copy())
 
     def follow(self, contact: Contact) -> None:
         """Takes over where a contact's object is: its outline, or its height as that of first touch."""
@@ -366,15 +347,15 @@ class PlaceTracker:
         self._outline = after = expected.indenter
         self.contact.set_indenter(after)
         self._given, self._stiffness = None, self.response.stiffness_at(float(expected.mean[1]))
-        away = abs(self._slow[1] - expected.mean[1]) > _FARTHEST_HEIGHT * self.settings.height_stddev
+        away = abs(self._state.slow[1] - expected.mean[1]) > _FARTHEST_HEIGHT * self.settings.height_stddev
         if isinstance(before, OutlineIndenter) and not after.resembles(before):
             self.roughness.reset()
         if away or not isinstance(before, OutlineIndenter) or not after.resembles(before):
             self._begin()
         elif after is not before:
             change = after.field.front - before.field.front
-            self._motion[0] += change
-            self._reached[DEPTH] += change
+            self._state.motion[0] += change
+            self._state.reached[DEPTH] += change
             self.slips.shift(change)
 
     def _lead_place(self) -> None:
@@ -385,124 +366,62 @@ class PlaceTracker:
         chance, moved = np.sqrt(self._prior_variance), self._prior - self._led
         way = np.array([leave_play(moved[0], chance[0]), leave_play(moved[1], chance[1])])
         if way.any():
-            self._slow += way
             self._led += way
-            self._average = self._average._replace(count=_KEPT * self._average.count)
+            self._state = self._state._replace(slow=self._state.slow + way, count=_KEPT * self._state.count)
             self._held.lead(way)
-
-    def _predict(self, dt: float) -> Forecast:
-        """Returns the place dt [s] later: constant speed of the depth under white acceleration."""
-        sudden = bool(self._released or self._jumped)
-        return forecast_place(
-            self._motion, self._motion_covariance, self._slow, dt, self.settings.acceleration, _DEPTH_DRIFT, sudden
-        )
-
-    def _expect_errors(self, noise: PointNoise, offset_variance: NDArray, forecast: Forecast) -> Uncertainty:
-        """Returns what is known of the errors of this frame's key points."""
-        return Uncertainty(
-            noise=noise.plane,
-            gain=noise.gain,
-            width_variance=noise.width_variance,
-            trust=noise.trust,
-            offset_variance=offset_variance,
-            depth_variance=float(min(forecast.spread[0, 0], _WIDEST_FORECAST**2)),
-            model_error=self.settings.model_error,
-            gate=self.settings.gate,
-        )
-
-    def _weigh(
-        self, q: NDArray, state: PressedState, measured: NDArray, moved: NDArray, place: NDArray, chance: Uncertainty
-    ) -> Residuals:
-        """Returns the residuals of a state at a place (3,) that has moved by `moved` (3,) since the forecast."""
-        model = self.contact.model
-        self._motions = model.project(self.probe, q, state.modes)
-        below = float(place[DEPTH] - self._reachable(place)[DEPTH])
-        positions = model.positions(self.probe, q)
-        return weigh_residuals(measured, positions, self._rest, self._motions[:, :, :3], moved, below, chance)
-
-    def _update_place(self, data: Residuals, forecast: Forecast) -> PlaceUpdate:
-        """Returns the place that the residuals ask for."""
-        return update_place(
-            data,
-            self._average,
-            forecast,
-            self._prior,
-            self._prior_variance,
-            float(self.settings.memory),
-            np.array([self.contact.indenter.shape_range.largest_change, _LARGEST_SHIFT]),
-        )
-
-    def _leap(
-        self, q: NDArray, state: PressedState, mechanical: NDArray, place: NDArray, data: Residuals
-    ) -> tuple[NDArray, NDArray]:
-        """Returns place and unknowns moved towards the median depth when the points disagree with the forecast."""
-        jump = float(np.clip(data.jump, -_LARGEST_LEAP, _LARGEST_LEAP))
-        place = place + np.array([jump, 0.0, 0.0])
-        step = state.modes[:, DEPTH] * (self._reachable(place)[DEPTH] - mechanical[DEPTH])
-        return place, q + limit_step(self.contact.model, step)
 
     def _lose(self) -> None:
         """Widens the search for the next frame."""
-        self._motion[1] = 0.0
-        self._motion_covariance[0, 0] += _LOST_STDDEV**2
+        self._state.motion[1] = 0.0
+        self._state.spread[0, 0] += _LOST_STDDEV**2
 
-    def _keep(self, q: NDArray, place: NDArray, update: PlaceUpdate, modes: NDArray) -> None:
+    def _keep(self, found: FoundPlace) -> None:
         """Keeps what the next frame starts from; a released jaw expects any object again."""
-        self.q, self._modes, self._reached = q, modes, self._reachable(place)
-        self._slow = place[1:].copy()
-        self._motion = np.array([place[DEPTH], update.speed])
-        self._motion_covariance, self._jumped = update.spread, update.jumped
-        self._average = update.average
-        pressed = place[DEPTH] - self._find_touch(place)
-        self._released = self._released + 1 if pressed < _TOUCH_DEPTH else 0
+        update, place = found.update, found.place
+        self._released = self._released + 1 if found.pressed < TOUCH_DEPTH else 0
+        self._state = PlaceState(
+            found.q,
+            found.modes,
+            found.reached,
+            np.array([place[DEPTH], update.speed]),
+            update.spread,
+            place[1:].copy(),
+            *update.average,
+            bool(self._released or update.jumped),
+        )
         if self._released >= _FRAMES_RELEASED:
             self._forget_place()
 
-    def _report(
-        self,
-        state: PressedState,
-        place: NDArray,
-        moved: NDArray,
-        data: Residuals,
-        update: PlaceUpdate,
-        iterations: int,
-        settled: bool,
-    ) -> Track:
-        force = state.force + state.force_modes[:, :3] @ moved
-        pressed = place[DEPTH] - self._find_touch(place)
-        if pressed < _LEAST_DEPTH:
-            force = force * max(0.0, pressed / _LEAST_DEPTH)
-        normal = float(np.hypot(*force[::2]))
-        covariance = update.covariance * max(1.0, update.misfit**2)
-        covariance[DEPTH, DEPTH] += update.depth_variance * max(1.0, update.misfit**2)
-        finite = np.isfinite(force.sum() + update.covariance.sum() + self.q.sum())
+    def _report(self, found: FoundPlace) -> Track:
+        update, data, normal = found.update, found.data, hypot(found.force[0], found.force[2])
+        known, modes = self._is_known, found.force_modes
         return Track(
-            covariance=covariance,
-            force=force,
-            force_modes=state.force_modes[:, :3],
-            pressure_point=state.pressure_point,
-            pressure_place=state.pressure_place,
+            covariance=found.covariance,
+            force=found.force,
+            force_modes=modes[:, :3],
+            pressure_point=found.pressure_point,
+            pressure_place=found.pressure_place,
             weights=data.weights,
-            stiffening=self._stiffening(force, place),
+            stiffening=found.stiffening,
             residual=update.residual,
             misfit=update.misfit,
             kkt=update.kkt,
-            iterations=iterations,
-            converged=settled,
+            iterations=found.iterations,
+            converged=found.settled,
             bearable=self._levels[0].contact.bearable,
-            across=self._describe_across(normal) if self._is_known else None,
-            lean_stddev=self._describe_lean(normal) if self._is_known else None,
-            lean_leak=self._find_leak(state, normal) if self._is_known else 0.0,
-            ambiguity=0.0 if settled else float(np.linalg.norm(state.force_modes[:, :3] @ moved)),
-            sound=bool(finite and state.smallest_det > 0),
-            quiet=bool(pressed < _TOUCH_DEPTH),
-            loaded=bool(pressed > _LOADED_DEPTH),
+            across=self._describe_across(normal) if known else None,
+            lean_stddev=self._describe_lean(normal) if known else None,
+            lean_leak=self._find_leak(modes, normal) if known else 0.0,
+            ambiguity=found.ambiguity,
+            sound=found.sound,
+            quiet=found.pressed < TOUCH_DEPTH,
+            loaded=found.pressed > LOADED_DEPTH,
             away=update.away,
-            extrapolation=state.extrapolation,
+            extrapolation=found.extrapolation,
             mistaken=update.mistaken,
             agreement=data.agreed / data.known,
             condition=update.condition,
-            place_stddev=float(np.sqrt(max(update.covariance[HEIGHT, HEIGHT], 0.0))),
+            place_stddev=sqrt(max(update.covariance[HEIGHT, HEIGHT], 0.0)),
         )
 
     def _describe_across(self, normal: float) -> AcrossFinger:
@@ -513,11 +432,11 @@ class PlaceTracker:
         doubt = held.across_stddev / max(normal, _LEAST_NORMAL)
         return AcrossFinger(seen.place, seen.place_stddev, seen.force + held.across, hypot(seen.lean_stddev, doubt))
 
-    def _find_leak(self, state: PressedState, normal: float) -> float:
+    def _find_leak(self, modes: NDArray, normal: float) -> float:
         """Returns by how much a held object's force [N] along the finger changes that along x [-]."""
         if self.settings.held != "yes" or normal < _LEAST_NORMAL:
             return 0.0
-        return float(state.force_modes[0, 3] / normal - state.force_modes[0, DEPTH] * self._held.leverage)
+        return float(modes[0, 3] / normal - modes[0, DEPTH] * self._held.leverage)
 
     def _describe_lean(self, normal: float) -> float:
         """Returns the standard deviation of the lean of a force [N] along the finger that friction leaves [-]."""
@@ -526,12 +445,10 @@ class PlaceTracker:
         found = self.roughness.coefficient
         return sqrt((found.stddev * self.slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _LEAN**2)
 
-    def _stiffening(self, force: NDArray, place: NDArray) -> float:
-        """Returns how much stiffer the pressed jaw is than at first touch; 1 until it is surely pressed."""
-        pressed = place[DEPTH] - self._find_touch(place)
-        if self._stiffness is None or pressed < _LOADED_DEPTH:
-            return 1.0
-        return float(np.linalg.norm(force) / (self._stiffness * pressed))
+
+def _blank_average(count: int) -> Average:
+    """Returns the average of `count` key points over no frame."""
+    return Average(np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros(count))
 
 
 def _attach(contact: RollingContact, keypoints: NDArray) -> _Level:

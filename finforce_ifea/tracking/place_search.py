@@ -1,0 +1,370 @@
+"""The place of an object in one image: forecast, Newton's method on jaw and place together, and what is to be reported.
+
+The same function runs as Python, for the mechanics that are evaluated in full, and compiled for a reduced jaw.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from finforce_ifea.contact_mechanics.friction import Rubbing
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, PressedObject
+from finforce_ifea.contact_mechanics.pressed_jaw import RollingContact
+from finforce_ifea.reduced.evaluation import ReducedContact, ReducedJaw, ReducedProbe
+from finforce_ifea.tracking.place_update import (
+    Average,
+    PlaceUpdate,
+    Residuals,
+    Uncertainty,
+    forecast_place,
+    update_place,
+    weigh_residuals,
+)
+from finforce_ifea.tracking.pressing import (
+    CompiledContact,
+    CompiledProbe,
+    approach_at,
+    limit_at,
+    linearize_at,
+    motions_at,
+    positions_at,
+    touch_at,
+)
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+_BOTH = {"error_model": "numpy"}
+# The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
+_LEAST_DEPTH = 3e-5
+TOUCH_DEPTH, LOADED_DEPTH = 0.15e-3, 0.5e-3
+_DEPTH_DRIFT = 0.01e-3
+_LARGEST_MOVE = 0.7e-3
+# A leap only has to come near. One that leaves the points as far as they were by all but this is in vain [m].
+_LARGEST_LEAP, _LEAST_APPROACH = 2e-3, 0.1e-3
+_LARGEST_SHIFT = 0.3e-3
+_SETTLED_MOVE = 1e-4
+# Of the model's reach, 0.1 mm.
+_SETTLED_CORRECTION = 0.05
+_UNDECIDED = 0.2
+# Fewer points in agreement with the forecast than this share call for a leap; a forecast is never wider than this [m].
+_LEAST_AGREEMENT = 0.6
+_WIDEST_FORECAST = 1e-3
+
+
+class PlaceState(NamedTuple):
+    """What one frame leaves to the next.
+
+    Attributes:
+        q: unknowns of the jaw (size,).
+        modes: their motions by depth, shape and height (size, 3).
+        reached: the place at which the mechanics stands (3,).
+        motion: depth [m] and speed [m/s] (2,).
+        spread: covariance of both (2, 2).
+        slow: shape and height [m] (2,).
+        residuals: averaged over the last frames (K, 2) [m]; see `Average`.
+        by_place: their derivatives (K, 2, 3).
+        count: frames that they stand for (K,).
+        sudden: whether the last frame did not show the speed.
+    """
+
+    q: NDArray
+    modes: NDArray
+    reached: NDArray
+    motion: NDArray
+    spread: NDArray
+    slow: NDArray
+    residuals: NDArray
+    by_place: NDArray
+    count: NDArray
+    sudden: bool
+
+
+class PlaceFrame(NamedTuple):
+    """The key points of one image.
+
+    Attributes:
+        measured: (K, 3) [m], offsets and what acts across taken off, NaN where unused.
+        rest: of the undeformed model (K, 3) [m].
+        noise: see `Uncertainty`; so the next four.
+        gain: (K, 2).
+        width_variance: (K,) [m^2].
+        trust: (K,).
+        offset_variance: (K,) [m^2].
+        dt: time since the last image [s].
+    """
+
+    measured: NDArray
+    rest: NDArray
+    noise: NDArray
+    gain: NDArray
+    width_variance: NDArray
+    trust: NDArray
+    offset_variance: NDArray
+    dt: float
+
+
+class PlaceRules(NamedTuple):
+    """What is expected of the object and allowed to the search.
+
+    Attributes:
+        prior: of shape and height (2,).
+        prior_variance: (2,).
+        lowest: shape [-] or tilt [rad].
+        highest: the same.
+        largest_change: of it at once.
+        settled_change: of it that matters no more.
+        has_corners: whether the object may rock.
+        farthest: of the height from the prior [m].
+        acceleration: expected [m/s^2].
+        memory: longest average [frames].
+        model_error: see `Uncertainty`.
+        gate: see `Uncertainty`.
+        iterations: most of them.
+        fewest: key points.
+        stiffness: of the jaw at first touch [N/m], 0 where nobody knows.
+    """
+
+    prior: NDArray
+    prior_variance: NDArray
+    lowest: float
+    highest: float
+    largest_change: float
+    settled_change: float
+    has_corners: bool
+    farthest: float
+    acceleration: float
+    memory: float
+    model_error: float
+    gate: float
+    iterations: int
+    fewest: int
+    stiffness: float
+
+
+class FoundPlace(NamedTuple):
+    """The outcome of one image.
+
+    Attributes:
+        q: see `PlaceState`; so the next two.
+        modes: (size, 3).
+        reached: (3,).
+        place: (3,).
+        moved: of the place since the forecast (3,).
+        motions: of the key points by the place and a lean of the force (K, 3, 4).
+        data: residuals and weights.
+        update: of the place.
+        pressing: of the object on the jaw before the last step (3,) [N].
+        force: elastic contact force on the jaw (3,) [N].
+        force_modes: derivatives by the place and a lean of the force (3, 4).
+        covariance: of the place (3, 3), by the misfit too.
+        pressure_point: pressure centre on the deformed surface (3,) [m].
+        pressure_place: the same on the undeformed surface (3,) [m].
+        pressed: depth below first touch [m].
+        stiffening: see `Track`.
+        ambiguity: see `Track`.
+        extrapolation: see `PressedState`.
+        iterations: made.
+        settled: whether the last one changed nothing that matters.
+        sound: whether the numbers are finite and the mesh is in order.
+    """
+
+    q: NDArray
+    modes: NDArray
+    reached: NDArray
+    place: NDArray
+    moved: NDArray
+    motions: NDArray
+    data: Residuals
+    update: PlaceUpdate
+    pressing: NDArray
+    force: NDArray
+    force_modes: NDArray
+    covariance: NDArray
+    pressure_point: NDArray
+    pressure_place: NDArray
+    pressed: float
+    stiffening: float
+    ambiguity: float
+    extrapolation: float
+    iterations: int
+    settled: bool
+    sound: bool
+
+
+def find_place(
+    contact: RollingContact, probe: Any, state: PlaceState, frame: PlaceFrame, rules: PlaceRules
+) -> FoundPlace | None:
+    """Returns the place of the object in one image, None where too few key points agree.
+
+    Args:
+        contact: of the jaw with the object.
+        probe: of its key points.
+        state: of the image before.
+        frame: key points.
+        rules: what is expected and allowed.
+    """
+    if not (isinstance(contact, ReducedContact) and isinstance(probe, ReducedProbe)):
+        return _find_place(contact, probe, state, frame, rules)
+    points = probe.points, probe.shapes, probe.compliance
+    rubbing = contact.rubbing.describe(np.zeros(2))
+    return _find_reduced(
+        *(tuple(part) for part in (contact.jaw, contact.indenter.pressed, rubbing, points, state, frame, rules))
+    )
+
+
+@register_jitable(**_BOTH)
+def reach_place(contact: Any, place: NDArray) -> NDArray:
+    """Returns the place (3,) at which the mechanics stands for `place`: nowhere above the surface."""
+    reached = place.copy()
+    reached[DEPTH] = max(place[DEPTH], touch_at(contact, place) + _LEAST_DEPTH)
+    return reached
+
+
+@register_jitable(**_BOTH)
+def _bound(asked, place, share, rules):
+    """Returns the place asked for, within a share of where the linearisation about the present one holds."""
+    aim = asked.copy()
+    change = (_LARGEST_MOVE, share * rules.largest_change, share * _LARGEST_SHIFT)
+    for i in range(3):
+        aim[i] = min(max(asked[i], place[i] - change[i]), place[i] + change[i])
+    aim[SHAPE] = min(max(aim[SHAPE], rules.lowest), rules.highest)
+    middle = rules.prior[1]
+    aim[HEIGHT] = min(max(aim[HEIGHT], middle - rules.farthest), middle + rules.farthest)
+    return aim
+
+
+@register_jitable(**_BOTH)
+def _is_settled(state, moved, missing, rules):
+    """Whether the last iteration changed nothing that matters."""
+    change = (_SETTLED_MOVE, rules.settled_change, _SETTLED_MOVE)
+    for i in range(3):
+        if max(abs(moved[i]), abs(missing[i])) >= change[i]:
+            return False
+    return state.size < _SETTLED_CORRECTION
+
+
+@register_jitable(**_BOTH)
+def _spread_modes(modes, change):
+    """Returns what a change (3,) of the place makes of the unknowns (size,)."""
+    return modes[:, 0] * change[0] + modes[:, 1] * change[1] + modes[:, 2] * change[2]
+
+
+@register_jitable(**_BOTH)
+def _weigh(contact, probe, q, state, frame, chance, place, expected):
+    """Returns the residuals of a linearised state at a place, and the motions of the key points (K, 3, 4)."""
+    motions = motions_at(contact, probe, q, state.modes)
+    positions = positions_at(contact, probe, q)
+    below = place[DEPTH] - reach_place(contact, place)[DEPTH]
+    moved = place - expected
+    by_place = motions[:, :, :3]
+    data = weigh_residuals(frame.measured, positions, frame.rest, by_place, moved, below, chance)
+    return data, motions
+
+
+@register_jitable(**_BOTH)
+def _find_place(contact, probe, state, frame, rules):
+    """Returns the `FoundPlace` of one image, None where too few key points agree."""
+    forecast = forecast_place(
+        state.motion, state.spread, state.slow, frame.dt, rules.acceleration, _DEPTH_DRIFT, state.sudden
+    )
+    depth_variance = min(forecast.spread[0, 0], _WIDEST_FORECAST**2)
+    chance = Uncertainty(
+        frame.noise,
+        frame.gain,
+        frame.width_variance,
+        frame.trust,
+        frame.offset_variance,
+        depth_variance,
+        rules.model_error,
+        rules.gate,
+    )
+    average = Average(state.residuals, state.by_place, state.count)
+    largest = np.array([rules.largest_change, _LARGEST_SHIFT])
+    place = forecast.place.copy()
+    q = state.q + _spread_modes(state.modes, reach_place(contact, place) - state.reached)
+    found, settled, iteration, share = False, False, 0, 1.0
+    last, moved, far, in_vain = np.zeros(3), np.zeros(3), np.inf, 0
+    while not settled and iteration < rules.iterations and in_vain < 2:
+        iteration += 1
+        mechanical = reach_place(contact, place)
+        pressed = linearize_at(contact, q, mechanical)
+        if not pressed.touches:
+            q = q + approach_at(contact, q, pressed.correction, mechanical)
+            continue
+        q = q + pressed.correction
+        data, motions = _weigh(contact, probe, q, pressed, frame, chance, place, forecast.place)
+        if data.used < max(rules.fewest, _LEAST_AGREEMENT * data.known):
+            # towards the median depth that the points ask for, which disagree with the forecast
+            leapt = place.copy()
+            leapt[DEPTH] += min(max(data.jump, -_LARGEST_LEAP), _LARGEST_LEAP)
+            step = pressed.modes[:, DEPTH] * (reach_place(contact, leapt)[DEPTH] - mechanical[DEPTH])
+            place, q = leapt, q + limit_at(contact, step)
+            in_vain = in_vain + 1 if abs(data.jump) > far - _LEAST_APPROACH else 0
+            far = abs(data.jump)
+            continue
+        update, found = (
+            update_place(data, average, forecast, rules.prior, rules.prior_variance, rules.memory, largest),
+            True,
+        )
+        aim = _bound(update.place, place, share, rules)
+        # between two corners of an object the linearisation changes its mind: meet in the middle
+        change = aim - place
+        if rules.has_corners and last[SHAPE] * change[SHAPE] + last[HEIGHT] * change[HEIGHT] < 0.0:
+            share *= 0.5
+        missing = update.place - aim if share > _UNDECIDED else np.zeros(3)
+        last, moved, place = change, reach_place(contact, aim) - mechanical, aim
+        q = q + limit_at(contact, _spread_modes(pressed.modes, moved))
+        settled = _is_settled(pressed, moved, missing, rules)
+    if not found or not pressed.touches:
+        return None
+    return _report(contact, q, place, moved, pressed, motions, data, update, forecast.place, rules, iteration, settled)
+
+
+@register_jitable(**_BOTH)
+def _report(contact, q, place, moved, pressed, motions, data, update, expected, rules, iterations, settled):
+    """Returns the `FoundPlace` of a search that has ended, the last step `moved` (3,) included."""
+    change, depth = np.zeros(3), place[DEPTH] - touch_at(contact, place)
+    for a in range(3):
+        for i in range(3):
+            change[a] += pressed.force_modes[a, i] * moved[i]
+    force = pressed.force + change
+    if depth < _LEAST_DEPTH:
+        force = force * max(0.0, depth / _LEAST_DEPTH)
+    misfit = max(1.0, update.misfit**2)
+    covariance = update.covariance * misfit
+    covariance[DEPTH, DEPTH] += update.depth_variance * misfit
+    stiffening = 1.0
+    if rules.stiffness > 0.0 and depth >= LOADED_DEPTH:
+        stiffening = np.sqrt((force * force).sum()) / (rules.stiffness * depth)
+    return FoundPlace(
+        q,
+        pressed.modes[:, :3].copy(),
+        reach_place(contact, place),
+        place,
+        update.place - expected,
+        motions,
+        data,
+        update,
+        pressed.force,
+        force,
+        pressed.force_modes,
+        covariance,
+        pressed.pressure_point,
+        pressed.pressure_place,
+        depth,
+        stiffening,
+        0.0 if settled else np.sqrt((change * change).sum()),
+        pressed.extrapolation,
+        iterations,
+        settled,
+        bool(np.isfinite(force.sum() + update.covariance.sum() + q.sum()) and pressed.smallest_det > 0.0),
+    )
+
+
+@njit(**_OPTIONS)
+def _find_reduced(jaw, pressed, rubbing, probe, state, frame, rules):
+    """Returns the `FoundPlace` of a reduced jaw; plain tuples are handed over several times as fast as named ones."""
+    contact = CompiledContact(ReducedJaw(*jaw), PressedObject(*pressed), Rubbing(*rubbing))
+    return _find_place(contact, CompiledProbe(*probe), PlaceState(*state), PlaceFrame(*frame), PlaceRules(*rules))
