@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from math import hypot, sqrt
 
 import numpy as np
 from numba import njit
@@ -286,9 +287,9 @@ class JawEstimator:
             return self._fail("unobservable", doubt, used, track.iterations)
         self._taring.note(quiet=track.quiet, loaded=track.loaded)
         force = self._relax(track.force)
-        elastic = float(np.linalg.norm(track.force))
+        elastic = sqrt(track.force @ track.force)
         if track.across is not None and elastic > 0.0:
-            force[1] = track.across.force * float(np.linalg.norm(force)) / elastic
+            force[1] = track.across.force * sqrt(force @ force) / elastic
         return self._solution(track, force, used)
 
     def _relax(self, elastic: NDArray) -> NDArray:
@@ -303,8 +304,9 @@ class JawEstimator:
         leaning = 0.0
         if self.settings.held != "yes":
             leaning = _LEANING * min(friction, float(abs(force[2])) / max(float(abs(force[0])), 1e-9))
-        share = float(np.sqrt(self._force_error**2 + track.place_error**2 + extrapolated**2 + leaning**2))
+        share = hypot(self._force_error, track.place_error, extrapolated, leaning)
         unseen = UNSEEN_LEAN * friction
+        across = track.across or AcrossFinger(0.0, MIDDLE_STDDEV, 0.0, unseen)
         evidence = ForceEvidence(
             force=force,
             elastic=track.force,
@@ -313,11 +315,11 @@ class JawEstimator:
             pressure=track.pressure_point,
             place=track.pressure_place,
             place_stddev=track.place_stddev,
-            across=track.across or AcrossFinger(0.0, MIDDLE_STDDEV, 0.0, unseen),
+            across=tuple(across),
             along=unseen if track.lean_stddev is None else track.lean_stddev,
             leak=track.lean_leak,
         )
-        numbers = find_numbers(evidence, share, _LEAN)
+        numbers = find_numbers(tuple(evidence), share, _LEAN)
         return Solution(
             stamp=self._stamp,
             status="ok" if numbers.magnitude > 0.0 else "unloaded",

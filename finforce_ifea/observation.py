@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
@@ -150,21 +152,37 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
             f"key points of shape {points.shape} with likelihoods of shape {likelihood.shape}, "
             f"expected ({count}, 3) and ({count},)"
         )
-    if np.isinf(points).any():
+    if not _are_finite_or_missing(np.asarray(points, float)):
         raise ObservationError(
             f"key point {int(np.argwhere(np.isinf(points))[0, 0])} is infinite, expected metres or NaN"
         )
-    if not ((likelihood >= 0) & (likelihood <= 1)).all():
+    if not _are_shares(np.asarray(likelihood, float)):
         raise ObservationError(f"likelihoods from {likelihood.min():g} to {likelihood.max():g}, expected 0 to 1")
     if observation.stddev is not None:
         check_stddev(np.asarray(observation.stddev), points)
-    if not np.isfinite(observation.stamp):
+    if not isfinite(observation.stamp):
         raise ObservationError(f"stamp {observation.stamp}, expected seconds")
     if last_stamp is not None and observation.stamp <= last_stamp:
         raise ObservationError(
             f"stamp {observation.stamp:.6f} s after {last_stamp:.6f} s, expected rising stamps; "
             "reset for a new recording"
         )
+
+
+@njit(cache=True)
+def _are_finite_or_missing(points):
+    """Whether no coordinate (K, 3) is infinite."""
+    for k in range(len(points)):
+        for a in range(3):
+            if np.isinf(points[k, a]):
+                return False
+    return True
+
+
+@njit(cache=True)
+def _are_shares(values):
+    """Whether all values (K,) are from 0 to 1."""
+    return len(values) == 0 or (values.min() >= 0.0 and values.max() <= 1.0)
 
 
 def check_contact(contact: Contact, jaw: Jaw) -> None:

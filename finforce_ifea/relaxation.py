@@ -25,8 +25,8 @@ class Relaxation:
 
     def __init__(self, terms: Sequence[RelaxationTerm]) -> None:
         """Starts relaxed."""
-        self._share = np.array([term.share for term in terms])[:, None]
-        self._tau = np.array([term.time_constant for term in terms])[:, None]
+        self._share = np.array([term.share for term in terms], float)
+        self._tau = np.array([term.time_constant for term in terms], float)
         self.reset()
 
     def reset(self) -> None:
@@ -36,13 +36,7 @@ class Relaxation:
 
     def update(self, elastic: NDArray, dt: float) -> NDArray:
         """Returns the measured force (3,) [N] for the elastic force (3,) [N] after dt [s], exact for a ramp between."""
-        change, self._elastic = elastic - self._elastic, elastic
-        if len(self._share):
-            decay, gain = _ramp_factors(dt, self._tau)
-            self._over = self._over * decay + self._share * gain * change
-        total = elastic + self._over.sum(0)
-        # contact cannot pull: the overstress may take the whole force away, never turn it round
-        return total if total @ elastic > 0 else np.zeros(3)
+        return _follow(np.asarray(elastic, float), self._elastic, self._over, self._share, self._tau, dt)
 
     @property
     def gain(self) -> float:
@@ -89,7 +83,16 @@ def _invert(measured, stamps, share, tau):
     return elastic
 
 
-def _ramp_factors(dt: float, tau: NDArray) -> tuple[NDArray, NDArray]:
-    decay = np.exp(-dt / tau)
-    ratio = np.maximum(dt / tau, 1e-12)
-    return decay, -np.expm1(-ratio) / ratio
+@njit(cache=True)
+def _follow(elastic, before, over, share, tau, dt):
+    """Returns the force (3,) [N] after dt [s], and writes over the elastic one (3,) and the overstresses (n, 3)."""
+    total = elastic.copy()
+    for k in range(len(share)):
+        ratio = max(dt / tau[k], 1e-12)
+        decay, gain = np.exp(-dt / tau[k]), -np.expm1(-ratio) / ratio
+        for a in range(3):
+            over[k, a] = over[k, a] * decay + share[k] * gain * (elastic[a] - before[a])
+            total[a] += over[k, a]
+    before[:] = elastic
+    # contact cannot pull: the overstress may take the whole force away, never turn it round
+    return total if (total * elastic).sum() > 0.0 else np.zeros(3)

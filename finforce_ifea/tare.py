@@ -141,7 +141,14 @@ class Tare:
 
     def offset_variance(self, unseen: float) -> NDArray:
         """Returns the variance (K,) [m^2] of each offset; `unseen` is the standard deviation without a tare [m]."""
-        return np.where(self.counts > 0, self._seen_variance, unseen**2)
+        if unseen not in self._variances:
+            self._variances[unseen] = np.where(self.counts > 0, self._seen_variance, unseen**2)
+        return self._variances[unseen]
+
+    @cached_property
+    def _variances(self) -> dict[float, NDArray]:
+        """By the standard deviation of what is not seen [m]."""
+        return {}
 
     @cached_property
     def _seen_variance(self) -> NDArray:

@@ -97,6 +97,18 @@ def pose_object(pressed, face_x, place):
 
 
 @njit(**_OPTIONS)
+def is_clear_of(pressed, pose, x, z):
+    """Whether a point at x and z [m] is surely outside an object."""
+    dx, dz = x - pose.x, z - pose.z
+    if pressed.is_round:
+        return dx * dx + dz * dz >= pose.radius * pose.radius
+    rows, columns = pressed.coefficients.shape
+    a = (pose.c * dx + pose.s * dz - pressed.low[0]) / CELL
+    b = (pose.c * dz - pose.s * dx - pressed.low[1]) / CELL
+    return a < 1.0 or b < 1.0 or a >= rows - 2 or b >= columns - 2
+
+
+@njit(**_OPTIONS)
 def touch_object(pressed, pose, x, z, stiffness, weights):
     """Returns the `Touch` of one point at x and z [m], derivatives by the place's shape; `weights` is (6, 4)."""
     if pressed.is_round:

@@ -247,10 +247,11 @@ class Touch(NamedTuple):
 def touch_cylinder(x, z, stiffness, centre_x, centre_z, radius):
     """Returns the `Touch` of a cylinder on a point at x and z [m]; see `press_cylinder`."""
     dx, dz = x - centre_x, z - centre_z
-    r = np.sqrt(dx * dx + dz * dz)
-    depth = radius - r
-    if depth <= 0.0 or r < 1e-12:
+    square = dx * dx + dz * dz
+    if square >= radius * radius or square < 1e-24:
         return Touch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    r = np.sqrt(square)
+    depth = radius - r
     nx, nz = dx / r, dz / r
     push, slope = _resist(depth, stiffness)
     side = push / r

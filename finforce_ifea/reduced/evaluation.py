@@ -19,6 +19,7 @@ from finforce_ifea.contact_mechanics.indenter import (
     Indenter,
     PressedObject,
     RoundIndenter,
+    is_clear_of,
     pose_object,
     touch_object,
 )
@@ -401,6 +402,17 @@ def _add_springs(out, weight, row, low, share, stiffness):
 
 
 @njit(**_OPTIONS)
+def _add_to_clamp(out, weight, share, held, grip):
+    """Adds what the clamp takes of a point, see `rub_point`, to held (2, 5), and its springs to grip (2, 2)."""
+    for a in range(2):
+        held[a, 0] += weight * out[a, 0]
+        for c in range(4):
+            held[a, c + 1] += weight * out[a, 3 + c]
+        for b in range(2):
+            grip[a, b] += weight * share * out[a, 1 + b]
+
+
+@njit(**_OPTIONS)
 def _gather(jaw, pressed, pose, rubbing, points):
     """Returns the contact of an object with contact points (p, 3) [m] at the rows."""
     count = jaw.loads.shape[2]
@@ -409,6 +421,8 @@ def _gather(jaw, pressed, pose, rubbing, points):
     out, weights = np.zeros(POINT_SHAPE), np.zeros((6, 4))
     for p in range(len(points)):
         x, z = points[p, 0], points[p, 2]
+        if is_clear_of(pressed, pose, x, z):
+            continue
         touch = touch_object(pressed, pose, x, z, jaw.stiffness[p], weights)
         if touch.kxx == 0.0 and touch.kzz == 0.0:
             continue
@@ -422,11 +436,7 @@ def _gather(jaw, pressed, pose, rubbing, points):
         for i in range(2):
             row, w = low + i, (share if i else 1.0 - share)
             if row < 0:
-                for a in range(2):
-                    held[a, 0] += w * out[a, 0]
-                    held[a, 1:] += w * out[a, 3:]
-                    for b in range(2):
-                        grip[a, b] += w * share * out[a, 1 + b]
+                _add_to_clamp(out, w, share, held, grip)
                 continue
             for a in range(2):
                 loads[2 * row + a, 0] += w * out[a, 0]
@@ -471,6 +481,8 @@ def _change_energy(jaw, pressed, pose, rubbing, points, motion, share, work):
     out, weights, change = np.zeros(POINT_SHAPE), np.zeros((6, 4)), work[0] + share * work[1]
     for p in range(len(points)):
         x, z = points[p, 0] + share * motion[p, 0], points[p, 2] + share * motion[p, 2]
+        if is_clear_of(pressed, pose, x, z):
+            continue
         touch = touch_object(pressed, pose, x, z, jaw.stiffness[p], weights)
         if touch.kxx != 0.0 or touch.kzz != 0.0:
             rub_point(rubbing, touch, p, x, z, jaw.stiffness[p], out)

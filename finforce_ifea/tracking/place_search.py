@@ -16,7 +16,6 @@ from finforce_ifea.contact_mechanics.pressed_jaw import RollingContact
 from finforce_ifea.reduced.evaluation import ReducedContact, ReducedJaw, ReducedProbe
 from finforce_ifea.tracking.place_update import (
     Average,
-    PlaceUpdate,
     Residuals,
     Uncertainty,
     forecast_place,
@@ -33,6 +32,7 @@ from finforce_ifea.tracking.pressing import (
     positions_at,
     touch_at,
 )
+from finforce_ifea.tracking.track import measure_along
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 _BOTH = {"error_model": "numpy"}
@@ -54,7 +54,7 @@ _WIDEST_FORECAST = 1e-3
 
 
 class PlaceState(NamedTuple):
-    """What one frame leaves to the next.
+    """What one frame leaves to the next, which writes over it.
 
     Attributes:
         q: unknowns of the jaw (size,).
@@ -66,7 +66,6 @@ class PlaceState(NamedTuple):
         residuals: averaged over the last frames (K, 2) [m]; see `Average`.
         by_place: their derivatives (K, 2, 3).
         count: frames that they stand for (K,).
-        sudden: whether the last frame did not show the speed.
     """
 
     q: NDArray
@@ -78,7 +77,6 @@ class PlaceState(NamedTuple):
     residuals: NDArray
     by_place: NDArray
     count: NDArray
-    sudden: bool
 
 
 class PlaceFrame(NamedTuple):
@@ -93,6 +91,7 @@ class PlaceFrame(NamedTuple):
         trust: (K,).
         offset_variance: (K,) [m^2].
         dt: time since the last image [s].
+        sudden: whether that did not show the speed.
     """
 
     measured: NDArray
@@ -103,6 +102,7 @@ class PlaceFrame(NamedTuple):
     trust: NDArray
     offset_variance: NDArray
     dt: float
+    sudden: bool
 
 
 class PlaceRules(NamedTuple):
@@ -147,21 +147,28 @@ class FoundPlace(NamedTuple):
     """The outcome of one image.
 
     Attributes:
-        q: see `PlaceState`; so the next two.
-        modes: (size, 3).
-        reached: (3,).
-        place: (3,).
-        moved: of the place since the forecast (3,).
+        place: that the key points ask for (3,).
+        moved: of it since the forecast (3,).
         motions: of the key points by the place and a lean of the force (K, 3, 4).
         data: residuals and weights.
-        update: of the place.
         pressing: of the object on the jaw before the last step (3,) [N].
         force: elastic contact force on the jaw (3,) [N].
-        force_modes: derivatives by the place and a lean of the force (3, 4).
+        stddev: of it along itself [N].
+        force_modes: derivatives by the place (3, 3).
+        leaning: derivative by a lean of the force (3,).
         covariance: of the place (3, 3), by the misfit too.
         pressure_point: pressure centre on the deformed surface (3,) [m].
         pressure_place: the same on the undeformed surface (3,) [m].
         pressed: depth below first touch [m].
+        jumped: see `PlaceUpdate`; so the next seven.
+        depth_variance: [m^2].
+        kkt: [-].
+        residual: [m].
+        misfit: [-].
+        away: [m].
+        mistaken: [-].
+        condition: [-].
+        height_variance: [m^2].
         stiffening: see `Track`.
         ambiguity: see `Track`.
         extrapolation: see `PressedState`.
@@ -170,21 +177,28 @@ class FoundPlace(NamedTuple):
         sound: whether the numbers are finite and the mesh is in order.
     """
 
-    q: NDArray
-    modes: NDArray
-    reached: NDArray
     place: NDArray
     moved: NDArray
     motions: NDArray
     data: Residuals
-    update: PlaceUpdate
     pressing: NDArray
     force: NDArray
+    stddev: float
     force_modes: NDArray
+    leaning: NDArray
     covariance: NDArray
     pressure_point: NDArray
     pressure_place: NDArray
     pressed: float
+    jumped: bool
+    depth_variance: float
+    kkt: float
+    residual: float
+    misfit: float
+    away: float
+    mistaken: float
+    condition: float
+    height_variance: float
     stiffening: float
     ambiguity: float
     extrapolation: float
@@ -267,7 +281,7 @@ def _weigh(contact, probe, q, state, frame, chance, place, expected):
 def _find_place(contact, probe, state, frame, rules):
     """Returns the `FoundPlace` of one image, None where too few key points agree."""
     forecast = forecast_place(
-        state.motion, state.spread, state.slow, frame.dt, rules.acceleration, _DEPTH_DRIFT, state.sudden
+        state.motion, state.spread, state.slow, frame.dt, rules.acceleration, _DEPTH_DRIFT, frame.sudden
     )
     depth_variance = min(forecast.spread[0, 0], _WIDEST_FORECAST**2)
     chance = Uncertainty(
@@ -319,13 +333,29 @@ def _find_place(contact, probe, state, frame, rules):
         settled = _is_settled(pressed, moved, missing, rules)
     if not found or not pressed.touches:
         return None
-    return _report(contact, q, place, moved, pressed, motions, data, update, forecast.place, rules, iteration, settled)
+    _keep(state, q, pressed.modes, reach_place(contact, place), place, update)
+    depth = place[DEPTH] - touch_at(contact, place)
+    return _report(depth, q, moved, pressed, motions, data, update, forecast.place, rules.stiffness, iteration, settled)
 
 
 @register_jitable(**_BOTH)
-def _report(contact, q, place, moved, pressed, motions, data, update, expected, rules, iterations, settled):
+def _keep(state, q, modes, reached, place, update):
+    """Writes what the next frame starts from."""
+    state.q[:] = q
+    state.modes[:] = modes[:, :3]
+    state.reached[:] = reached
+    state.motion[0], state.motion[1] = place[DEPTH], update.speed
+    state.spread[:] = update.spread
+    state.slow[:] = place[1:]
+    state.residuals[:] = update.average.residuals
+    state.by_place[:] = update.average.modes
+    state.count[:] = update.average.count
+
+
+@register_jitable(**_BOTH)
+def _report(depth, q, moved, pressed, motions, data, update, expected, stiffness, iterations, settled):
     """Returns the `FoundPlace` of a search that has ended, the last step `moved` (3,) included."""
-    change, depth = np.zeros(3), place[DEPTH] - touch_at(contact, place)
+    change = np.zeros(3)
     for a in range(3):
         for i in range(3):
             change[a] += pressed.force_modes[a, i] * moved[i]
@@ -335,25 +365,32 @@ def _report(contact, q, place, moved, pressed, motions, data, update, expected, 
     misfit = max(1.0, update.misfit**2)
     covariance = update.covariance * misfit
     covariance[DEPTH, DEPTH] += update.depth_variance * misfit
-    stiffening = 1.0
-    if rules.stiffness > 0.0 and depth >= LOADED_DEPTH:
-        stiffening = np.sqrt((force * force).sum()) / (rules.stiffness * depth)
+    modes, stiffening = np.ascontiguousarray(pressed.force_modes[:, :3]), 1.0
+    if stiffness > 0.0 and depth >= LOADED_DEPTH:
+        stiffening = np.sqrt((force * force).sum()) / (stiffness * depth)
     return FoundPlace(
-        q,
-        pressed.modes[:, :3].copy(),
-        reach_place(contact, place),
-        place,
+        update.place,
         update.place - expected,
         motions,
         data,
-        update,
         pressed.force,
         force,
-        pressed.force_modes,
+        measure_along(force, modes, covariance),
+        modes,
+        np.ascontiguousarray(pressed.force_modes[:, 3]),
         covariance,
         pressed.pressure_point,
         pressed.pressure_place,
         depth,
+        update.jumped,
+        update.depth_variance,
+        update.kkt,
+        update.residual,
+        update.misfit,
+        update.away,
+        update.mistaken,
+        update.condition,
+        update.covariance[HEIGHT, HEIGHT],
         stiffening,
         0.0 if settled else np.sqrt((change * change).sum()),
         pressed.extrapolation,

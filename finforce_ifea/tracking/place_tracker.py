@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, OutlineIndenter, RoundIndenter, expect_object
+from finforce_ifea.contact_mechanics.indenter import DEPTH, OutlineIndenter, RoundIndenter, expect_object
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact
 from finforce_ifea.contact_mechanics.torsion import Torsion
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
@@ -33,7 +33,7 @@ from finforce_ifea.tracking.place_search import (
     find_place,
     reach_place,
 )
-from finforce_ifea.tracking.place_update import Average
+from finforce_ifea.tracking.place_update import blank_average
 from finforce_ifea.tracking.slip_history import SlipHistory, leave_play
 from finforce_ifea.tracking.track import UNSEEN_LEAN, AcrossFinger, Track, explain_offsets
 from finforce_ifea.tracking.width_tracker import WidthTracker
@@ -135,7 +135,7 @@ class PlaceTracker:
         """
         before, pressed = self.contact, float(self._state.motion[0])
         if self._level == 0 and extrapolation > _STRANGE and len(self._levels) > 1:
-            self._left = (self.q, _BACK * pressed)
+            self._left = (self.q.copy(), _BACK * pressed)
             q = before.model.expand(self.q)
             self._stand_on(1)
         elif self._level == 1 and pressed < self._left[1]:
@@ -175,21 +175,21 @@ class PlaceTracker:
             np.array([touch, 0.0]),
             np.diag([0.1e-3, 1e-3]) ** 2,
             self._prior.copy(),
-            *_blank_average(len(self._rest)),
-            False,
+            *blank_average(len(self._rest)),
         )
         self._led = self._prior.copy()
         self.slips.reset()
         self._held.reset()
         self._width.reset()
-        self._released = 0
+        self._released, self._jumped = 0, False
         self._unlearnt: Callable[[], None] | None = None
 
     def _forget_place(self) -> None:
         """Expects any object again, as the next one may be."""
-        residuals, by_place, count = _blank_average(len(self._rest))
-        slow, self._led = self._prior.copy(), self._prior.copy()
-        self._state = self._state._replace(slow=slow, residuals=residuals, by_place=by_place, count=count)
+        self._led, state = self._prior.copy(), self._state
+        state.slow[:] = self._prior
+        for average in (state.residuals, state.by_place, state.count):
+            average[:] = 0.0
 
     def update(self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None) -> Track | None:
         """Takes the key points (K, 3) [m], NaN where unused, dt [s] after the last; None when too few agree.
@@ -197,8 +197,11 @@ class PlaceTracker:
         `stddev` (K, 3) [m] are their stated standard deviations.
         """
         noise, unseen = tare.point_noise(stddev), self.settings.offset_stddev
+        measured = points - tare.offsets
+        if self._is_known:
+            measured -= self._width.motions + self._width.sideways * self._held.across
         frame = PlaceFrame(
-            measured=points - tare.offsets - self._move_across(),
+            measured=measured,
             rest=self._rest,
             noise=noise.plane,
             gain=noise.gain,
@@ -206,11 +209,15 @@ class PlaceTracker:
             trust=noise.trust,
             offset_variance=tare.offset_variance(unseen) + noise.standing,
             dt=dt,
+            sudden=bool(self._released or self._jumped),
         )
         found = find_place(self.contact, self.probe, self._state, frame, self._rules())
         if found is None:
             return self._lose()
-        self._keep(found)
+        self._jumped = found.jumped
+        self._released = self._released + 1 if found.pressed < TOUCH_DEPTH else 0
+        if self._released >= _FRAMES_RELEASED:  # the next object may be any again
+            self._forget_place()
         if found.settled and self._is_known:
             self._learn_friction(found, noise.gain, dt)
         track = self._report(found)
@@ -220,6 +227,28 @@ class PlaceTracker:
             self._width.update(aside - self._rest[:, 1], found.data, variances, track.force, track.pressure_place[2])
         self._change_level(found.extrapolation)
         return track
+
+    def _rules(self) -> PlaceRules:
+        """Returns what is expected of the object and allowed to the search."""
+        settings, indenter = self.settings, self.contact.indenter
+        shapes = indenter.shape_range
+        return PlaceRules(
+            self._prior,
+            self._prior_variance,
+            shapes.low,
+            shapes.high,
+            shapes.largest_change,
+            shapes.settled_change,
+            indenter.has_corners,
+            _FARTHEST_HEIGHT * settings.height_stddev,
+            settings.acceleration,
+            float(settings.memory),
+            settings.model_error,
+            settings.gate,
+            settings.iterations,
+            settings.minimum_keypoints,
+            self._stiffness or 0.0,
+        )
 
     def _rules(self) -> PlaceRules:
         """Returns what is expected of the object and allowed to the search."""
@@ -272,8 +301,7 @@ class PlaceTracker:
 
         `gain` (K, 2) is the regression of the noise along x and z on that along y, `dt` the time since the last [s].
         """
-        reached = found.reached[DEPTH] - self.contact.find_touch(found.reached)
-        if reached < LOADED_DEPTH or found.update.jumped:
+        if found.pressed < LOADED_DEPTH or found.jumped:
             return
         normal = hypot(found.pressing[0], found.pressing[2])
         if self.settings.held == "yes":
@@ -286,7 +314,7 @@ class PlaceTracker:
                 normal=normal,
                 lean=rubbing.lean - upright,
                 moved=found.moved,
-                place=found.update.place,
+                place=found.place,
                 aside=see_aside(width.sideways, gain),
                 across=self._held.across,
                 twist=see_aside(width.twisting, gain),
@@ -305,12 +333,11 @@ class PlaceTracker:
 
     def _follow_slide(self, normal: float, found: FoundPlace) -> None:
         """Follows how an object slides that presses with a normal force [N]."""
-        update = found.update
         expected = np.array([self._state.reached[DEPTH], self._prior[0], self._prior[1]])
         before, known = self.slips.mobilised, self.roughness.coefficient.mean
         self.slips.set_indenter(self.contact.indenter)
-        mobilised = self.slips.follow(self.give_shape(), expected, float(np.sqrt(update.depth_variance)), known)
-        away = update.place[1:] - self._prior
+        mobilised = self.slips.follow(self.give_shape(), expected, sqrt(found.depth_variance), known)
+        away = found.place[1:] - self._prior
         frame = FrictionFrame(
             found.data, found.motions[:, ::2], normal, before, self.contact.rubbing.lean, found.moved, away
         )
@@ -367,7 +394,8 @@ class PlaceTracker:
         way = np.array([leave_play(moved[0], chance[0]), leave_play(moved[1], chance[1])])
         if way.any():
             self._led += way
-            self._state = self._state._replace(slow=self._state.slow + way, count=_KEPT * self._state.count)
+            self._state.slow[:] += way
+            self._state.count[:] *= _KEPT
             self._held.lead(way)
 
     def _lose(self) -> None:
@@ -375,53 +403,36 @@ class PlaceTracker:
         self._state.motion[1] = 0.0
         self._state.spread[0, 0] += _LOST_STDDEV**2
 
-    def _keep(self, found: FoundPlace) -> None:
-        """Keeps what the next frame starts from; a released jaw expects any object again."""
-        update, place = found.update, found.place
-        self._released = self._released + 1 if found.pressed < TOUCH_DEPTH else 0
-        self._state = PlaceState(
-            found.q,
-            found.modes,
-            found.reached,
-            np.array([place[DEPTH], update.speed]),
-            update.spread,
-            place[1:].copy(),
-            *update.average,
-            bool(self._released or update.jumped),
-        )
-        if self._released >= _FRAMES_RELEASED:
-            self._forget_place()
-
     def _report(self, found: FoundPlace) -> Track:
-        update, data, normal = found.update, found.data, hypot(found.force[0], found.force[2])
-        known, modes = self._is_known, found.force_modes
+        data, normal, known = found.data, hypot(found.force[0], found.force[2]), self._is_known
         return Track(
             covariance=found.covariance,
             force=found.force,
-            force_modes=modes[:, :3],
+            stddev=found.stddev,
+            force_modes=found.force_modes,
             pressure_point=found.pressure_point,
             pressure_place=found.pressure_place,
             weights=data.weights,
             stiffening=found.stiffening,
-            residual=update.residual,
-            misfit=update.misfit,
-            kkt=update.kkt,
+            residual=found.residual,
+            misfit=found.misfit,
+            kkt=found.kkt,
             iterations=found.iterations,
             converged=found.settled,
             bearable=self._levels[0].contact.bearable,
             across=self._describe_across(normal) if known else None,
             lean_stddev=self._describe_lean(normal) if known else None,
-            lean_leak=self._find_leak(modes, normal) if known else 0.0,
+            lean_leak=self._find_leak(found, normal) if known else 0.0,
             ambiguity=found.ambiguity,
             sound=found.sound,
             quiet=found.pressed < TOUCH_DEPTH,
             loaded=found.pressed > LOADED_DEPTH,
-            away=update.away,
+            away=found.away,
             extrapolation=found.extrapolation,
-            mistaken=update.mistaken,
+            mistaken=found.mistaken,
             agreement=data.agreed / data.known,
-            condition=update.condition,
-            place_stddev=sqrt(max(update.covariance[HEIGHT, HEIGHT], 0.0)),
+            condition=found.condition,
+            place_stddev=sqrt(max(found.height_variance, 0.0)),
         )
 
     def _describe_across(self, normal: float) -> AcrossFinger:
@@ -432,11 +443,11 @@ class PlaceTracker:
         doubt = held.across_stddev / max(normal, _LEAST_NORMAL)
         return AcrossFinger(seen.place, seen.place_stddev, seen.force + held.across, hypot(seen.lean_stddev, doubt))
 
-    def _find_leak(self, modes: NDArray, normal: float) -> float:
+    def _find_leak(self, found: FoundPlace, normal: float) -> float:
         """Returns by how much a held object's force [N] along the finger changes that along x [-]."""
         if self.settings.held != "yes" or normal < _LEAST_NORMAL:
             return 0.0
-        return float(modes[0, 3] / normal - modes[0, DEPTH] * self._held.leverage)
+        return float(found.leaning[0] / normal - found.force_modes[0, DEPTH] * self._held.leverage)
 
     def _describe_lean(self, normal: float) -> float:
         """Returns the standard deviation of the lean of a force [N] along the finger that friction leaves [-]."""
@@ -444,11 +455,6 @@ class PlaceTracker:
             return sqrt(min(self._held.stddev / max(normal, _LEAST_NORMAL), _WEIGHT) ** 2 + _LEAN**2)
         found = self.roughness.coefficient
         return sqrt((found.stddev * self.slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _LEAN**2)
-
-
-def _blank_average(count: int) -> Average:
-    """Returns the average of `count` key points over no frame."""
-    return Average(np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros(count))
 
 
 def _attach(contact: RollingContact, keypoints: NDArray) -> _Level:

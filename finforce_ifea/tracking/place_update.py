@@ -170,6 +170,11 @@ class Average(NamedTuple):
     count: NDArray
 
 
+def blank_average(count: int) -> Average:
+    """Returns the average of `count` key points over no frame."""
+    return Average(np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros(count))
+
+
 class PlaceUpdate(NamedTuple):
     """The place after one frame.
 

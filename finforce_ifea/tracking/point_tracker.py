@@ -194,6 +194,7 @@ class PointTracker:
         return Track(
             covariance=covariance,
             force=force,
+            stddev=stddev,
             force_modes=result.directions,
             pressure_point=share @ deformed,
             pressure_place=share @ undeformed,

@@ -1,6 +1,7 @@
 """What a tracker says of one image with its standard deviations, and when a force must not be reported."""
 
 from dataclasses import dataclass
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -33,13 +34,13 @@ class AcrossFinger(NamedTuple):
     lean_stddev: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Track:
+class Track(NamedTuple):
     """The outcome of one frame.
 
     Attributes:
         covariance: of what was estimated (m, m): depth [m], log radius and height [m], or a given contact's force [N].
         force: elastic contact force on the jaw (3,) [N].
+        stddev: of it along itself, by the covariance [N].
         force_modes: derivative of the force by what was estimated (3, m).
         pressure_point: pressure centre on the deformed surface (3,) [m].
         pressure_place: the same on the undeformed surface (3,) [m].
@@ -69,6 +70,7 @@ class Track:
 
     covariance: NDArray
     force: NDArray
+    stddev: float
     force_modes: NDArray
     pressure_point: NDArray
     pressure_place: NDArray
@@ -169,13 +171,12 @@ def find_doubt(track: Track, *, settles: bool) -> str:
         return f"only {100 * track.agreement:.0f} % of the key points agree with the jaw's shape"
     if track.mistaken > _MISTAKEN and abs(track.away) > _LEAST_AWAY:
         return f"the contact is not where it was said to be: the key points have it {1e3 * track.away:+.0f} mm away"
-    magnitude = float(np.linalg.norm(track.force))
+    magnitude = sqrt(track.force @ track.force)
     if magnitude > track.bearable:
         most = f"expected {track.bearable:.0f} N at most"
         return f"the shape would take {magnitude:.0f} N, {most}; is the contact elsewhere?"
-    stddev = compute_magnitude_stddev(track.force, track.force_modes, track.covariance)
-    if not stddev <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
-        return f"the visible key points tell the force only within {stddev:.2g} N"
+    if not track.stddev <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
+        return f"the visible key points tell the force only within {track.stddev:.2g} N"
     return ""
 
 
@@ -239,7 +240,7 @@ class ForceEvidence(NamedTuple):
         pressure: pressure centre on the deformed surface (3,) [m].
         place: the same on the undeformed surface (3,) [m].
         place_stddev: of its height [m].
-        across: what acts across the finger.
+        across: the four of `AcrossFinger`.
         along: standard deviation of the lean along the finger [-].
         leak: by which such a lean shows along x, too [-].
     """
@@ -251,17 +252,17 @@ class ForceEvidence(NamedTuple):
     pressure: NDArray
     place: NDArray
     place_stddev: float
-    across: AcrossFinger
+    across: tuple[float, float, float, float]
     along: float
     leak: float
 
 
 @njit(**_OPTIONS)
-def find_numbers(evidence: ForceEvidence, share: float, lean: float) -> SolutionNumbers:
+def find_numbers(evidence: tuple, share: float, lean: float) -> SolutionNumbers:
     """Returns what belongs to a force; see `SolutionNumbers`.
 
     Args:
-        evidence: the force that was tracked.
+        evidence: `ForceEvidence` as a plain tuple, which is handed over several times as fast.
         share: relative standard deviation of the mechanics; it errs in the direction as in the magnitude.
         lean: share of a force that nobody has seen along z.
     """
