@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import shutil
+import sys
+import time
+from contextlib import suppress
 from pathlib import Path
+
+# Packages whose functions are compiled, and days after which what nobody has used is removed.
+_COMPILED = ("finforce_contact", "finforce_ifea", "finforce_keypoints")
+_UNUSED = 30.0
 
 
 def cache_folder() -> Path:
@@ -12,3 +21,39 @@ def cache_folder() -> Path:
     if named:
         return Path(named)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "finforce"
+
+
+def keep_compiled() -> None:
+    """Let Numba keep what it compiles in a folder of these very sources, unless NUMBA_CACHE_DIR names one.
+
+    Numba compiles a function anew when its own file has changed, and does not look at the files of what that calls.
+    Called before anything is compiled; a folder that cannot be written leaves Numba to its own choice.
+    """
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        return
+    folder = cache_folder() / "compiled" / _name_sources(Path(__file__).parents[1])
+    with suppress(OSError, RuntimeError):
+        if not folder.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
+            _remove_unused(folder.parent)
+        os.utime(folder)
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    if "numba" in sys.modules:
+        sys.modules["numba"].config.CACHE_DIR = str(folder)
+
+
+def _name_sources(root: Path) -> str:
+    """Return a name for the sources below a folder: where they lie, and when each was written."""
+    digest = hashlib.sha256(str(root).encode())
+    for package in _COMPILED:
+        for path in sorted((root / package).rglob("*.py")):
+            state = path.stat()
+            digest.update(f"{path} {state.st_size} {state.st_mtime_ns}".encode())
+    return digest.hexdigest()[:16]
+
+
+def _remove_unused(parent: Path) -> None:
+    """Remove the folders that no start has used for long."""
+    for folder in parent.iterdir():
+        if time.time() - folder.stat().st_mtime > _UNUSED * 86400.0:
+            shutil.rmtree(folder, ignore_errors=True)
