@@ -25,5 +25,7 @@ ENV PATH=/opt/finforce/bin:$PATH
 RUN useradd --create-home --groups dialout finforce
 USER finforce
 WORKDIR /home/finforce
+# in the image, so that no container has to compile
+RUN finforce prepare --calibration bench
 ENTRYPOINT ["finforce"]
 CMD ["--help"]

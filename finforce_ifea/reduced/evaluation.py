@@ -20,10 +20,17 @@ from finforce_ifea.contact_mechanics.indenter import (
     PressedObject,
     RoundIndenter,
     is_clear_of,
+    measure_gap,
     pose_object,
     touch_object,
 )
-from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, PressedState, RollingContact
+from finforce_ifea.contact_mechanics.pressed_jaw import (
+    BISECTIONS,
+    TOUCH,
+    ContactSurface,
+    PressedState,
+    RollingContact,
+)
 from finforce_ifea.fem.factorisation import Factor
 from finforce_ifea.fem.model import LARGEST_MOVE, Across, JawModel, Linearization
 from finforce_ifea.jaw.face import FaceLine
@@ -221,6 +228,7 @@ class ReducedContact(RollingContact):
 
     Attributes:
         rubbing: what acts along the surface: a lean of all forces, or friction with its history.
+        packed: `ReducedJaw` as a plain tuple.
         bearable: force beyond which no equilibrium is believed [N]: half of the largest that is stored, beside the
             clamp; in its middle the bench finger bears a sixth of that.
     """
@@ -238,7 +246,7 @@ class ReducedContact(RollingContact):
         farthest = _FARTHEST_SHAPE * length if model.manifold.depths.any() else np.inf
         x, z = (model.loads[:, :, axis::2].sum(axis=2) for axis in (0, 1))
         self.bearable = _BEARABLE * float(np.hypot(x, z).max()) if np.isfinite(farthest) else np.inf
-        self.jaw = ReducedJaw(
+        self._jaw = ReducedJaw(
             moves=model.manifold.moves,
             compliance=model.compliance,
             loads=model.loads,
@@ -253,10 +261,11 @@ class ReducedContact(RollingContact):
             farthest=farthest,
             reach=model.reach,
         )
+        self.packed = tuple(self._jaw)
 
     def place_points(self, q: NDArray) -> NDArray:
         """See `RollingContact`."""
-        return place_contact(self.jaw.points, self.jaw.low, self.jaw.share, self.model.moves(q))
+        return place_contact(self._jaw.points, self._jaw.low, self._jaw.share, self.model.moves(q))
 
     def begin(self, height: float) -> NDArray:
         """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
@@ -267,7 +276,11 @@ class ReducedContact(RollingContact):
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
         """Linearises the equilibrium with the object at a place (depth, shape, height); see `RollingContact`."""
         rubbing = self.rubbing.describe(np.array([-place[DEPTH], place[HEIGHT]]))
-        return _linearize(tuple(self.jaw), tuple(self.indenter.pressed), tuple(rubbing), q, place)
+        return linearize_reduced(self.packed, tuple(self.indenter.pressed), tuple(rubbing), q, place)
+
+    def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
+        """See `RollingContact`."""
+        return approach_reduced(self.packed, tuple(self.indenter.pressed), q, step, place)
 
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -555,7 +568,18 @@ def read_grid(rods, height):
 
 @njit(**_OPTIONS)
 def linearize_reduced(jaw, pressed, rubbing, q, place):
-    """Returns one linearised equilibrium of a `ReducedJaw` with a `PressedObject`, rubbed, as `PressedState`."""
+    """Returns one linearised equilibrium as `PressedState`.
+
+    Plain tuples are handed over from Python several times as fast as named ones.
+
+    Args:
+        jaw: `ReducedJaw` as a plain tuple.
+        pressed: `PressedObject` as a plain tuple.
+        rubbing: `Rubbing` as a plain tuple.
+        q: unknowns (2 n + 2,).
+        place: depth [m], shape and height [m] of the object (3,).
+    """
+    jaw, pressed, rubbing = ReducedJaw(*jaw), PressedObject(*pressed), Rubbing(*rubbing)
     count = jaw.loads.shape[2]
     moves = follow(jaw.moves, jaw.compliance, jaw.loads, q)
     points, pose = place_contact(jaw.points, jaw.low, jaw.share, moves), pose_object(pressed, jaw.face_x, place)
@@ -602,6 +626,15 @@ def _hold_base(jaw, q, contact, steps, force, force_modes):
 
 
 @njit(**_OPTIONS)
-def _linearize(jaw, pressed, rubbing, q, place):
-    """Returns `linearize_reduced` of plain tuples, which are handed over several times as fast as named ones."""
-    return linearize_reduced(ReducedJaw(*jaw), PressedObject(*pressed), Rubbing(*rubbing), q, place)
+def approach_reduced(jaw, pressed, q, step, place):
+    """Returns the step of a jaw that has lost contact, cut where it meets the object again; see `linearize_reduced`."""
+    jaw, pressed = ReducedJaw(*jaw), PressedObject(*pressed)
+    low, high, pose = 0.0, 1.0, pose_object(pressed, jaw.face_x, place)
+    for _ in range(BISECTIONS):
+        share = 0.5 * (low + high)
+        moves = follow(jaw.moves, jaw.compliance, jaw.loads, q + share * step)
+        if measure_gap(pressed, pose, place_contact(jaw.points, jaw.low, jaw.share, moves)) < -TOUCH:
+            high = share
+        else:
+            low = share
+    return high * step

@@ -10,10 +10,9 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.friction import Rubbing
-from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, PressedObject
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE
 from finforce_ifea.contact_mechanics.pressed_jaw import RollingContact
-from finforce_ifea.reduced.evaluation import ReducedContact, ReducedJaw, ReducedProbe
+from finforce_ifea.reduced.evaluation import ReducedContact, ReducedProbe
 from finforce_ifea.tracking.place_update import (
     Average,
     Residuals,
@@ -23,8 +22,6 @@ from finforce_ifea.tracking.place_update import (
     weigh_residuals,
 )
 from finforce_ifea.tracking.pressing import (
-    CompiledContact,
-    CompiledProbe,
     approach_at,
     limit_at,
     linearize_at,
@@ -36,6 +33,7 @@ from finforce_ifea.tracking.track import measure_along
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 _BOTH = {"error_model": "numpy"}
+_STILL = np.zeros(2)
 # The mechanics is evaluated at this depth [m] at least; below it shapes and forces are continued linearly.
 _LEAST_DEPTH = 3e-5
 TOUCH_DEPTH, LOADED_DEPTH = 0.15e-3, 0.5e-3
@@ -221,11 +219,9 @@ def find_place(
     """
     if not (isinstance(contact, ReducedContact) and isinstance(probe, ReducedProbe)):
         return _find_place(contact, probe, state, frame, rules)
+    packed = contact.packed, tuple(contact.indenter.pressed), tuple(contact.rubbing.describe(_STILL))
     points = probe.points, probe.shapes, probe.compliance
-    rubbing = contact.rubbing.describe(np.zeros(2))
-    return _find_reduced(
-        *(tuple(part) for part in (contact.jaw, contact.indenter.pressed, rubbing, points, state, frame, rules))
-    )
+    return _find_reduced(packed, points, tuple(state), tuple(frame), tuple(rules))
 
 
 @register_jitable(**_BOTH)
@@ -277,9 +273,9 @@ def _weigh(contact, probe, q, state, frame, chance, place, expected):
     return data, motions
 
 
-@register_jitable(**_BOTH)
 def _find_place(contact, probe, state, frame, rules):
-    """Returns the `FoundPlace` of one image, None where too few key points agree."""
+    """Returns the `FoundPlace` of one image, None where too few key points agree; see `pressing`."""
+    state, frame, rules = PlaceState(*state), PlaceFrame(*frame), PlaceRules(*rules)
     forecast = forecast_place(
         state.motion, state.spread, state.slow, frame.dt, rules.acceleration, _DEPTH_DRIFT, frame.sudden
     )
@@ -400,8 +396,5 @@ def _report(depth, q, moved, pressed, motions, data, update, expected, stiffness
     )
 
 
-@njit(**_OPTIONS)
-def _find_reduced(jaw, pressed, rubbing, probe, state, frame, rules):
-    """Returns the `FoundPlace` of a reduced jaw; plain tuples are handed over several times as fast as named ones."""
-    contact = CompiledContact(ReducedJaw(*jaw), PressedObject(*pressed), Rubbing(*rubbing))
-    return _find_place(contact, CompiledProbe(*probe), PlaceState(*state), PlaceFrame(*frame), PlaceRules(*rules))
+# Plain tuples are handed over from Python several times as fast as named ones.
+_find_reduced = njit(**_OPTIONS)(_find_place)

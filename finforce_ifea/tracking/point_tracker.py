@@ -1,7 +1,7 @@
 """Force at a given contact from key points, image after image, and whether they have the load somewhere else."""
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -42,16 +42,23 @@ class PointTracker:
     def __init__(
         self, jaw: Jaw, mechanics: Mechanics, settings: EstimatorSettings, response: InfluenceCoefficients
     ) -> None:
-        """Attaches the key points, `response` being that of the unloaded jaw; raises MeshError when one is off it."""
+        """Keeps the jaw, whose key points lie on it; `response` is that of the unloaded one."""
         self._watch = PlaceWatch(response, settings)
         self.jaw, self.mechanics, self.settings = jaw, mechanics, settings
         self.paper = settings.solver == "paper"
-        self.probe = mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
-        self._rest = mechanics.model.positions(self.probe, np.zeros(mechanics.model.size))
         self._energy_weights = parse_energy_weights(settings, len(jaw.candidates))
         self._known: dict[tuple[float, ...], tuple[Any, Any]] = {}
         self._load = lru_cache(maxsize=256)(self._build_load)
         self.reset()
+
+    @cached_property
+    def probe(self) -> Any:
+        """The model's probe of the key points, ten megabytes that few need: most contacts are tracked, not given."""
+        return self.mechanics.model.attach(self.jaw.keypoints, KEYPOINT_DISTANCE)
+
+    @cached_property
+    def _rest(self) -> NDArray:
+        return self.mechanics.model.positions(self.probe, np.zeros(self.mechanics.model.size))
 
     def reset(self) -> None:
         """Starts anew, unloaded, with the middle candidate."""

@@ -1,48 +1,27 @@
 """What the search for a place asks of a jaw's mechanics: by their methods, or compiled where the jaw is a reduced one.
 
-Each function is called with a `RollingContact` from Python and with a `CompiledContact` from compiled code.
+Each function is called with a `RollingContact` and the probe of its model from Python. From compiled code the contact
+is a plain tuple of the plain tuples `ReducedJaw`, `PressedObject` and `Rubbing`, and the probe the points, shapes and
+compliance of a `ReducedProbe`.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 from numba import types
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.friction import Rubbing
-from finforce_ifea.contact_mechanics.indenter import (
-    FaceProfile,
-    PressedObject,
-    find_first_touch,
-    measure_gap,
-    pose_object,
-)
-from finforce_ifea.contact_mechanics.pressed_jaw import BISECTIONS, TOUCH, PressedState, limit_step
+from finforce_ifea.contact_mechanics.indenter import FaceProfile, PressedObject, find_first_touch
+from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, limit_step
 from finforce_ifea.reduced.evaluation import (
     ReducedJaw,
-    follow,
+    approach_reduced,
     linearize_reduced,
     move_points,
-    place_contact,
     place_points,
 )
 
-
-class CompiledContact(NamedTuple):
-    """A reduced jaw with the object that is pressed into it, for compiled code."""
-
-    jaw: ReducedJaw
-    pressed: PressedObject
-    rubbing: Rubbing
-
-
-class CompiledProbe(NamedTuple):
-    """Material points of a reduced jaw for compiled code; see `ReducedProbe`."""
-
-    points: NDArray
-    shapes: NDArray
-    compliance: NDArray
+_INLINE = {"inline": "always"}
 
 
 def linearize_at(contact: Any, q: NDArray, place: NDArray) -> PressedState:
@@ -75,65 +54,52 @@ def motions_at(contact: Any, probe: Any, q: NDArray, modes: NDArray) -> NDArray:
     return contact.model.project(probe, q, modes)
 
 
-@overload(linearize_at)
+@overload(linearize_at, **_INLINE)
 def _linearize_at(contact, q, place):
-    if isinstance(contact, types.NamedTuple):
-        return lambda contact, q, place: linearize_reduced(contact.jaw, contact.pressed, contact.rubbing, q, place)
+    if isinstance(contact, types.BaseTuple):
+        return lambda contact, q, place: linearize_reduced(contact[0], contact[1], contact[2], q, place)
 
 
-@overload(approach_at)
+@overload(approach_at, **_INLINE)
 def _approach_at(contact, q, step, place):
-    if not isinstance(contact, types.NamedTuple):
-        return None
-
-    def approach(contact, q, step, place):
-        jaw, low, high = contact.jaw, 0.0, 1.0
-        pose = pose_object(contact.pressed, jaw.face_x, place)
-        for _ in range(BISECTIONS):
-            share = 0.5 * (low + high)
-            moves = follow(jaw.moves, jaw.compliance, jaw.loads, q + share * step)
-            if measure_gap(contact.pressed, pose, place_contact(jaw.points, jaw.low, jaw.share, moves)) < -TOUCH:
-                high = share
-            else:
-                low = share
-        return high * step
-
-    return approach
+    if isinstance(contact, types.BaseTuple):
+        return lambda contact, q, step, place: approach_reduced(contact[0], contact[1], q, step, place)
 
 
 @overload(touch_at)
 def _touch_at(contact, place):
-    if not isinstance(contact, types.NamedTuple):
+    if not isinstance(contact, types.BaseTuple):
         return None
 
     def touch(contact, place):
-        jaw = contact.jaw
-        return find_first_touch(contact.pressed, FaceProfile(jaw.face_points, jaw.is_flat, jaw.face_x), place)
+        jaw = ReducedJaw(*contact[0])
+        face = FaceProfile(jaw.face_points, jaw.is_flat, jaw.face_x)
+        return find_first_touch(PressedObject(*contact[1]), face, place)
 
     return touch
 
 
 @overload(limit_at)
 def _limit_at(contact, step):
-    if not isinstance(contact, types.NamedTuple):
+    if not isinstance(contact, types.BaseTuple):
         return None
 
     def limit(contact, step):
-        largest = np.abs(step / contact.jaw.reach).max()
+        reach, largest = ReducedJaw(*contact[0]).reach, 0.0
+        for k in range(len(step)):
+            largest = max(largest, abs(step[k]) / reach[k])
         return step if largest <= 1.0 else step / largest
 
     return limit
 
 
-@overload(positions_at)
+@overload(positions_at, **_INLINE)
 def _positions_at(contact, probe, q):
-    if isinstance(contact, types.NamedTuple):
-        return lambda contact, probe, q: place_points(
-            probe.points, probe.shapes, probe.compliance, contact.jaw.loads, q
-        )
+    if isinstance(contact, types.BaseTuple):
+        return lambda contact, probe, q: place_points(probe[0], probe[1], probe[2], contact[0][2], q)
 
 
-@overload(motions_at)
+@overload(motions_at, **_INLINE)
 def _motions_at(contact, probe, q, modes):
-    if isinstance(contact, types.NamedTuple):
-        return lambda contact, probe, q, modes: move_points(probe.compliance, q, modes)
+    if isinstance(contact, types.BaseTuple):
+        return lambda contact, probe, q, modes: move_points(probe[2], q, modes)

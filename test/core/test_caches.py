@@ -1,0 +1,65 @@
+"""Where compiled code is kept."""
+
+import os
+import time
+
+import pytest
+
+from finforce import caches
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("FINFORCE_CACHE", str(tmp_path))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    import numba
+
+    monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)
+    return tmp_path / "compiled"
+
+
+def make_sources(root):
+    for package in ("finforce_contact", "finforce_ifea", "finforce_keypoints"):
+        (root / package / "deep").mkdir(parents=True)
+        (root / package / "deep" / "kernels.py").write_text("one = 1\n")
+    return root
+
+
+def test_another_source_has_another_folder(tmp_path):
+    root = make_sources(tmp_path)
+    name = caches._name_sources(root)
+    assert caches._name_sources(root) == name
+    (root / "finforce_ifea" / "deep" / "kernels.py").write_text("one = 11\n")
+    assert caches._name_sources(root) != name
+
+
+def test_numba_is_told_before_and_after_its_import(cache):
+    import numba
+
+    caches.keep_compiled()
+    (folder,) = cache.iterdir()
+    assert os.environ["NUMBA_CACHE_DIR"] == numba.config.CACHE_DIR == str(folder)
+
+
+def test_a_folder_that_was_named_is_left_alone(cache, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "elsewhere")
+    caches.keep_compiled()
+    assert os.environ["NUMBA_CACHE_DIR"] == "elsewhere"
+    assert not cache.exists()
+
+
+def test_what_nobody_has_used_for_long_is_removed(cache):
+    old, recent = cache / "old", cache / "recent"
+    for folder, days in ((old, 40), (recent, 3)):
+        folder.mkdir(parents=True)
+        os.utime(folder, (time.time() - days * 86400,) * 2)
+    caches.keep_compiled()
+    assert not old.exists()
+    assert recent.exists()
+
+
+def test_a_folder_that_cannot_be_written_stops_nobody(cache, monkeypatch):
+    cache.parent.joinpath("file").write_text("")
+    monkeypatch.setenv("FINFORCE_CACHE", str(cache.parent / "file" / "below"))
+    caches.keep_compiled()
+    assert not cache.exists()

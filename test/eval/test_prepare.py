@@ -1,0 +1,55 @@
+"""What `finforce prepare` leaves for a start to do."""
+
+import subprocess
+import sys
+from textwrap import dedent
+
+import pytest
+
+from finforce_eval.cli.main import main
+from finforce_eval.preparation import build_equilibria, compile_solver, list_tasks
+
+START = dedent("""
+    from numba.core import event
+
+    compiled = []
+
+    class Listener(event.Listener):
+        def on_start(self, event):
+            compiled.append(event.data["dispatcher"].__name__)
+
+        def on_end(self, event):
+            pass
+
+    event.register("numba:compile", Listener())
+    from finforce_eval import preparation
+    from finforce_ifea.estimator import JawEstimator
+    from finforce_ifea.jaw.jaw import load_jaw
+
+    JawEstimator(load_jaw("bench")).warm_up()
+    preparation.compile_contact()
+    preparation.compile_detector()
+    print(compiled)
+""")
+
+
+def test_after_it_a_start_compiles_nothing(capsys):
+    assert main(["prepare"]) == 0
+    said = capsys.readouterr().out
+    assert all(word in said for word in ("solver compiled", "equilibria stored", "contact estimator", "detector"))
+    done = subprocess.run([sys.executable, "-c", START], capture_output=True, text=True, timeout=300, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_jaw_that_is_named_has_its_equilibria_built():
+    tasks = list_tasks(["bench", "mine.yaml"], "bench")
+    assert (build_equilibria, ("bench", "bench")) in tasks
+    assert (build_equilibria, ("mine.yaml", "bench")) in tasks
+    assert (compile_solver, ()) in tasks
+
+
+@pytest.mark.parametrize("words", [["nowhere"], ["bench", "--calibration", "nowhere"]])
+def test_an_unknown_name_is_one_line(words, capsys):
+    assert main(["prepare", *words]) == 2
+    error = capsys.readouterr().err
+    assert "nowhere" in error and error.count("\n") == 1
