@@ -305,7 +305,7 @@ def check_stddev(stddev: NDArray, points: NDArray) -> None:
     if stddev.shape != points.shape:
         raise ObservationError(f"standard deviations of shape {stddev.shape}, expected {points.shape}")
     there = np.isfinite(points).all(axis=1)[:, None]
-    odd = there & ~((stddev > 0.0) & np.isfinite(stddev))
+    odd = there & ~((stddev > 0.0) & (stddev < np.inf))
     if odd.any():
         row, axis = np.argwhere(odd)[0]
         raise ObservationError(

@@ -180,8 +180,9 @@ class JawEstimator:
         points = self._gate.accept(observation)
         self._taring.add(points, observation.stddev, apart=contact is not None and contact.touching is False)
         used, self.spared = np.isfinite(points[:, 0]), False
-        if used.sum() < self.settings.minimum_keypoints:
-            seen = f"{int(used.sum())} of {len(used)} key points can be used"
+        count = np.count_nonzero(used)
+        if count < self.settings.minimum_keypoints:
+            seen = f"{count} of {len(used)} key points can be used"
             return self._fail("not_enough_points", seen, used)
         waiting = self._await_tare()
         if waiting:
@@ -212,6 +213,8 @@ class JawEstimator:
 
     def _await_tare(self) -> str:
         """Returns what is missing for the first tare, empty when it is done or not due."""
+        if self._taring.tared:
+            return ""
         if self._taring.missing:
             self._relax(np.zeros(3))
             return f"{self._taring.missing} more unloaded frames for the tare"

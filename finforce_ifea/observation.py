@@ -146,17 +146,17 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
         ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], a standard deviation that is none,
             stamps not rising.
     """
-    points, likelihood = np.asarray(observation.points), np.asarray(observation.likelihood)
+    points, likelihood = np.asarray(observation.points, float), np.asarray(observation.likelihood, float)
     if points.shape != (count, 3) or likelihood.shape != (count,):
         raise ObservationError(
             f"key points of shape {points.shape} with likelihoods of shape {likelihood.shape}, "
             f"expected ({count}, 3) and ({count},)"
         )
-    if not _are_finite_or_missing(np.asarray(points, float)):
-        raise ObservationError(
-            f"key point {int(np.argwhere(np.isinf(points))[0, 0])} is infinite, expected metres or NaN"
-        )
-    if not _are_shares(np.asarray(likelihood, float)):
+    if not _are_possible(points, likelihood):
+        if np.isinf(points).any():
+            raise ObservationError(
+                f"key point {int(np.argwhere(np.isinf(points))[0, 0])} is infinite, expected metres or NaN"
+            )
         raise ObservationError(f"likelihoods from {likelihood.min():g} to {likelihood.max():g}, expected 0 to 1")
     if observation.stddev is not None:
         check_stddev(np.asarray(observation.stddev), points)
@@ -170,19 +170,15 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
 
 
 @njit(cache=True)
-def _are_finite_or_missing(points):
-    """Whether no coordinate (K, 3) is infinite."""
+def _are_possible(points, likelihood):
+    """Whether no coordinate (K, 3) is infinite and all likelihoods (K,) are from 0 to 1."""
     for k in range(len(points)):
         for a in range(3):
             if np.isinf(points[k, a]):
                 return False
+        if not 0.0 <= likelihood[k] <= 1.0:
+            return False
     return True
-
-
-@njit(cache=True)
-def _are_shares(values):
-    """Whether all values (K,) are from 0 to 1."""
-    return len(values) == 0 or (values.min() >= 0.0 and values.max() <= 1.0)
 
 
 def check_contact(contact: Contact, jaw: Jaw) -> None:

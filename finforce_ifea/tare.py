@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from finforce_ifea.errors import NotEnoughDataError, UnderLoadError
@@ -94,25 +95,31 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
         stddev: stated in this image (K, 3) [m], NaN where there is no key point; None when nothing is stated.
     """
     plane, gain = condition_on_width(usual.covariance)
-    width_variance = usual.covariance[:, 1, 1]
+    parts = list(map(np.ascontiguousarray, (plane, gain, usual.covariance, usual.stddev)))
     if stddev is None:
-        return _pack_noise(plane, gain, width_variance, np.ones(len(plane)), np.zeros(len(plane)))
-    growth = np.fmax(1.0, stddev / usual.stddev)
-    across, along = growth[:, [0, 2]], growth[:, 1]
-    own = np.einsum("kaa->ka", plane)
-    stated = ((usual.stddev[:, [0, 2]] * across) ** 2).sum(axis=1)
-    return _pack_noise(
-        plane,
-        gain * across / along[:, None],
-        width_variance * along**2,
-        own.sum(axis=1) / (own * across**2).sum(axis=1),
-        np.maximum(0.0, stated - np.einsum("kaa->k", usual.covariance[:, ::2, ::2])),
-    )
+        width, count = np.ascontiguousarray(usual.covariance[:, 1, 1]), len(plane)
+        return PointNoise(*parts[:2], width, np.ones(count), np.zeros(count))
+    return PointNoise(parts[0], *_enlarge_noise(*parts, np.ascontiguousarray(stddev, float)))
 
 
-def _pack_noise(*parts: NDArray) -> PointNoise:
-    """Returns the noise of which each part lies in one piece, so that what takes it is compiled once."""
-    return PointNoise(*map(np.ascontiguousarray, parts))
+@njit(cache=True)
+def _enlarge_noise(plane, gain, covariance, usual, stddev):
+    """Returns the rest of a `PointNoise`, where an image states `stddev` (K, 3) [m] and usual ones are (K, 3)."""
+    count = len(plane)
+    gains, along, trust, standing = np.empty((count, 2)), np.empty(count), np.empty(count), np.empty(count)
+    for k in range(count):
+        width = max(1.0, stddev[k, 1] / usual[k, 1])
+        own, now, stated, scatter = 0.0, 0.0, 0.0, 0.0
+        for a in range(2):
+            growth = max(1.0, stddev[k, 2 * a] / usual[k, 2 * a])
+            gains[k, a] = gain[k, a] * growth / width
+            own += plane[k, a, a]
+            now += plane[k, a, a] * growth**2
+            stated += (usual[k, 2 * a] * growth) ** 2
+            scatter += covariance[k, 2 * a, 2 * a]
+        along[k], trust[k] = covariance[k, 1, 1] * width**2, own / now
+        standing[k] = max(0.0, stated - scatter)
+    return gains, along, trust, standing
 
 
 def condition_on_width(noise: NDArray) -> tuple[NDArray, NDArray]:

@@ -230,6 +230,7 @@ class OutlineIndenter:
     def __init__(self, polygons: tuple[NDArray, ...]) -> None:
         """Builds the distance field of the polygons (n, 2) [m]; raises ContactError for one that is too small."""
         self.polygons = polygons
+        self._size = np.ptp(np.concatenate(polygons), axis=0)
         self.field: DistanceField = build_distance_field(polygons)
         field = self.field
         self.pressed = PressedObject(False, field.coefficients, field.low, field.front, field.segments)
@@ -240,8 +241,7 @@ class OutlineIndenter:
 
     def resembles(self, other: "OutlineIndenter") -> bool:
         """Whether another outline has about the size of this one, as two cuts of one object do."""
-        sizes = [np.ptp(np.concatenate(item.polygons), axis=0) for item in (self, other)]
-        return bool((np.abs(np.log(sizes[0] / sizes[1])) < np.log(_OTHER_SIZE)).all())
+        return other is self or bool((np.abs(np.log(self._size / other._size)) < np.log(_OTHER_SIZE)).all())
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, place: NDArray) -> PenaltyContact:
         """See `Indenter`."""

@@ -6,6 +6,7 @@ The mechanics of the jaw's plane know neither. Both are small beside bending, so
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from finforce_ifea.fem.solid import SolidModel
@@ -39,14 +40,20 @@ class Torsion:
 
     def at(self, height: float) -> tuple[NDArray, NDArray, float]:
         """Returns the motions by moment and by force (K, 3) each and the roll at a height [m]."""
-        place = float(np.interp(height, self.heights, np.arange(len(self.heights))))
-        low = min(int(place), len(self.heights) - 2)
-        share = place - low
-        moment, force, roll = (
-            (1.0 - share) * values[low] + share * values[low + 1]
-            for values in (self.by_moment, self.by_force, self.roll)
-        )
-        return moment, force, float(roll)
+        return _interpolate(self.heights, (self.by_moment, self.by_force), self.roll, height)
+
+
+@njit(cache=True, error_model="numpy")
+def _interpolate(heights, motions, roll, height):
+    """Returns both motions (m, K, 3) and the roll (m,) between rising heights (m,) [m], those at the ends beyond."""
+    low = 0
+    while low < len(heights) - 2 and height >= heights[low + 1]:
+        low += 1
+    share = min(max((height - heights[low]) / (heights[low + 1] - heights[low]), 0.0), 1.0)
+    moment, force = motions
+    moment = (1.0 - share) * moment[low] + share * moment[low + 1]
+    force = (1.0 - share) * force[low] + share * force[low + 1]
+    return moment, force, (1.0 - share) * roll[low] + share * roll[low + 1]
 
 
 def _find_narrowest(jaw: Jaw, heights: NDArray, half: float) -> float:

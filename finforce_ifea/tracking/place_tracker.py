@@ -250,28 +250,6 @@ class PlaceTracker:
             self._stiffness or 0.0,
         )
 
-    def _rules(self) -> PlaceRules:
-        """Returns what is expected of the object and allowed to the search."""
-        settings, indenter = self.settings, self.contact.indenter
-        shapes = indenter.shape_range
-        return PlaceRules(
-            self._prior,
-            self._prior_variance,
-            shapes.low,
-            shapes.high,
-            shapes.largest_change,
-            shapes.settled_change,
-            indenter.has_corners,
-            _FARTHEST_HEIGHT * settings.height_stddev,
-            settings.acceleration,
-            float(settings.memory),
-            settings.model_error,
-            settings.gate,
-            settings.iterations,
-            settings.minimum_keypoints,
-            self._stiffness or 0.0,
-        )
-
     def _move_across(self) -> NDArray:
         """Returns what acts across the finger moves the key points by (K, 3) [m]."""
         return self._width.motions + self._width.sideways * self._held.across
