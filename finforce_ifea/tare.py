@@ -94,32 +94,35 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
         usual: of each key point in the tare.
         stddev: stated in this image (K, 3) [m], NaN where there is no key point; None when nothing is stated.
     """
+    if stddev is not None:
+        return PointNoise(*_enlarge_noise(usual.covariance, usual.stddev, np.ascontiguousarray(stddev, float)))
     plane, gain = condition_on_width(usual.covariance)
-    parts = list(map(np.ascontiguousarray, (plane, gain, usual.covariance, usual.stddev)))
-    if stddev is None:
-        width, count = np.ascontiguousarray(usual.covariance[:, 1, 1]), len(plane)
-        return PointNoise(*parts[:2], width, np.ones(count), np.zeros(count))
-    return PointNoise(parts[0], *_enlarge_noise(*parts, np.ascontiguousarray(stddev, float)))
+    width, count = np.ascontiguousarray(usual.covariance[:, 1, 1]), len(plane)
+    return PointNoise(np.ascontiguousarray(plane), gain, width, np.ones(count), np.zeros(count))
 
 
 @njit(cache=True)
-def _enlarge_noise(plane, gain, covariance, usual, stddev):
-    """Returns the rest of a `PointNoise`, where an image states `stddev` (K, 3) [m] and usual ones are (K, 3)."""
-    count = len(plane)
-    gains, along, trust, standing = np.empty((count, 2)), np.empty(count), np.empty(count), np.empty(count)
+def _enlarge_noise(covariance, usual, stddev):
+    """Returns what `PointNoise` holds, where an image states `stddev` (K, 3) [m] and usual ones are (K, 3)."""
+    count = len(covariance)
+    plane, gain = np.empty((count, 2, 2)), np.empty((count, 2))
+    along, trust, standing = np.empty(count), np.empty(count), np.empty(count)
+    growth = np.empty(3)
     for k in range(count):
-        width = max(1.0, stddev[k, 1] / usual[k, 1])
-        own, now, stated, scatter = 0.0, 0.0, 0.0, 0.0
+        noise, own, now, stated = covariance[k], 0.0, 0.0, 0.0
+        for a in range(3):
+            growth[a] = max(1.0, stddev[k, a] / usual[k, a])
         for a in range(2):
-            growth = max(1.0, stddev[k, 2 * a] / usual[k, 2 * a])
-            gains[k, a] = gain[k, a] * growth / width
+            i, known = 2 * a, noise[2 * a, 1] / noise[1, 1]  # once y is known, see `condition_on_width`
+            for b in range(2):
+                plane[k, a, b] = noise[i, 2 * b] - known * noise[2 * b, 1]
+            gain[k, a] = known * growth[i] / growth[1]
             own += plane[k, a, a]
-            now += plane[k, a, a] * growth**2
-            stated += (usual[k, 2 * a] * growth) ** 2
-            scatter += covariance[k, 2 * a, 2 * a]
-        along[k], trust[k] = covariance[k, 1, 1] * width**2, own / now
-        standing[k] = max(0.0, stated - scatter)
-    return gains, along, trust, standing
+            now += plane[k, a, a] * growth[i] ** 2
+            stated += (usual[k, i] * growth[i]) ** 2
+        along[k], trust[k] = noise[1, 1] * growth[1] ** 2, own / now
+        standing[k] = max(0.0, stated - noise[0, 0] - noise[2, 2])
+    return plane, gain, along, trust, standing
 
 
 def condition_on_width(noise: NDArray) -> tuple[NDArray, NDArray]:

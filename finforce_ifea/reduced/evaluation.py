@@ -591,7 +591,6 @@ def linearize_reduced(jaw, pressed, rubbing, q, place):
         steps[:, 0] /= size
     nearest = _step_grid(jaw, q, moves, steps, size, contact)
     correction, modes = np.zeros(count + 2), np.zeros((count + 2, 4))
-    correction[:count], modes[:count] = steps[:, 0], steps[:, 1:]
     turned = max(abs(nearest[0]), abs(nearest[1])) / LARGEST_GRID_STEP
     if size <= _CALM:
         correction[count:] = nearest[:2]
@@ -600,8 +599,11 @@ def linearize_reduced(jaw, pressed, rubbing, q, place):
     _hold_base(jaw, q, contact, steps, force, force_modes)
     for k in range(count):
         axis = 2 * (k % 2)
-        force[axis] += q[k] + correction[k]
-        force_modes[axis] += modes[k]
+        correction[k] = steps[k, 0]
+        force[axis] += q[k] + steps[k, 0]
+        for c in range(4):
+            modes[k, c] = steps[k, c + 1]
+            force_modes[axis, c] += steps[k, c + 1]
     if touches and size > _LARGE_STEP and correction[count] == 0.0 and correction[count + 1] == 0.0:
         share = _find_share(jaw, pressed, pose, rubbing, points, moves, q, correction)
         correction *= share

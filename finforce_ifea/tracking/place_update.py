@@ -248,11 +248,12 @@ def _weigh_depth(data, mean, count):
 
     The averaged residuals are taken off as each point's bias; what they have in common along the depth is no bias.
     """
-    n00, n11, n01 = data.noise[:, 0, 0], data.noise[:, 1, 1], data.noise[:, 0, 1]
-    det = n00 * n11 - n01**2
-    p00, p11, p01 = n11 / det, n00 / det, -n01 / det
+    p00, p11, p01 = np.empty(len(count)), np.empty(len(count)), np.empty(len(count))
     along, norm = 0.0, 1e-300
     for k in range(len(count)):
+        n00, n11, n01 = data.noise[k, 0, 0], data.noise[k, 1, 1], data.noise[k, 0, 1]
+        det = n00 * n11 - n01 * n01
+        p00[k], p11[k], p01[k] = n11 / det, n00 / det, -n01 / det
         h0, h1 = data.modes[k, 0, 0], data.modes[k, 1, 0]
         along += count[k] * ((p00[k] * h0 + p01[k] * h1) * mean[k, 0] + (p01[k] * h0 + p11[k] * h1) * mean[k, 1])
         norm += count[k] * (p00[k] * h0 * h0 + 2.0 * p01[k] * h0 * h1 + p11[k] * h1 * h1)
@@ -491,11 +492,14 @@ class Residuals(NamedTuple):
 
 
 @njit(**_OPTIONS)
-def _square_distance(r0, r1, h0, h1, noise, bias, depth_variance):
-    """Returns the squared Mahalanobis distance of an in-plane residual, the depth being uncertain along (h0, h1)."""
-    s00 = noise[0, 0] + bias + h0 * h0 * depth_variance
-    s11 = noise[1, 1] + bias + h1 * h1 * depth_variance
-    s01 = noise[0, 1] + h0 * h1 * depth_variance
+def _square_distance(r0, r1, h0, h1, noise, level, bias, depth_variance):
+    """Returns the squared Mahalanobis distance of an in-plane residual, the depth being uncertain along (h0, h1).
+
+    The point's noise (2, 2) [m^2] counts `level` times.
+    """
+    s00 = noise[0, 0] * level + bias + h0 * h0 * depth_variance
+    s11 = noise[1, 1] * level + bias + h1 * h1 * depth_variance
+    s01 = noise[0, 1] * level + h0 * h1 * depth_variance
     return (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / (s00 * s11 - s01 * s01)
 
 
@@ -528,8 +532,12 @@ def weigh_residuals(
     count, used, known = len(measured), 0, 0
     r, modes, off = np.zeros((count, 2)), motions[:, ::2].copy(), np.zeros(count)
     weights, asked, say = np.zeros(count), np.zeros(count), np.zeros(count)
-    way = ((positions - rest) ** 2).sum(axis=1)
-    bias = _MODEL_FLOOR**2 + model_error**2 * way + offset_variance
+    bias = offset_variance.copy()
+    for k in range(count):
+        way = 0.0
+        for a in range(3):
+            way += (positions[k, a] - rest[k, a]) ** 2
+        bias[k] += _MODEL_FLOOR**2 + model_error**2 * way
     least = (noise[:, 0, 0] + noise[:, 1, 1]).min()
     for k in range(count):
         if not np.isfinite(measured[k, 0] + measured[k, 1] + measured[k, 2]):
@@ -549,10 +557,10 @@ def weigh_residuals(
         if np.isnan(off[k]):
             continue
         square = off[k] * off[k] / (level * width_variance[k] + bias[k])
-        spread = noise[k] * (level / trust[k])
         h0, h1 = modes[k, 0, 0], modes[k, 1, 0]
-        square += _square_distance(r[k, 0], r[k, 1], h0, h1, spread, bias[k], depth_variance)
-        r[k] += (modes[k] * moved).sum(axis=1)
+        square += _square_distance(r[k, 0], r[k, 1], h0, h1, noise[k], level / trust[k], bias[k], depth_variance)
+        for a in range(2):
+            r[k, a] += modes[k, a, 0] * moved[0] + modes[k, a, 1] * moved[1] + modes[k, a, 2] * moved[2]
         weight = 1.0 / (1.0 + square / gate**2) ** 2
         if weight >= _LEAST_WEIGHT:
             weights[k] = weight * trust[k]
@@ -576,8 +584,7 @@ def _find_noise_level(r, off, modes, jump, chance, bias):
         if np.isnan(off[k]):
             continue
         r0, r1 = r[k, 0] - modes[k, 0, 0] * jump, r[k, 1] - modes[k, 1, 0] * jump
-        spread = chance.noise[k] / chance.trust[k]
-        squares[known] = _square_distance(r0, r1, 0.0, 0.0, spread, bias[k], 0.0)
+        squares[known] = _square_distance(r0, r1, 0.0, 0.0, chance.noise[k], 1.0 / chance.trust[k], bias[k], 0.0)
         squares[known] += off[k] * off[k] / (chance.width_variance[k] + bias[k])
         known += 1
     if known < _FEWEST:
