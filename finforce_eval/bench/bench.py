@@ -72,6 +72,12 @@ PARTS = (
     ),
     BenchPart(name="chain", module="finforce_eval.bench.chain", title="Latency against force error of the whole chain"),
     BenchPart(
+        name="onset",
+        module="finforce_eval.bench.onset",
+        title="From a force's onset to its showing",
+        usual=False,
+    ),
+    BenchPart(
         name="skipping",
         module="finforce_eval.bench.skipping",
         title="Share of a core that each node takes on three scenes, with what need not be done and without",

@@ -182,7 +182,7 @@ def fingerprint(scene: BenchScene) -> str:
     import finforce_twin
 
     content = hashlib.sha256(json.dumps({**asdict(scene), "size": SIZE}, sort_keys=True).encode())
-    for source in sorted(Path(finforce_twin.__path__[0]).glob("*.py")):
+    for source in sorted(Path(finforce_twin.__path__[0]).rglob("*.py")):
         content.update(source.read_bytes())
     return content.hexdigest()[:12]
 

@@ -21,7 +21,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
     text = "shipped jaw or jaw file whose solvers are measured, pressed by its own solid model (bench)"
     parser.add_argument("--jaw", default="bench", metavar="NAME", help=text)
-    text = "solvers, peer, growth, localization, detection, chain, skipping; without it those of `make bench`"
+    text = "solvers, peer, growth, localization, detection, chain, onset, skipping; without it those of `make bench`"
     parser.add_argument("--parts", metavar="A,B", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
     text = "draw the first part, and every other beside it with its name added"

@@ -149,14 +149,13 @@ def add_product(table, m, vector, first, last, step, out):
     The vector is zero outside first to last; every `step`-th pair of rows is added to.
     """
     t, z, w00, w01, w10, w11 = _find_cell(table, m)
-    for i in range(len(out)):
-        if (i // 2) % step != 0:
-            continue
-        c00, c01, c10, c11 = table[t, z, i], table[t, z + 1, i], table[t + 1, z, i], table[t + 1, z + 1, i]
-        total = 0.0
-        for k in range(first, last):
-            total += (w00 * c00[k] + w01 * c01[k] + w10 * c10[k] + w11 * c11[k]) * vector[k]
-        out[i] += total
+    for pair in range(0, len(out), 2 * step):
+        for i in range(pair, min(pair + 2, len(out))):
+            c00, c01, c10, c11 = table[t, z, i], table[t, z + 1, i], table[t + 1, z, i], table[t + 1, z + 1, i]
+            total = 0.0
+            for k in range(first, last):
+                total += (w00 * c00[k] + w01 * c01[k] + w10 * c10[k] + w11 * c11[k]) * vector[k]
+            out[i] += total
 
 
 _EXACT = {"cache": True, "error_model": "numpy"}

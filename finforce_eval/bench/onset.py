@@ -1,0 +1,107 @@
+"""How long after its true onset a force shows, at 30 and 90 Hz, through all stages in one process.
+
+Short grasps that begin at other times between two images are played from images in real time. A force sets in where
+the true grasp force crosses 0.02 N, and shows when a grasp force above 0.1 N has arrived.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from finforce_eval.bench.chain import SIDES, TARE, chain_processes, true_grasp
+from finforce_eval.bench.scenes import EVERY_RATE, BenchScene, find_scene
+from finforce_eval.evaluation.results import Delay, DelayStats, delay_stats, force_delays
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.replay.node_run import describe_load, run_nodes
+from finforce_eval.replay.synthetic_stream import stream_images
+
+if TYPE_CHECKING:
+    from finforce_eval.bench.chain import TrueGrasp
+    from finforce_eval.replay.live import ReplayLog
+
+GRASPS = 7
+CLEARANCE, LATER = 5e-3, 0.13e-3  # [m] of the first grasp, and what each begins later by: 6.5 ms at 20 mm/s
+SHORT = {"settle": 0.2, "record": 0.2, "displacement": 0.002}
+PHASES = tuple(slot for slot in EVERY_RATE if slot % 2 == 0)  # of the images of 30 Hz among those of 90 Hz
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnsetRow:
+    """The grasps at one rate.
+
+    Attributes:
+        rate: of the images [Hz].
+        delays: of the force after its true onsets.
+        others: CPU use of everything else but nodes and player [% of a core]; it should be small.
+    """
+
+    rate: int
+    delays: DelayStats
+    others: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnsetFigures:
+    """What was measured."""
+
+    rows: Sequence[OnsetRow]
+
+
+def measure(quick: bool) -> OnsetFigures:
+    """Return how long forces take to show: of 21 grasps at each rate, of three when `quick`.
+
+    Raises:
+        MissingDependencyError: ROS 2 is not installed.
+        FinforceError: a scene cannot be rendered, or a node ended early.
+    """
+    rows = []
+    for rate, phases in ((30, PHASES), (90, (0,) * len(PHASES))):
+        delays: list[Delay] = []
+        others = 0.0
+        for grasp in range(1 if quick else GRASPS):
+            clearance = CLEARANCE + grasp * LATER
+            path = find_scene(
+                BenchScene(
+                    scenario="grasp_cylinder", seed=101, changes={**SHORT, "clearance": clearance}, slots=EVERY_RATE
+                )
+            )
+            recording, truth = read_recording(path), true_grasp(read_recording(path))
+            for phase in phases:
+                stream = stream_images(path, rate, phase=phase)
+                run = run_nodes(chain_processes(recording, images=True), stream, SIDES, heard=())
+                delays += find_delays(run.log, truth)
+                others = max(others, run.others)
+        rows.append(OnsetRow(rate=rate, delays=delay_stats(delays), others=others))
+    return OnsetFigures(rows=rows)
+
+
+def find_delays(log: ReplayLog, truth: TrueGrasp) -> list[Delay]:
+    """Return the delay after each onset in a run."""
+    sent = np.array(sorted(log.jaws[SIDES[0]].sent))
+    stamps = sent[sent >= sent[0] + int(0.5e9 * TARE)]
+    estimate = np.array([log.grasp.get(int(stamp), np.nan) for stamp in stamps])
+    lag = np.array([log.grasp_latency.get(int(stamp), np.nan) for stamp in stamps])
+    return force_delays(1e-9 * (stamps - stamps[0]), truth.at(stamps), estimate, lag)
+
+
+def format_table(figures: OnsetFigures) -> str:
+    """Return the rows as a table in Markdown."""
+    lines = [
+        "| Hz | onsets | missed | shows after: median/ms | max | the true force itself/ms |",
+        "|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row.rate} | {row.delays.n} | {row.delays.missed} | {row.delays.median_ms or np.nan:.0f} "
+        f"| {row.delays.max_ms or np.nan:.0f} | {row.delays.rise_ms or np.nan:.0f} |"
+        for row in figures.rows
+    ]
+    return "\n".join([*lines, describe_load(row.others for row in figures.rows)])
+
+
+def as_json(figures: OnsetFigures) -> dict[str, Any]:
+    """Return the figures as plain values; times in ms."""
+    return asdict(figures)
