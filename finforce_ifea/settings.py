@@ -1,7 +1,6 @@
 """What can be set on an estimator: defaults, units, bounds and meanings."""
 
 from dataclasses import dataclass, replace
-from typing import Self
 
 from finforce.errors import ObservationError
 from finforce.settings import check_bounds, setting
@@ -69,6 +68,6 @@ class EstimatorSettings:
         """
         check_bounds(self, ObservationError)
 
-    def resolve_held(self, *, both: bool) -> Self:
+    def resolve_held(self, *, both: bool) -> "EstimatorSettings":
         """Return settings in which `held` is no longer `auto`; `both` where another jaw presses the same object."""
         return self if self.held != "auto" else replace(self, held="yes" if both else "no")

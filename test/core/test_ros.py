@@ -1,5 +1,6 @@
 """Claims about what every node shares: messages, parameters from records, start and stop."""
 
+import gc
 import math
 import os
 import re
@@ -181,6 +182,21 @@ def test_a_node_that_cannot_be_built_ends_with_two_and_one_line(capsys):
     assert ros.run_node("some_node", build, []) == 2
     assert capsys.readouterr().err == "some_node: the jaw file says nothing\n"
     assert not rclpy.ok()
+
+
+def test_what_a_node_was_built_of_is_not_looked_through_for_garbage_again():
+    class Quiet:
+        def destroy_node(self):
+            pass
+
+    frozen, before = [], gc.get_freeze_count()
+    kept = [[] for _ in range(1000)]
+    node = Quiet()
+    node.known = kept
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ros.KeepingExecutor, "obey", lambda self, nodes: None)
+        assert ros.run_node("some_node", lambda: node, [], lambda *_: frozen.append(gc.get_freeze_count())) == 0
+    assert frozen[0] >= before + len(kept)
 
 
 def test_a_defect_is_not_swallowed():

@@ -45,6 +45,18 @@ def test_coloured_squares_are_found_by_every_kind_of_export(tmp_path, name):
     assert peaks.likelihood[1, [0, 2, 3]].max() < 0.05
 
 
+def test_many_pictures_are_looked_at_few_at_a_time_and_come_out_as_each_alone(tmp_path, monkeypatch):
+    model = KeypointModel(write_model(tmp_path), threads=1)
+    pictures = np.stack([paint({"green": (100 + 40 * number, 68)}) for number in range(5)])
+    alone = np.concatenate([model.locate(picture[None]).pixels for picture in pictures])[:, 1]
+    sizes, run = [], network_module.Network._run_once
+    monkeypatch.setattr(
+        network_module.Network, "_run_once", lambda self, tensor: (sizes.append(len(tensor)), run(self, tensor))[1]
+    )
+    assert np.abs(model.locate(pictures).pixels[:, 1] - alone).max() < 1e-3
+    assert sum(sizes) == 5 and max(sizes) == 2  # what the largest batch took is never given back
+
+
 def test_maps_have_the_shapes_of_a_resnet(tmp_path):
     model = KeypointModel(write_model(tmp_path), threads=1)
     heatmap, locref = model.run(paint(SQUARES)[None])
