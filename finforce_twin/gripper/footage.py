@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics
-from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, ROBOT_CAMERA
+from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, HALF_TURN, ROBOT_CAMERA
 from finforce.stamps import NANOSECONDS
 from finforce.transforms import invert_pose
 from finforce_twin.errors import ScenarioError
@@ -25,10 +25,15 @@ from finforce_twin.scenes.scenarios import Scenario
 
 FINGER = 0  # seed of the material for which the package has a calibration, `twin`
 START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
-TRACKED_EVERY = 3  # images: the object is tracked at 10 Hz
+TRACKED_EVERY = 0.1  # [s] the object is tracked, in the next image
 POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
 ANGLE_STDDEV = np.radians(0.3)  # about each axis
-CAMERAS = {"robot": ROBOT_CAMERA, "front": FRONT_CAMERA, "bench": BENCH_CAMERA}
+CAMERAS = {
+    "robot": ROBOT_CAMERA,
+    "turned": ROBOT_CAMERA @ HALF_TURN,
+    "front": FRONT_CAMERA,
+    "bench": BENCH_CAMERA,
+}
 LEAST_SIZE, LARGEST_SIZE = 16, 4096  # [px]
 
 
@@ -118,8 +123,10 @@ class Footage:
     def __iter__(self) -> Iterator[TwinFrame]:
         rng = np.random.default_rng((self._seed, 3))
         T_camera_gripper = invert_pose(self.T_gripper_camera)
-        for index, state in enumerate(self._gripper.states()):
-            tracked = state.T_gripper_object is not None and index % TRACKED_EVERY == 0
+        due = 0
+        for state in self._gripper.states():
+            tracked = state.T_gripper_object is not None and state.stamp >= TRACKED_EVERY * due - 1e-6
+            due += tracked
             shot = self._photographer.shoot(state)
             yield TwinFrame(
                 stamp=START + round(state.stamp * NANOSECONDS),
@@ -167,6 +174,7 @@ def set_stage(assembly: Assembly, camera: CameraIntrinsics, depth_step: float) -
         camera=camera,
         T_gripper_camera=CAMERAS[assembly.scenario.camera],
         light=assembly.scenario.light,
+        readout=assembly.scenario.readout,
         depth_step=depth_step,
     )
 

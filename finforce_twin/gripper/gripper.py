@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_twin.mechanics.assembly import Assembly, RelaxedWrench, find_elastic_weight
 from finforce_twin.mechanics.pressed_jaw import TWIN_DENSITY, JawShape
-from finforce_twin.scenes.scenarios import RATE, Posture, Scenario, write_script
+from finforce_twin.scenes.scenarios import Posture, Scenario, write_script
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,6 +52,29 @@ class TwinState:
     gravity: NDArray
 
 
+def blend_states(state: TwinState, before: TwinState, share: float) -> TwinState:
+    """Returns the state on a straight way from one (share 0) back to another a moment before (share 1)."""
+
+    def mix(now: NDArray, then: NDArray) -> NDArray:
+        return now + share * (then - now)
+
+    pose = state.T_gripper_object
+    return replace(
+        state,
+        stamp=mix(state.stamp, before.stamp),
+        jaws={
+            side: replace(
+                jaw,
+                origin_x=mix(jaw.origin_x, before.jaws[side].origin_x),
+                vertices=mix(jaw.vertices, before.jaws[side].vertices),
+                keypoints=mix(jaw.keypoints, before.jaws[side].keypoints),
+            )
+            for side, jaw in state.jaws.items()
+        },
+        T_gripper_object=None if pose is None else mix(pose, before.T_gripper_object),
+    )
+
+
 class TwinGripper(Assembly):
     """A gripper that plays a scenario, with a material drawn from a seed."""
 
@@ -65,7 +88,7 @@ class TwinGripper(Assembly):
         return len(self._script.stamps)
 
     def states(self) -> Iterator[TwinState]:
-        """Yields the states at `RATE`, always from the beginning.
+        """Yields the states at the scenario's rate, always from the beginning.
 
         Raises:
             GraspError: A jaw buckles, or the object slips or falls.
@@ -78,7 +101,7 @@ class TwinGripper(Assembly):
         wrenches = {side: RelaxedWrench(self.material.terms) for side in self._jaws}
         posture, weight, shapes, slid = None, None, self.rest_shapes(), 0.0
         for index, stamp in enumerate(script.stamps):
-            slid += held.creep / RATE if held is not None else 0.0
+            slid += held.creep / self.scenario.rate if held is not None else 0.0
             planned = script.postures[index]
             planned = replace(planned, slide=planned.slide + slid)
             is_same = planned == posture and np.array_equal(weights[index], weight)
@@ -95,7 +118,7 @@ class TwinGripper(Assembly):
             )
 
     def _jaw_state(self, side: str, posture: Posture, shape: JawShape, wrench: RelaxedWrench) -> JawState:
-        force, torque = wrench.update(shape.force, shape.torque, 1.0 / RATE)
+        force, torque = wrench.update(shape.force, shape.torque, 1.0 / self.scenario.rate)
         return JawState(
             origin_x=self.origin_x(side, posture),
             vertices=shape.vertices,

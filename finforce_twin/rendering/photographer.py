@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +12,15 @@ from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import jaw_in_camera
 from finforce.transforms import invert_pose
 from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_twin.gripper.gripper import TwinState, blend_states
 from finforce_twin.rendering.bodies import DrawnJaw, Wardrobe, draw_occluders, dress_jaw, dress_object, dress_palm
 from finforce_twin.rendering.lighting import Lighting, draw_look
 from finforce_twin.rendering.render import Picture, RenderedScene, Window
 from finforce_twin.rendering.sensor import D405_NOISE, expose, measure_depth
 
-if TYPE_CHECKING:
-    from finforce_twin.gripper.gripper import TwinState
-
 SHUTTER = 0.008  # [s] that the sensor collects light
 WINDOW_MARGIN = 90  # [px] around the jaws
+BANDS = 16  # of rows that a rolling shutter exposes together
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,6 +75,7 @@ class SceneSetting:
         light: "bright", "dim" or "any".
         clutter: whether bars may stand before the jaws.
         depth_step: of the depth image [m]; the ROS driver of a D405 gives 1 mm, the camera itself 0.1 mm.
+        readout: from the exposure of the first row to that of the last one, at a state's stamp [s].
     """
 
     shapes: Mapping[str, DrawnJaw]
@@ -86,6 +85,7 @@ class SceneSetting:
     light: str = "bright"
     clutter: bool = False
     depth_step: float = 1e-3
+    readout: float = 0.0
 
 
 class Photographer:
@@ -106,6 +106,7 @@ class Photographer:
         self._clutter = draw_occluders(self._T_camera_gripper, self._wardrobe, rng) if setting.clutter else []
         self._seed, self._window_only = seed, window_only
         self._last: tuple[float, Mapping[str, TrueKeypoints]] | None = None
+        self._before: TwinState | None = None
 
     def shoot(self, state: TwinState) -> Shot:
         """Return the image of a state; the same seed and stamp give the same noise."""
@@ -113,11 +114,52 @@ class Photographer:
         return self.develop(view, state.stamp, self._smear(state.stamp, view.truth))
 
     def look(self, state: TwinState) -> WristView:
-        """Return what a perfect sensor would see of a state."""
+        """Return what a perfect sensor would see of a state; its upper rows are of a moment before."""
+        before, self._before = self._before, state
         stage = self._build_stage(state)
         truth = {side: self._look_for(side, state, stage) for side in state.jaws}
+        if before is not None and self.setting.readout and before.stamp < state.stamp:
+            picture = self._roll(state, before)
+            truth = {side: self._roll_truth(side, true, state, before) for side, true in truth.items()}
+            return WristView(picture=picture, truth=truth)
         window = self._window(truth) if self._window_only else None
         return WristView(picture=stage.render(self.setting.camera, window), truth=truth)
+
+    def _shares(self, rows: NDArray, state: TwinState, before: TwinState) -> NDArray:
+        """Return how far back, of the way to the state before, rows (n,) [px] are exposed."""
+        left = 1.0 - rows / (self.setting.camera.height - 1)
+        return left.clip(0.0, 1.0) * self.setting.readout / (state.stamp - before.stamp)
+
+    def _roll(self, state: TwinState, before: TwinState) -> Picture:
+        """Return the image of a rolling shutter, band by band."""
+        edges = np.linspace(0, self.setting.camera.height, BANDS + 1).round().astype(int)
+        bands = []
+        for share, low, high in zip(
+            self._shares(0.5 * (edges[:-1] + edges[1:] - 1), state, before), edges[:-1], edges[1:], strict=True
+        ):
+            window = Window(rows=slice(low, high), columns=slice(0, self.setting.camera.width))
+            stage = self._build_stage(blend_states(state, before, share))
+            bands.append((window.rows, stage.render(self.setting.camera, window)))
+        layers = {
+            name: np.concatenate([getattr(picture, name)[rows] for rows, picture in bands])
+            for name in ("color", "depth", "owner")
+        }
+        return Picture(**layers)
+
+    def _roll_truth(self, side: str, true: TrueKeypoints, state: TwinState, before: TwinState) -> TrueKeypoints:
+        """Return the truth with the pixels at which points are when their own row is exposed."""
+        now, then = self._points(side, state), self._points(side, before)
+        pixels = true.pixels
+        for _ in range(3):  # in another row it is another time, by which the point has moved by a part of that
+            shares = self._shares(np.nan_to_num(pixels[:, 1]), state, before)
+            pixels = project(now + shares[:, None] * (then - now), self.setting.camera)
+        return replace(true, pixels=pixels)
+
+    def _points(self, side: str, state: TwinState) -> NDArray:
+        """Return a jaw's key points and then its reference point (K + 1, 3) [m], camera frame."""
+        jaw = state.jaws[side]
+        T = jaw_in_camera(self.setting.T_gripper_camera, side, jaw.origin_x)
+        return np.vstack((jaw.keypoints, jaw.reference)) @ T[:3, :3].T + T[:3, 3]
 
     def develop(self, view: WristView, stamp: float, smear: NDArray | None = None) -> Shot:
         """Return a view as the sensor gives it.
@@ -146,8 +188,7 @@ class Photographer:
         """Return where the key points of a jaw are and which of them can be seen."""
         jaw, camera = state.jaws[side], self.setting.camera
         T = jaw_in_camera(self.setting.T_gripper_camera, side, jaw.origin_x)
-        points = np.vstack((jaw.keypoints, jaw.reference))
-        seen = points @ T[:3, :3].T + T[:3, 3]
+        points, seen = np.vstack((jaw.keypoints, jaw.reference)), self._points(side, state)
         pixels = project(seen, camera)
         size = np.array([camera.width, camera.height])
         inside = ((pixels >= 0.0) & (pixels <= size - 1.0)).all(axis=1)

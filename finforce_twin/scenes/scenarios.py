@@ -12,7 +12,8 @@ from finforce.settings import check_bounds, setting
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_twin.errors import ScenarioError
 
-CAMERAS = ("robot", "front", "bench")
+CAMERAS = ("robot", "turned", "front", "bench")
+RATE = 30.0  # [Hz] of the images, unless a scene says otherwise
 LIGHTS = ("bright", "dim", "any")
 HELD = 1e-6  # [kg] of mass from which on an object is lifted
 
@@ -38,10 +39,13 @@ class Scenario:
     shift: float = setting(0.0, "y of the object's middle", "m", -0.05, 0.05)
     camera: str = setting(
         "robot",
-        "two jaws before the wrist camera or one beyond the tips, or one jaw before that of the bench",
+        "two jaws before the wrist camera, that one upside down, or one beyond the tips, or one jaw before that of the "
+        "bench",
         choices=CAMERAS,
     )
     light: str = setting("bright", "how the scene is lit", choices=LIGHTS)
+    rate: float = setting(RATE, "of the images", "Hz", 1.0, 240.0)
+    readout: float = setting(0.0, "from an image's first row to its last one, which the stamp is of", "s", 0.0, 0.1)
     clearance: float = setting(0.008, "from each jaw to first touch while open", "m", 5e-4, 0.06)
     closing_speed: float = setting(0.020, "of each jaw", "m/s", 5e-4, 0.3)
     displacement: float = setting(0.006, "of each jaw beyond first touch, at most", "m", 0.0, 0.02)
@@ -66,8 +70,8 @@ class Scenario:
         """Refuses numbers beyond their bounds, and what cannot be together.
 
         Raises:
-            ScenarioError: a value is out of its bounds, or a weight is lifted while a hand holds it, on the bench, or
-                without an object.
+            ScenarioError: a value is out of its bounds, an image takes longer than there is to the next, or a weight is
+                lifted while a hand holds it, on the bench, or without an object.
         """
         check_bounds(self, ScenarioError)
         lifted = self.mass > HELD
@@ -75,6 +79,11 @@ class Scenario:
             raise ScenarioError(
                 f"{self.name}: got a mass of {self.mass:g} kg to lift together with a slide, a rock, the bench or no "
                 "object; set mass to 0, or slide and rock to 0 with the robot's camera and an object"
+            )
+        if self.readout * self.rate > 1.0:
+            raise ScenarioError(
+                f"{self.name}: got a readout of {self.readout:g} s at {self.rate:g} Hz; expected no more than the "
+                f"{1.0 / self.rate:g} s between two images"
             )
         if self.turn_angle and not lifted:
             raise ScenarioError(f"{self.name}: the wrist turns with nothing held, expected a mass above 0")
@@ -145,7 +154,6 @@ def _fit_jaw(scenario: Scenario, overrides: dict[str, Any]) -> dict[str, float]:
     return {key: value for key, value in fitted.items() if key not in overrides}
 
 
-RATE = 30.0  # [Hz] of the images
 GRAVITY = 9.81  # [m/s^2]
 _DOWN = np.array([0.0, 0.0, 1.0])  # of a gripper that looks down
 _LIFT_TIME = 0.6
@@ -200,11 +208,11 @@ class Script:
 
 
 def write_script(scenario: Scenario) -> Script:
-    """Returns the course of a scenario, sampled at `RATE`."""
+    """Returns the course of a scenario, sampled at its `rate`."""
     start = Posture(closing=-scenario.clearance)
     steps = list(_plan_steps(scenario, start))
     ends = np.concatenate([[0.0], np.cumsum([step.duration for step in steps])])
-    stamps = np.arange(int(round(ends[-1] * RATE)) + 1) / RATE
+    stamps = np.arange(int(round(ends[-1] * scenario.rate)) + 1) / scenario.rate
     corners = np.array([list(vars(posture).values()) for posture in (start, *(step.end for step in steps))])
     courses = [np.interp(stamps, ends, column) for column in corners.T]
     # an image between two steps belongs to the later one, whatever the rounding

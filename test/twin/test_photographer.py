@@ -1,14 +1,15 @@
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from finforce.camera import project
 from finforce.gripper_frames import ROBOT_CAMERA
-from finforce_twin.gripper.gripper import TwinGripper
+from finforce_twin.gripper.gripper import TwinGripper, blend_states
 from finforce_twin.rendering.bodies import DrawnJaw
 from finforce_twin.rendering.depth_camera import build_d405_vga
-from finforce_twin.rendering.photographer import Photographer, SceneSetting
+from finforce_twin.rendering.photographer import BANDS, Photographer, SceneSetting
 from finforce_twin.scenes.scenarios import build_scenario
 
 
@@ -81,3 +82,25 @@ def test_depth_comes_in_the_steps_that_were_asked_for(setting, pressed):
         depth = depth[np.isfinite(depth)].astype(float)
         np.testing.assert_allclose(depth / step, np.round(depth / step), atol=1e-3)  # float32 metres
         assert len(np.unique(np.round(depth / step))) > (50 if step == 1e-3 else 500)
+
+
+def test_rows_of_a_rolling_shutter_are_of_their_own_time(setting, gripper):
+    states = gripper.states()
+    before, state = next((a, b) for a, b in pairwise(states) if a.jaws["left"].origin_x < b.jaws["left"].origin_x)
+    readout, height = 0.02, setting.camera.height
+    photographer = Photographer(replace(setting, readout=readout), 3)
+    photographer.look(before)
+    rolled, flat = photographer.look(state), Photographer(setting, 3)
+    band = height // BANDS
+    for number in (0, BANDS - 1):
+        rows = slice(number * band, (number + 1) * band)
+        ago = readout * (1.0 - (rows.start + 0.5 * (band - 1)) / (height - 1))
+        then = flat.look(blend_states(state, before, ago / (state.stamp - before.stamp)))
+        inner = slice(rows.start + 1, rows.stop - 1)  # a band's edge has no neighbours that show an edge in its pixels
+        np.testing.assert_allclose(rolled.picture.color[inner], then.picture.color[inner], atol=1e-6)
+    # a point is where the jaw was when the point's own row was exposed
+    now, past = (flat.look(some).truth["left"].pixels for some in (state, before))
+    seen = rolled.truth["left"].pixels
+    ago = readout * (1.0 - seen[:, 1] / (height - 1)) / (state.stamp - before.stamp)
+    np.testing.assert_allclose(seen[:, 0], now[:, 0] + ago * (past - now)[:, 0], atol=0.02)
+    assert np.ptp((seen - now)[:, 0]) > 0.5

@@ -296,6 +296,14 @@ def test_too_wide_an_object_and_bad_fields_are_refused():
         build_scenario("grasp_cylinder", turn_angle=1.0)
 
 
+def test_images_come_at_the_rate_that_was_asked_for_of_the_same_course():
+    slow, fast = (write_script(build_scenario("grasp_cylinder", rate=rate)) for rate in (RATE, 3.0 * RATE))
+    np.testing.assert_allclose(np.diff(fast.stamps), 1.0 / 90.0)
+    assert [posture.closing for posture in fast.postures[::3]] == pytest.approx([p.closing for p in slow.postures])
+    with pytest.raises(ScenarioError, match="readout of 0.02 s at 90 Hz"):
+        build_scenario("grasp_cylinder", rate=90.0, readout=0.02)
+
+
 def test_every_field_of_a_scenario_is_read():
     folder = Path(__file__).parents[2] / "finforce_twin"
     files = sorted(path for path in folder.rglob("*.py"))
