@@ -11,6 +11,8 @@ from finforce_twin.mechanics.assembly import Assembly, RelaxedWrench, find_elast
 from finforce_twin.mechanics.pressed_jaw import TWIN_DENSITY, JawShape
 from finforce_twin.scenes.scenarios import Posture, Scenario, write_script
 
+MOVING = ("origin_x", "vertices", "keypoints")  # of a jaw
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JawState:
@@ -51,28 +53,18 @@ class TwinState:
     T_gripper_object: NDArray | None
     gravity: NDArray
 
+    def blend(self, before: "TwinState", share: float) -> "TwinState":
+        """Returns the state on a straight way from this one (share 0) back to one a moment before (share 1)."""
 
-def blend_states(state: TwinState, before: TwinState, share: float) -> TwinState:
-    """Returns the state on a straight way from one (share 0) back to another a moment before (share 1)."""
+        def mix(now: NDArray, then: NDArray) -> NDArray:
+            return now + share * (then - now)
 
-    def mix(now: NDArray, then: NDArray) -> NDArray:
-        return now + share * (then - now)
-
-    pose = state.T_gripper_object
-    return replace(
-        state,
-        stamp=mix(state.stamp, before.stamp),
-        jaws={
-            side: replace(
-                jaw,
-                origin_x=mix(jaw.origin_x, before.jaws[side].origin_x),
-                vertices=mix(jaw.vertices, before.jaws[side].vertices),
-                keypoints=mix(jaw.keypoints, before.jaws[side].keypoints),
-            )
-            for side, jaw in state.jaws.items()
-        },
-        T_gripper_object=None if pose is None else mix(pose, before.T_gripper_object),
-    )
+        jaws = {}
+        for side, jaw in self.jaws.items():
+            moving = {name: mix(getattr(jaw, name), getattr(before.jaws[side], name)) for name in MOVING}
+            jaws[side] = replace(jaw, **moving)
+        pose = None if self.T_gripper_object is None else mix(self.T_gripper_object, before.T_gripper_object)
+        return replace(self, stamp=mix(self.stamp, before.stamp), jaws=jaws, T_gripper_object=pose)
 
 
 class TwinGripper(Assembly):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,13 @@ from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import jaw_in_camera
 from finforce.transforms import invert_pose
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_twin.gripper.gripper import TwinState, blend_states
 from finforce_twin.rendering.bodies import DrawnJaw, Wardrobe, draw_occluders, dress_jaw, dress_object, dress_palm
 from finforce_twin.rendering.lighting import Lighting, draw_look
 from finforce_twin.rendering.render import Picture, RenderedScene, Window
 from finforce_twin.rendering.sensor import D405_NOISE, expose, measure_depth
+
+if TYPE_CHECKING:
+    from finforce_twin.gripper.gripper import TwinState
 
 SHUTTER = 0.008  # [s] that the sensor collects light
 WINDOW_MARGIN = 90  # [px] around the jaws
@@ -138,7 +141,7 @@ class Photographer:
             self._shares(0.5 * (edges[:-1] + edges[1:] - 1), state, before), edges[:-1], edges[1:], strict=True
         ):
             window = Window(rows=slice(low, high), columns=slice(0, self.setting.camera.width))
-            stage = self._build_stage(blend_states(state, before, share))
+            stage = self._build_stage(state.blend(before, share))
             bands.append((window.rows, stage.render(self.setting.camera, window)))
         layers = {
             name: np.concatenate([getattr(picture, name)[rows] for rows, picture in bands])

@@ -6,7 +6,7 @@ import pytest
 
 from finforce.camera import project
 from finforce.gripper_frames import ROBOT_CAMERA
-from finforce_twin.gripper.gripper import TwinGripper, blend_states
+from finforce_twin.gripper.gripper import TwinGripper
 from finforce_twin.rendering.bodies import DrawnJaw
 from finforce_twin.rendering.depth_camera import build_d405_vga
 from finforce_twin.rendering.photographer import BANDS, Photographer, SceneSetting
@@ -95,7 +95,7 @@ def test_rows_of_a_rolling_shutter_are_of_their_own_time(setting, gripper):
     for number in (0, BANDS - 1):
         rows = slice(number * band, (number + 1) * band)
         ago = readout * (1.0 - (rows.start + 0.5 * (band - 1)) / (height - 1))
-        then = flat.look(blend_states(state, before, ago / (state.stamp - before.stamp)))
+        then = flat.look(state.blend(before, ago / (state.stamp - before.stamp)))
         inner = slice(rows.start + 1, rows.stop - 1)  # a band's edge has no neighbours that show an edge in its pixels
         np.testing.assert_allclose(rolled.picture.color[inner], then.picture.color[inner], atol=1e-6)
     # a point is where the jaw was when the point's own row was exposed
