@@ -22,6 +22,12 @@ def bind_caller(threads: int) -> None:
         os.sched_setaffinity(0, {min(ALL)})
 
 
+def bind_helper(threads: int) -> None:
+    """Bind the calling thread, a helper of one that is bound, to the other processors, where they are scarce."""
+    if are_scarce(threads):
+        os.sched_setaffinity(0, ALL - {min(ALL)})
+
+
 def free_caller() -> None:
     """Let the calling thread run everywhere, whoever it was started by."""
     if ALL:

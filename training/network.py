@@ -187,10 +187,10 @@ class ExportedCoarse(nn.Module):
             templates: (B, h / 2, w / 2, 3) uint8, at half size.
             points: (B, K, 2) in the templates at full size [px].
         """
-        layers = pictures.float()
-        mean = layers.mean(dim=(1, 2))
-        gain = torch.rsqrt((layers * layers).mean(dim=(1, 2)) - mean * mean + VARIANCE * 255.0**2)
-        half = nn.functional.avg_pool2d(layers.permute(0, 3, 1, 2), 2)
+        layers = pictures.permute(0, 3, 1, 2).float()  # sums of planes are quicker than of pixels in turn
+        mean = layers.mean(dim=(2, 3))
+        gain = torch.rsqrt((layers * layers).mean(dim=(2, 3)) - mean * mean + VARIANCE * 255.0**2)
+        half = nn.functional.avg_pool2d(layers, 2)
         half = (half - mean[:, :, None, None]) * gain[:, :, None, None]
         moves, features = self.network.coarse(torch.cat((half, templates.permute(0, 3, 1, 2).float() / 255.0), dim=1))
         return points + SPAN * self.network.read(moves, points), self.network.read(features, points), mean, gain

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-_OPTIONS = {"cache": True, "error_model": "numpy"}
+_OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
 POLYNOMIAL, FISHEYE = 1.0, 2.0  # kinds of lenses beside the pinhole, the fifth number of one
 OUTSIDE = -1e4  # [px] where what the camera does not see is taken
 
@@ -269,3 +269,94 @@ def solve_weighted(prior, rows, known, seen, variance):
                 A[a, b] += w * rows[i, a] * rows[i, b]
     covariance = np.ascontiguousarray(np.linalg.inv(A))
     return covariance, covariance @ g
+
+
+@njit(**_OPTIONS)
+def cut_pieces(picture, centres, size):
+    """Return pieces (K, size, size, 3) uint8 of a picture (h, w, 3) around places (K, 2) [px], its edge continued."""
+    height, width = picture.shape[:2]
+    pieces = np.empty((len(centres), size, size, 3), np.uint8)
+    line = np.empty(3 * (size + 1), np.float32)
+    upper, lower = np.empty(3 * size, np.float32), np.empty(3 * size, np.float32)
+    for k in range(len(centres)):
+        left, top = centres[k, 0] - 0.5 * (size - 1), centres[k, 1] - 0.5 * (size - 1)
+        column, row = int(np.floor(left)), int(np.floor(top))
+        across, down = np.float32(left - column), np.float32(top - row)
+        piece = pieces[k].reshape(size, 3 * size)
+        for r in range(size + 1):
+            y = min(max(row + r, 0), height - 1)
+            for c in range(size + 1):
+                x = min(max(column + c, 0), width - 1)
+                for n in range(3):
+                    line[3 * c + n] = picture[y, x, n]
+            for n in range(3 * size):
+                upper[n] = lower[n]
+                lower[n] = line[n] + across * (line[n + 3] - line[n])
+            if r > 0:
+                for n in range(3 * size):
+                    piece[r - 1, n] = np.uint8(upper[n] + down * (lower[n] - upper[n]) + np.float32(0.5))
+    return pieces
+
+
+@njit(**_OPTIONS)
+def fit_motion(shapes, pairs, moves, stddev, weight, limits):
+    """Return the motion (K, 2) [px] within a finger's shapes that is nearest to another; see `shapes.fit_motion`.
+
+    Args:
+        shapes: (2 K, m), the last columns those of products.
+        pairs: (p, 2) of which columns.
+        moves: (K, 2) [px], not finite where nobody knows.
+        stddev: (K,) [px].
+        weight: (K,).
+        limits: largest size, number of rounds, change [px] after which there is no other (3,).
+    """
+    sizes, believed = np.zeros(shapes.shape[1] - len(pairs)), np.zeros(len(moves))
+    found, doubt = np.zeros(moves.shape), np.ones(len(moves))
+    for k in range(len(moves)):
+        if np.isfinite(moves[k, 0]) and np.isfinite(moves[k, 1]) and np.isfinite(stddev[k]):
+            believed[k] = weight[k] / stddev[k] ** 2
+    for _ in range(int(limits[1])):
+        sizes = improve_sizes(shapes, pairs, sizes, moves - found, believed * doubt)
+        sizes = np.minimum(np.maximum(sizes, -limits[0]), limits[0])
+        before, found = found, move_by(shapes, pairs, sizes)
+        if np.abs(found - before).max() < limits[2]:
+            break
+        for k in range(len(moves)):
+            if believed[k] > 0.0:
+                apart = (moves[k, 0] - found[k, 0]) ** 2 + (moves[k, 1] - found[k, 1]) ** 2
+                doubt[k] = 1.0 / (1.0 + 0.5 * apart / stddev[k] ** 2)
+    return found
+
+
+@njit(**_OPTIONS)
+def improve_sizes(shapes, pairs, sizes, left, weight):
+    """Return the sizes (n,) of shapes by least squares of what is left (K, 2) [px], to first order around some."""
+    count = len(sizes)
+    A, g, slope = np.eye(count), np.zeros(count), np.empty(count)
+    for row in range(len(shapes)):
+        w = weight[row // 2]
+        if not w > 0.0:
+            continue
+        slope[:] = shapes[row, :count]
+        for p in range(len(pairs)):
+            i, j = pairs[p]
+            slope[i] += sizes[j] * shapes[row, count + p]
+            slope[j] += sizes[i] * shapes[row, count + p]
+        aim = left[row // 2, row % 2] + (slope * sizes).sum()
+        for a in range(count):
+            g[a] += w * slope[a] * aim
+            for b in range(count):
+                A[a, b] += w * slope[a] * slope[b]
+    return np.linalg.solve(A, g)
+
+
+@njit(**_OPTIONS)
+def move_by(shapes, pairs, sizes):
+    """Return the motion (K, 2) [px] of shapes by their sizes (n,)."""
+    moved = np.zeros((len(shapes) // 2, 2))
+    for row in range(len(shapes)):
+        for a in range(len(sizes)):
+            moved[row // 2, row % 2] += shapes[row, a] * sizes[a]
+        for p in range(len(pairs)):
+            moved[row // 2, row % 2] += shapes[row, len(sizes) + p] * sizes[pairs[p, 0]] * sizes[pairs[p, 1]]
+    return moved

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_keypoints.geometry import kernels
+
 if TYPE_CHECKING:
     from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
     from finforce_ifea.jaw.jaw import Jaw
@@ -28,6 +30,7 @@ RIDGE = 1e-4  # of the products' fit, in the mean of its normal matrix
 ROUNDS, SETTLED = 10, 0.02  # of reweighting, and the largest change after which there is no other [px]
 FARTHEST = 3.0  # standard deviations that a motion can be large
 TOLERANCE, SHARE = 1.0, 0.05  # [px] and share of a point's motion by which a finger may differ from its shapes
+_PAIRS, _LIMITS = np.array(PAIRS), np.array([FARTHEST, ROUNDS, SETTLED])
 _known: dict[tuple[str, bytes], NDArray] = {}
 
 
@@ -142,43 +145,23 @@ def span_shapes(motions: NDArray, points: NDArray, scale: float) -> NDArray:
     whole = np.zeros((3, len(points), 2))
     whole[0, :, 0] = whole[1, :, 1] = PIXELS
     whole[2] = TURN * away[:, ::-1] * (-1.0, 1.0)
-    return np.vstack((bending[:BENDS], whole, bending[BENDS:])).reshape(-1, 2 * len(points)).T
+    return np.vstack((bending[:BENDS], whole, bending[BENDS:])).reshape(-1, 2 * len(points)).T.copy()
 
 
-def fit_shapes(shapes: NDArray, moves: NDArray, stddev: NDArray, weight: NDArray) -> NDArray:
-    """Return motions (B, K, 2) [px] within the shapes that are nearest to others, whatever single points claim.
+def fit_motion(shapes: NDArray, moves: NDArray, stddev: NDArray, weight: NDArray) -> NDArray:
+    """Return the motion (K, 2) [px] within the shapes that is nearest to another, whatever single points claim.
 
     Args:
-        shapes: of `span_shapes` (B, 2 K, m).
-        moves: how far points seem to have moved (B, K, 2) [px]; not finite where nobody knows.
-        stddev: of each along a row or a column (B, K) [px].
-        weight: how much each is believed (B, K), 0 to 1.
+        shapes: of `span_shapes` (2 K, m).
+        moves: how far points seem to have moved (K, 2) [px]; not finite where nobody knows.
+        stddev: of each along a row or a column (K,) [px].
+        weight: how much each is believed (K,), 0 to 1.
     """
-    known = np.isfinite(moves).all(axis=2) & np.isfinite(stddev)
-    wanted = np.where(known[..., None], moves, 0.0)
-    variance = np.where(known, stddev, 1.0) ** 2
-    believed = np.where(known, weight, 0.0)
-    linear, products = shapes[..., : -len(PAIRS)], shapes[..., -len(PAIRS) :]
-    sizes = np.zeros((len(shapes), linear.shape[2]))
-    doubt, prior = np.ones_like(variance), np.eye(linear.shape[2])
-    found = np.zeros_like(wanted)
-    for _ in range(ROUNDS):
-        slopes = linear.copy()
-        for number, (i, j) in enumerate(PAIRS):
-            slopes[..., i] += sizes[:, None, j] * products[..., number]
-            slopes[..., j] += sizes[:, None, i] * products[..., number]
-        weighted = slopes.swapaxes(1, 2) * (believed * doubt / variance).repeat(2, axis=1)[:, None]
-        missing = (wanted - found).reshape(len(shapes), -1, 1) + slopes @ sizes[..., None]
-        sizes = np.linalg.solve(weighted @ slopes + prior, weighted @ missing)[..., 0].clip(-FARTHEST, FARTHEST)
-        together = np.column_stack([sizes[:, i] * sizes[:, j] for i, j in PAIRS])
-        before, found = found, (linear @ sizes[..., None] + products @ together[..., None]).reshape(moves.shape)
-        if np.abs(found - before).max(initial=0.0) < SETTLED:
-            break
-        doubt = 1.0 / (1.0 + 0.5 * ((wanted - found) ** 2).sum(axis=2) / variance)
-    return found
+    numbers = (np.ascontiguousarray(values, dtype=float) for values in (moves, stddev, weight))
+    return kernels.fit_motion(shapes, _PAIRS, *numbers, _LIMITS)
 
 
 def trust(moves: NDArray, shape: NDArray) -> NDArray:
-    """Return factors (B, K), 0 to 1, of the likelihood of points that moved (B, K, 2) [px] unlike their shape."""
-    tolerance = np.hypot(TOLERANCE, SHARE * np.linalg.norm(shape, axis=2))
-    return 1.0 / (1.0 + (np.linalg.norm(moves - shape, axis=2) / (3.0 * tolerance)) ** 4)
+    """Return factors (K,), 0 to 1, of the likelihood of points that moved (K, 2) [px] unlike their shape."""
+    tolerance = np.hypot(TOLERANCE, SHARE * np.linalg.norm(shape, axis=1))
+    return 1.0 / (1.0 + (np.linalg.norm(moves - shape, axis=1) / (3.0 * tolerance)) ** 4)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -19,8 +20,10 @@ from numpy.typing import NDArray
 
 from finforce.errors import one_line
 from finforce.optional import import_cv2
+from finforce.processors import bind_helper
 from finforce_keypoints.errors import DetectionError, ModelError
-from finforce_keypoints.geometry.shapes import fit_shapes, trust
+from finforce_keypoints.geometry.kernels import cut_pieces
+from finforce_keypoints.geometry.shapes import fit_motion, trust
 from finforce_keypoints.networks.network import CPU, open_session
 
 METADATA = "finforce"  # key of the files' own metadata
@@ -81,7 +84,7 @@ class SideNetwork:
 
         Args:
             path: the folder with `coarse.onnx` and `fine.onnx`.
-            threads: that one batch is computed with.
+            threads: that the pictures of a batch are shared among.
             providers: onnxruntime's execution providers, best first.
 
         Raises:
@@ -95,15 +98,15 @@ class SideNetwork:
                 f"{path}: there is no {' and no '.join(missing)}; expected the folder of a network for side planes; a "
                 "DeepLabCut network is used with finder frame"
             )
-        self._coarse = open_session(self.path / COARSE, threads, providers)
-        self._fine = open_session(self.path / FINE, threads, providers)
+        # Two threads on one picture wait for each other at every layer; two pictures do not.
+        self._coarse, self._fine = (open_session(self.path / name, 1, providers) for name in (COARSE, FINE))
+        self._threads = threads
+        self._helpers = ThreadPoolExecutor(max(threads - 1, 1), "side plane", bind_helper, (threads,))
         for session, layout, name in ((self._coarse, COARSE_LAYOUT, COARSE), (self._fine, FINE_LAYOUT, FINE)):
             self._check_layout(session, layout, name)
         self.height, self.width = self._read_size(self._coarse, COARSE)
         self._piece, _ = self._read_size(self._fine, FINE)
         self._factor = self._read_factor()
-        steps = np.arange(self._piece, dtype=np.float32) - np.float32(0.5 * (self._piece - 1))
-        self._window = np.stack(np.meshgrid(steps, steps), axis=-1)
 
     def _check_layout(self, session, layout: tuple[tuple[str, ...], ...], name: str) -> None:
         """Refuse a file with other inputs or outputs."""
@@ -158,7 +161,7 @@ class SideNetwork:
         return Template(half=half, points=points, pieces=self._cut(template, points), shapes=shapes)
 
     def locate(self, pictures: NDArray, templates: Sequence[Template], starts: Sequence[NDArray | None] = ()) -> Places:
-        """Find points in pictures.
+        """Find points in pictures, as many of these at a time as there are threads.
 
         Args:
             pictures: (B, height, width, 3) uint8 RGB.
@@ -169,61 +172,65 @@ class SideNetwork:
         Raises:
             DetectionError: the network cannot be computed for these.
         """
-        points = np.stack([template.points for template in templates])
-        half = np.stack([template.half for template in templates])
-        guesses, *seen = self._run(self._coarse, COARSE_LAYOUT[0], (pictures, half, points))
-        everywhere = np.ones(points.shape[:2], dtype=bool)
-        if any(template.shapes is None for template in templates):
-            return self._compare(pictures, templates, seen, guesses, everywhere)
-        shapes = np.stack([template.shapes for template in templates])
-        moves = fit_shapes(shapes, guesses - points, np.full(everywhere.shape, GUESS), np.ones(everywhere.shape))
-        for move, start in zip(moves, starts, strict=False):
-            if start is not None and np.linalg.norm(start - move, axis=1).max() < ASTRAY:
-                move[:] = start
-        places = self._compare(pictures, templates, seen, points + moves, everywhere)
-        better = _fit(shapes, points, places)
-        wrong = np.linalg.norm(better - moves, axis=2) > NEAR
+        starts = starts or [None] * len(pictures)
+        found: list[Places | None] = [None] * len(pictures)
+        waiting = iter(range(len(pictures)))
+
+        def work() -> None:
+            for number in waiting:
+                found[number] = self._locate_one(pictures[number], templates[number], starts[number])
+
+        helpers = [self._helpers.submit(work) for _ in range(min(self._threads, len(pictures)) - 1)]
+        work()
+        for helper in helpers:
+            helper.result()
+        layers = {entry.name: [getattr(places, entry.name) for places in found] for entry in fields(Places)}
+        return Places(**{name: None if values[0] is None else np.stack(values) for name, values in layers.items()})
+
+    def _locate_one(self, picture: NDArray, template: Template, start: NDArray | None) -> Places:
+        """Return where the points are in one picture, all without its axis."""
+        points, shapes = template.points, template.shapes
+        seen = self._run(self._coarse, COARSE_LAYOUT[0], (picture[None], template.half[None], points[None]))
+        guesses, *seen = (value[0] for value in seen)
+        everywhere = np.ones(len(points), dtype=bool)
+        if shapes is None:
+            return self._compare(picture, template, seen, guesses, everywhere)
+        moves = fit_motion(shapes, guesses - points, GUESS * everywhere, everywhere)
+        if start is not None and np.linalg.norm(start - moves, axis=1).max() < ASTRAY:
+            moves = start
+        places = self._compare(picture, template, seen, points + moves, everywhere)
+        better = _fit(template, places)
+        wrong = np.linalg.norm(better - moves, axis=1) > NEAR
         if wrong.any():
-            again = self._compare(pictures, templates, seen, points + better, wrong)
+            again = self._compare(picture, template, seen, points + better, wrong)
             places = Places(
-                pixels=np.where(wrong[..., None], again.pixels, places.pixels),
+                pixels=np.where(wrong[:, None], again.pixels, places.pixels),
                 likelihood=np.where(wrong, again.likelihood, places.likelihood),
                 stddev=np.where(wrong, again.stddev, places.stddev),
             )
-            better = _fit(shapes, points, places)
+            better = _fit(template, places)
         believed = trust(places.pixels - points, better)
         return replace(places, likelihood=places.likelihood * np.nan_to_num(believed), moves=better)
 
     def _compare(
-        self,
-        pictures: NDArray,
-        templates: Sequence[Template],
-        seen: Sequence[NDArray],
-        guesses: NDArray,
-        wanted: NDArray,
+        self, picture: NDArray, template: Template, seen: Sequence[NDArray], guesses: NDArray, wanted: NDArray
     ) -> Places:
-        """Return where points are that lie near guesses (B, K, 2) [px]; of those not wanted (B, K) nothing is known.
+        """Return where points are that lie near guesses (K, 2) [px]; of those not wanted (K,) nothing is known.
 
-        What was seen by the coarse part is context (B, K, C), and mean and gain of the colours (B, 3).
+        What was seen by the coarse part is context (K, C), and mean and gain of the colours (3,).
         """
         context, mean, gain = seen
-        which = np.nonzero(wanted)
-        pieces, known = [], []
-        for picture, template, guess, chosen in zip(pictures, templates, guesses, wanted, strict=True):
-            pieces.append(self._cut(picture, guess[chosen]))
-            known.append(template.pieces[chosen])
-        inputs = (np.concatenate(pieces), np.concatenate(known), context[which], mean[which[0]], gain[which[0]])
+        near = guesses[wanted]
+        colours = (np.broadcast_to(value, (len(near), 3)) for value in (mean, gain))
+        inputs = (self._cut(picture, near), template.pieces[wanted], context[wanted], *colours)
         offsets, likely, spread = self._run(self._fine, FINE_LAYOUT[0], inputs)
-        places = guesses[which] + offsets
+        places = near + offsets
         good = np.isfinite(places).all(axis=1) & np.isfinite(likely) & np.isfinite(spread)
-        pixels, likelihood, stddev = (
-            np.full(guesses.shape, np.nan),
-            np.zeros(wanted.shape),
-            np.full(wanted.shape, np.inf),
-        )
-        pixels[which] = np.where(good[:, None], places, np.nan)
-        likelihood[which] = np.where(good, np.clip(likely, 0.0, 1.0), 0.0)
-        stddev[which] = np.where(good, self._factor * spread, np.inf)
+        count = len(guesses)
+        pixels, likelihood, stddev = np.full((count, 2), np.nan), np.zeros(count), np.full(count, np.inf)
+        pixels[wanted] = np.where(good[:, None], places, np.nan)
+        likelihood[wanted] = np.where(good, np.clip(likely, 0.0, 1.0), 0.0)
+        stddev[wanted] = np.where(good, self._factor * spread, np.inf)
         return Places(pixels=pixels, likelihood=likelihood, stddev=stddev)
 
     def _run(self, session, names: tuple[str, ...], inputs: tuple[NDArray, ...]) -> list[NDArray]:
@@ -235,15 +242,11 @@ class SideNetwork:
 
     def _cut(self, picture: NDArray, centres: NDArray) -> NDArray[np.uint8]:
         """Return the pieces (K, p, p, 3) of a picture (h, w, 3) around places (K, 2) [px]."""
-        if not len(centres):
-            return np.empty((0, self._piece, self._piece, 3), np.uint8)
-        cv2 = import_cv2()
         centres = np.nan_to_num(centres, nan=-1e3, posinf=-1e3, neginf=-1e3).clip(-1e3, 4e3)
-        maps = (centres[:, None, None] + self._window).reshape(-1, self._piece, 2).astype(np.float32)
-        pieces = cv2.remap(picture, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return pieces.reshape(-1, self._piece, self._piece, 3)
+        return cut_pieces(picture, np.ascontiguousarray(centres, dtype=float), self._piece)
 
 
-def _fit(shapes: NDArray, points: NDArray, places: Places) -> NDArray:
-    """Return how points (B, K, 2) [px] have moved by what was found of them, as one shape."""
-    return fit_shapes(shapes, places.pixels - points, np.hypot(BLUR, places.stddev), places.likelihood**2)
+def _fit(template: Template, places: Places) -> NDArray:
+    """Return how a finger's points (K, 2) [px] have moved by what was found of them in one picture, as one shape."""
+    moves, stddev = places.pixels - template.points, np.hypot(BLUR, places.stddev)
+    return fit_motion(template.shapes, moves, stddev, places.likelihood**2)

@@ -7,7 +7,7 @@ from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.detectors.side_plane import find_rest
-from finforce_keypoints.geometry.shapes import COUNT, find_motions, fit_shapes, span_shapes, trust
+from finforce_keypoints.geometry.shapes import COUNT, find_motions, fit_motion, span_shapes, trust
 from finforce_keypoints.geometry.template import find_shape, fit_grid
 
 NAMES = ("bench", "xlerobot", "ssg48_fin_ray_1")
@@ -39,8 +39,8 @@ def press(name, height, force):
 
 
 def fit(shapes, moves, stddev=1.0, weight=1.0):
-    ones = np.ones((1, len(moves)))
-    return fit_shapes(shapes[None], moves[None], stddev * ones, weight * ones)[0]
+    ones = np.ones(len(moves))
+    return fit_motion(shapes, moves, stddev * ones, weight * ones)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -67,7 +67,7 @@ def test_points_on_the_wrong_rib_do_not_bend_the_shape(name):
     wrong[which] += (2.0, 9.0)
     found = fit(shapes, wrong)
     assert np.abs(found - moved)[which].max() < 3.0
-    factors = trust(wrong[None], found[None])[0]
+    factors = trust(wrong, found)
     assert factors[which].max() < 0.5 < 0.8 < np.delete(factors, which).min()
 
 

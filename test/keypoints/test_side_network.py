@@ -9,6 +9,7 @@ import pytest
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.errors import DetectionError, ModelError
+from finforce_keypoints.geometry.kernels import cut_pieces
 from finforce_keypoints.geometry.template import draw_template, find_shape, fit_grid
 from finforce_keypoints.networks.side_network import COARSE, FINE, METADATA, SideNetwork
 
@@ -52,6 +53,31 @@ def test_pictures_in_one_batch_do_not_disturb_each_other(network):
         off = np.linalg.norm(alone.pixels[0] - both.pixels[number], axis=1)
         assert np.sqrt((off**2).mean()) < 0.6 * both.stddev[number].min() and off.max() < 0.3
         np.testing.assert_allclose(alone.likelihood[0], both.likelihood[number], atol=0.05)
+
+
+def test_threads_share_pictures_and_change_no_place(network):
+    pictures, templates = draw(5, network), [prepare(network, 6) for _ in range(5)]
+    one, two = (some.locate(pictures, templates) for some in (network, SideNetwork(ANY_FINGER, threads=2)))
+    np.testing.assert_array_equal(one.pixels, two.pixels)
+    np.testing.assert_array_equal(one.likelihood, two.likelihood)
+
+
+def test_what_cannot_be_computed_is_said_by_every_thread():
+    network = SideNetwork(ANY_FINGER, threads=2)
+    with pytest.raises(DetectionError, match="cannot be computed"):
+        network.locate(draw(2, network)[:, :100], [prepare(network), prepare(network)])
+
+
+def test_pieces_are_those_of_a_map_also_beyond_the_picture():
+    import cv2
+
+    picture = RNG.integers(0, 255, (60, 50, 3), dtype=np.uint8)
+    centres = np.array([[20.25, 30.5], [3.0, -4.0], [48.75, 59.5], [-900.0, 2000.0]])  # exact in cv2's 1/32 px
+    steps = np.arange(16, dtype=np.float32) - 7.5
+    maps = (centres[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1)).reshape(-1, 16, 2)
+    wanted = cv2.remap(picture, maps.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    difference = cut_pieces(picture, centres, 16).reshape(wanted.shape).astype(int) - wanted
+    assert np.abs(difference).max() <= 1
 
 
 def test_black_pictures_and_points_outside_are_no_crash(network):

@@ -12,6 +12,7 @@ pytest.importorskip("onnx", reason="the export needs onnx: pip install onnx")
 pytest.importorskip("onnxruntime", reason="the exported network runs on onnxruntime: pip install onnxruntime")
 pytest.importorskip("cv2", reason="pictures need OpenCV: pip install opencv-contrib-python-headless")
 
+import onnx
 import torch
 from training_fakes import KEYPOINTS, POINTS, draw_ladders, write_ladders
 
@@ -78,6 +79,10 @@ def test_a_network_in_bytes_is_the_same_but_for_their_steps(tmp_path):
     size = sum((tmp_path / name).stat().st_size for name in (COARSE, FINE))
     quantize_network(tmp_path, pictures)
     assert sum((tmp_path / name).stat().st_size for name in (COARSE, FINE)) < 0.4 * size
+    nodes = onnx.load(str(tmp_path / FINE)).graph.node
+    maker = {name: node.op_type for node in nodes for name in node.output}
+    rounded = [maker[node.input[0]] for node in nodes if node.op_type == "Relu"]
+    assert rounded and "DequantizeLinear" not in rounded  # a convolution and its ReLU are one to onnxruntime
     after = training.evaluate.detect(SideNetwork(tmp_path, threads=1), pictures)
     assert np.median(np.abs(after.pixels - before.pixels)) < 0.5  # random weights pass errors on as trained ones do not
     again, factor = read_network(tmp_path)
