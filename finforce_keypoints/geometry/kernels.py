@@ -8,6 +8,7 @@ from numba import njit
 _OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
 POLYNOMIAL, FISHEYE = 1.0, 2.0  # kinds of lenses beside the pinhole, the fifth number of one
 OUTSIDE = -1e4  # [px] where what the camera does not see is taken
+FARTHEST = 4e3  # [px] that a piece can be from a picture's first pixel
 
 
 @njit(**_OPTIONS)
@@ -165,11 +166,25 @@ def sample_side(depth, lens, T, points, offsets, used):
 
 @njit(**_OPTIONS)
 def median_of(values, count):
-    """Return the median of the first values (count,), NaN of none; they are sorted."""
+    """Return the median of the first values (count,), NaN of none."""
     if count == 0:
         return np.nan
-    ordered = np.sort(values[:count])
-    return 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2])
+    part, middle = values[:count].copy(), count // 2
+    low, high = 0, count - 1
+    while low < high:  # values are only sorted as far as it takes to have the middle one in its place
+        pivot, i, j = part[(low + high) // 2], low, high
+        while i <= j:
+            while part[i] < pivot:
+                i += 1
+            while part[j] > pivot:
+                j -= 1
+            if i <= j:
+                part[i], part[j] = part[j], part[i]
+                i, j = i + 1, j - 1
+        if j < middle < i:
+            break
+        low, high = (low, j) if middle <= j else (i, high)
+    return part[middle] if count % 2 else 0.5 * (part[:middle].max() + part[middle])
 
 
 @njit(**_OPTIONS)
@@ -279,16 +294,19 @@ def cut_pieces(picture, centres, size):
     line = np.empty(3 * (size + 1), np.float32)
     upper, lower = np.empty(3 * size, np.float32), np.empty(3 * size, np.float32)
     for k in range(len(centres)):
-        left, top = centres[k, 0] - 0.5 * (size - 1), centres[k, 1] - 0.5 * (size - 1)
+        x, y = centres[k]
+        if not (abs(x) < FARTHEST and abs(y) < FARTHEST):
+            x = y = -FARTHEST
+        left, top = x - 0.5 * (size - 1), y - 0.5 * (size - 1)
         column, row = int(np.floor(left)), int(np.floor(top))
         across, down = np.float32(left - column), np.float32(top - row)
         piece = pieces[k].reshape(size, 3 * size)
         for r in range(size + 1):
-            y = min(max(row + r, 0), height - 1)
+            here = min(max(row + r, 0), height - 1)
             for c in range(size + 1):
-                x = min(max(column + c, 0), width - 1)
+                there = min(max(column + c, 0), width - 1)
                 for n in range(3):
-                    line[3 * c + n] = picture[y, x, n]
+                    line[3 * c + n] = picture[here, there, n]
             for n in range(3 * size):
                 upper[n] = lower[n]
                 lower[n] = line[n] + across * (line[n + 3] - line[n])

@@ -14,6 +14,7 @@ from finforce.errors import one_line
 from finforce.optional import import_onnxruntime
 from finforce.processors import places_of_helpers
 from finforce_keypoints.errors import DetectionError, ModelError
+from finforce_keypoints.networks.helpers import Helpers
 from finforce_keypoints.networks.trial import try_network
 
 if TYPE_CHECKING:
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 
 CPU = "CPUExecutionProvider"
 COLOURS = 3
-# A search looks at many places; onnxruntime never gives back what its largest batch took.
-_MOST_AT_ONCE = 2
 INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _HEATMAP_WORDS = ("heat", "score", "pred")
 _LOCREF_WORDS = ("locref", "offset")
@@ -145,19 +144,23 @@ def find_network(path: str | Path) -> Path:
 class Network:
     """An ONNX network of one image input; not for several threads at once."""
 
-    def __init__(self, path: Path, threads: int = 2, providers: Sequence[str] = (CPU,)) -> None:
+    def __init__(
+        self, path: Path, threads: int = 2, providers: Sequence[str] = (CPU,), *, shared: bool = False
+    ) -> None:
         """Load a network.
 
         Args:
             path: the .onnx file.
-            threads: that one picture is computed with.
+            threads: that one picture is computed with, or that share the pictures of a batch.
             providers: onnxruntime's execution providers, best first.
+            shared: whether the pictures are shared, which is quicker with small networks.
 
         Raises:
             ModelError: the file cannot be loaded, or its input is no colour image.
             MissingDependencyError: onnxruntime is not installed.
         """
-        self._session = open_session(path, threads, providers)
+        self._session = open_session(path, 1 if shared else threads, providers)
+        self._helpers, self._is_shared = Helpers(threads), shared
         self.input = find_input([(item.name, item.shape, item.type) for item in self._session.get_inputs()])
         self.output_names = tuple(item.name for item in self._session.get_outputs())
 
@@ -167,12 +170,15 @@ class Network:
         Raises:
             DetectionError: the network cannot be computed for this input.
         """
-        size, parts = self.input.batch or min(len(tensor), _MOST_AT_ONCE), []
-        if size == len(tensor):
+        if self._is_shared and self.input.batch is None and len(tensor) > 1:
+            found = self._helpers.share(lambda number: self._run_once(tensor[number : number + 1]), len(tensor))
+            return [np.concatenate(outputs) for outputs in zip(*found, strict=True)]
+        if self.input.batch in (None, len(tensor)):
             return self._run_once(tensor)
+        size, parts = self.input.batch, []
         for start in range(0, len(tensor), size):
             part = tensor[start : start + size]
-            missing = size - len(part) if self.input.batch else 0
+            missing = size - len(part)
             outputs = self._run_once(np.concatenate((part, part[:1].repeat(missing, axis=0))))
             parts.append([output[: len(part)] for output in outputs])
         return [np.concatenate(outputs) for outputs in zip(*parts, strict=True)]

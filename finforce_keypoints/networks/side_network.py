@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,10 +19,10 @@ from numpy.typing import NDArray
 
 from finforce.errors import one_line
 from finforce.optional import import_cv2
-from finforce.processors import bind_helper
 from finforce_keypoints.errors import DetectionError, ModelError
 from finforce_keypoints.geometry.kernels import cut_pieces
 from finforce_keypoints.geometry.shapes import fit_motion, trust
+from finforce_keypoints.networks.helpers import Helpers
 from finforce_keypoints.networks.network import CPU, open_session
 
 METADATA = "finforce"  # key of the files' own metadata
@@ -98,10 +97,8 @@ class SideNetwork:
                 f"{path}: there is no {' and no '.join(missing)}; expected the folder of a network for side planes; a "
                 "DeepLabCut network is used with finder frame"
             )
-        # Two threads on one picture wait for each other at every layer; two pictures do not.
         self._coarse, self._fine = (open_session(self.path / name, 1, providers) for name in (COARSE, FINE))
-        self._threads = threads
-        self._helpers = ThreadPoolExecutor(max(threads - 1, 1), "side plane", bind_helper, (threads,))
+        self._helpers = Helpers(threads)
         for session, layout, name in ((self._coarse, COARSE_LAYOUT, COARSE), (self._fine, FINE_LAYOUT, FINE)):
             self._check_layout(session, layout, name)
         self.height, self.width = self._read_size(self._coarse, COARSE)
@@ -173,17 +170,9 @@ class SideNetwork:
             DetectionError: the network cannot be computed for these.
         """
         starts = starts or [None] * len(pictures)
-        found: list[Places | None] = [None] * len(pictures)
-        waiting = iter(range(len(pictures)))
-
-        def work() -> None:
-            for number in waiting:
-                found[number] = self._locate_one(pictures[number], templates[number], starts[number])
-
-        helpers = [self._helpers.submit(work) for _ in range(min(self._threads, len(pictures)) - 1)]
-        work()
-        for helper in helpers:
-            helper.result()
+        found = self._helpers.share(
+            lambda number: self._locate_one(pictures[number], templates[number], starts[number]), len(pictures)
+        )
         layers = {entry.name: [getattr(places, entry.name) for places in found] for entry in fields(Places)}
         return Places(**{name: None if values[0] is None else np.stack(values) for name, values in layers.items()})
 
@@ -242,7 +231,6 @@ class SideNetwork:
 
     def _cut(self, picture: NDArray, centres: NDArray) -> NDArray[np.uint8]:
         """Return the pieces (K, p, p, 3) of a picture (h, w, 3) around places (K, 2) [px]."""
-        centres = np.nan_to_num(centres, nan=-1e3, posinf=-1e3, neginf=-1e3).clip(-1e3, 4e3)
         return cut_pieces(picture, np.ascontiguousarray(centres, dtype=float), self._piece)
 
 

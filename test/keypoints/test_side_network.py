@@ -72,9 +72,12 @@ def test_pieces_are_those_of_a_map_also_beyond_the_picture():
     import cv2
 
     picture = RNG.integers(0, 255, (60, 50, 3), dtype=np.uint8)
-    centres = np.array([[20.25, 30.5], [3.0, -4.0], [48.75, 59.5], [-900.0, 2000.0]])  # exact in cv2's 1/32 px
+    centres = np.array(
+        [[20.25, 30.5], [3.0, -4.0], [48.75, 59.5], [-900.0, 2000.0], [np.nan, np.inf]]
+    )  # exact in cv2's 1/32 px
+    places = np.nan_to_num(centres, nan=-900.0, posinf=-900.0)
     steps = np.arange(16, dtype=np.float32) - 7.5
-    maps = (centres[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1)).reshape(-1, 16, 2)
+    maps = (places[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1)).reshape(-1, 16, 2)
     wanted = cv2.remap(picture, maps.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     difference = cut_pieces(picture, centres, 16).reshape(wanted.shape).astype(int) - wanted
     assert np.abs(difference).max() <= 1
