@@ -112,6 +112,11 @@ def test_extrinsics_of_another_convention_are_named(still, capsys, tmp_path):
         assert status == 1 and words in said
 
 
+def test_another_finger_than_in_the_jaw_file_is_named(still, capsys, tmp_path):
+    status, said = check(still, capsys, tmp_path, "--jaw", "umi")
+    assert status == 1 and "the finger is bench" in said
+
+
 def test_jaws_that_are_nowhere_are_said_to_be_so(record, capsys, tmp_path):
     rng = np.random.default_rng(0)
     folder = record("noise", lambda color: cv2.GaussianBlur(rng.integers(0, 255, color.shape, np.uint8), (0, 0), 1.0))
