@@ -278,7 +278,7 @@ class KeypointModel:
         Args:
             path: the folder with one .onnx file and its metadata, or that .onnx file.
             overrides: of the metadata.
-            threads: that one picture is computed with; two pictures of side planes have one each.
+            threads: that one picture is computed with.
             providers: onnxruntime's execution providers, best first.
 
         Raises:
@@ -288,7 +288,7 @@ class KeypointModel:
         self.path = find_network(path)
         self.metadata: ModelMetadata = read_metadata(self.path.parent / METADATA_FILE)
         self._overrides = overrides or ModelOverrides()
-        self._network = Network(self.path, threads, providers, shared="plane" in self.metadata.extra)
+        self._network = Network(self.path, threads, providers)
         self._scale, self._shift = self._build_normalization()
         self._buffer = np.empty(0)
         self._rules: dict[tuple[int, ...], DecodingRule] = {}

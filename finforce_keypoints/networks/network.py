@@ -14,7 +14,6 @@ from finforce.errors import one_line
 from finforce.optional import import_onnxruntime
 from finforce.processors import places_of_helpers
 from finforce_keypoints.errors import DetectionError, ModelError
-from finforce_keypoints.networks.helpers import Helpers
 from finforce_keypoints.networks.trial import try_network
 
 if TYPE_CHECKING:
@@ -144,23 +143,19 @@ def find_network(path: str | Path) -> Path:
 class Network:
     """An ONNX network of one image input; not for several threads at once."""
 
-    def __init__(
-        self, path: Path, threads: int = 2, providers: Sequence[str] = (CPU,), *, shared: bool = False
-    ) -> None:
+    def __init__(self, path: Path, threads: int = 2, providers: Sequence[str] = (CPU,)) -> None:
         """Load a network.
 
         Args:
             path: the .onnx file.
-            threads: that one picture is computed with, or that share the pictures of a batch.
+            threads: that one picture is computed with.
             providers: onnxruntime's execution providers, best first.
-            shared: whether the pictures are shared, which is quicker with small networks.
 
         Raises:
             ModelError: the file cannot be loaded, or its input is no colour image.
             MissingDependencyError: onnxruntime is not installed.
         """
-        self._session = open_session(path, 1 if shared else threads, providers)
-        self._helpers, self._is_shared = Helpers(threads), shared
+        self._session = open_session(path, threads, providers)
         self.input = find_input([(item.name, item.shape, item.type) for item in self._session.get_inputs()])
         self.output_names = tuple(item.name for item in self._session.get_outputs())
 
@@ -170,9 +165,6 @@ class Network:
         Raises:
             DetectionError: the network cannot be computed for this input.
         """
-        if self._is_shared and self.input.batch is None and len(tensor) > 1:
-            found = self._helpers.share(lambda number: self._run_once(tensor[number : number + 1]), len(tensor))
-            return [np.concatenate(outputs) for outputs in zip(*found, strict=True)]
         if self.input.batch in (None, len(tensor)):
             return self._run_once(tensor)
         size, parts = self.input.batch, []
