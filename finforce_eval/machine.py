@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -52,20 +53,25 @@ def _processor() -> str:
 
 @cache
 def commit() -> str:
-    """Return the commit of the sources, with a mark when they were changed since; "unknown" of what is installed."""
-    here = Path(__file__)
+    """Return the commit of the sources, and a hash of what was changed since; "unknown" of what is installed."""
+    return describe_sources(Path(__file__))
+
+
+def describe_sources(file: Path) -> str:
+    """Return the commit that a file is of with `-dirty-` and a hash of all changes since, if there are any."""
     commands = (
-        ["git", "ls-files", "--error-unmatch", here.name],  # a package in somebody's repository is not of it
+        ["git", "ls-files", "--error-unmatch", file.name],  # a package in somebody's repository is not of it
         ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+        ["git", "diff", "HEAD", "--binary"],
     )
     try:
-        said = [
-            subprocess.run(command, cwd=here.parent, capture_output=True, text=True, check=True).stdout.strip()
-            for command in commands
-        ]
+        _, said, changes = (
+            subprocess.run(command, cwd=file.parent, capture_output=True, check=True).stdout for command in commands
+        )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return said[-1]
+    mark = f"-{hashlib.sha256(changes).hexdigest()[:8]}" if changes else ""
+    return said.decode().strip() + mark
 
 
 def without_nan(content: Any) -> Any:

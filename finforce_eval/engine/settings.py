@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,12 @@ def describe_options(options: argparse.Namespace) -> dict[str, Any]:
     """Return all options that forces depend on, hashes of the files that they name, version and commit."""
     chosen = {name: value for name, value in vars(options).items() if name not in _OUTSIDE}
     words = [str(word) for value in chosen.values() for word in (value if isinstance(value, list) else [value])]
-    files = {word: sha256(Path(word).read_bytes()).hexdigest() for word in words if _is_file(word)}
-    return chosen | {"files": files, "version": version(), "commit": commit()}
+    return chosen | {"files": hash_files(words), "version": version(), "commit": commit()}
+
+
+def hash_files(words: Iterable[str]) -> dict[str, str]:
+    """Return hashes of the files that are among some options' words."""
+    return {word: sha256(Path(word).read_bytes()).hexdigest() for word in words if _is_file(word)}
 
 
 def _is_file(word: str) -> bool:

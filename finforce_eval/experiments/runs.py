@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import rmtree
@@ -12,11 +13,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
+from finforce_eval.engine.settings import hash_files
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.experiments.experiment import Case
+from finforce_eval.machine import commit, write_json
 from finforce_eval.recordings.bags import bag_source
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
@@ -27,7 +30,7 @@ from finforce_ifea.settings import EstimatorSettings
 from finforce_twin.gripper.footage import parse_size
 from finforce_twin.scenes.scenarios import build_scenario
 
-RECORDINGS = "recordings"
+RECORDINGS, SCENE = "recordings", "scene.json"
 FARTHEST = 0.3  # [m] of depth that is kept; jaws are nearer
 
 
@@ -60,7 +63,8 @@ class RunOptions:
     @property
     def shared(self) -> dict[str, Any]:
         """The settings that every case has."""
-        return {"jaw": self.jaw, "calibration": self.calibration, "source": self.source}
+        files = hash_files((self.jaw, self.calibration))
+        return {"jaw": self.jaw, "calibration": self.calibration, "source": self.source, "files": files}
 
     def scene_case(self, name: str, scene: str, changes: Mapping[str, Any], number: int, **more: Any) -> Case:
         """Return a case that is a scene of the twin; `more` is kept in its settings, too."""
@@ -134,13 +138,17 @@ def build_setup(settings: Mapping[str, Any], contact: ContactChoice | None = Non
 
 
 def render_scene(settings: Mapping[str, Any], bag: Path) -> None:
-    """Write the recording of a scene, unless it is there."""
-    if (bag / "case.json").exists():
-        return
-    rmtree(bag, ignore_errors=True)  # what a killed run has left
+    """Write the recording of a scene, unless it is there: of the same scene, seed, size and code."""
+    made = {key: settings[key] for key in ("scene", "changes", "seed", "size")} | {"commit": commit()}
+    told = bag / SCENE
+    with suppress(OSError, ValueError):
+        if json.loads(told.read_text(encoding="utf-8")) == made:
+            return
+    rmtree(bag, ignore_errors=True)  # another scene of that name, or what a killed run has left
     scenario = build_scenario(settings["scene"], **settings["changes"])
     form = RecordingForm(farthest=FARTHEST)
     record_scene(scenario, settings["seed"], bag, camera=parse_size(settings["size"]), form=form)
+    write_json(told, made)  # last: where it stands all of the recording is there
 
 
 def keep_poses(recording: Recording, seen: NDArray) -> Recording:

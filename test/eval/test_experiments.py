@@ -1,6 +1,7 @@
 """Claims about the letter's experiments: resumed after a kill, honest of what failed, and right in what they count."""
 
 import json
+import subprocess
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,6 +33,7 @@ from finforce_eval.experiments.pose import PoseExperiment, drop_poses, flip_pose
 from finforce_eval.experiments.runs import RunOptions, keep_poses, list_missing, render_scene
 from finforce_eval.experiments.shape import write_generated
 from finforce_eval.experiments.tracked_poses import score_poses, track_object, true_poses
+from finforce_eval.machine import describe_sources
 from finforce_eval.recordings.image_files import read_generated_pose
 from finforce_eval.recordings.images import StampedImage
 from finforce_eval.recordings.objects import ObjectTrack
@@ -102,6 +104,61 @@ def test_other_settings_are_another_case(tmp_path):
     other = Counting(settings={"size": 2})
     run_experiment(other, tmp_path)
     assert other.ran == ["one", "two", "three"]
+
+
+def test_other_code_is_another_case(tmp_path, monkeypatch):
+    run_experiment(Counting(), tmp_path)
+    monkeypatch.setattr("finforce_eval.experiments.experiment.commit", lambda: "another")
+    other = Counting()
+    run_experiment(other, tmp_path)
+    assert other.ran == ["one", "two", "three"]
+
+
+def test_sources_are_told_apart_by_their_changes(tmp_path):
+    file = tmp_path / "module.py"
+    file.write_text("one = 1\n")
+    assert describe_sources(file) == "unknown"
+    who = ("-c", "user.name=A", "-c", "user.email=a@b.c")
+    for words in (("init", "-q"), ("add", "module.py"), (*who, "commit", "-qm", "One")):
+        subprocess.run(("git", *words), cwd=tmp_path, check=True)
+    clean = describe_sources(file)
+    (tmp_path / "notes.txt").write_text("not of the sources")
+    assert describe_sources(file) == clean and "dirty" not in clean
+    told = []
+    for text in ("one = 2\n", "one = 3\n"):
+        file.write_text(text)
+        told.append(describe_sources(file))
+    assert all(text.startswith(f"{clean}-dirty-") for text in told) and told[0] != told[1]
+
+
+def test_a_jaw_file_with_another_content_is_another_case(tmp_path):
+    jaw = tmp_path / "jaw.yaml"
+    cases = []
+    for text in ("one", "two"):
+        jaw.write_text(text)
+        cases.append(ManipulationExperiment(options=RunOptions(jaw=str(jaw))).list_cases()[0])
+    assert cases[0].settings != cases[1].settings
+
+
+def test_a_recording_of_another_scene_of_that_name_is_rendered_anew(tmp_path, monkeypatch):
+    rendered = []
+
+    def record(scenario, seed, folder, **how):
+        rendered.append((seed, how["camera"].width))
+        folder.mkdir(parents=True)
+        (folder / "case.json").write_text("{}")
+
+    monkeypatch.setattr("finforce_eval.experiments.runs.record_scene", record)
+    small, large, other = (
+        RunOptions(size=size, seed=seed).scene_case("one", "grasp_cube", {"record": 0.2}, 0).settings
+        for size, seed in (("320x240", 1), ("640x480", 1), ("640x480", 2))
+    )
+    for settings in (small, small, large, large, other):
+        render_scene(settings, tmp_path / "one")
+    assert rendered == [(1, 320), (1, 640), (2, 640)]
+    (tmp_path / "one" / "scene.json").write_text('{"scene": "gra')  # killed while it was written
+    render_scene(other, tmp_path / "one")
+    assert len(rendered) == 4
 
 
 def test_a_case_that_fails_costs_itself_only_and_is_named(tmp_path, capsys):
