@@ -162,7 +162,8 @@ class JawEstimator:
         """Takes one image's key points and returns what they say.
 
         Args:
-            observation: stamp [s], points (K, 3) [m] in the jaw frame, likelihood (K,), stddev (K, 3) [m] if known.
+            observation: stamp [s], points (K, 3) [m] in the jaw frame, likelihood (K,), stddev (K, 3) [m] and
+                gravity (3,) if known.
             contact: where the object touches; None or no rows when there is no object.
 
         Raises:
@@ -177,6 +178,7 @@ class JawEstimator:
             self._follow(contact)
         self._contact = contact
         self._stamp = observation.stamp
+        self._rolling.gravity = observation.gravity
         points = self._gate.accept(observation)
         self._taring.add(points, observation.stddev, apart=contact is not None and contact.touching is False)
         used, self.spared = np.isfinite(points[:, 0]), False

@@ -15,6 +15,7 @@ from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.jaw import Jaw
 
 TRUSTED = ("ok", "unloaded")
+_UNIT = 1e-3  # by which the length of a unit vector may be off
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,12 +28,15 @@ class Observation:
         likelihood: (K,) in [0, 1].
         stddev: (K, 3) [m] of each point along the axes of the jaw frame, above zero where there is a point; None when
             the detector states none.
+        gravity: unit vector (3,) along which things fall, jaw frame; None where nobody knows. Who gives it says that
+            next to nothing but its weight, 0.1 N, acts along and across the fingers on what they hold.
     """
 
     stamp: float
     points: NDArray
     likelihood: NDArray
     stddev: NDArray | None = None
+    gravity: NDArray | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,7 +148,7 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
 
     Raises:
         ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], a standard deviation that is none,
-            stamps not rising.
+            a direction of gravity of another length than 1, stamps not rising.
     """
     points, likelihood = np.asarray(observation.points, float), np.asarray(observation.likelihood, float)
     if points.shape != (count, 3) or likelihood.shape != (count,):
@@ -160,6 +164,9 @@ def check_observation(observation: Observation, count: int, last_stamp: float | 
         raise ObservationError(f"likelihoods from {likelihood.min():g} to {likelihood.max():g}, expected 0 to 1")
     if observation.stddev is not None:
         check_stddev(np.asarray(observation.stddev), points)
+    gravity = observation.gravity
+    if gravity is not None and not (np.shape(gravity) == (3,) and abs(np.linalg.norm(gravity) - 1.0) < _UNIT):
+        raise ObservationError(f"gravity {np.asarray(gravity).tolist()}, expected a unit vector of three numbers")
     if not isfinite(observation.stamp):
         raise ObservationError(f"stamp {observation.stamp}, expected seconds")
     if last_stamp is not None and observation.stamp <= last_stamp:

@@ -35,12 +35,14 @@ class KeypointTrack:
         points: (n, K, 3) [m], jaw frame; NaN = none.
         likelihood: (n, K) in [0, 1].
         stddev: (n, K, 3) one standard deviation [m], jaw frame, NaN = not known; None when nothing says.
+        gravity: (n, 3) its direction, jaw frame; None when nothing says.
     """
 
     stamps: NDArray[np.int64]
     points: NDArray[np.float64]
     likelihood: NDArray[np.float64]
     stddev: NDArray[np.float64] | None = None
+    gravity: NDArray[np.float64] | None = None
 
     @classmethod
     def empty(cls, count: int = 0) -> KeypointTrack:
@@ -59,6 +61,7 @@ class KeypointTrack:
             points=self.points[index],
             likelihood=self.likelihood[index],
             stddev=None if self.stddev is None else self.stddev[index],
+            gravity=None if self.gravity is None else self.gravity[index],
         )
 
 

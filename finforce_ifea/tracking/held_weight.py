@@ -10,7 +10,8 @@ residual is remembered from when the hold began, and the change since then is ex
     a force T along the finger, a force S across it, and a moment M that twists it, for what is held by two flat faces
     does not roll with either,
 
-where T and S rise or fall steadily over the images that are averaged. Once a
+where T and S rise or fall steadily over the images that are averaged. Where gravity's direction is known, T and S are
+expected as it points: its share along the finger and across, and beside it what little acts from outside. Once a
 change of T or S is beyond chance the object is lifted, and every change counts until the hold ends. Where the jaws move
 on far, or the object slides, the memory begins anew, and T and S are what they were.
 """
@@ -35,6 +36,8 @@ _TURNED = 0.1
 # Standard deviations of how a lifted object settles, as a share of what shape and height were expected to be off, and
 # of the weight [N].
 _SETTLES, _WEIGHT = 0.05, 0.7
+# And of T and S beside what a weight makes of them in a known direction [N].
+_OUTSIDE = 0.1
 # And of how far it has slid or tilted, as a share of what its pose says. A tilt [rad] after which a hold begins anew,
 # and how far from its axis a tilted object presses [m].
 _SLIDES, _TILTED, _ARM = 0.3, 0.05, 0.01
@@ -89,6 +92,7 @@ class HeldWeight:
 
     def __init__(self) -> None:
         """Starts with an object that is not held yet."""
+        self._gravity: NDArray | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -111,14 +115,16 @@ class HeldWeight:
         self._led += way
         self._information, self._vector = np.zeros((_UNKNOWN, _UNKNOWN)), np.zeros(_UNKNOWN)
 
-    def update(self, frame: HeldFrame, prior: NDArray, dt: float) -> float:
+    def update(self, frame: HeldFrame, prior: NDArray, dt: float, gravity: NDArray | None = None) -> float:
         """Takes one frame of something that presses and returns the force along the finger [N].
 
         Args:
             frame: see `HeldFrame`.
             prior: variance of shape and height (2,).
             dt: time since the last one [s].
+            gravity: its direction (3,) in the jaw's frame; None where nobody knows.
         """
+        self._gravity = gravity
         away = frame.place - self._place
         has_slid = abs(away[2]) > _HIGHER or abs(self._led[0]) > _TILTED
         if self._frames and (abs(away[DEPTH]) > _DEEPER or has_slid):
@@ -148,7 +154,10 @@ class HeldWeight:
         self.leverage = _accumulate(frame, left, known, beyond, self._information, self._vector)
         settles = np.array([0.0, 0.0, _WEIGHT, _WEIGHT, frame.arm * frame.normal + _LEAST_MOMENT, _RISES, _RISES]) ** 2
         settles[:2] = _SETTLES**2 * prior + (_SLIDES * self._led) ** 2
-        spread = np.linalg.inv(self._information / _ALIKE + np.diag(1.0 / settles))
+        expected = np.diag(1.0 / settles)
+        if self._gravity is not None:
+            expected[_T : _S + 1, _T : _S + 1] = _expect_weight(self._gravity)
+        spread = np.linalg.inv(self._information / _ALIKE + expected)
         asked = self._vector / _ALIKE
         asked[:2] += self._led / settles[:2]
         changes, stddev = (spread @ asked)[_T : _S + 1], np.sqrt(np.diag(spread))[_T : _S + 1]
@@ -157,6 +166,12 @@ class HeldWeight:
         if self._changed:
             self.force, self.across = float(self._before[0] + changes[0]), float(self._before[1] + changes[1])
             self.across_stddev = float(stddev[1])
+
+
+def _expect_weight(gravity: NDArray) -> NDArray:
+    """Returns the inverse covariance (2, 2) [1/N^2] of T and S before anything is seen of them."""
+    pulls = gravity[[2, 1]]
+    return np.linalg.inv(_WEIGHT**2 * np.outer(pulls, pulls) + _OUTSIDE**2 * np.eye(2))
 
 
 @njit(**_OPTIONS)

@@ -74,6 +74,7 @@ class PlaceTracker:
     Attributes:
         roughness: what is known of the object's friction.
         slips: how far the object makes use of it.
+        gravity: its direction (3,) in the jaw's frame; None where nobody knows.
     """
 
     def __init__(
@@ -106,6 +107,7 @@ class PlaceTracker:
         self.slips = SlipHistory(contact.with_friction())
         self.roughness = FrictionEstimate(settings, smooth)
         self._held = HeldWeight()
+        self.gravity: NDArray | None = None
         self._width = WidthTracker(torsion, len(keypoints), UNSEEN_LEAN * settings.friction)
         self._face = contact.surface.heights[[0, -1]]
         self.reset()
@@ -298,7 +300,7 @@ class PlaceTracker:
                 twist=see_aside(width.twisting, gain),
                 arm=_ARM * width.half_width,
             )
-            wanted = upright + self._held.update(frame, self._prior_variance, dt) / normal
+            wanted = upright + self._held.update(frame, self._prior_variance, dt, self.gravity) / normal
             rubbing.lean += _HELD_GAIN * (min(max(wanted, -_LARGEST_LEAN), _LARGEST_LEAN) - rubbing.lean)
             return
         self._unlearnt = partial(self._follow_slide, normal, found)

@@ -27,7 +27,12 @@ from finforce_eval.experiments.experiment import Case, Findings, ResultTable, fo
 from finforce_eval.experiments.force_network import HEIGHT, SHOWN, WIDTH, ForceNetwork, reduce_image
 from finforce_eval.experiments.grasp import GraspCourse, GraspExperiment, score_course
 from finforce_eval.experiments.letter_tables import BenchExperiment
-from finforce_eval.experiments.manipulation import ManipulationExperiment, score_weight
+from finforce_eval.experiments.manipulation import (
+    ManipulationExperiment,
+    score_weight,
+    tell_gravity,
+    true_gravity,
+)
 from finforce_eval.experiments.network import NetworkExperiment
 from finforce_eval.experiments.pose import PoseExperiment, drop_poses, flip_poses
 from finforce_eval.experiments.runs import RunOptions, keep_poses, list_missing, render_scene
@@ -39,7 +44,7 @@ from finforce_eval.recordings.images import StampedImage
 from finforce_eval.recordings.objects import ObjectTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
-from finforce_ifea.grasp_force import Wrench
+from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench
 from finforce_twin.scenes.guesses import place_mesh
 from finforce_twin.scenes.objects import build_object
 
@@ -245,6 +250,19 @@ def test_a_weight_is_scored_along_gravity():
     assert score["across_rmse_N"] == pytest.approx(0.3)
     assert score["within_3_sigma_pct"] == 100.0
     assert np.ptp(score["course"]["angle"]) == pytest.approx(2.0 * np.pi, rel=0.01)
+
+
+def test_gravity_is_told_in_each_jaws_frame():
+    case = ManipulationExperiment(options=RunOptions()).list_cases()[0]
+    gravity = true_gravity(case.settings)
+    directions = np.array(list(gravity.values()))
+    assert directions[0] == pytest.approx([0.0, -1.0, 0.0])  # a level gripper that rolls
+    assert directions[:, 0].min() == pytest.approx(-1.0, abs=1e-3) and np.abs(directions[:, 2]).max() < 1e-9
+    one = make_recording("one")
+    told = tell_gravity(one, {stamp: np.array([0.6, 0.0, 0.8]) for stamp in one.jaw("left").keypoints.stamps.tolist()})
+    seen = told.jaw("left").keypoints.observation(0).gravity
+    assert R_GRIPPER_JAW["left"] @ seen == pytest.approx([0.6, 0.0, 0.8])
+    assert one.jaw("left").keypoints.observation(0).gravity is None
 
 
 def test_the_twin_has_27_grasps_with_seeds_of_their_own():

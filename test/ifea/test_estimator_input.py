@@ -27,7 +27,7 @@ from finforce_ifea.errors import CalibrationError, ContactError, JawFileError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, load_jaw
 from finforce_ifea.mechanics import build_mechanics
-from finforce_ifea.observation import Contact, Observation
+from finforce_ifea.observation import Contact, Observation, check_observation
 from finforce_ifea.settings import EstimatorSettings
 
 # --- contacts
@@ -262,3 +262,11 @@ def test_steel_finger_works_with_the_same_estimator():
         assert solution.trusted
         assert np.linalg.norm(solution.force) == pytest.approx(force, abs=0.1 + 0.05 * force)
     assert force > 2.0
+
+
+@pytest.mark.parametrize("gravity", [np.array([0.0, 0.0, 9.81]), np.array([0.0, 1.0]), np.full(3, np.nan)])
+def test_a_direction_of_gravity_is_a_unit_vector(gravity):
+    one = Observation(stamp=0.0, points=np.zeros((2, 3)), likelihood=np.ones(2), gravity=np.array([0.0, 0.6, 0.8]))
+    check_observation(one, 2, None)
+    with pytest.raises(ObservationError, match="expected a unit vector"):
+        check_observation(replace(one, gravity=gravity), 2, None)

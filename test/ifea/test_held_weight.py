@@ -106,6 +106,28 @@ def test_a_force_across_shows_and_does_not_look_like_one_along():
     assert 0.0 < held.across_stddev < 0.2
 
 
+def test_what_looks_like_a_weight_along_is_hardly_one_where_gravity_points_across():
+    dim = MODES * [1.0, 1.0, 1.0, 0.05]  # a newton along the finger moves key points by hundredths of a millimetre
+    blind, told = HeldWeight(), HeldWeight()
+    for held, gravity in ((blind, None), (told, np.array([0.6, 0.8, 0.0]))):
+        for one in [frame() for _ in range(30)] + [frame(0.05, across=0.4) for _ in range(60)]:
+            held.update(one._replace(modes=dim), PRIOR, DT, gravity)
+    assert blind.force == pytest.approx(1.0, abs=0.2)
+    assert abs(told.force) < 0.35 and told.stddev < 0.1 < blind.stddev
+    assert told.across == pytest.approx(0.4, abs=0.05)
+
+
+@pytest.mark.parametrize("along", [0.8, -0.8])
+def test_a_weight_along_that_nobody_sees_follows_from_what_is_seen_across(along):
+    held = HeldWeight()
+    unseen = MODES * [1.0, 1.0, 1.0, 0.0]  # a lean moves nothing
+    for one in [frame() for _ in range(30)] + [frame(across=0.3) for _ in range(60)]:
+        held.update(one._replace(modes=unseen), PRIOR, DT, np.array([0.0, 0.6, along]))
+    assert held.across == pytest.approx(0.3, abs=0.05)
+    assert held.force == pytest.approx(0.3 * along / 0.6, abs=0.05)
+    assert 0.1 < held.stddev < 0.25  # what may act from outside
+
+
 def test_what_twists_the_finger_is_no_force():
     held = HeldWeight()
     follow(held, [frame() for _ in range(30)])
