@@ -33,6 +33,13 @@ class DetectorSettings:
     workspace_closing: float = setting(0.025, "how far a key point may leave its place along x", "m", 1e-3, 0.5)
     workspace_width: float = setting(4e-3, "the same along y", "m", 1e-4, 0.5)
     workspace_length: float = setting(0.012, "the same along z", "m", 1e-3, 0.5)
+    readout: float = setting(
+        0.0,
+        "a rolling shutter's, from the first row's exposure to the last one's, which the stamp tells",
+        "s",
+        0.0,
+        0.1,
+    )
     opening_min: float = setting(0.010, "least distance of a jaw's origin from the middle of the grasp", "m", 0.0, 0.5)
     opening_max: float = setting(0.080, "largest distance of a jaw's origin from there", "m", 1e-3, 0.5)
     acceleration: float = setting(

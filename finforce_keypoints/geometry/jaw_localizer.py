@@ -12,7 +12,7 @@ image, it tells ten times as exactly how far it has slid since the first ones.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
@@ -248,7 +248,7 @@ class JawLocalizer:
 
     def __init__(self, jaw: Jaw, T_gripper_camera: NDArray, settings: DetectorSettings) -> None:
         """Prepare where to sample depth on the jaw."""
-        self._settings = settings
+        self._settings, self._sign = settings, 1.0 if jaw.side == "left" else -1.0
         self._origin, self._track = OriginFinder(jaw, T_gripper_camera, settings), OriginTrack(settings)
         self._patch, self._rest_check = ReferencePatch(jaw), RestCheck(jaw.keypoints)
         self._unconfirmed = 0
@@ -364,6 +364,8 @@ class JawLocalizer:
         depths = sight.depths_at(self._rest[:, 1] + side.fit.y)
         self._check_rest(seen, sight, side)
         points = np.where(side.has_depth[:, None], sight.camera + depths[:, None] * sight.rays, np.nan)
+        late = self._find_delays(seen, T_camera_jaw)
+        points[:, 0] -= self._sign * self._track.speed * (late - late[-1])
         stddev = compute_stddev(sight, depths, side.fit.stddev, seen.ray_stddev)
         stddev[:, 0] = np.hypot(stddev[:, 0], origin.stddev)
         reasons = self._judge(seen.image, seen.finding, side, points)
@@ -376,10 +378,19 @@ class JawLocalizer:
             pixels=seen.finding.pixels[:count],
             valid=valid,
             stddev=stddev[:count],
-            T_camera_jaw=T_camera_jaw,
+            T_camera_jaw=self._origin.place(replace(origin, x=origin.x - self._track.speed * late[-1])),
             reasons=reasons,
         )
         return Located(keypoints=keypoints, scale=side.fit.scale)
+
+    def _find_delays(self, seen: _Seen, T_camera_jaw: NDArray) -> NDArray:
+        """Return how long after the image's stamp the points' rows were exposed (K + 1,) [s].
+
+        The reference point, which tells where the jaw is, has one wherever it was found.
+        """
+        camera, rows = seen.image.camera, seen.finding.pixels[:, 1].copy()
+        rows[-1] = project(self._rest[-1:] @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3], camera)[0, 1]
+        return self._settings.readout * (rows / camera.height - 1.0)
 
     def _check_rest(self, seen: _Seen, sight: SideView, side: SideEvidence) -> None:
         """Compare the likely points with the jaw file: along the side where their rays meet it, across it by depth."""

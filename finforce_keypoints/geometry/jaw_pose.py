@@ -128,6 +128,11 @@ class OriginTrack:
         """Whether nobody knows where the jaw is."""
         return self._stamp is None
 
+    @property
+    def speed(self) -> float:
+        """How fast the jaw slides [m/s]."""
+        return float(self._state[1])
+
     def forecast(self, stamp: float) -> Origin | None:
         """Return where the jaw should be at a time [s]; None when it is lost."""
         if self._stamp is None or stamp - self._stamp > _LONGEST_STEP:

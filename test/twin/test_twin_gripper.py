@@ -71,6 +71,18 @@ def test_phases_of_every_scenario_read_as_those_of_the_bench_and_tell_the_displa
     np.testing.assert_allclose(track.displacement_at(stamps), 1e3 * closing, atol=1.01 * one_image)
 
 
+@pytest.mark.parametrize("rate", [15.0, 90.0])
+def test_images_come_at_the_rate_that_was_asked_for(rate):
+    usual, script = (write_script(build_scenario("grasp_cylinder", **changes)) for changes in ({}, {"rate": rate}))
+    np.testing.assert_allclose(np.diff(script.stamps), 1.0 / rate)
+    assert abs(script.stamps[-1] - usual.stamps[-1]) <= 1.0 / min(rate, RATE)
+
+
+def test_rows_that_take_longer_than_an_image_are_refused():
+    with pytest.raises(ScenarioError, match=r"rows are read within 0\.02 s, expected 0\.0111"):
+        build_scenario("grasp_cylinder", rate=90.0, readout=0.02)
+
+
 def test_jaws_move_no_faster_than_the_closing_speed_and_reach_it(cylinder):
     gripper, states = cylinder
     origins = np.array([[state.jaws[side].origin_x for side in ("left", "right")] for state in states])
