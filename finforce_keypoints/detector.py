@@ -26,6 +26,7 @@ from finforce_keypoints.settings import LOOK_EVERY, RULES, SEARCH_EVERY, SEARCHE
 __all__ = ["JawKeypoints", "KeypointDetector"]
 
 _SAME_SIDE = 2e-3  # [m] by which a reference point may lie off the plane of the key points
+_BESIDE = 6e-3  # [m] by which the middle between two jaws may lie beside the gripper's
 _PRACTICE_SIZE, _RATE = (640, 480), 30.0  # px, Hz
 _LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is better than this
 
@@ -83,6 +84,13 @@ class KeypointDetector:
     @property
     def warnings(self) -> Mapping[str, str]:
         """What is suspicious about a jaw, by side, in a sentence; nothing is refused for it."""
+        beside = sum(jaw.place for jaw in self._jaws.values()) / 2.0
+        if len(self._jaws) == 2 and abs(beside) > _BESIDE:
+            text = (
+                f"the jaws' middle lies {1e3 * abs(beside):.0f} mm beside the gripper's: is the picture cut and "
+                "camera_info not, or the camera elsewhere?"
+            )
+            return {side: "; ".join(filter(None, (jaw.warning, text))) for side, jaw in self._jaws.items()}
         return {side: jaw.warning for side, jaw in self._jaws.items() if jaw.warning}
 
     @property

@@ -286,6 +286,11 @@ class JawLocalizer:
         return self._track.is_lost
 
     @property
+    def place(self) -> float:
+        """Where the jaw's origin is on the closing axis [m]; NaN when it is lost."""
+        return self._track.place
+
+    @property
     def is_settled(self) -> bool:
         """Whether the jaw's place is no longer learnt, so that images in a row tell the same."""
         return self._patch.is_learnt

@@ -25,10 +25,12 @@ class Origin:
     Attributes:
         x: of the jaw's origin in the gripper base [m].
         stddev: [m].
+        shared: the part of it that images in a row have in common [m].
     """
 
     x: float
     stddev: float
+    shared: float = 0.0
 
 
 class OriginFinder:
@@ -83,7 +85,7 @@ class OriginFinder:
         weights = 1.0 / (error**2 + bent**2 + (x - np.median(x)) ** 2)
         # bent points do not err independently: what they share is no smaller than the least bending
         spread = np.sqrt(1.0 / weights.sum() + bent.min() ** 2)
-        return Origin(x=float(weights @ x / weights.sum()), stddev=float(spread))
+        return Origin(x=float(weights @ x / weights.sum()), stddev=float(spread), shared=float(bent.min()))
 
     def _agrees(self, origin: Origin, x: NDArray, off: NDArray) -> bool:
         """Say whether the points near the base, by origins (K + 1,) and distances (K + 1,), are of a jaw there."""
@@ -129,6 +131,11 @@ class OriginTrack:
         return self._stamp is None
 
     @property
+    def place(self) -> float:
+        """Where the jaw's origin is on the closing axis [m]; NaN when it is lost."""
+        return float("nan") if self.is_lost else float(self._state[0])
+
+    @property
     def speed(self) -> float:
         """How fast the jaw slides [m/s]."""
         return float(self._state[1])
@@ -157,8 +164,11 @@ class OriginTrack:
             P = P + np.diag([error**2, (error / dt) ** 2])
         gain = P[:, 0] / (P[0, 0] + origin.stddev**2)
         self._stamp, self._state = stamp, state + gain * error
+        least = min(P[0, 0], origin.shared**2)
         self._P = P - np.outer(gain, P[0])
-        return self._estimate()
+        # a finger stays bent from image to image: no average of its points knows better where its base is
+        self._P[0, 0] = max(self._P[0, 0], least)
+        return self._estimate() if np.sqrt(self._P[0, 0]) <= self._settings.origin_stddev else None
 
     def rest(self, stamp: float) -> None:
         """Take it that the jaw has not moved since the last image."""
@@ -170,7 +180,7 @@ class OriginTrack:
         self._stamp, self._state = stamp, np.array([origin.x, speed])
         self._P = np.diag([origin.stddev**2, 0.01**2])
         self._aside, self._missed = [], 0
-        return self._estimate()
+        return self._estimate() if origin.stddev <= self._settings.origin_stddev else None
 
     def _miss(self, stamp: float, forecast: Origin | None) -> Origin | None:
         """Go on without an origin for a few images."""

@@ -108,6 +108,20 @@ def test_one_impossible_origin_is_not_believed_and_three_that_agree_are():
     np.testing.assert_allclose(found, [-0.05, -0.05, -0.03], atol=1e-3)
 
 
+def test_a_finger_that_stays_bent_tells_no_better_where_its_base_is_the_longer_it_is_seen():
+    bent = {"stddev": 1.0e-3, "shared": 0.9e-3}
+    for told, is_known in ((bent, False), ({"stddev": 1.0e-3}, True)):
+        track = OriginTrack(SETTINGS)
+        found = [track.update(n / RATE, Origin(x=-0.05, **told)) for n in range(60)]
+        assert found[0] is None and (found[-1] is not None) == is_known
+    # what the reference point told before it was hidden is not forgotten at once
+    track = OriginTrack(SETTINGS)
+    for n in range(30):
+        track.update(n / RATE, Origin(x=-0.05, stddev=1e-4))
+    found = [track.update((30 + n) / RATE, Origin(x=-0.0507, **bent)) for n in range(10)]
+    assert all(origin is not None and abs(origin.x + 0.05) < 3.0 * origin.stddev for origin in found)
+
+
 def test_a_jaw_is_lost_after_some_images_without_it_and_found_again_at_once():
     track = OriginTrack(SETTINGS)
     for n in range(30):

@@ -196,6 +196,17 @@ def test_rows_that_were_exposed_one_after_the_other_do_not_bend_a_closing_jaw(re
         assert min(off.values()) > 0.3e-3 and away > 0.5e-3
 
 
+@pytest.mark.parametrize(("cut", "is_said"), [(0.0, False), (60.0, True), (-60.0, True)])
+def test_a_picture_that_was_cut_and_its_intrinsics_not_is_noticed_by_the_jaws_middle(cut, is_said):
+    scene, _, finder, detector = build(plane_depth=True)
+    finder.pixels = {side: rows + (cut, 0.0) for side, rows in finder.pixels.items()}
+    found = detector.detect(bare_image(0.0, None))
+    assert set(found) == {"left", "right"}
+    said = detector.warnings
+    assert set(said) == (set(found) if is_said else set())
+    assert all("mm beside the gripper's" in text for text in said.values())
+
+
 def test_a_lost_jaw_is_absent_looked_for_everywhere_and_found_again():
     scene, depth, finder, detector = build()
     image = bare_image(0.0, depth.astype(np.float32))
