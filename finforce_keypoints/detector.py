@@ -27,6 +27,7 @@ __all__ = ["JawKeypoints", "KeypointDetector"]
 
 _SAME_SIDE = 2e-3  # [m] by which a reference point may lie off the plane of the key points
 _BESIDE = 6e-3  # [m] by which the middle between two jaws may lie beside the gripper's
+_FEW, _MEMORY = 0.4, 45  # share of a jaw's key points that are too few on average, and over how many images
 _PRACTICE_SIZE, _RATE = (640, 480), 30.0  # px, Hz
 _LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is better than this
 
@@ -72,6 +73,7 @@ class KeypointDetector:
         self._stamp: float | None = None
         self._looked = -np.inf
         self._missed = dict.fromkeys(self._jaws, 0)
+        self._looks, self._shares = dict.fromkeys(self._jaws, 0), dict.fromkeys(self._jaws, 0.0)
         self._watch = StillWatch()
         self._scale = DepthScale(error=0.0, stddev=self.settings.scale_stddev)
         self.counts: Counter[str] = Counter()
@@ -84,14 +86,21 @@ class KeypointDetector:
     @property
     def warnings(self) -> Mapping[str, str]:
         """What is suspicious about a jaw, by side, in a sentence; nothing is refused for it."""
+        said = {side: [jaw.warning] if jaw.warning else [] for side, jaw in self._jaws.items()}
+        for side, share in self._shares.items():
+            if self._looks[side] >= _MEMORY and share < _FEW:
+                said[side].append(
+                    f"{100 * share:.0f} % of the key points are seen on average: is it the finger of the jaw file, and "
+                    "nothing before it?"
+                )
         beside = sum(jaw.place for jaw in self._jaws.values()) / 2.0
         if len(self._jaws) == 2 and abs(beside) > _BESIDE:
             text = (
                 f"the jaws' middle lies {1e3 * abs(beside):.0f} mm beside the gripper's: is the picture cut and "
                 "camera_info not, or the camera elsewhere?"
             )
-            return {side: "; ".join(filter(None, (jaw.warning, text))) for side, jaw in self._jaws.items()}
-        return {side: jaw.warning for side, jaw in self._jaws.items() if jaw.warning}
+            said = {side: [*texts, text] for side, texts in said.items()}
+        return {side: "; ".join(texts) for side, texts in said.items() if texts}
 
     @property
     def depth_scale(self) -> DepthScale:
@@ -156,6 +165,10 @@ class KeypointDetector:
         findings = self._finder.find(image, expected) if expected else {}
         self.counts["images"] += 1
         found = self._locate(image, findings)
+        for side in expected:
+            self._looks[side] += 1
+            seen = float(found[side].valid.mean()) if side in found else 0.0
+            self._shares[side] += (seen - self._shares[side]) / min(self._looks[side], _MEMORY)
         self._missed = {side: 0 if side in found else missed + 1 for side, missed in self._missed.items()}
         if not self._skips.allows(STILL):
             return found

@@ -207,6 +207,18 @@ def test_a_picture_that_was_cut_and_its_intrinsics_not_is_noticed_by_the_jaws_mi
     assert all("mm beside the gripper's" in text for text in said.values())
 
 
+@pytest.mark.parametrize(("hidden", "is_said"), [(0, False), (6, False), (11, True)])
+def test_a_finger_of_which_hardly_a_point_is_seen_is_said_within_two_seconds(hidden, is_said):
+    _, _, finder, detector = build(plane_depth=True)
+    finder.likelihood["left"][2 : 2 + hidden] = 0.1
+    for n in range(60):
+        detector.detect(bare_image(n / RATE, None))
+        if n < 30:  # a hand before the camera for a moment is nothing to say
+            assert not detector.warnings
+    assert set(detector.warnings) == ({"left"} if is_said else set())
+    assert not is_said or "is it the finger of the jaw file" in detector.warnings["left"]
+
+
 def test_a_lost_jaw_is_absent_looked_for_everywhere_and_found_again():
     scene, depth, finder, detector = build()
     image = bare_image(0.0, depth.astype(np.float32))
