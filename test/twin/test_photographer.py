@@ -1,7 +1,6 @@
 from dataclasses import replace
 from itertools import pairwise
 
-import cv2
 import numpy as np
 import pytest
 
@@ -75,37 +74,6 @@ def test_the_dot_on_the_holder_is_where_the_reference_point_is(shot):
         dot = shot.color[row - 1 : row + 2, column - 1 : column + 2].mean()
         around = shot.color[row - 14 : row + 15, column - 14 : column + 15].astype(float)
         assert abs(dot - np.median(around)) > 20.0  # grey levels
-
-
-def test_a_rolling_shutter_sees_each_row_when_it_is_exposed(gripper, setting):
-    readout = 0.020
-    states = [state for state in gripper.states() if state.stamp > 1.7][:3]
-    before, state = states[1:]
-    views = {}
-    for seconds in (0.0, readout):
-        photographer = Photographer(replace(setting, readout=seconds), 3)
-        photographer.look(before)
-        views[seconds] = photographer.look(state)  # without noise
-    camera = setting.camera
-    moved = state.jaws["left"].origin_x - before.jaws["left"].origin_x
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        still, rolled = (views[seconds].truth[side] for seconds in (0.0, readout))
-        early = readout * (1.0 - still.pixels[:, 1] / camera.height)
-        x = early / (state.stamp - before.stamp) * moved * sign
-        points = still.points @ still.T_camera_jaw[:3, :3].T + still.T_camera_jaw[:3, 3]
-        expected = project(points - x[:, None] * setting.T_gripper_camera[0, :3], camera)
-        assert np.abs(rolled.pixels - expected).max() < 0.1  # [px]; rows of a strip are exposed together
-        assert np.abs(rolled.pixels - still.pixels).max() > 0.5
-        # the picture shows the dot on the holder there, too, and not where it is without
-        there, elsewhere = (
-            np.abs(cut(views[readout], at.pixels[-1]) - cut(views[0.0], still.pixels[-1])).mean()
-            for at in (rolled, still)
-        )
-        assert there < 0.5 * elsewhere
-
-
-def cut(view, pixel):
-    return cv2.getRectSubPix(view.picture.color.mean(axis=2).astype(np.float32), (21, 21), pixel.tolist())
 
 
 def test_depth_comes_in_the_steps_that_were_asked_for(setting, pressed):
