@@ -66,13 +66,14 @@ class ChipExperiment:
         from finforce_eval.experiments.grasp_sensors import EstimatorSensor, ImageSensor, build_plant
         from finforce_eval.experiments.grasp_world import GraspCase, NoisySensor, World
 
-        way, seed = case.settings["way"], case.settings["seed"]
+        way, seed, untold = case.settings["way"], case.settings["seed"], []
         pressed = _lay(seed)
         grasp = GraspCase(plant=build_plant(OBJECT, pressed), force=BEARS, speed=SPEED, latency=LATENCY, seed=seed)
         if way == "force":
             make = ImageSensor if case.settings["source"] == "images" else EstimatorSensor
             more = {"size": case.settings["size"]} if make is ImageSensor else {}
-            course = World(grasp, make(pressed, seed, **more), holding=HOLDING).run()
+            sensor = make(pressed, seed, **more)
+            course, untold = World(grasp, sensor, holding=HOLDING).run(), sensor.untold
         else:
             opening = find_taught_opening() if way == "position" else 0.0
             course = World(grasp, NoisySensor(0.0, seed)).run_blind(opening, STRONG if way == "position" else CURRENT)
@@ -84,6 +85,7 @@ class ChipExperiment:
             "end_N": float(forces[times > times[-1] - 1.0].mean()),
             "is_broken": bool(forces.max(initial=0.0) >= BREAKS),
             "error": course.error,
+            "untold": [[round(stamp - start, 3), words] for stamp, words in untold],
             "violations": sum(course.violations.values()),
             "seconds": np.round(times[::DRAWN_EVERY] - start, 3).tolist(),
             "force": np.round(forces[::DRAWN_EVERY], 3).tolist(),
@@ -106,6 +108,7 @@ class ChipExperiment:
                 "peak_N": [float(peaks.min()), float(peaks.mean()), float(peaks.max())],
                 "end_N": [float(ends.min()), float(ends.mean()), float(ends.max())],
                 "ended_early": sum(bool(row["error"]) for row in members),
+                "images_without_force": sum(len(row["untold"]) for row in members),
                 "violations": sum(row["violations"] for row in members),
             }
             numbers = (f"{value:.2f}" for value in (*one["peak_N"], *one["end_N"]))
@@ -113,6 +116,7 @@ class ChipExperiment:
         head = ("by", "grasps", "broken", "peak/N: least", "mean", "largest", "at the end/N: least", "mean", "largest",
                 "ended early")  # fmt: skip
         note = f"Broken: a true force of {BREAKS:g} N was reached; wanted: {BEARS:g} N."
+        note += "".join(_tell_end(name, row) for name, row in figures.items() if row["error"])
         table = ResultTable(title="**Grasps**", head=head, rows=rows, note=note)
         pictures = {"True force over time; the line is where it breaks": "chips.png"}
         return Findings(
@@ -120,6 +124,12 @@ class ChipExperiment:
             tables=[table],
             pictures=pictures,
         )
+
+
+def _tell_end(name: str, row: Mapping[str, Any]) -> str:
+    """Return why a grasp ended early, and what the jaws said of the last image that had no force."""
+    last = f" ({row['untold'][-1][1]})" if row["untold"] else ""
+    return f" {name} ended early: {row['error']}{last}."
 
 
 def _lay(seed: int | None) -> Any:

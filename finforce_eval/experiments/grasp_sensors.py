@@ -84,6 +84,7 @@ class EstimatorSensor:
     Attributes:
         touching: whether a jaw was said to touch in the last image.
         stddev: of the jaw whose force is less certain, as the driver takes it from `wrench_stddev` [N].
+        untold: time [s] of every image without a force since the first one with, and what the jaws said.
     """
 
     def __init__(self, pressed: PressedGrasp, seed: int) -> None:
@@ -92,6 +93,8 @@ class EstimatorSensor:
         self._next_pose = 0.0
         self.touching: bool | None = None
         self.stddev = 0.0
+        self.untold: list[tuple[float, str]] = []
+        self._has_told = False
 
     def measure(self, stamp: float, force: float, opening: float) -> float | None:
         """Return min(|F_left|, |F_right|), None unless both are trusted."""
@@ -102,14 +105,18 @@ class EstimatorSensor:
             for side, jaw in self._jaws.items():
                 jaw.take_pose(stamp, pose, state.jaws[side].origin_x)
         seen = self._look(state)
-        solutions = [jaw.solve(seen[side]) for side, jaw in self._jaws.items() if side in seen]
-        if len(solutions) < len(self._jaws):
+        solutions = {side: jaw.solve(seen[side]) for side, jaw in self._jaws.items() if side in seen}
+        silent = {side: "not found in the image" for side in self._jaws if side not in solutions}
+        if not silent:
+            self.touching = any(jaw.touching for jaw in self._jaws.values())
+        silent |= {side: f"{one.status}: {one.message}" for side, one in solutions.items() if not one.trusted}
+        if silent:
+            if self._has_told:
+                self.untold.append((stamp, "; ".join(f"{side} {words}" for side, words in silent.items())))
             return None
-        self.touching = any(jaw.touching for jaw in self._jaws.values())
-        if not all(solution.trusted for solution in solutions):
-            return None
-        self.stddev = max(magnitude_stddev(solution.force_stddev) for solution in solutions)
-        return min(float(np.linalg.norm(solution.force)) for solution in solutions)
+        self._has_told = True
+        self.stddev = max(magnitude_stddev(solution.force_stddev) for solution in solutions.values())
+        return min(float(np.linalg.norm(solution.force)) for solution in solutions.values())
 
     def _look(self, state: TwinState) -> Mapping[str, Observation]:
         """Return the key points of the jaws that are found in a state."""

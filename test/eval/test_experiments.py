@@ -22,6 +22,7 @@ from finforce_eval.engine.tasks import Manifest
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import EstimatedContact
 from finforce_eval.evaluation.manipulation import NetForces
+from finforce_eval.experiments import grasp_sensors
 from finforce_eval.experiments.chip import ChipExperiment
 from finforce_eval.experiments.experiment import Case, Findings, ResultTable, format_tables, run_experiment
 from finforce_eval.experiments.force_network import HEIGHT, SHOWN, WIDTH, ForceNetwork, reduce_image
@@ -286,6 +287,52 @@ def test_quick_cases_are_some_of_the_others():
     for kind in kinds:
         every, few = ([c.name for c in kind(options=RunOptions(quick=q)).list_cases()] for q in (False, True))
         assert set(few) < set(every)
+
+
+class ScriptedJaw:
+    """A jaw that says of its images what it is told to."""
+
+    def __init__(self, pressed, side):
+        self._words, self.touching = iter(pressed.script[side]), True
+
+    def take_pose(self, stamp, pose, origin_x):
+        pass
+
+    def solve(self, observation):
+        status, message = next(self._words)
+        force = np.array([3.0, 0.0, 0.0])
+        return SimpleNamespace(
+            status=status, message=message, trusted=status == "ok", force=force, force_stddev=0.1 * force
+        )
+
+
+def test_images_without_a_force_are_told_with_what_the_jaws_said(monkeypatch):
+    monkeypatch.setattr(grasp_sensors, "JawSensor", ScriptedJaw)
+    fine, doubt, start = ("ok", ""), ("unobservable", "they do not fit"), ("waiting", "for the tare")
+    script = {"left": [start, fine, fine, fine], "right": [start, fine, doubt]}
+    seen = SimpleNamespace(origin_x=0.0, keypoints=np.zeros((8, 3)))
+    jaws = [{"left": seen, "right": seen}] * 3 + [{"left": seen}]
+    states = iter(SimpleNamespace(stamp=0.1 * n, jaws=each, T_gripper_object=np.eye(4)) for n, each in enumerate(jaws))
+    pressed = SimpleNamespace(script=script, assembly=SimpleNamespace(jaws=script), state=lambda *_: next(states))
+    sensor = grasp_sensors.EstimatorSensor(pressed, 0)
+    sensor._next_pose = np.inf
+    assert [sensor.measure(0.1 * n, 3.0, 0.02) for n in range(4)] == [None, 3.0, None, None]
+    assert [words for _, words in sensor.untold] == [
+        "right unobservable: they do not fit",
+        "right not found in the image",
+    ]
+    assert [stamp for stamp, _ in sensor.untold] == pytest.approx([0.2, 0.3])
+
+
+def test_why_a_grasp_ended_early_is_on_the_page(tmp_path):
+    row = {"way": "force", "peak_N": 3.0, "end_N": 2.9, "is_broken": False, "error": "", "violations": 0,
+           "seconds": [0.0], "force": [0.0], "untold": []}  # fmt: skip
+    early = {"error": "the newest force is 0.27 s old", "untold": [[0.1, "left waiting"], [0.2, "right unobservable"]]}
+    findings = ChipExperiment(options=RunOptions()).find({"force_00": row, "force_01": row | early}, tmp_path)
+    assert "force_01 ended early: the newest force is 0.27 s old (right unobservable)" in findings.tables[0].note
+    assert "force_00" not in findings.tables[0].note
+    assert findings.figures["ways"]["force"]["images_without_force"] == 2
+    assert findings.figures["grasps"]["force_01"]["untold"] == early["untold"]
 
 
 def test_a_recording_that_lacks_something_is_told_what(tmp_path, capsys):
