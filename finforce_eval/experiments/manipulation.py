@@ -47,8 +47,9 @@ class ManipulationExperiment:
     about: str = (
         "The letter grasps a calibration weight of 100 g (0.98 N), turns the gripper once round and back, with a lamp "
         "and without, five times each, and compares the manipulation force of Eq. 3 with the weight along gravity. "
-        "Here the turn is rendered: about the axis along which the jaws close (x: gravity never presses on a jaw) "
-        "and about the camera's (y: it presses on one and then on the other), in bright and in dim light, and "
+        "Here the turn is rendered: about where a level gripper points (roll: gravity presses on one jaw and then on "
+        "the other, and acts across the fingers between), about the axis along which the jaws close (x: it never "
+        "presses on a jaw) and about the camera's (y: it never acts across), in bright and in dim light, and "
         "*swapped*: begun the other way round, as if left and right had changed places. The object's poses come at "
         "10 Hz with noise; its mass is not known to the estimator."
     )
