@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
@@ -35,3 +35,14 @@ def one_line_errors() -> Iterator[None]:
         yield
     except FinforceError as error:
         raise SystemExit(f"training: {error}") from error
+
+
+def read_share(text: str) -> float:
+    """Return an option as a number from 0 to 1."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = -1.0
+    if not 0.0 <= number <= 1.0:
+        raise ArgumentTypeError(f"{text[:40]!r}: expected a number from 0 to 1")
+    return number

@@ -8,7 +8,8 @@ from training.network import LARGEST_SPREAD, FingerNetwork, standardise
 from training.optional import import_torch
 
 torch = import_torch()
-POINTS = 18  # of a picture that the fine part looks at in one step
+POINTS = 12  # of a picture that the fine part looks at in one step
+COVERED = 4  # of them that are key points which cannot be seen, where there are any
 ANYWHERE = 2  # of them that need not be key points
 FAR, FAR_SHARE, NEAR = (
     9.0,
@@ -88,7 +89,7 @@ def compute_losses(network: FingerNetwork, batch: Batch, *, low: bool) -> Losses
         away = torch.sqrt((guess - places).square().sum(dim=2) + 0.25)
         weight = known * torch.where(batch.visible, 1.0, 0.4)
         coarse = (weight * away).sum() / weight.sum().clamp(min=1.0)
-        chosen = _choose(batch)
+        chosen = choose_points(batch)
         rest, places, visible = (_take(part, chosen) for part in (batch.rest, places, batch.visible))
         found, judged = network.compare(
             pictures, templates, rest, places + _draw_miss(rest), network.read(features, rest)
@@ -112,11 +113,14 @@ def to_layers(images: torch.Tensor) -> torch.Tensor:
     return images.permute(0, 3, 1, 2).float() / 255.0
 
 
-def _choose(batch: Batch) -> torch.Tensor:
-    """Return the indices (B, POINTS) of points that the fine part looks at: the mark, key points, some anywhere."""
+def choose_points(batch: Batch) -> torch.Tensor:
+    """Return the indices (B, POINTS) of what the fine part looks at: mark, hidden and other key points, any points."""
     count, points = batch.visible.shape
     device = batch.rest.device
     chosen = (torch.rand(count, POINTS, device=device) * batch.keypoints[:, None]).long()
+    hidden = ~batch.visible & (torch.arange(points, device=device) < batch.keypoints[:, None])
+    first = (torch.rand(count, points, device=device) + hidden).argsort(dim=1, descending=True)[:, :COVERED]
+    chosen[:, 1 : 1 + COVERED] = torch.where(_take(hidden, first), first, chosen[:, 1 : 1 + COVERED])
     chosen[:, 0] = 0
     chosen[:, -ANYWHERE:] = torch.randint(0, points, (count, ANYWHERE), device=device)
     return chosen

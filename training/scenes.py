@@ -30,7 +30,7 @@ from finforce_twin.rendering.lighting import Lighting, Paint, draw_color, draw_j
 from finforce_twin.rendering.render import Body, Decal, RenderedScene
 from finforce_twin.rendering.sensor import expose
 from finforce_twin.scenes.objects import OBJECT_NAMES, build_object
-from training.arguments import one_line_errors
+from training.arguments import one_line_errors, read_share
 from training.dataset import MARGIN, TRAIN, VALIDATION, FingerPictures, save_shard
 from training.fingers import BentFinger, Finger, draw_finger, outline
 from training.making import make_all
@@ -39,6 +39,8 @@ SEED = 40_000_000_000  # of training's fingers begin here
 STATES = 8  # pictures of a finger
 KEYPOINTS, ANYWHERE = 24, 72  # points of a picture: key points with the mark, and points anywhere on the material
 BARS = 0.35  # share of the pictures with something between camera and finger
+HELD = 0.6  # share of the pictures of a grasp as the camera on a wrist sees it: aslant, a held object that juts out
+ALIKE = 0.3  # share of the held objects that look much like the finger
 NO_MARK = 0.08  # share of the fingers whose holder has no dot
 R_CAMERA_JAW = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # square at the side, x right, z down
 TEXTURES = Path(__file__).parent / "textures"
@@ -187,10 +189,16 @@ def _rod(rng: np.random.Generator, radius: NDArray, half: float, *, round_: bool
 
 
 class FingerScenes:
-    """Draws the pictures of one finger, the same for the same seed."""
+    """Draws the pictures of one finger, the same for the same seed.
 
-    def __init__(self, seed: int) -> None:
+    Args:
+        seed: of finger and scenes.
+        held: share of the pictures that show a grasp as the camera on a wrist sees it.
+    """
+
+    def __init__(self, seed: int, held: float = HELD) -> None:
         self._rng = rng = np.random.default_rng((SEED, seed))
+        self._held = held
         self._finger = finger = draw_finger(rng)
         self._bent = BentFinger(finger, rng)
         self._solid = extrude(finger)
@@ -232,8 +240,9 @@ class FingerScenes:
         places = bend(rest, self._bent.attach(rest))
         places[0] = rest[0] = finger.reference
         side_y = float(finger.half_width(finger.keypoints[:, 1]).mean())
-        camera, centre = self._draw_camera(grid, side_y)
-        bodies, look, R = self._build(section, state, side_y)
+        held = self._held > 0.0 and bool(rng.random() < self._held)
+        camera, centre = self._draw_camera(grid, side_y, held=held)
+        bodies, look, R = self._build(section, state, side_y, held=held)
         moved = [replace(body, vertices=(body.vertices - centre) @ R_CAMERA_JAW.T) for body in bodies]
         scene = RenderedScene(moved, look, R, R_CAMERA_JAW @ -centre)
         color = expose(scene.render(camera).color, look.exposure, rng)
@@ -258,21 +267,26 @@ class FingerScenes:
         anywhere[len(anywhere) - len(inner) :] = shapely.get_coordinates(inner)
         return np.vstack((chosen, anywhere))
 
-    def _draw_camera(self, grid: PlaneGrid, side_y: float) -> tuple[CameraIntrinsics, NDArray]:
+    def _draw_camera(self, grid: PlaneGrid, side_y: float, *, held: bool) -> tuple[CameraIntrinsics, NDArray]:
         """Return the virtual camera and its centre (3,) [m] in the jaw frame."""
         rng, length = self._rng, self._finger.length
-        away = max(0.05, length) * rng.uniform(0.8, 3.5)
-        steep = np.array([np.clip(rng.normal(0.0, 0.35), -0.9, 0.9), np.clip(rng.normal(-0.25, 0.55), -1.4, 1.0)])
+        if held:
+            away, steep = rng.uniform(0.06, 0.14), np.array([rng.uniform(-0.15, 0.6), rng.uniform(-1.5, -0.5)])
+        else:
+            away = max(0.05, length) * rng.uniform(0.8, 3.5)
+            steep = np.array([np.clip(rng.normal(0.0, 0.35), -0.9, 0.9), np.clip(rng.normal(-0.25, 0.55), -1.4, 1.0)])
         centre = np.array([0.0, side_y + away, 0.5 * length]) + np.insert(steep * away, 1, 0.0)
         f = away / grid.scale
         at = grid.pixels(centre[None, [0, 2]])[0]
         camera = CameraIntrinsics(width=grid.width, height=grid.height, fx=f, fy=f, cx=float(at[0]), cy=float(at[1]))
         return camera, centre
 
-    def _build(self, section: NDArray, state: NDArray | None, side_y: float) -> tuple[list[Body], Lighting, NDArray]:
+    def _build(
+        self, section: NDArray, state: NDArray | None, side_y: float, *, held: bool
+    ) -> tuple[list[Body], Lighting, NDArray]:
         """Return the bodies of a scene in the jaw frame, its look, and the rotation of the look's directions."""
         rng, finger = self._rng, self._finger
-        look = draw_look(rng, "dim" if rng.random() < 0.2 else "any")
+        look = draw_look(rng, "dim" if rng.random() < (0.5 if held else 0.2) else "any")
         if rng.random() < 0.6:
             look = replace(look, background=_fill_square(_draw_texture(rng)))
         if rng.random() < 0.15:  # light that does not come from single lamps
@@ -328,10 +342,10 @@ class FingerScenes:
             bodies.append(
                 _box((-0.1, -0.04, -0.12), (0.1, side_y + rng.uniform(-0.01, 0.01), -rng.uniform(0.02, 0.05)), palm)
             )
-        thing = None if rng.random() < 0.15 else self._thing(section, side_y)
+        thing = None if not held and rng.random() < 0.15 else self._thing(section, side_y, paint, held=held)
         if thing is not None:
             bodies.append(thing)
-        if rng.random() < 0.55:  # the other jaw, closing from the other side
+        if held or rng.random() < 0.55:  # the other jaw, closing from the other side
             face = section[:, 0].max() if thing is None else thing.vertices[:, 0].max()
             middle = 0.5 * (section[:, 0].max() + max(face, section[:, 0].max() + 1e-3)) + rng.uniform(0.0, 0.01)
             bodies += [_mirror(body, middle) for body in bodies[: 2 if holder in bodies else 1]]
@@ -339,11 +353,11 @@ class FingerScenes:
             bodies.append(self._bar(side_y, low, high))
         return bodies, look, R
 
-    def _thing(self, section: NDArray, side_y: float) -> Body:
-        """Return an object that touches the finger, or stands before it."""
+    def _thing(self, section: NDArray, side_y: float, paint: Paint, *, held: bool) -> Body:
+        """Return an object that touches the finger, or stands before it; some of those held look like its paint."""
         rng, length = self._rng, self._finger.length
         height = rng.uniform(0.15, 1.0) * length
-        half = rng.uniform(0.3, 2.6) * side_y
+        half = (rng.uniform(1.0, 3.5) if held else rng.uniform(0.3, 2.6)) * side_y
         if rng.random() < 0.2:
             mesh = _load_objects()[rng.integers(len(_load_objects()))]
             T = Rotation.random(rng=rng).as_matrix()
@@ -361,7 +375,11 @@ class FingerScenes:
         at = 0.0 if len(near) == 0 else np.max(near[:, 0] - np.interp(near[:, 1] - height, *_left_side(line)))
         gap = 0.0 if rng.random() < 0.75 else rng.uniform(0.0, 0.25) * length
         shift = np.array([at + gap, rng.uniform(-0.3, 0.3) * side_y, height])
-        return Body(vertices=vertices + shift, triangles=triangles, rest=rest, paint=_draw_any_paint(rng))
+        if held and rng.random() < ALIKE:
+            own = replace(paint, color=np.clip(paint.color * np.exp(rng.normal(0.0, 0.25)), 0.0, 1.0))
+        else:
+            own = _draw_any_paint(rng)
+        return Body(vertices=vertices + shift, triangles=triangles, rest=rest, paint=own)
 
     def _bar(self, side_y: float, low: NDArray, high: NDArray) -> Body:
         """Return something between camera and finger."""
@@ -399,14 +417,14 @@ def _fill_square(image: NDArray) -> NDArray:
     return import_cv2().resize(np.ascontiguousarray(image), (384, 384), interpolation=import_cv2().INTER_AREA)
 
 
-def write_shard(seeds: Sequence[int], path: str) -> dict[str, int]:
+def write_shard(seeds: Sequence[int], path: str, held: float = HELD) -> dict[str, int]:
     """Write the pictures of the fingers with these seeds as one file and return how many fingers they are."""
-    save_shard(Path(path), FingerPictures.join([FingerScenes(seed).draw() for seed in seeds]))
+    save_shard(Path(path), FingerPictures.join([FingerScenes(seed, held).draw() for seed in seeds]))
     return {"fingers": len(seeds)}
 
 
 def make_shards(
-    seeds: range, folder: Path, name: str, engine: EngineOptions, shard: str = "", fingers: int = 32
+    seeds: range, folder: Path, name: str, engine: EngineOptions, shard: str = "", fingers: int = 32, held: float = HELD
 ) -> None:
     """Render the pictures of fingers and write them as `NAME_SEED.npz`, several fingers a file.
 
@@ -417,7 +435,7 @@ def make_shards(
     tasks = []
     for part in choose_shard(parts, shard):
         path = str(folder / f"{name}_{part[-1]:09d}.npz")
-        given = {"seeds": list(part), "path": path}
+        given = {"seeds": list(part), "path": path, "held": held}
         tasks.append(Task(name=Path(path).stem, key=str(part), work=write_shard, given=given, output=path))
     make_all(tasks, engine, folder, shard, "file")
 
@@ -433,6 +451,9 @@ def main() -> None:
     parser.add_argument(
         "--first", type=whole_number(0, 10**9), default=0, help="seed of the first finger, to share the work (0)"
     )
+    parser.add_argument(
+        "--held", type=read_share, default=HELD, help=f"share of pictures of a grasp from the wrist ({HELD})"
+    )
     add_engine_options(parser)
     options = parser.parse_args()
     with one_line_errors():
@@ -440,7 +461,8 @@ def main() -> None:
         for name, first, count in ((VALIDATION, 10_000_000, options.validation), (TRAIN, 0, options.fingers)):
             if count:
                 start = first + options.first
-                make_shards(range(start, start + count), options.folder, name, engine, options.shard)
+                seeds = range(start, start + count)
+                make_shards(seeds, options.folder, name, engine, options.shard, held=options.held)
 
 
 if __name__ == "__main__":

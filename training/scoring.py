@@ -106,6 +106,12 @@ def fit_factor(detections: Detections, threshold: float = THRESHOLD) -> float:
     return float(max(np.quantile(ratio, 0.683) / 1.52, np.quantile(ratio, 0.9) / 2.15))
 
 
+def fit_shift(detections: Detections, lost: float, threshold: float = THRESHOLD) -> float:
+    """Return what is to be added to logits so that the threshold loses a share of the points that can be seen."""
+    last = np.clip(np.quantile(detections.likelihood[detections.visible], lost), 1e-6, 1.0 - 1e-6)
+    return float(np.log(threshold / (1.0 - threshold)) - np.log(last / (1.0 - last)))
+
+
 def find_worst(detections: Detections, count: int, threshold: float = THRESHOLD) -> NDArray:
     """Return the indices (count,) of the pictures with the largest error of an accepted point, hidden ones included."""
     accepted = detections.likelihood >= threshold

@@ -12,6 +12,7 @@ from training.checkpoint import load_checkpoint
 from training.dataset import TRAIN, VALIDATION, load_pictures
 from training.recipe import Recipe
 from training.trainer import CHECKPOINT, Trainer, TrainingImages, train
+from training.weights import read_network
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -27,6 +28,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("dataset", type=Path, help="folder of shards train_*.npz and val_*.npz")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the run")
     parser.add_argument("--limit", type=int, help="train on the first so many pictures only")
+    parser.add_argument("--network", type=Path, help="begin with the weights of an exported network")
+    parser.add_argument("--fine", action="store_true", help="train the fine part alone, leave the coarse one as it is")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder of the run")
     add_settings(parser, Recipe)
     add_settings(parser.add_argument_group("augmentation"), AugmentSettings)
@@ -40,7 +43,8 @@ def run(options: argparse.Namespace) -> None:
         train=load_pictures(options.dataset, TRAIN, options.limit),
         validation=load_pictures(options.dataset, VALIDATION, recipe.validation),
     )
-    trainer = Trainer(recipe)
+    trainer = Trainer(recipe, read_network(options.network)[0] if options.network else None)
+    trainer.network.coarse.requires_grad_(not options.fine)
     if options.resume:
         trainer.resume(load_checkpoint(options.output / CHECKPOINT))
     print(train(trainer, pictures, settings_from(options, AugmentSettings), options.output))

@@ -1,5 +1,7 @@
 """Claims about random fingers: what is drawn is a finger, it bends as its beams do, and the truth is in the picture."""
 
+import argparse
+
 import numpy as np
 import pytest
 import shapely
@@ -7,7 +9,8 @@ import shapely
 pytest.importorskip("open3d", reason="scenes are rendered with Open3D: pip install open3d")
 pytest.importorskip("cv2", reason="pictures need OpenCV: pip install opencv-contrib-python-headless")
 
-from training.dataset import MARGIN
+from training.arguments import read_share
+from training.dataset import MARGIN, FingerPictures
 from training.fingers import BentFinger, draw_finger, outline
 from training.scenes import ANYWHERE, KEYPOINTS, STATES, FingerScenes, load_textures
 
@@ -71,6 +74,23 @@ def test_scenes_are_the_same_for_the_same_seed_and_show_the_truth():
     flat = np.abs(first.place[0] - MARGIN - first.rest[0])
     if FingerScenes(4)._finger.taper == 0.0:
         assert flat.max() < 1e-3
+
+
+def test_a_held_object_hides_more_of_the_finger():
+    hidden = []
+    for held in (0.0, 1.0):
+        pictures = FingerPictures.join([FingerScenes(seed, held).draw() for seed in range(6)])
+        keypoints = np.arange(KEYPOINTS + ANYWHERE) < pictures.keypoints[:, None]
+        keypoints[:, 0] = False  # the mark may lack its dot
+        hidden.append((~pictures.visible & keypoints).sum() / keypoints.sum())
+    assert hidden[1] > 1.2 * hidden[0]
+
+
+@pytest.mark.parametrize("text", ["1.1", "-0.1", "nan", "half"])
+def test_a_share_is_between_none_and_all(text):
+    assert read_share("0.25") == 0.25
+    with pytest.raises(argparse.ArgumentTypeError, match="expected a number from 0 to 1"):
+        read_share(text)
 
 
 def test_textures_are_there_with_their_sources():

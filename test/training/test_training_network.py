@@ -19,16 +19,18 @@ from training_fakes import KEYPOINTS, POINTS, draw_ladders, write_ladders
 import training.evaluate
 from finforce_keypoints.networks.side_network import COARSE, FINE, SideNetwork
 from training.augment import AugmentSettings, augment
+from training.calibrate import main as calibrate_main
 from training.checkpoint import load_checkpoint
 from training.dataset import MARGIN, TRAIN, VALIDATION, FingerPictures, iterate_batches, load_pictures
 from training.errors import CheckpointError, DatasetError, RecipeError
 from training.export import write_network
 from training.loading import LoadingSettings, load_batches
-from training.losses import compute_losses
+from training.losses import COVERED, choose_points, compute_losses
 from training.network import FingerNetwork, NetworkShape, fold_batch_norm
 from training.quantization import quantize_network
 from training.recipe import Recipe
 from training.scoring import Detections, fit_factor, score_detections
+from training.train import main as train_main
 from training.trainer import CHECKPOINT, Trainer, TrainingImages, compute_rate, detect, train
 from training.weights import read_network
 
@@ -92,6 +94,20 @@ def test_a_network_in_bytes_is_the_same_but_for_their_steps(tmp_path):
         torch.testing.assert_close(again.state_dict()[name], weights.data, atol=float(step), rtol=0.02, msg=name)
 
 
+def test_shifted_likelihoods_lose_the_wanted_share_and_move_no_point(tmp_path):
+    write_network(build_trained_like(), tmp_path / "network", 1.5)
+    quantize_network(tmp_path / "network", draw_ladders(3, 3, 7))
+    dataset = write_ladders(tmp_path / "data", 1, 1)
+    calibrate_main([str(tmp_path / "network"), str(dataset), "--lost", "0.25", "-o", str(tmp_path / "shifted")])
+    pictures = load_pictures(dataset, VALIDATION)
+    before, after = (
+        training.evaluate.detect(SideNetwork(tmp_path / name, threads=1), pictures) for name in ("network", "shifted")
+    )
+    assert score_detections(after).visible_lost == pytest.approx(0.25, abs=1.0 / after.visible.sum())
+    np.testing.assert_array_equal(after.pixels, before.pixels)
+    np.testing.assert_array_equal(after.stddev, before.stddev)
+
+
 def test_what_is_no_export_cannot_be_trained_further(tmp_path):
     with pytest.raises(CheckpointError, match="expected a network exported by training"):
         read_network(tmp_path)
@@ -117,6 +133,18 @@ def test_points_that_are_not_told_teach_nothing_of_places():
     losses = compute_losses(network, nothing, low=False)
     assert losses.coarse == 0.0 and losses.fine == 0.0 and losses.likely == 0.0 and losses.seen > 0.0
     assert torch.isfinite(compute_losses(network, batch, low=False).total)
+
+
+def test_hidden_points_are_always_among_those_that_teach():
+    torch.manual_seed(0)
+    batch = next(load_batches(draw_ladders(3, 4, 1), STILL, LoadingSettings(size=12, workers=0)))
+    own = torch.arange(POINTS) < KEYPOINTS
+    hidden = own & (torch.rand(12, POINTS) < 0.2)
+    chosen = choose_points(replace(batch, visible=~hidden))
+    taken = torch.zeros(12, POINTS, dtype=torch.bool).scatter(1, chosen, True)
+    assert hidden.any(dim=1).sum() > 6
+    assert ((taken & hidden).sum(dim=1) >= hidden.sum(dim=1).clamp(max=COVERED)).all()
+    assert (taken & ~hidden & own).any(dim=1).all()
 
 
 def test_a_certain_mistake_costs_more_than_an_uncertain_one():
@@ -217,6 +245,17 @@ def test_a_short_training_lowers_the_loss_and_can_go_on(tmp_path):
     assert again.progress == 1.0
     with pytest.raises(CheckpointError, match="expected one of"):
         Trainer(recipe, FingerNetwork(NetworkShape(fine=(16, 16)))).resume(checkpoint)
+
+
+def test_an_exported_network_is_trained_on_and_its_coarse_part_can_stay(tmp_path):
+    write_network(build_trained_like(), tmp_path / "network", 1.5)
+    dataset, run = write_ladders(tmp_path / "data"), tmp_path / "run"
+    given = [str(dataset), "-o", str(run), "--network", str(tmp_path / "network"), "--fine"]
+    train_main([*given, "--steps", "3", "--batch", "4", "--workers", "0"])
+    before, _ = read_network(tmp_path / "network")
+    after = load_checkpoint(run / CHECKPOINT).averaged
+    moved = {name for name, weights in before.named_parameters() if not torch.equal(after[name], weights)}
+    assert moved and all(name.startswith("fine.") for name in moved)
 
 
 def test_a_broken_checkpoint_is_refused(tmp_path):
