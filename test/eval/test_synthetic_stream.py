@@ -52,6 +52,14 @@ def test_film_holds_every_image_of_its_rate_and_no_other(rate):
     assert [slot_of(kept.stamp) for kept in stream] == list(range(0, 60, step))
 
 
+@pytest.mark.parametrize("phase", [2, 4])
+def test_a_slow_camera_may_begin_between_the_images_of_another(phase):
+    messages = [message(slot, topic) for slot in SLOTS for topic in ("/left/keypoints", OBJECT_TOPIC)]
+    stream = thin_messages(messages, {"/left/keypoints", OBJECT_TOPIC}, 30, phase)
+    slots = {topic: [slot_of(kept.stamp) for kept in stream if kept.topic == topic] for topic in stream.types}
+    assert slots == {"/left/keypoints": list(range(phase, 60, 6)), OBJECT_TOPIC: [0, 18, 36, 54]}
+
+
 def test_object_is_tracked_at_ten_hertz_whatever_the_camera_does():
     messages = [message(slot, topic) for slot in SLOTS for topic in ("/left/keypoints", OBJECT_TOPIC)]
     stream = thin_messages(messages, {"/left/keypoints", OBJECT_TOPIC}, 90)
