@@ -25,7 +25,7 @@ from finforce_twin.scenes.scenarios import Scenario
 
 FINGER = 0  # seed of the material for which the package has a calibration, `twin`
 START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
-TRACKED_EVERY = 0.1  # [s] the object is tracked, in the next image
+TRACKING_PERIOD = 0.1  # [s]; in the first image of each the object is tracked
 POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
 ANGLE_STDDEV = np.radians(0.3)  # about each axis
 CAMERAS = {
@@ -123,10 +123,11 @@ class Footage:
     def __iter__(self) -> Iterator[TwinFrame]:
         rng = np.random.default_rng((self._seed, 3))
         T_camera_gripper = invert_pose(self.T_gripper_camera)
-        due = 0
+        last = -1
         for state in self._gripper.states():
-            tracked = state.T_gripper_object is not None and state.stamp >= TRACKED_EVERY * due - 1e-6
-            due += tracked
+            period = int(state.stamp / TRACKING_PERIOD + 1e-5)
+            tracked = state.T_gripper_object is not None and period > last
+            last = period if tracked else last
             shot = self._photographer.shoot(state)
             yield TwinFrame(
                 stamp=START + round(state.stamp * NANOSECONDS),

@@ -21,7 +21,7 @@ from finforce_driver.emulator.pty_port import PtyPort
 from finforce_driver.emulator.settings import EmulatorSettings
 from finforce_ifea.grasp_force import Wrench
 from finforce_twin.errors import ScenarioError
-from finforce_twin.gripper.footage import FINGER, TRACKED_EVERY, TwinFrame, disturb_pose, set_stage, true_jaw
+from finforce_twin.gripper.footage import FINGER, TwinFrame, disturb_pose, set_stage, true_jaw
 from finforce_twin.gripper.pressing import PressedGrasp, RelaxedGrasp
 from finforce_twin.rendering.depth_camera import build_d405_vga
 from finforce_twin.rendering.photographer import Photographer
@@ -29,6 +29,7 @@ from finforce_twin.scenes.scenarios import Scenario
 
 T = TypeVar("T")
 LEAST_CLEARANCE = 2e-3  # [m] of opening that the open gripper leaves around the object
+TRACKED_EVERY = 3  # images: the object is tracked at 10 Hz
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
