@@ -471,7 +471,7 @@ def run_nodes(
         with _ending_with_context():
             nodes = build()
         gc.collect()
-        gc.freeze()  # what was built stays: looking through all of it for garbage takes a tenth of a second each time
+        gc.freeze()  # what was built stays, and would be looked through for garbage again and again
         executor.obey(nodes)
         work(nodes, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
