@@ -18,9 +18,6 @@ from shutil import rmtree
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
 
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import CAMERA_INFO, IMAGE
@@ -29,7 +26,7 @@ from finforce_eval.replay.playback import Playback, RawMessage
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 if TYPE_CHECKING:
-    from finforce_twin.gripper.gripper import JawState, TwinState
+    from finforce_twin.gripper.gripper import TwinState
     from finforce_twin.scenes.scenarios import Scenario
 
 SCRIPT_SLOTS = 6  # slots from one state of a script to the next
@@ -109,40 +106,9 @@ class SmoothGripper:
         before = next(states)
         for after in states:
             for slot in self._slots:
-                yield before if slot == 0 else blend_states(before, after, slot / SCRIPT_SLOTS)
+                yield before if slot == 0 else before.blend(after, slot / SCRIPT_SLOTS)
             before = after
         yield before
-
-
-def blend_states(before: TwinState, after: TwinState, share: float) -> TwinState:
-    """Return the state at a share of the way between two: x = (1 - s) x_before + s x_after; turns the short way."""
-    pose = before.T_gripper_object
-    if pose is not None:
-        pose = _blend_poses(pose, after.T_gripper_object, share)
-    return replace(
-        before,
-        stamp=_blend(before.stamp, after.stamp, share),
-        jaws={side: _blend_jaws(jaw, after.jaws[side], share) for side, jaw in before.jaws.items()},
-        T_gripper_object=pose,
-        gravity=_blend(before.gravity, after.gravity, share),
-    )
-
-
-def _blend(before: Any, after: Any, share: float) -> Any:
-    return (1.0 - share) * before + share * after
-
-
-def _blend_jaws(before: JawState, after: JawState, share: float) -> JawState:
-    """Return a jaw between two states: place, shape and wrench."""
-    return replace(before, **{name: _blend(value, vars(after)[name], share) for name, value in vars(before).items()})
-
-
-def _blend_poses(before: NDArray, after: NDArray, share: float) -> NDArray:
-    """Return a pose (4, 4) between two."""
-    turn = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec()
-    pose = _blend(before, after, share)
-    pose[:3, :3] = before[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
-    return pose
 
 
 def find_scene(scene: BenchScene, folder: Path | None = None) -> Path:

@@ -252,10 +252,6 @@ class PlaceTracker:
             self._stiffness or 0.0,
         )
 
-    def _move_across(self) -> NDArray:
-        """Returns what acts across the finger moves the key points by (K, 3) [m]."""
-        return self._width.motions + self._width.sideways * self._held.across
-
     def significance(self, tare: Tare, stddev: float) -> float:
         """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
         return explain_offsets(self.rest_modes(), tare, stddev)

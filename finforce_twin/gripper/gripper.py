@@ -2,16 +2,16 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_twin.mechanics.assembly import Assembly, RelaxedWrench, find_elastic_weight
 from finforce_twin.mechanics.pressed_jaw import TWIN_DENSITY, JawShape
 from finforce_twin.scenes.scenarios import Posture, Scenario, write_script
-
-MOVING = ("origin_x", "vertices", "keypoints")  # of a jaw
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,18 +53,35 @@ class TwinState:
     T_gripper_object: NDArray | None
     gravity: NDArray
 
-    def blend(self, before: "TwinState", share: float) -> "TwinState":
-        """Returns the state on a straight way from this one (share 0) back to one a moment before (share 1)."""
+    def blend(self, other: "TwinState", share: float) -> "TwinState":
+        """Returns the state at a share of the way to another: x = (1 - s) x + s x_other; turns the short way."""
+        pose = self.T_gripper_object
+        if pose is not None:
+            pose = _blend_poses(pose, other.T_gripper_object, share)
+        return replace(
+            self,
+            stamp=_blend(self.stamp, other.stamp, share),
+            jaws={side: _blend_jaws(jaw, other.jaws[side], share) for side, jaw in self.jaws.items()},
+            T_gripper_object=pose,
+            gravity=_blend(self.gravity, other.gravity, share),
+        )
 
-        def mix(now: NDArray, then: NDArray) -> NDArray:
-            return now + share * (then - now)
 
-        jaws = {}
-        for side, jaw in self.jaws.items():
-            moving = {name: mix(getattr(jaw, name), getattr(before.jaws[side], name)) for name in MOVING}
-            jaws[side] = replace(jaw, **moving)
-        pose = None if self.T_gripper_object is None else mix(self.T_gripper_object, before.T_gripper_object)
-        return replace(self, stamp=mix(self.stamp, before.stamp), jaws=jaws, T_gripper_object=pose)
+def _blend(value: Any, other: Any, share: float) -> Any:
+    return (1.0 - share) * value + share * other
+
+
+def _blend_jaws(jaw: JawState, other: JawState, share: float) -> JawState:
+    """Returns a jaw between two states: place, shape and wrench."""
+    return replace(jaw, **{name: _blend(value, vars(other)[name], share) for name, value in vars(jaw).items()})
+
+
+def _blend_poses(pose: NDArray, other: NDArray, share: float) -> NDArray:
+    """Returns a pose (4, 4) between two."""
+    turn = Rotation.from_matrix(pose[:3, :3].T @ other[:3, :3]).as_rotvec()
+    blended = _blend(pose, other, share)
+    blended[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+    return blended
 
 
 class TwinGripper(Assembly):

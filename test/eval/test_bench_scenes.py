@@ -8,7 +8,7 @@ from rgbd_fakes import FakeGripper
 from scipy.spatial.transform import Rotation
 
 from finforce_eval.bench import scenes
-from finforce_eval.bench.scenes import EVERY_RATE, GRASP, SmoothGripper, blend_states, find_scene
+from finforce_eval.bench.scenes import EVERY_RATE, GRASP, SmoothGripper, find_scene
 from finforce_eval.replay import synthetic_stream
 from finforce_eval.replay.synthetic_stream import FINE_RATE, slot_of
 from finforce_twin.gripper.footage import START
@@ -23,7 +23,7 @@ def turned(state, angle):
 
 def test_state_between_two_is_between_them_in_all():
     before, after = list(FakeGripper().states())[7:9]
-    middle = blend_states(turned(before, 0.2), turned(after, 0.6), 0.25)
+    middle = turned(before, 0.2).blend(turned(after, 0.6), 0.25)
     assert middle.stamp == pytest.approx(before.stamp + 0.25 / 30.0)
     for name in ("keypoints", "force", "torque"):
         ends = [getattr(state.jaws["left"], name) for state in (before, after)]
@@ -34,7 +34,7 @@ def test_state_between_two_is_between_them_in_all():
 
 def test_scene_without_an_object_has_none_in_between():
     before, after = list(FakeGripper(has_object=False).states())[:2]
-    assert blend_states(before, after, 0.5).T_gripper_object is None
+    assert before.blend(after, 0.5).T_gripper_object is None
 
 
 @pytest.mark.parametrize("rate", [30, 60, 90])
