@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 # Packages whose functions are compiled, and days after which what nobody has used is removed.
-_COMPILED = ("finforce_contact", "finforce_ifea", "finforce_keypoints")
+_COMPILED = ("finforce", "finforce_contact", "finforce_ifea", "finforce_keypoints")
 _UNUSED = 30.0
 
 

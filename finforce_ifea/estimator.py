@@ -436,6 +436,9 @@ def _close(points, likelihood, rest, allowed, presence, threshold, margin):
     for k in range(len(points)):
         visible = likelihood[k] >= threshold
         presence[k] += _PRESENCE_GAIN * ((1.0 if visible else 0.0) - presence[k])
-        far = np.abs(points[k] - rest[k]).max()
-        if not (visible and presence[k] >= _LEAST_PRESENCE and allowed[k] and far <= margin):
-            points[k] = np.nan
+        near = True
+        for a in range(3):
+            near = near and abs(points[k, a] - rest[k, a]) <= margin
+        if not (visible and presence[k] >= _LEAST_PRESENCE and allowed[k] and near):
+            for a in range(3):
+                points[k, a] = np.nan

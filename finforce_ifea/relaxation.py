@@ -93,6 +93,9 @@ def _follow(elastic, before, over, share, tau, dt):
         for a in range(3):
             over[k, a] = over[k, a] * decay + share[k] * gain * (elastic[a] - before[a])
             total[a] += over[k, a]
-    before[:] = elastic
+    ahead = 0.0
+    for a in range(3):
+        before[a] = elastic[a]
+        ahead += total[a] * elastic[a]
     # contact cannot pull: the overstress may take the whole force away, never turn it round
-    return total if (total * elastic).sum() > 0.0 else np.zeros(3)
+    return total if ahead > 0.0 else np.zeros(3)

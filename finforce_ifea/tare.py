@@ -94,11 +94,12 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
         usual: of each key point in the tare.
         stddev: stated in this image (K, 3) [m], NaN where there is no key point; None when nothing is stated.
     """
-    if stddev is not None:
-        return PointNoise(*_enlarge_noise(usual.covariance, usual.stddev, np.ascontiguousarray(stddev, float)))
-    plane, gain = condition_on_width(usual.covariance)
-    width, count = np.ascontiguousarray(usual.covariance[:, 1, 1]), len(plane)
-    return PointNoise(np.ascontiguousarray(plane), gain, width, np.ones(count), np.zeros(count))
+    before, now = usual.stddev, stddev
+    if now is None:
+        before = now = np.sqrt(np.diagonal(usual.covariance, axis1=1, axis2=2))
+    before, now = (np.ascontiguousarray(each, float) for each in (before, now))
+    noise = PointNoise(*_enlarge_noise(np.ascontiguousarray(usual.covariance), before, now))
+    return noise if stddev is not None else noise._replace(standing=np.zeros(len(before)))
 
 
 @njit(cache=True)
@@ -113,7 +114,7 @@ def _enlarge_noise(covariance, usual, stddev):
         for a in range(3):
             growth[a] = max(1.0, stddev[k, a] / usual[k, a])
         for a in range(2):
-            i, known = 2 * a, noise[2 * a, 1] / noise[1, 1]  # once y is known, see `condition_on_width`
+            i, known = 2 * a, noise[2 * a, 1] / noise[1, 1]  # what is left once y is known
             for b in range(2):
                 plane[k, a, b] = noise[i, 2 * b] - known * noise[2 * b, 1]
             gain[k, a] = known * growth[i] / growth[1]
@@ -123,14 +124,6 @@ def _enlarge_noise(covariance, usual, stddev):
         along[k], trust[k] = noise[1, 1] * growth[1] ** 2, own / now
         standing[k] = max(0.0, stated - noise[0, 0] - noise[2, 2])
     return plane, gain, along, trust, standing
-
-
-def condition_on_width(noise: NDArray) -> tuple[NDArray, NDArray]:
-    """Returns the in-plane noise (..., 2, 2) [m^2] left of (..., 3, 3) once y is known, and its regression on y."""
-    shared = noise[..., [0, 2], 1]
-    gain = shared / noise[..., 1, 1, None]
-    plane = noise[..., [0, 2], :][..., [0, 2]]
-    return plane - gain[..., :, None] * shared[..., None, :], gain
 
 
 _FARTHEST_OFFSET = 3e-3

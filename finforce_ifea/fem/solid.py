@@ -252,7 +252,9 @@ def _invert(A, out):
 @njit(**_OPTIONS)
 def _rotate(F, R, inverse):
     """Writes the rotation R of F = R U by Newton's iteration R <- (R + R^-T) / 2; returns det F."""
-    R[:] = F
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = F[i, j]
     det = 1.0
     for iteration in range(_POLAR_ITERATIONS):
         now = _invert(R, inverse)

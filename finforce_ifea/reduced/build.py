@@ -201,7 +201,7 @@ def build_rest(mechanics: Mechanics, young_modulus: float) -> Manifold:
     heights, rest = _choose_rows(mechanics), np.zeros(mechanics.model.size)
     face = Face(mechanics, heights[1:])
     face.find_basis(rest[None], SHAPES)
-    grid = _Grid(rods=np.arange(STENCIL), depths=np.zeros(STENCIL), q=np.zeros((STENCIL, STENCIL, len(rest))))
+    grid = _Grid(rods=np.arange(float(STENCIL)), depths=np.zeros(STENCIL), q=np.zeros((STENCIL, STENCIL, len(rest))))
     return _store(young_modulus, grid, heights, [[face.describe(rest)] * STENCIL] * STENCIL, face)
 
 

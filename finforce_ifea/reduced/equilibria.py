@@ -189,7 +189,8 @@ def find_grid_step(moves, now, m):
     damping = _DAMPING * max(a, c) + _DAMPING_FLOOR
     a, c = a + damping, c + damping
     det = a * c - b * b
-    step = np.array([(c * u - b * v) / det, (a * v - b * u) / det, np.sqrt(square / count)])
+    step = np.empty(3)
+    step[0], step[1], step[2] = (c * u - b * v) / det, (a * v - b * u) / det, np.sqrt(square / count)
     return bound_grid_step(step, m, moves)
 
 
@@ -212,7 +213,10 @@ def _measure_miss(tables, loads, m):
         extra[k] = loads[k] - extra[k]
     first, last = find_ends(extra)
     add_product(tables[1], m, extra, first, last, WATCHED, miss)
-    return np.sqrt((miss**2).sum() / ((count // 2 + WATCHED - 1) // WATCHED))
+    square = 0.0
+    for k in range(count):
+        square += miss[k] * miss[k]
+    return np.sqrt(square / ((count // 2 + WATCHED - 1) // WATCHED))
 
 
 @njit(**_EXACT)
@@ -221,9 +225,10 @@ def approach_grid(tables, loads, m, step):
 
     The step takes the jaw to stay as it is, which it does not where compliances change fast, as at the base.
     """
-    largest = (1.0 + _SLACK) * step[2] + _SLACK_FLOOR
+    largest, there = (1.0 + _SLACK) * step[2] + _SLACK_FLOOR, np.empty(2)
     for _ in range(_HALVINGS):
-        if _measure_miss(tables, loads, m + step[:2]) <= largest:
+        there[0], there[1] = m[0] + step[0], m[1] + step[1]
+        if _measure_miss(tables, loads, there) <= largest:
             return
-        step[:2] *= 0.5
-    step[:2] = 0.0
+        step[0], step[1] = 0.5 * step[0], 0.5 * step[1]
+    step[0] = step[1] = 0.0

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from finforce.elimination import eliminate
 from finforce_ifea.contact_mechanics.friction import POINT_SHAPE, Friction, LeaningContact, Rubbing, rub_point
 from finforce_ifea.contact_mechanics.indenter import (
     DEPTH,
@@ -364,7 +365,11 @@ def follow(moves, compliance, loads, q):
 @njit(**_OPTIONS)
 def place_points(points, shapes, compliance, loads, q):
     """Returns points (p, c) [m] moved as the table shapes (T, Z, p c) [m] and its compliance say."""
-    return points + follow(shapes, compliance, loads, q).reshape(points.shape)
+    placed = follow(shapes, compliance, loads, q).reshape(points.shape)
+    for k in range(len(points)):
+        for a in range(points.shape[1]):
+            placed[k, a] += points[k, a]
+    return placed
 
 
 @njit(**_OPTIONS)
@@ -456,7 +461,10 @@ def _gather(jaw, pressed, pose, rubbing, points):
                 for c in range(4):
                     loads[2 * row + a, c + 1] += w * out[a, 3 + c]
             _add_springs(out, w, row, low, share, stiffness)
-    return _Gathered(loads, stiffness, held, grip, total, point / total, place / total)
+    for a in range(3):
+        point[a] /= total
+        place[a] /= total
+    return _Gathered(loads, stiffness, held, grip, total, point, place)
 
 
 @njit(**_OPTIONS)
@@ -476,16 +484,25 @@ def _solve_rows(q, compliance, loads, stiffness):
     size = last - first
     if size == 0:
         return out, 0.0
-    C, A = np.empty((size, size)), np.eye(size)
+    C, A = np.empty((size, size)), np.zeros((size, size))
     blend(compliance, q[len(loads) :], first, last, first, last, C)
     for i in range(size):
+        A[i, i] = 1.0
+        for c in range(5):
+            out[first + i, c] = loads[first + i, c]
         for d in range(7):
             k, s = i + d - 3, stiffness[first + i, d]
             if s != 0.0:
                 for j in range(size):
                     A[i, j] += s * C[k, j]
-    out[first:last] = np.linalg.solve(A, loads[first:last])
-    return out, np.abs(C @ np.ascontiguousarray(out[first:last, 0])).max()
+    eliminate(A, out[first:last])
+    largest = 0.0
+    for i in range(size):
+        move = 0.0
+        for j in range(size):
+            move += C[i, j] * out[first + j, 0]
+        largest = max(largest, abs(move))
+    return out, largest
 
 
 @njit(**_OPTIONS)
@@ -542,12 +559,14 @@ def _step_grid(jaw, q, moves, steps, size, contact):
         contact: see `_Gathered`.
     """
     count, tables = len(moves), (jaw.moves, jaw.compliance, jaw.loads)
-    after, change = moves.copy(), np.ascontiguousarray(steps[:, 0])
+    after, change, there = np.empty(count), np.empty(count), np.empty(count)
+    for k in range(count):
+        after[k], change[k], there[k] = moves[k], steps[k, 0], q[k] + steps[k, 0]
     first, last = find_ends(change)
     add_product(jaw.compliance, q[count:], change, first, last, WATCHED, after)
     nearest = find_grid_step(jaw.moves, after, q[count:])
     if size <= _CALM:
-        approach_grid(tables, q[:count] + change, q[count:], nearest)
+        approach_grid(tables, there, q[count:], nearest)
     if q[count] < SHALLOW and contact.size > 0.0:
         nearest[1] = read_grid(jaw.rods, contact.place[2]) - q[count + 1]
         bound_grid_step(nearest, q[count:], jaw.moves)
@@ -619,12 +638,19 @@ def _hold_base(jaw, q, contact, steps, force, force_modes):
     if not (contact.grip[0, 0] + contact.grip[1, 1] > 0.0):
         return
     count = len(steps)
-    rows = np.empty((2, count))
+    rows, moved = np.empty((2, count)), np.zeros((2, 5))
     blend(jaw.compliance, q[count:], 0, 2, 0, count, rows)
-    held = contact.held - contact.grip @ (rows @ steps)
     for a in range(2):
-        force[2 * a] += held[a, 0]
-        force_modes[2 * a] += held[a, 1:]
+        for k in range(count):
+            for c in range(5):
+                moved[a, c] += rows[a, k] * steps[k, c]
+    for a in range(2):
+        for c in range(5):
+            held = contact.held[a, c] - contact.grip[a, 0] * moved[0, c] - contact.grip[a, 1] * moved[1, c]
+            if c == 0:
+                force[2 * a] += held
+            else:
+                force_modes[2 * a, c - 1] += held
 
 
 @njit(**_OPTIONS)

@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from finforce.elimination import eliminate
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.place_update import Residuals
 
@@ -175,13 +176,7 @@ def _accumulate(frame, information, vector, means):
         det = n00 * n11 - n01 * n01
         p00, p11, p01 = w * n11 / det, w * n00 / det, -w * n01 / det
         _explain(frame, k, row, left)
-        m = frame.mobilised
-        means.counts[k] = (1.0 - 1.0 / _MEMORY) * means.counts[k] + w * m * m
-        if means.counts[k] > 0.0:
-            share = w * m / means.counts[k]
-            means.left[k] += share * (left - m * means.left[k])
-            means.rows[k] += share * (row - m * means.rows[k])
-            means.noise[k] += m * share * (data.noise[k] - means.noise[k])
+        _remember(means, k, w, frame.mobilised, left, row, data.noise)
         for i in range(6):
             q0, q1 = p00 * row[i, 0] + p01 * row[i, 1], p01 * row[i, 0] + p11 * row[i, 1]
             g[i] += q0 * left[0] + q1 * left[1]
@@ -197,6 +192,21 @@ def _accumulate(frame, information, vector, means):
 
 
 @njit(**_OPTIONS)
+def _remember(means, k, weight, m, left, row, noise):
+    """Takes what is left (2,) to key point k and its derivatives (6, 2) into the means, as far as they go with m."""
+    means.counts[k] = (1.0 - 1.0 / _MEMORY) * means.counts[k] + weight * m * m
+    if not means.counts[k] > 0.0:
+        return
+    share = weight * m / means.counts[k]
+    for a in range(2):
+        means.left[k, a] += share * (left[a] - m * means.left[k, a])
+        for i in range(6):
+            means.rows[k, i, a] += share * (row[i, a] - m * means.rows[k, i, a])
+        for b in range(2):
+            means.noise[k, a, b] += m * share * (noise[k, a, b] - means.noise[k, a, b])
+
+
+@njit(**_OPTIONS)
 def _solve(information, vector, prior):
     """Returns variance and mean of mu by the key points alone, infinite where they say nothing, and all unknowns."""
     A = information.copy()
@@ -204,17 +214,20 @@ def _solve(information, vector, prior):
     A[1, 1] += 1.0 / prior[1]
     A[3, 3] += 1.0 / _LEAN_ERROR**2
     A[4, 4] += 1.0 / _FORCE_ERROR**2
-    others = np.array([0, 1, 3, 4])
-    B, v, a = np.empty((4, 4)), np.empty(4), np.empty(4)
+    others = (0, 1, 3, 4)
+    B, known = np.empty((4, 4)), np.empty((4, 2))
     for i in range(4):
-        v[i], a[i] = vector[others[i]], A[2, others[i]]
+        known[i, 0], known[i, 1] = vector[others[i]], A[2, others[i]]
         for j in range(4):
             B[i, j] = A[others[i], others[j]]
-    known = np.linalg.solve(B, np.stack((v, a), axis=1))
-    left, found = A[2, 2] - a @ np.ascontiguousarray(known[:, 1]), np.zeros(5)
+    eliminate(B, known)
+    left, rest, found = A[2, 2], vector[2], np.zeros(5)
+    for i in range(4):
+        left -= A[2, others[i]] * known[i, 1]
+        rest -= A[2, others[i]] * known[i, 0]
     if not left > 1e-9:
         return np.inf, 0.0, found
-    found[2] = (vector[2] - a @ np.ascontiguousarray(known[:, 0])) / left
+    found[2] = rest / left
     for i in range(4):
         found[others[i]] = known[i, 0] - known[i, 1] * found[2]
     return 1.0 / left, found[2], found

@@ -235,7 +235,7 @@ def reach_place(contact: Any, place: NDArray) -> NDArray:
 @register_jitable(**_BOTH)
 def _bound(asked, place, share, rules):
     """Returns the place asked for, within a share of where the linearisation about the present one holds."""
-    aim = asked.copy()
+    aim = np.empty(3)
     change = (_LARGEST_MOVE, share * rules.largest_change, share * _LARGEST_SHIFT)
     for i in range(3):
         aim[i] = min(max(asked[i], place[i] - change[i]), place[i] + change[i])
@@ -267,9 +267,7 @@ def _weigh(contact, probe, q, state, frame, chance, place, expected):
     motions = motions_at(contact, probe, q, state.modes)
     positions = positions_at(contact, probe, q)
     below = place[DEPTH] - reach_place(contact, place)[DEPTH]
-    moved = place - expected
-    by_place = motions[:, :, :3]
-    data = weigh_residuals(frame.measured, positions, frame.rest, by_place, moved, below, chance)
+    data = weigh_residuals(frame.measured, positions, frame.rest, motions, place - expected, below, chance)
     return data, motions
 
 
@@ -339,41 +337,52 @@ def _keep(state, q, modes, reached, place, update):
     """Writes what the next frame starts from."""
     state.q[:] = q
     state.modes[:] = modes[:, :3]
-    state.reached[:] = reached
     state.motion[0], state.motion[1] = place[DEPTH], update.speed
-    state.spread[:] = update.spread
-    state.slow[:] = place[1:]
-    state.residuals[:] = update.average.residuals
-    state.by_place[:] = update.average.modes
-    state.count[:] = update.average.count
+    for i in range(3):
+        state.reached[i] = reached[i]
+    for a in range(2):
+        state.slow[a] = place[1 + a]
+        for b in range(2):
+            state.spread[a, b] = update.spread[a, b]
+    for k in range(len(state.count)):
+        state.count[k] = update.average.count[k]
+        for a in range(2):
+            state.residuals[k, a] = update.average.residuals[k, a]
+            for i in range(3):
+                state.by_place[k, a, i] = update.average.modes[k, a, i]
 
 
 @register_jitable(**_BOTH)
 def _report(depth, q, moved, pressed, motions, data, update, expected, stiffness, iterations, settled):
     """Returns the `FoundPlace` of a search that has ended, the last step `moved` (3,) included."""
-    change = np.zeros(3)
+    force, modes, leaning, came = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
+    covariance, misfit = np.empty((3, 3)), max(1.0, update.misfit**2)
+    continued = max(0.0, depth / _LEAST_DEPTH) if depth < _LEAST_DEPTH else 1.0
+    changed, size, total = 0.0, 0.0, q.sum()
     for a in range(3):
+        change = 0.0
         for i in range(3):
-            change[a] += pressed.force_modes[a, i] * moved[i]
-    force = pressed.force + change
-    if depth < _LEAST_DEPTH:
-        force = force * max(0.0, depth / _LEAST_DEPTH)
-    misfit = max(1.0, update.misfit**2)
-    covariance = update.covariance * misfit
+            modes[a, i] = pressed.force_modes[a, i]
+            change += modes[a, i] * moved[i]
+            covariance[a, i] = update.covariance[a, i] * misfit
+            total += update.covariance[a, i]
+        force[a] = (pressed.force[a] + change) * continued
+        leaning[a], came[a] = pressed.force_modes[a, 3], update.place[a] - expected[a]
+        changed, size, total = changed + change * change, size + force[a] * force[a], total + force[a]
     covariance[DEPTH, DEPTH] += update.depth_variance * misfit
-    modes, stiffening = np.ascontiguousarray(pressed.force_modes[:, :3]), 1.0
+    stiffening = 1.0
     if stiffness > 0.0 and depth >= LOADED_DEPTH:
-        stiffening = np.sqrt((force * force).sum()) / (stiffness * depth)
+        stiffening = np.sqrt(size) / (stiffness * depth)
     return FoundPlace(
         update.place,
-        update.place - expected,
+        came,
         motions,
         data,
         pressed.force,
         force,
         measure_along(force, modes, covariance),
         modes,
-        np.ascontiguousarray(pressed.force_modes[:, 3]),
+        leaning,
         covariance,
         pressed.pressure_point,
         pressed.pressure_place,
@@ -388,11 +397,11 @@ def _report(depth, q, moved, pressed, motions, data, update, expected, stiffness
         update.condition,
         update.covariance[HEIGHT, HEIGHT],
         stiffening,
-        0.0 if settled else np.sqrt((change * change).sum()),
+        0.0 if settled else np.sqrt(changed),
         pressed.extrapolation,
         iterations,
         settled,
-        bool(np.isfinite(force.sum() + update.covariance.sum() + q.sum()) and pressed.smallest_det > 0.0),
+        bool(np.isfinite(total) and pressed.smallest_det > 0.0),
     )
 
 

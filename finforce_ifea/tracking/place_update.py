@@ -33,7 +33,10 @@ def invert_symmetric(A):
     out[1, 2] = A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2]
     out[2, 2] = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
     out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
-    return out / det
+    for i in range(3):
+        for j in range(3):
+            out[i, j] /= det
+    return out
 
 
 @njit(**_OPTIONS)
@@ -42,9 +45,9 @@ def measure_condition(covariance):
 
     With C = 1 + O, O without diagonal: l = 1 + 2 p cos(t + 2 k pi / 3), p = sqrt(|O|^2 / 6), cos 3 t = det O / (2 p^3).
     """
-    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    a, b = covariance[0, 1] / scale[0] / scale[1], covariance[0, 2] / scale[0] / scale[2]
-    c = covariance[1, 2] / scale[1] / scale[2]
+    sx, sy = np.sqrt(max(covariance[0, 0], 1e-300)), np.sqrt(max(covariance[1, 1], 1e-300))
+    sz = np.sqrt(max(covariance[2, 2], 1e-300))
+    a, b, c = covariance[0, 1] / sx / sy, covariance[0, 2] / sx / sz, covariance[1, 2] / sy / sz
     p = np.sqrt((a * a + b * b + c * c) / 3.0)
     if not p > 1e-12:
         return 1.0
@@ -96,7 +99,9 @@ def doubt_height(
     data[2, 2] -= (1.0 - 1e-6) * pull
     slope[2] += (1.0 - 1e-6) * pull * offset
     covariance = invert_symmetric(data)
-    away, spread = offset + (covariance[2] * slope).sum(), max(covariance[2, 2], 0.0)
+    away, spread = offset, max(covariance[2, 2], 0.0)
+    for i in range(3):
+        away += covariance[2, i] * slope[i]
     mistaken, variance = doubt_place(away, spread, prior_variance, offset)
     return away, mistaken, variance
 
@@ -352,10 +357,11 @@ def forecast_place(
     """
     a, b, c, power = covariance[0, 0], covariance[0, 1], covariance[1, 1], acceleration**2
     mixed = b + dt * c + power * dt**3 / 2.0
-    spread = np.array(
-        [[a + 2.0 * dt * b + dt**2 * c + power * dt**4 / 4.0 + drift**2, mixed], [mixed, c + power * dt**2]]
-    )
-    place = np.array([motion[0] + min(dt, _LONGEST_SIGHT) * motion[1], slow[0], slow[1]])
+    spread, place = np.empty((2, 2)), np.empty(3)
+    spread[0, 0] = a + 2.0 * dt * b + dt**2 * c + power * dt**4 / 4.0 + drift**2
+    spread[0, 1] = spread[1, 0] = mixed
+    spread[1, 1] = c + power * dt**2
+    place[0], place[1], place[2] = motion[0] + min(dt, _LONGEST_SIGHT) * motion[1], slow[0], slow[1]
     return Forecast(place, motion[1], spread, dt if sudden else 0.0)
 
 
@@ -384,14 +390,15 @@ def update_place(
     innovation /= information
     reference, spread = forecast.place, _allow_for_manoeuvre(forecast, innovation, 1.0 / information)
     jumped = spread[0, 0] > forecast.spread[0, 0]
-    gain = spread[0] / (1.0 / information + max(spread[0, 0], 0.0))
-    depth = reference[0] + gain[0] * innovation
+    expected = 1.0 / information + max(spread[0, 0], 0.0)
+    gain_depth, gain_speed = spread[0, 0] / expected, spread[0, 1] / expected
+    depth = reference[0] + gain_depth * innovation
     new = _extend(average, data, depth - reference[0], memory)
-    hessian, gradient = _posterior(data, new, reference[1:] - prior, prior_variance, information)
+    away_before = (reference[1] - prior[0], reference[2] - prior[1])
+    hessian, gradient = _posterior(data, new, away_before, prior_variance, information)
     covariance = invert_symmetric(hessian)
-    away, mistaken, doubt = doubt_height(hessian, gradient, reference[2] - prior[1], prior_variance[1])
-    shift = covariance @ gradient
-    kkt = np.abs(hessian @ shift - gradient).max() / max(np.abs(gradient).max(), 1e-30)
+    away, mistaken, doubt = doubt_height(hessian, gradient, away_before[1], prior_variance[1])
+    shift, kkt = _find_shift(hessian, covariance, gradient)
     place = reference.copy()
     place[0] = depth
     for i in range(1, 3):
@@ -399,19 +406,40 @@ def update_place(
         place[i] += step
         # radius and height leave the depth that this frame's key points ask for
         place[0] -= pull[i] * step / information
-    residual = _move_residuals(data, new, place - reference, place[0] - depth)
+    moved = np.empty(3)
+    for i in range(3):
+        moved[i] = place[i] - reference[i]
+    residual = _move_residuals(data, new, moved, place[0] - depth)
     condition = measure_condition(covariance)
     covariance[2, 2] += doubt
     misfit = _compute_misfit(data, new.residuals, new.count)
-    speed = forecast.speed + gain[1] * innovation
+    speed = forecast.speed + gain_speed * innovation
     # what chance leaves of the innovation may be a motion that was not expected; the gain has followed a part of it
     beyond = max(0.0, innovation**2 - 1.0 / information - max(forecast.spread[0, 0], 0.0))
-    known = gain[0] / information + (1.0 - gain[0]) ** 2 * beyond
+    known = gain_depth / information + (1.0 - gain_depth) ** 2 * beyond
     known += find_leverage(data, depth - reference[0], information) ** 2
-    spread = spread - np.outer(gain, spread[0])
+    left = np.empty((2, 2))
+    for j in range(2):
+        left[0, j] = spread[0, j] - gain_depth * spread[0, j]
+        left[1, j] = spread[1, j] - gain_speed * spread[0, j]
     return PlaceUpdate(
-        place, speed, spread, jumped, new, covariance, known, kkt, residual, misfit, away, mistaken, condition
+        place, speed, left, jumped, new, covariance, known, kkt, residual, misfit, away, mistaken, condition
     )
+
+
+@njit(**_OPTIONS)
+def _find_shift(hessian, covariance, gradient):
+    """Returns what a gradient (3,) asks for, and what is left of it there as a share of what it was."""
+    shift, left, largest = np.zeros(3), 0.0, 1e-30
+    for i in range(3):
+        for j in range(3):
+            shift[i] += covariance[i, j] * gradient[j]
+    for i in range(3):
+        rest = -gradient[i]
+        for j in range(3):
+            rest += hessian[i, j] * shift[j]
+        left, largest = max(left, abs(rest)), max(largest, abs(gradient[i]))
+    return shift, left / largest
 
 
 @njit(**_OPTIONS)
@@ -530,15 +558,15 @@ def weigh_residuals(
     """
     noise, gain, width_variance, trust, offset_variance, depth_variance, model_error, gate = chance
     count, used, known = len(measured), 0, 0
-    r, modes, off = np.zeros((count, 2)), motions[:, ::2].copy(), np.zeros(count)
+    r, modes, off = np.zeros((count, 2)), np.empty((count, 2, 3)), np.zeros(count)
     weights, asked, say = np.zeros(count), np.zeros(count), np.zeros(count)
-    bias = offset_variance.copy()
+    bias, least = np.empty(count), np.inf
     for k in range(count):
-        way = 0.0
+        bias[k] = offset_variance[k] + _MODEL_FLOOR**2
         for a in range(3):
-            way += (positions[k, a] - rest[k, a]) ** 2
-        bias[k] += _MODEL_FLOOR**2 + model_error**2 * way
-    least = (noise[:, 0, 0] + noise[:, 1, 1]).min()
+            bias[k] += model_error**2 * (positions[k, a] - rest[k, a]) ** 2
+            modes[k, 0, a], modes[k, 1, a] = motions[k, 0, a], motions[k, 2, a]
+        least = min(least, noise[k, 0, 0] + noise[k, 1, 1])
     for k in range(count):
         if not np.isfinite(measured[k, 0] + measured[k, 1] + measured[k, 2]):
             off[k] = np.nan
@@ -553,8 +581,10 @@ def weigh_residuals(
         known += 1
     jump = _weighted_median(asked, say)
     level = _find_noise_level(r, off, modes, jump, chance, bias)
+    agreed = 0
     for k in range(count):
         if np.isnan(off[k]):
+            off[k] = 0.0
             continue
         square = off[k] * off[k] / (level * width_variance[k] + bias[k])
         h0, h1 = modes[k, 0, 0], modes[k, 1, 0]
@@ -565,11 +595,23 @@ def weigh_residuals(
         if weight >= _LEAST_WEIGHT:
             weights[k] = weight * trust[k]
             used += 1
+            agreed += weights[k] >= _BELIEVED * trust[k]
         else:
-            r[k, 0] = r[k, 1] = 0.0
-    off = np.where(weights > 0.0, off, 0.0)
-    agreed = int((weights >= _BELIEVED * trust).sum())
-    return Residuals(r, modes, weights, noise * level, bias, off, width_variance * level, used, known, jump, agreed)
+            r[k, 0] = r[k, 1] = off[k] = 0.0
+    loud, wide = _scale_noise(noise, width_variance, level)
+    return Residuals(r, modes, weights, loud, bias, off, wide, used, known, jump, agreed)
+
+
+@njit(**_OPTIONS)
+def _scale_noise(noise, width_variance, level):
+    """Returns the noise (K, 2, 2) and the variance along the width (K,) [m^2] of an image, `level` times the usual."""
+    loud, wide = np.empty(noise.shape), np.empty(len(noise))
+    for k in range(len(noise)):
+        wide[k] = width_variance[k] * level
+        for a in range(2):
+            for b in range(2):
+                loud[k, a, b] = noise[k, a, b] * level
+    return loud, wide
 
 
 @njit(**_OPTIONS)
@@ -589,15 +631,32 @@ def _find_noise_level(r, off, modes, jump, chance, bias):
         known += 1
     if known < _FEWEST:
         return 1.0
-    level = max(1.0, np.median(squares[:known]) / (_MEDIAN_SQUARE * _CHANCE))
+    order = _sort(squares, known)
+    median = 0.5 * (squares[order[(known - 1) // 2]] + squares[order[known // 2]])
+    level = max(1.0, median / (_MEDIAN_SQUARE * _CHANCE))
     return level if level < _LOUDEST else 1.0
+
+
+@njit(**_OPTIONS)
+def _sort(values, count):
+    """Returns the indices that sort the first `count` of a few values, by insertion."""
+    order = np.empty(count, np.int64)
+    for k in range(count):
+        at = k
+        while at > 0 and values[order[at - 1]] > values[k]:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = k
+    return order
 
 
 @njit(**_OPTIONS)
 def _weighted_median(values, weights):
     """Returns the value (of n) that has half of the weight on either side; 0 without any weight."""
-    half, total = 0.5 * weights.sum(), 0.0
-    for k in np.argsort(values):
+    half, total = 0.0, 0.0
+    for k in range(len(weights)):
+        half += 0.5 * weights[k]
+    for k in _sort(values, len(values)):
         total += weights[k]
         if total >= half and weights[k] > 0.0:
             return values[k]

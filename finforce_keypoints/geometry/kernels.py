@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from finforce.elimination import eliminate
+
 _OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
 POLYNOMIAL, FISHEYE = 1.0, 2.0  # kinds of lenses beside the pinhole, the fifth number of one
 OUTSIDE = -1e4  # [px] where what the camera does not see is taken
@@ -282,7 +284,8 @@ def solve_weighted(prior, rows, known, seen, variance):
             g[a] += w * rows[i, a] * known[i]
             for b in range(size):
                 A[a, b] += w * rows[i, a] * rows[i, b]
-    covariance = np.ascontiguousarray(np.linalg.inv(A))
+    covariance = np.eye(size)
+    eliminate(A, covariance)
     return covariance, covariance @ g
 
 
@@ -350,7 +353,7 @@ def fit_motion(shapes, pairs, moves, stddev, weight, limits):
 def improve_sizes(shapes, pairs, sizes, left, weight):
     """Return the sizes (n,) of shapes by least squares of what is left (K, 2) [px], to first order around some."""
     count = len(sizes)
-    A, g, slope = np.eye(count), np.zeros(count), np.empty(count)
+    A, g, slope = np.eye(count), np.zeros((count, 1)), np.empty(count)
     for row in range(len(shapes)):
         w = weight[row // 2]
         if not w > 0.0:
@@ -362,10 +365,11 @@ def improve_sizes(shapes, pairs, sizes, left, weight):
             slope[j] += sizes[i] * shapes[row, count + p]
         aim = left[row // 2, row % 2] + (slope * sizes).sum()
         for a in range(count):
-            g[a] += w * slope[a] * aim
+            g[a, 0] += w * slope[a] * aim
             for b in range(count):
                 A[a, b] += w * slope[a] * slope[b]
-    return np.linalg.solve(A, g)
+    eliminate(A, g)
+    return g.reshape(count)
 
 
 @njit(**_OPTIONS)

@@ -25,7 +25,7 @@ from mechanics_fakes import BENCH
 from finforce.errors import ObservationError
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tare import compute_point_noise, compute_tare, condition_on_width, match_stated
+from finforce_ifea.tare import compute_point_noise, compute_tare, match_stated
 
 FLOOR = 0.02e-3
 K = len(BENCH.keypoints)
@@ -105,11 +105,13 @@ def test_a_point_counts_less_when_it_states_more_than_in_the_tare_and_never_more
 def test_nothing_stated_is_the_pooled_noise_for_all():
     tare = compute_tare(list(BENCH.keypoints + scatter_of(np.tile(OWN, (K, 1)), 60)), BENCH.keypoints)
     assert tare.stated is None
-    noise, (plane, gain) = tare.point_noise(None), condition_on_width(tare.noise)
+    noise, shared = tare.point_noise(None), tare.noise[::2, 1]
+    gain = shared / tare.noise[1, 1]
     for k in range(K):
-        np.testing.assert_array_equal(noise.plane[k], plane)
-        np.testing.assert_array_equal(noise.gain[k], gain)
+        np.testing.assert_allclose(noise.plane[k], tare.noise[::2, ::2] - np.outer(gain, shared), rtol=1e-12)
+        np.testing.assert_allclose(noise.gain[k], gain, rtol=1e-12)
     np.testing.assert_array_equal(noise.trust, 1.0)
+    np.testing.assert_allclose(noise.standing, 0.0, atol=1e-12 * np.trace(tare.noise))
     stated = tare.point_noise(np.sqrt(np.diag(tare.noise)) * COARSE[:, None])
     np.testing.assert_allclose(stated.trust, COARSE**-2.0)
 

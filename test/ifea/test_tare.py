@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mechanics_fakes import BENCH
 
-from finforce_ifea.tare import blank_tare, compute_tare, condition_on_width
+from finforce_ifea.tare import StatedNoise, blank_tare, compute_point_noise, compute_tare
 from finforce_ifea.tracking.track import explain_offsets
 
 REST = BENCH.keypoints
@@ -138,7 +138,10 @@ def test_noise_left_in_the_plane_is_what_the_width_does_not_explain():
     """The finger does not move along y: what it seems to do there tells of the noise along the line of sight."""
     random, sight = np.random.default_rng(0), np.array([0.25, -0.95, 0.18])
     samples = 0.1e-3 * random.normal(size=(200_000, 3)) + 0.5e-3 * random.normal(size=(200_000, 1)) * sight
-    left, gain = condition_on_width(np.cov(samples.T))
+    covariance = np.cov(samples.T)
+    usual = StatedNoise(covariance[None], np.sqrt(np.diag(covariance))[None])
+    noise = compute_point_noise(usual, None)
+    left, gain = noise.plane[0], noise.gain[0]
     corrected = samples[:, [0, 2]] - samples[:, 1:2] * gain
     np.testing.assert_allclose(np.cov(corrected.T), left, rtol=1e-4, atol=1e-15)
     assert np.trace(left) < 0.5 * np.trace(np.cov(samples[:, [0, 2]].T))

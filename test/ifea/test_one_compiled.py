@@ -1,0 +1,17 @@
+"""What takes seconds to compile is compiled once, whatever jaw, solver and contact it is for."""
+
+import pytest
+
+from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.reduced.evaluation import linearize_reduced
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tracking.place_search import _find_reduced
+
+
+@pytest.mark.parametrize("held", ["no", "yes"])
+def test_the_search_for_a_place_is_compiled_once(held):
+    for solver in ("linear", "reduced"):
+        JawEstimator(load_jaw("bench"), settings=EstimatorSettings(solver=solver, held=held)).warm_up()
+    assert len(_find_reduced.signatures) == 1
+    assert len(linearize_reduced.signatures) == 1
