@@ -124,10 +124,10 @@ def compute_rate(progress: float, recipe: Schedule) -> float:
 
 
 def has_bfloat16(device: torch.device) -> bool:
-    """Tell whether a device multiplies bfloat16 faster than float32."""
+    """Tell whether a device multiplies bfloat16 faster than float32: GPUs of late, processors only with tiles (AMX)."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
-    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
+    return bool(getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)())
 
 
 @torch.no_grad()

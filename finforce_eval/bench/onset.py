@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -60,23 +60,30 @@ def measure(quick: bool) -> OnsetFigures:
     """
     rows = []
     for rate, phases in ((30, PHASES), (90, (0,) * len(PHASES))):
-        delays: list[Delay] = []
-        others = 0.0
-        for grasp in range(1 if quick else GRASPS):
-            clearance = CLEARANCE + grasp * LATER
-            path = find_scene(
-                BenchScene(
-                    scenario="grasp_cylinder", seed=101, changes={**SHORT, "clearance": clearance}, slots=EVERY_RATE
-                )
-            )
-            recording, truth = read_recording(path), true_grasp(read_recording(path))
-            for phase in phases:
-                stream = stream_images(path, rate, phase=phase)
-                run = run_nodes(chain_processes(recording, images=True), stream, SIDES, heard=())
-                delays += find_delays(run.log, truth)
-                others = max(others, run.others)
-        rows.append(OnsetRow(rate=rate, delays=delay_stats(delays), others=others))
+        runs = [_play(grasp, rate, phases) for grasp in range(1 if quick else GRASPS)]
+        delays = [delay for run in runs for delay in run.delays]
+        rows.append(OnsetRow(rate=rate, delays=delay_stats(delays), others=max(run.others for run in runs)))
     return OnsetFigures(rows=rows)
+
+
+class _Played(NamedTuple):
+    """The delays of one grasp, played several times, and the CPU use of everything else [% of a core]."""
+
+    delays: list[Delay]
+    others: float
+
+
+def _play(grasp: int, rate: int, phases: Sequence[int]) -> _Played:
+    """Play a grasp at a rate [Hz], once from each phase of the images."""
+    changes = {**SHORT, "clearance": CLEARANCE + grasp * LATER}
+    path = find_scene(BenchScene(scenario="grasp_cylinder", seed=101, changes=changes, slots=EVERY_RATE))
+    recording = read_recording(path)
+    truth, played = true_grasp(recording), _Played([], 0.0)
+    for phase in phases:
+        stream = stream_images(path, rate, phase=phase)
+        run = run_nodes(chain_processes(recording, images=True), stream, SIDES, heard=())
+        played = _Played(played.delays + find_delays(run.log, truth), max(played.others, run.others))
+    return played
 
 
 def find_delays(log: ReplayLog, truth: TrueGrasp) -> list[Delay]:
