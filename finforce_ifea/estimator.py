@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from math import hypot, sqrt
+from math import hypot, nan
 
 import numpy as np
 from numba import njit
@@ -33,7 +33,15 @@ from finforce_ifea.tracking.friction_estimate import SMOOTH, Coefficient
 from finforce_ifea.tracking.influence import ReachWatch
 from finforce_ifea.tracking.place_tracker import PlaceTracker
 from finforce_ifea.tracking.point_tracker import PointTracker
-from finforce_ifea.tracking.track import UNSEEN_LEAN, AcrossFinger, ForceEvidence, Track, find_doubt, find_numbers
+from finforce_ifea.tracking.track import (
+    UNSEEN_ALONG,
+    UNSEEN_LEAN,
+    AcrossFinger,
+    ForceEvidence,
+    Track,
+    find_doubt,
+    find_numbers,
+)
 from finforce_ifea.tracking.width_tracker import MIDDLE_STDDEV
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
@@ -45,14 +53,8 @@ _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are un
 _UNCALIBRATED = 0.1
 # Relative error of forces at the distance from stored shapes that those are good for.
 _EXTRAPOLATED = 0.015
-# What two jaws hold does not slide out, though their bent faces lean: friction takes up the force along the finger, and
-# the magnitude that belongs to the same shape is larger, by a share of the tangent of the lean that the twin's held
-# objects have.
-_LEANING = 0.3
 # Relative error of a jaw that is taken to be linear, 10 mm deep.
 _LINEAR = 0.05
-# Share of a force that nobody has seen along z.
-_LEAN = 0.3
 
 
 class JawEstimator:
@@ -218,7 +220,7 @@ class JawEstimator:
         if self._taring.tared:
             return ""
         if self._taring.missing:
-            self._relax(np.zeros(3))
+            self._relax()
             return f"{self._taring.missing} more unloaded frames for the tare"
         try:
             self._taring.begin()
@@ -258,7 +260,7 @@ class JawEstimator:
     def _rest(self, message: str, points: NDArray) -> Solution:
         """Says that nothing presses, as far as the key points (K, 3) [m] tell it."""
         self._taring.note(quiet=True, loaded=False)
-        self._relax(np.zeros(3))
+        self._relax()
         if not self._at_rest:  # the shape of a load that has gone
             self._tracker.reset()
             self._contact, self._at_rest = None, True
@@ -268,7 +270,7 @@ class JawEstimator:
         return replace(
             blank_solution(self._stamp, "unloaded", message, used),
             converged=True,
-            force_stddev=stddev * np.array([1.0, 0.0, _LEAN]),
+            force_stddev=stddev * np.array([1.0, 0.0, UNSEEN_ALONG]),
             torque_stddev=np.array([0.0, stddev * response.heights[-1], 0.0]),
             magnitude_stddev=stddev,
         )
@@ -291,29 +293,23 @@ class JawEstimator:
         if doubt:
             return self._fail("unobservable", doubt, used, track.iterations)
         self._taring.note(quiet=track.quiet, loaded=track.loaded)
-        force = self._relax(track.force)
-        elastic = sqrt(track.force @ track.force)
-        if track.across is not None and elastic > 0.0:
-            force[1] = track.across.force * sqrt(force @ force) / elastic
-        return self._solution(track, force, used)
+        return self._solution(track, used)
 
-    def _relax(self, elastic: NDArray) -> NDArray:
-        """Returns the force (3,) [N] that the material gives for an elastic force (3,) [N] now."""
+    def _relax(self) -> None:
+        """Lets the material relax without a load."""
+        self._relaxation.update(np.zeros(3), self._pass_time())
+
+    def _pass_time(self) -> float:
+        """Returns the time since the material's last force [s]."""
         dt = 0.0 if self._relaxed is None else self._stamp - self._relaxed
         self._relaxed = self._stamp
-        return self._relaxation.update(elastic, dt)
+        return dt
 
-    def _solution(self, track: Track, force: NDArray, used: NDArray) -> Solution:
-        extrapolated = _EXTRAPOLATED * track.extrapolation
+    def _solution(self, track: Track, used: NDArray) -> Solution:
         friction = self.settings.friction
-        leaning = 0.0
-        if self.settings.held != "yes":
-            leaning = _LEANING * min(friction, float(abs(force[2])) / max(float(abs(force[0])), 1e-9))
-        share = hypot(self._force_error, track.place_error, extrapolated, leaning)
         unseen = UNSEEN_LEAN * friction
-        across = track.across or AcrossFinger(0.0, MIDDLE_STDDEV, 0.0, unseen)
+        across = track.across or AcrossFinger(0.0, MIDDLE_STDDEV, nan, unseen)
         evidence = ForceEvidence(
-            force=force,
             elastic=track.force,
             modes=track.force_modes,
             covariance=track.covariance,
@@ -323,13 +319,15 @@ class JawEstimator:
             across=tuple(across),
             along=unseen if track.lean_stddev is None else track.lean_stddev,
             leak=track.lean_leak,
+            error=hypot(self._force_error, track.place_error, _EXTRAPOLATED * track.extrapolation),
+            sliding=0.0 if self.settings.held == "yes" else friction,
         )
-        numbers = find_numbers(tuple(evidence), share, _LEAN)
+        numbers = find_numbers(evidence, self._relaxation.packed, self._pass_time())
         return Solution(
             stamp=self._stamp,
             status="ok" if numbers.magnitude > 0.0 else "unloaded",
             message="" if self.tared else _UNTARED,
-            force=force,
+            force=numbers.force,
             torque=numbers.torque,
             force_stddev=numbers.force_stddev,
             torque_stddev=numbers.torque_stddev,

@@ -36,7 +36,14 @@ class Relaxation:
 
     def update(self, elastic: NDArray, dt: float) -> NDArray:
         """Returns the measured force (3,) [N] for the elastic force (3,) [N] after dt [s], exact for a ramp between."""
-        return _follow(np.asarray(elastic, float), self._elastic, self._over, self._share, self._tau, dt)
+        out = np.empty(3)
+        relax_force(np.asarray(elastic, float), self.packed, dt, out)
+        return out
+
+    @property
+    def packed(self) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """The last elastic force (3,) and overstresses (n, 3) [N], shares and time constants (n,) of `relax_force`."""
+        return self._elastic, self._over, self._share, self._tau
 
     @property
     def gain(self) -> float:
@@ -84,18 +91,22 @@ def _invert(measured, stamps, share, tau):
 
 
 @njit(cache=True)
-def _follow(elastic, before, over, share, tau, dt):
-    """Returns the force (3,) [N] after dt [s], and writes over the elastic one (3,) and the overstresses (n, 3)."""
-    total = elastic.copy()
+def relax_force(elastic, relaxation, dt, out):
+    """Writes to out the force (3,) [N] for an elastic one (3,) [N] after dt [s]; see `Relaxation.packed`."""
+    before, over, share, tau = relaxation
+    for a in range(3):
+        out[a] = elastic[a]
     for k in range(len(share)):
         ratio = max(dt / tau[k], 1e-12)
         decay, gain = np.exp(-dt / tau[k]), -np.expm1(-ratio) / ratio
         for a in range(3):
             over[k, a] = over[k, a] * decay + share[k] * gain * (elastic[a] - before[a])
-            total[a] += over[k, a]
+            out[a] += over[k, a]
     ahead = 0.0
     for a in range(3):
         before[a] = elastic[a]
-        ahead += total[a] * elastic[a]
+        ahead += out[a] * elastic[a]
     # contact cannot pull: the overstress may take the whole force away, never turn it round
-    return total if ahead > 0.0 else np.zeros(3)
+    if not ahead > 0.0:
+        for a in range(3):
+            out[a] = 0.0

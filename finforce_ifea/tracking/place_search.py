@@ -142,21 +142,22 @@ class PlaceRules(NamedTuple):
 
 
 class FoundPlace(NamedTuple):
-    """The outcome of one image.
+    """The outcome of one image; its arrays hold until the next image is looked at.
 
     Attributes:
         place: that the key points ask for (3,).
         moved: of it since the forecast (3,).
-        motions: of the key points by the place and a lean of the force (K, 3, 4).
-        data: residuals and weights.
         pressing: of the object on the jaw before the last step (3,) [N].
         force: elastic contact force on the jaw (3,) [N].
-        stddev: of it along itself [N].
-        force_modes: derivatives by the place (3, 3).
-        leaning: derivative by a lean of the force (3,).
-        covariance: of the place (3, 3), by the misfit too.
+        leaning: its derivative by a lean of the force (3,).
         pressure_point: pressure centre on the deformed surface (3,) [m].
         pressure_place: the same on the undeformed surface (3,) [m].
+        force_modes: derivatives of the force by the place (3, 3).
+        covariance: of the place (3, 3), by the misfit too.
+        motions: of the key points by the place and a lean of the force (K, 3, 4).
+        data: residuals and weights.
+        magnitude: of the force [N].
+        stddev: of it along itself [N].
         pressed: depth below first touch [m].
         jumped: see `PlaceUpdate`; so the next seven.
         depth_variance: [m^2].
@@ -177,16 +178,17 @@ class FoundPlace(NamedTuple):
 
     place: NDArray
     moved: NDArray
-    motions: NDArray
-    data: Residuals
     pressing: NDArray
     force: NDArray
-    stddev: float
-    force_modes: NDArray
     leaning: NDArray
-    covariance: NDArray
     pressure_point: NDArray
     pressure_place: NDArray
+    force_modes: NDArray
+    covariance: NDArray
+    motions: NDArray
+    data: Residuals
+    magnitude: float
+    stddev: float
     pressed: float
     jumped: bool
     depth_variance: float
@@ -205,8 +207,51 @@ class FoundPlace(NamedTuple):
     sound: bool
 
 
+_VECTORS, _MATRICES = 7, 2  # of three and of nine numbers, the first of `FoundPlace`
+_SCALARS = 3 * _VECTORS + 9 * _MATRICES  # where the single numbers begin
+_SINGLE = 22  # of them: used, known, jump, agreed of `Residuals`, and what follows `data`
+
+
+class _Room(NamedTuple):
+    """Arrays that the search writes to, for compiled code: the numbers (61,), motions, and those of `Residuals`."""
+
+    numbers: NDArray
+    motions: NDArray
+    r: NDArray
+    modes: NDArray
+    weights: NDArray
+    noise: NDArray
+    bias: NDArray
+    off: NDArray
+    off_noise: NDArray
+
+
+class PlaceRoom:
+    """Where a search for the place of an object leaves what it has found.
+
+    Arrays that are made anew in compiled code and handed to Python cost more than finding what they hold.
+    """
+
+    def __init__(self, count: int) -> None:
+        """Makes room for `count` key points."""
+        shapes = (_SCALARS + _SINGLE,), (count, 3, 4), (count, 2), (count, 2, 3), (count,), (count, 2, 2)
+        self.arrays = _Room(*map(np.zeros, shapes), *(np.zeros(count) for _ in range(3)))
+        numbers, middle = self.arrays.numbers, 3 * _VECTORS
+        vectors, matrices = numbers[:middle].reshape(-1, 3), numbers[middle:_SCALARS].reshape(-1, 3, 3)
+        self._views = (*vectors, *matrices, self.arrays.motions)
+        self._residuals, self._single = self.arrays[2:], numbers[_SCALARS:]
+
+    def read(self) -> FoundPlace:
+        """Returns what the last search has found."""
+        single = self._single.tolist()
+        used, known, jump, agreed = single[:4]
+        data = Residuals(*self._residuals, int(used), int(known), jump, int(agreed))
+        ends = int(single[-3]), bool(single[-2]), bool(single[-1])
+        return FoundPlace(*self._views, data, *single[4:7], bool(single[7]), *single[8:-3], *ends)
+
+
 def find_place(
-    contact: RollingContact, probe: Any, state: PlaceState, frame: PlaceFrame, rules: PlaceRules
+    contact: RollingContact, probe: Any, state: PlaceState, frame: PlaceFrame, rules: PlaceRules, room: PlaceRoom
 ) -> FoundPlace | None:
     """Returns the place of the object in one image, None where too few key points agree.
 
@@ -216,12 +261,15 @@ def find_place(
         state: of the image before.
         frame: key points.
         rules: what is expected and allowed.
+        room: for what is found.
     """
-    if not (isinstance(contact, ReducedContact) and isinstance(probe, ReducedProbe)):
-        return _find_place(contact, probe, state, frame, rules)
-    packed = contact.packed, tuple(contact.indenter.pressed), tuple(contact.rubbing.describe(_STILL))
-    points = probe.points, probe.shapes, probe.compliance
-    return _find_reduced(packed, points, tuple(state), tuple(frame), tuple(rules))
+    if isinstance(contact, ReducedContact) and isinstance(probe, ReducedProbe):
+        packed = contact.packed, tuple(contact.indenter.pressed), tuple(contact.rubbing.describe(_STILL))
+        points = probe.points, probe.shapes, probe.compliance
+        found = _find_reduced(packed, points, tuple(state), tuple(frame), tuple(rules), tuple(room.arrays))
+    else:
+        found = _find_place(contact, probe, state, frame, rules, room.arrays)
+    return room.read() if found else None
 
 
 @register_jitable(**_BOTH)
@@ -271,9 +319,9 @@ def _weigh(contact, probe, q, state, frame, chance, place, expected):
     return data, motions
 
 
-def _find_place(contact, probe, state, frame, rules):
-    """Returns the `FoundPlace` of one image, None where too few key points agree; see `pressing`."""
-    state, frame, rules = PlaceState(*state), PlaceFrame(*frame), PlaceRules(*rules)
+def _find_place(contact, probe, state, frame, rules, room):
+    """Writes the `FoundPlace` of one image to room; returns whether enough key points agree. See `pressing`."""
+    state, frame, rules, room = PlaceState(*state), PlaceFrame(*frame), PlaceRules(*rules), _Room(*room)
     forecast = forecast_place(
         state.motion, state.spread, state.slow, frame.dt, rules.acceleration, _DEPTH_DRIFT, frame.sudden
     )
@@ -326,10 +374,13 @@ def _find_place(contact, probe, state, frame, rules):
         q = q + limit_at(contact, _spread_modes(pressed.modes, moved))
         settled = _is_settled(pressed, moved, missing, rules)
     if not found or not pressed.touches:
-        return None
+        return False
     _keep(state, q, pressed.modes, reach_place(contact, place), place, update)
     depth = place[DEPTH] - touch_at(contact, place)
-    return _report(depth, q, moved, pressed, motions, data, update, forecast.place, rules.stiffness, iteration, settled)
+    last_step = (moved, iteration, settled)
+    _report(room.numbers, depth, q, last_step, pressed, data, update, forecast.place, rules.stiffness)
+    _write_residuals(tuple(room), tuple(data), motions)
+    return True
 
 
 @register_jitable(**_BOTH)
@@ -353,12 +404,12 @@ def _keep(state, q, modes, reached, place, update):
 
 
 @register_jitable(**_BOTH)
-def _report(depth, q, moved, pressed, motions, data, update, expected, stiffness, iterations, settled):
-    """Returns the `FoundPlace` of a search that has ended, the last step `moved` (3,) included."""
-    force, modes, leaning, came = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
-    covariance, misfit = np.empty((3, 3)), max(1.0, update.misfit**2)
+def _report(out, depth, q, last_step, pressed, data, update, expected, stiffness):
+    """Writes the numbers of a `FoundPlace` to out (61,) after a search whose last step moved the place by (3,)."""
+    moved, iterations, settled = last_step
+    modes, covariance, misfit = np.empty((3, 3)), np.empty((3, 3)), max(1.0, update.misfit**2)
     continued = max(0.0, depth / _LEAST_DEPTH) if depth < _LEAST_DEPTH else 1.0
-    changed, size, total = 0.0, 0.0, q.sum()
+    force, changed, size, total = np.empty(3), 0.0, 0.0, q.sum()
     for a in range(3):
         change = 0.0
         for i in range(3):
@@ -367,42 +418,44 @@ def _report(depth, q, moved, pressed, motions, data, update, expected, stiffness
             covariance[a, i] = update.covariance[a, i] * misfit
             total += update.covariance[a, i]
         force[a] = (pressed.force[a] + change) * continued
-        leaning[a], came[a] = pressed.force_modes[a, 3], update.place[a] - expected[a]
         changed, size, total = changed + change * change, size + force[a] * force[a], total + force[a]
     covariance[DEPTH, DEPTH] += update.depth_variance * misfit
-    stiffening = 1.0
+    for a in range(3):
+        out[a], out[3 + a], out[6 + a] = update.place[a], update.place[a] - expected[a], pressed.force[a]
+        out[9 + a], out[12 + a] = force[a], pressed.force_modes[a, 3]
+        out[15 + a], out[18 + a] = pressed.pressure_point[a], pressed.pressure_place[a]
+        for i in range(3):
+            out[21 + 3 * a + i], out[30 + 3 * a + i] = modes[a, i], covariance[a, i]
+    single = out[_SCALARS:]
+    single[0], single[1], single[2], single[3] = data.used, data.known, data.jump, data.agreed
+    magnitude = np.sqrt(size)
+    single[4], single[5] = magnitude, measure_along(force, modes, covariance)
+    single[6], single[7], single[8] = depth, update.jumped, update.depth_variance
+    single[9], single[10], single[11] = update.kkt, update.residual, update.misfit
+    single[12], single[13], single[14] = update.away, update.mistaken, update.condition
+    single[15], single[16] = update.covariance[HEIGHT, HEIGHT], 1.0
     if stiffness > 0.0 and depth >= LOADED_DEPTH:
-        stiffening = np.sqrt(size) / (stiffness * depth)
-    return FoundPlace(
-        update.place,
-        came,
-        motions,
-        data,
-        pressed.force,
-        force,
-        measure_along(force, modes, covariance),
-        modes,
-        leaning,
-        covariance,
-        pressed.pressure_point,
-        pressed.pressure_place,
-        depth,
-        update.jumped,
-        update.depth_variance,
-        update.kkt,
-        update.residual,
-        update.misfit,
-        update.away,
-        update.mistaken,
-        update.condition,
-        update.covariance[HEIGHT, HEIGHT],
-        stiffening,
-        0.0 if settled else np.sqrt(changed),
-        pressed.extrapolation,
-        iterations,
-        settled,
-        bool(np.isfinite(total) and pressed.smallest_det > 0.0),
-    )
+        single[16] = magnitude / (stiffness * depth)
+    single[17], single[18] = 0.0 if settled else np.sqrt(changed), pressed.extrapolation
+    single[19], single[20], single[21] = iterations, settled, np.isfinite(total) and pressed.smallest_det > 0.0
+
+
+@njit(**_OPTIONS)
+def _write_residuals(room, data, motions):
+    """Writes residuals and the motions of the key points (K, 3, 4) to room; both as plain tuples."""
+    room, data = _Room(*room), Residuals(*data)
+    for k in range(len(data.weights)):
+        room.weights[k], room.bias[k] = data.weights[k], data.bias[k]
+        room.off[k], room.off_noise[k] = data.off[k], data.off_noise[k]
+        for a in range(2):
+            room.r[k, a] = data.r[k, a]
+            for b in range(2):
+                room.noise[k, a, b] = data.noise[k, a, b]
+            for i in range(3):
+                room.modes[k, a, i] = data.modes[k, a, i]
+        for a in range(3):
+            for i in range(4):
+                room.motions[k, a, i] = motions[k, a, i]
 
 
 # Plain tuples are handed over from Python several times as fast as named ones.

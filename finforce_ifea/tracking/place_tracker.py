@@ -28,6 +28,7 @@ from finforce_ifea.tracking.place_search import (
     TOUCH_DEPTH,
     FoundPlace,
     PlaceFrame,
+    PlaceRoom,
     PlaceRules,
     PlaceState,
     find_place,
@@ -100,6 +101,7 @@ class PlaceTracker:
         self.settings = settings
         self._levels = [_attach(level.contact, keypoints) for level in (mechanics, mechanics.full) if level is not None]
         self._stand_on(0)
+        self._room = PlaceRoom(len(keypoints))
         self._stiffness: float | None = None
         contact = self.contact
         self.response = measure_influence(contact, self.probe, len(keypoints))
@@ -213,7 +215,7 @@ class PlaceTracker:
             dt=dt,
             sudden=bool(self._released or self._jumped),
         )
-        found = find_place(self.contact, self.probe, self._state, frame, self._rules())
+        found = find_place(self.contact, self.probe, self._state, frame, self._rules(), self._room)
         if found is None:
             return self._lose()
         self._jumped = found.jumped
@@ -384,6 +386,7 @@ class PlaceTracker:
         return Track(
             covariance=found.covariance,
             force=found.force,
+            magnitude=found.magnitude,
             stddev=found.stddev,
             force_modes=found.force_modes,
             pressure_point=found.pressure_point,

@@ -201,6 +201,7 @@ class PointTracker:
         return Track(
             covariance=covariance,
             force=force,
+            magnitude=magnitude,
             stddev=stddev,
             force_modes=result.directions,
             pressure_point=share @ deformed,

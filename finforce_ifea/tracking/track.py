@@ -1,13 +1,13 @@
 """What a tracker says of one image with its standard deviations, and when a force must not be reported."""
 
 from dataclasses import dataclass
-from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from finforce_ifea.relaxation import relax_force
 from finforce_ifea.tare import Tare
 
 # Standard deviation of an offset that all key points share [m]: a depth scale wrong by 1 % at 0.15 m.
@@ -40,6 +40,7 @@ class Track(NamedTuple):
     Attributes:
         covariance: of what was estimated (m, m): depth [m], log radius and height [m], or a given contact's force [N].
         force: elastic contact force on the jaw (3,) [N].
+        magnitude: of it [N].
         stddev: of it along itself, by the covariance [N].
         force_modes: derivative of the force by what was estimated (3, m).
         pressure_point: pressure centre on the deformed surface (3,) [m].
@@ -70,6 +71,7 @@ class Track(NamedTuple):
 
     covariance: NDArray
     force: NDArray
+    magnitude: float
     stddev: float
     force_modes: NDArray
     pressure_point: NDArray
@@ -171,11 +173,10 @@ def find_doubt(track: Track, *, settles: bool) -> str:
         return f"only {100 * track.agreement:.0f} % of the key points agree with the jaw's shape"
     if track.mistaken > _MISTAKEN and abs(track.away) > _LEAST_AWAY:
         return f"the contact is not where it was said to be: the key points have it {1e3 * track.away:+.0f} mm away"
-    magnitude = sqrt(track.force @ track.force)
-    if magnitude > track.bearable:
+    if track.magnitude > track.bearable:
         most = f"expected {track.bearable:.0f} N at most"
-        return f"the shape would take {magnitude:.0f} N, {most}; is the contact elsewhere?"
-    if not track.stddev <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
+        return f"the shape would take {track.magnitude:.0f} N, {most}; is the contact elsewhere?"
+    if not track.stddev <= max(_VAGUE_FORCE, _VAGUE_SHARE * track.magnitude):
         return f"the visible key points tell the force only within {track.stddev:.2g} N"
     return ""
 
@@ -184,27 +185,29 @@ _OPTIONS = {"cache": True, "error_model": "numpy"}
 
 
 class SolutionNumbers(NamedTuple):
-    """What belongs to one force.
+    """One force, and what belongs to it.
 
     Attributes:
-        magnitude: of the force [N].
-        magnitude_stddev: [N].
+        force: that the material gives now (3,) [N].
         torque: about the jaw frame's origin (3,) [N m].
         force_stddev: (3,) [N].
         torque_stddev: (3,) [N m].
         contact_point: pressure centre (3,) [m], NaN without a force.
         contact_place: the same on the undeformed surface (3,) [m], NaN without a force.
         normal: direction of the force (3,), NaN without a force.
+        magnitude: of the force [N].
+        magnitude_stddev: [N].
     """
 
-    magnitude: float
-    magnitude_stddev: float
+    force: NDArray
     torque: NDArray
     force_stddev: NDArray
     torque_stddev: NDArray
     contact_point: NDArray
     contact_place: NDArray
     normal: NDArray
+    magnitude: float
+    magnitude_stddev: float
 
 
 @njit(**_OPTIONS)
@@ -233,19 +236,19 @@ class ForceEvidence(NamedTuple):
     """A force that was tracked, and what is known of it.
 
     Attributes:
-        force: that the material gives now (3,) [N].
         elastic: that the shape asks for (3,) [N].
-        modes: derivative of the elastic force by what was estimated (3, m).
+        modes: its derivative by what was estimated (3, m).
         covariance: of what was estimated (m, m).
         pressure: pressure centre on the deformed surface (3,) [m].
         place: the same on the undeformed surface (3,) [m].
         place_stddev: of its height [m].
-        across: the four of `AcrossFinger`.
+        across: the four of `AcrossFinger`; the force is NaN where nobody knows it.
         along: standard deviation of the lean along the finger [-].
         leak: by which such a lean shows along x, too [-].
+        error: relative standard deviation of the mechanics.
+        sliding: friction of an object that may slide along the finger, 0 for one that does not.
     """
 
-    force: NDArray
     elastic: NDArray
     modes: NDArray
     covariance: NDArray
@@ -255,45 +258,74 @@ class ForceEvidence(NamedTuple):
     across: tuple[float, float, float, float]
     along: float
     leak: float
+    error: float
+    sliding: float
+
+
+def find_numbers(evidence: ForceEvidence, relaxation: tuple, dt: float) -> SolutionNumbers:
+    """Returns the force that the material gives for a tracked one, and what belongs to it.
+
+    Args:
+        evidence: of the force.
+        relaxation: the finger's, see `Relaxation.packed`, which goes on by dt.
+        dt: time since the last force [s].
+    """
+    vectors, magnitude, stddev = _find_numbers(tuple(evidence), relaxation, dt)
+    return SolutionNumbers(*vectors, magnitude, stddev)
+
+
+# What two jaws hold does not slide out, though their bent faces lean: friction takes up the force along the finger, and
+# the magnitude that belongs to the same shape is larger, by a share of the tangent of the lean that the twin's held
+# objects have.
+_LEANING = 0.3
+# Share of a force that nobody has seen along z.
+UNSEEN_ALONG = 0.3
 
 
 @njit(**_OPTIONS)
-def find_numbers(evidence: tuple, share: float, lean: float) -> SolutionNumbers:
-    """Returns what belongs to a force; see `SolutionNumbers`.
-
-    Args:
-        evidence: `ForceEvidence` as a plain tuple, which is handed over several times as fast.
-        share: relative standard deviation of the mechanics; it errs in the direction as in the magnitude.
-        lean: share of a force that nobody has seen along z.
-    """
-    force, elastic, modes, covariance, pressure, place, place_stddev, across, along, leak = evidence
-    y, y_stddev, _, lean_across = across
-    fit, magnitude = measure_along(elastic, modes, covariance), np.sqrt((force * force).sum())
-    stddev = np.zeros(3)
+def _find_numbers(evidence, relaxation, dt):
+    """Returns the vectors (7, 3), the magnitude and its standard deviation of `SolutionNumbers`."""
+    elastic, modes, covariance, pressure, place, place_stddev, across, along, leak, error, sliding = evidence
+    out = np.empty((7, 3))
+    force, torque, stddev, torque_stddev, arm, undeformed, normal = out
+    y, y_stddev, aside, lean_across = across
+    fit, before = measure_along(elastic, modes, covariance), _measure_length(elastic)
+    relax_force(elastic, relaxation, dt, force)
+    if before > 0.0 and np.isfinite(aside):
+        force[1] = aside * _measure_length(force) / before
+    magnitude, leaning = _measure_length(force), 0.0
+    if sliding > 0.0:
+        leaning = _LEANING * min(sliding, abs(force[2]) / max(abs(force[0]), 1e-9))
+    # the mechanics errs in the direction as in the magnitude
+    wrong = (error**2 + leaning**2) * magnitude**2
+    leaked, leaned = (leak * along * magnitude) ** 2, (along * magnitude) ** 2
+    # a larger force leans more: where it is hardly known, its direction is not known either
+    leaned += (UNSEEN_ALONG * fit**2 / max(magnitude + fit, 1e-300)) ** 2
+    more = (wrong + leaked, (lean_across * magnitude) ** 2, wrong + leaned)
     for a in range(3):
+        variance = more[a]
         for i in range(modes.shape[1]):
             for j in range(modes.shape[1]):
-                stddev[a] += modes[a, i] * covariance[i, j] * modes[a, j]
-    stddev[0] += (share * magnitude) ** 2 + (leak * along * magnitude) ** 2
-    stddev[2] += (share * magnitude) ** 2
-    stddev[1] += (lean_across * magnitude) ** 2
-    stddev[2] += (along * magnitude) ** 2
-    # a larger force leans more: where it is hardly known, its direction is not known either
-    stddev[2] += (lean * fit**2 / max(magnitude + fit, 1e-300)) ** 2
-    stddev = np.sqrt(stddev)
-    arm, undeformed = pressure.copy(), place.copy()
+                variance += modes[a, i] * covariance[i, j] * modes[a, j]
+        stddev[a] = np.sqrt(variance)
+        arm[a], undeformed[a] = pressure[a], place[a]
     arm[1] = undeformed[1] = y
-    torque, torque_stddev = np.zeros(3), np.zeros(3)
-    arm_stddev = np.array([0.0, y_stddev, place_stddev])
+    arm_stddev = (0.0, y_stddev, place_stddev)
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
         torque[a] = arm[b] * force[c] - arm[c] * force[b]
-        torque_stddev[a] += (arm[b] * stddev[c]) ** 2 + (arm[c] * stddev[b]) ** 2
-        torque_stddev[a] += (arm_stddev[b] * force[c]) ** 2 + (arm_stddev[c] * force[b]) ** 2
-    torque_stddev = np.sqrt(torque_stddev)
-    if magnitude > 0.0:
-        normal = force / magnitude
-    else:
-        arm, undeformed, normal = np.full(3, np.nan), np.full(3, np.nan), np.full(3, np.nan)
-    spread = np.sqrt(fit**2 + (share * magnitude) ** 2 + (leak * along * magnitude) ** 2)
-    return SolutionNumbers(magnitude, spread, torque, stddev, torque_stddev, arm, undeformed, normal)
+        variance = (arm[b] * stddev[c]) ** 2 + (arm[c] * stddev[b]) ** 2
+        variance += (arm_stddev[b] * force[c]) ** 2 + (arm_stddev[c] * force[b]) ** 2
+        torque_stddev[a] = np.sqrt(variance)
+    for a in range(3):
+        if magnitude > 0.0:
+            normal[a] = force[a] / magnitude
+        else:
+            arm[a] = undeformed[a] = normal[a] = np.nan
+    return out, magnitude, np.sqrt(fit**2 + wrong + leaked)
+
+
+@njit(**_OPTIONS)
+def _measure_length(vector):
+    """Returns the length of a vector (3,)."""
+    return np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
