@@ -360,6 +360,23 @@ def wrench_from_message(message: Any, frame: str) -> tuple[NDArray, NDArray]:
     return force, torque
 
 
+_LEAST_LENGTH = 1e-6  # of what is a direction
+
+
+def direction_from_message(message: Any, frame: str, what: str) -> NDArray:
+    """Return the unit vector (3,) of a geometry_msgs/Vector3Stamped in `frame`, whatever its length.
+
+    Raises:
+        ObservationError: the frame is another one, a number is not finite, or the length is next to nothing.
+    """
+    check_frame(message, frame, what)
+    vector = np.array([message.vector.x, message.vector.y, message.vector.z])
+    length = float(np.linalg.norm(vector))
+    if not _LEAST_LENGTH < length < np.inf:
+        raise ObservationError(f"{what} is {vector.tolist()}, expected a direction: three finite numbers, not all zero")
+    return vector / length
+
+
 def magnitude_stddev(axes: Sequence[float]) -> float:
     """Return the standard deviation [N] of the magnitude of a jaw's force: that along x, the closing direction.
 

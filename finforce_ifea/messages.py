@@ -13,8 +13,13 @@ from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, are_same_polygons
 
 
-def observation_from_cloud(cloud: Any, frame: str) -> Observation:
+def observation_from_cloud(cloud: Any, frame: str, gravity: NDArray | None = None) -> Observation:
     """Return the key points of a sensor_msgs/PointCloud2 in the jaw frame `frame`.
+
+    Args:
+        cloud: one row per key point.
+        frame: the jaw frame.
+        gravity: its direction (3,) there, None where nobody knows.
 
     Raises:
         ObservationError: the frame, the height, the fields, a standard deviation or the buffer are wrong.
@@ -22,7 +27,7 @@ def observation_from_cloud(cloud: Any, frame: str) -> Observation:
     check_cloud(cloud, frame, "the key points")
     points, likelihood, stddev = decode_keypoints(cloud)
     stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
-    return Observation(stamp=stamp, points=points, likelihood=likelihood, stddev=stddev)
+    return Observation(stamp=stamp, points=points, likelihood=likelihood, stddev=stddev, gravity=gravity)
 
 
 def contact_from_cloud(cloud: Any, frame: str, *, free: bool) -> Contact:

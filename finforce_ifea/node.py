@@ -10,7 +10,7 @@ from threading import Timer
 from time import perf_counter
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
@@ -24,7 +24,13 @@ from finforce.stamps import Idling, StampGate
 from finforce_ifea.grasp_force import ForcePairing, Wrench, single_jaw_grasp
 from finforce_ifea.messages import observation_from_cloud
 from finforce_ifea.observation import Observation, Solution
-from finforce_ifea.parameters import NodeParameters, build_contact_feed, build_estimator, load_parameter_jaw
+from finforce_ifea.parameters import (
+    GravityFeed,
+    NodeParameters,
+    build_contact_feed,
+    build_estimator,
+    load_parameter_jaw,
+)
 from finforce_ifea.publishers import (
     SolverOutputs,
     describe_friction,
@@ -60,6 +66,7 @@ class IfeaSolverNode(Node):
         self.skips = Skips(SOLVER, parameters.skip_off)
         jaw = load_parameter_jaw(parameters)
         self.contacts = build_contact_feed(jaw, parameters)
+        self.gravity = GravityFeed(parameters) if settings.held == "yes" else None
         with self._patience(jaw.name):
             self.estimator = build(jaw, parameters, settings, self.skips.allows(AWAY))
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
@@ -106,6 +113,8 @@ class IfeaSolverNode(Node):
             self.qos.subscription(WrenchStamped, f"{peer}/wrench", self._on_peer, ros.RESULT)
             for jaw in SIDES:
                 self.qos.subscription(PoseStamped, f"{jaw}/jaw_pose", partial(self._on_jaw_pose, jaw), ros.SENSOR)
+        if self.gravity is not None:  # of what one jaw presses, friction tells nothing of its weight
+            self.qos.subscription(Vector3Stamped, "gravity", self._on_gravity, ros.SENSOR)
         topic = f"{side}/keypoints"
         # of an image that is passed over no more than the stamp is read
         self.keypoints = self.qos.subscription(PointCloud2, topic, self._on_keypoints, ros.SENSOR, unread=True)
@@ -143,7 +152,8 @@ class IfeaSolverNode(Node):
         """Solve an image and publish its wrench, if it can be trusted."""
         header, stamp = cloud.header, stamp_of(cloud)
         with self._refusals():
-            observation = observation_from_cloud(cloud, self.parameters.frame)
+            gravity = self.gravity.at(stamp) if self.gravity is not None else None
+            observation = observation_from_cloud(cloud, self.parameters.frame, gravity)
             if self.gate.enter(stamp, self._now()):
                 self._restart("the stamps went back: a new recording")
             self.last = solution = self.estimator.update(observation, self.contacts.at(stamp))
@@ -198,6 +208,11 @@ class IfeaSolverNode(Node):
             found = Wrench(*wrench_from_message(wrench, f"{peer}_jaw"))
             self.gate.check_age(stamp, self._now())
             self.out.send_grasp(wrench.header, self.pairing.add(stamp, found, own=False))
+
+    def _on_gravity(self, direction: Vector3Stamped) -> None:
+        """Keep which way things fall."""
+        with self._refusals():
+            self.gravity.take(direction)
 
     def _on_jaw_pose(self, side: str, pose: PoseStamped) -> None:
         """Keep where a jaw is, for the torque on the gripper."""

@@ -7,11 +7,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from finforce.errors import ObservationError
+from finforce.messages import direction_from_message, stamp_of
 from finforce.settings import TimeParameters, setting
+from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_ifea.observation import Contact, ObjectOutline
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from finforce_ifea.estimator import JawEstimator
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_ifea.settings import EstimatorSettings
@@ -200,3 +204,30 @@ def _check_size(cloud: Any, most: int, what: str) -> None:
     wide = [field.name for field in cloud.fields if field.count > 1]
     if wide:
         raise ObservationError(f"{what} came with several numbers in the field {', '.join(wide)}; expected one each")
+
+
+class GravityFeed:
+    """Keeps which way things fall, and gives it away while it is fresh.
+
+    Args:
+        parameters: of the node.
+    """
+
+    def __init__(self, parameters: NodeParameters) -> None:
+        self._frame, self._R = parameters.gripper_frame, R_GRIPPER_JAW[parameters.jaw_name]
+        self._max_age = round(1e9 * parameters.max_age)
+        self._direction: NDArray | None = None
+        self._stamp = 0
+
+    def take(self, message: Any) -> None:
+        """Keep a direction in the gripper's frame (geometry_msgs/Vector3Stamped), of any length.
+
+        Raises:
+            ObservationError: it is in another frame, or no direction.
+        """
+        self._direction = direction_from_message(message, self._frame, "gravity") @ self._R
+        self._stamp = stamp_of(message)
+
+    def at(self, stamp: int) -> NDArray | None:
+        """Return the direction (3,) in the jaw's frame, None where it is farther from an image [ns] than `max_age`."""
+        return self._direction if abs(stamp - self._stamp) <= self._max_age else None

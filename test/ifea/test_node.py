@@ -5,7 +5,7 @@ from time import time_ns
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
 from node_fakes import KEYPOINTS, FakeEstimator, keypoint_cloud, start_solver
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -19,6 +19,7 @@ from finforce.health import Level
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce.transforms import pose_numbers
+from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.node import IfeaSolverNode
 
 SECOND = 1_000_000_000
@@ -86,6 +87,57 @@ def cut_short(cloud):
 def without_z(cloud):
     cloud.fields = [field for field in cloud.fields if field.name != "z"]
     return cloud
+
+
+def gravity_message(vector, frame="gripper_base"):
+    message = Vector3Stamped(header=Header(stamp=ros.stamp_message(time_ns()), frame_id=frame))
+    message.vector.x, message.vector.y, message.vector.z = vector
+    return message
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_which_way_things_fall_reaches_the_estimator_in_the_jaws_frame(probe, side):
+    estimator = FakeEstimator()
+    node = start_solver(probe, estimator, jaw_name=side, peer="left" if side == "right" else "right")
+    out, down = probe.speak(f"{side}/keypoints"), probe.speak("gravity", Vector3Stamped)
+    probe.connected(out)
+    probe.connected(down)
+    down.publish(gravity_message((0.0, 3.0, -4.0)))
+    probe.wait_for(lambda: node.gravity.at(time_ns()) is not None)
+    out.publish(keypoint_cloud(frame=f"{side}_jaw"))
+    probe.wait_for(lambda: estimator.observations)
+    expected = R_GRIPPER_JAW[side].T @ [0.0, 0.6, -0.8]
+    np.testing.assert_allclose(estimator.observations[0].gravity, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("message", "word"),
+    [(((0.0, 0.0, 0.0),), "not all zero"), (((0.0, np.nan, 1.0),), "finite"), (((0, 0, 1.0), "camera"), "camera")],
+)
+def test_a_direction_that_is_none_is_refused_and_forces_go_on_without(probe, message, word):
+    estimator = FakeEstimator()
+    start_solver(probe, estimator, peer="right")
+    out, down = probe.speak("left/keypoints"), probe.speak("gravity", Vector3Stamped)
+    probe.connected(out)
+    probe.connected(down)
+    down.publish(gravity_message(*message))
+    probe.diagnosis(level=Level.ERROR, word=word)
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: estimator.observations)
+    assert estimator.observations[0].gravity is None
+
+
+def test_a_direction_of_long_ago_is_no_longer_used(probe):
+    estimator = FakeEstimator()
+    start_solver(probe, estimator, peer="right", max_age=0.3)
+    out, down = probe.speak("left/keypoints"), probe.speak("gravity", Vector3Stamped)
+    probe.connected(out)
+    probe.connected(down)
+    down.publish(gravity_message((0.0, 0.0, 1.0)))
+    probe.spin(0.6)
+    out.publish(keypoint_cloud())
+    probe.wait_for(lambda: estimator.observations)
+    assert estimator.observations[0].gravity is None
 
 
 MALFORMED = {
