@@ -85,7 +85,7 @@ class KeypointDetector:
 
     @property
     def warnings(self) -> Mapping[str, str]:
-        """What is suspicious about a jaw, by side, in a sentence; nothing is refused for it."""
+        """What is suspicious about a jaw, by side, in a sentence."""
         said = {side: [jaw.warning] if jaw.warning else [] for side, jaw in self._jaws.items()}
         for side, share in self._shares.items():
             if self._looks[side] >= _MEMORY and share < _FEW:
@@ -93,14 +93,18 @@ class KeypointDetector:
                     f"{100 * share:.0f} % of the key points are seen on average: is it the finger of the jaw file, and "
                     "nothing before it?"
                 )
-        beside = sum(jaw.place for jaw in self._jaws.values()) / 2.0
-        if len(self._jaws) == 2 and abs(beside) > _BESIDE:
+        if self._beside > _BESIDE:
             text = (
-                f"the jaws' middle lies {1e3 * abs(beside):.0f} mm beside the gripper's: is the picture cut and "
+                f"the jaws' middle lies {1e3 * self._beside:.0f} mm beside the gripper's: is the picture cut and "
                 "camera_info not, or the camera elsewhere?"
             )
             said = {side: [*texts, text] for side, texts in said.items()}
         return {side: "; ".join(texts) for side, texts in said.items() if texts}
+
+    @property
+    def _beside(self) -> float:
+        """By how much the middle between two jaws lies beside the gripper's [m]; 0 with one jaw."""
+        return abs(sum(jaw.place for jaw in self._jaws.values()) / 2.0) if len(self._jaws) == 2 else 0.0
 
     @property
     def depth_scale(self) -> DepthScale:
@@ -145,7 +149,9 @@ class KeypointDetector:
     def detect(self, image: RgbdImage) -> Mapping[str, JawKeypoints]:
         """Return the key points of the jaws in an image; a jaw that is not found is absent.
 
-        Counts go to `counts`: "images", "<side>" found, "<side>/<reason>" refused key points.
+        None is there while their middle lies beside the gripper's by more than the settings allow; see `warnings`.
+        Counts go to `counts`: "images", "<side>" found, "<side>/<reason>" refused key points,
+        "beside".
 
         Raises:
             ImageError: the image's parts do not fit each other.
@@ -165,6 +171,9 @@ class KeypointDetector:
         findings = self._finder.find(image, expected) if expected else {}
         self.counts["images"] += 1
         found = self._locate(image, findings)
+        if self._beside > self.settings.largest_beside:  # intrinsics or place of a camera that bend every finger
+            self.counts["beside"] += 1
+            found = {}
         for side in expected:
             self._looks[side] += 1
             seen = float(found[side].valid.mean()) if side in found else 0.0

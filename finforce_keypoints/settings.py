@@ -50,6 +50,9 @@ class DetectorSettings:
     reference_tolerance: float = setting(
         5e-3, "a reference point farther off its line of motion is another thing", "m", 1e-4, 0.1
     )
+    largest_beside: float = setting(
+        0.015, "with the middle between two jaws farther beside the gripper's, none is told of", "m", 1e-3, 1.0
+    )
     rigid_stddev: float = setting(
         0.3e-3, "bending of the jaw 10 mm above its base, more with the square of the height", "m", 1e-5, 0.01
     )

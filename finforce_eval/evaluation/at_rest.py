@@ -17,7 +17,8 @@ from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, find_extrinsics
 
 ROUNDS = 4  # of finding the key points with the place found before
-LOOSE = {"detector.reference_tolerance": 0.02, "detector.lost_images": 1000}  # [m]; a guess is allowed to be far off
+# [m]; a guess is allowed to be far off
+LOOSE = {"detector.reference_tolerance": 0.02, "detector.largest_beside": 0.5, "detector.lost_images": 1000}
 STILL = 0.05e-3  # [m] below which another round changes nothing
 OFTEN = 0.5  # share of the images in which a jaw, and a key point, has to be seen
 

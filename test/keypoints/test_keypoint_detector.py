@@ -196,7 +196,7 @@ def test_rows_that_were_exposed_one_after_the_other_do_not_bend_a_closing_jaw(re
         assert min(off.values()) > 0.3e-3 and away > 0.5e-3
 
 
-@pytest.mark.parametrize(("cut", "is_said"), [(0.0, False), (60.0, True), (-60.0, True)])
+@pytest.mark.parametrize(("cut", "is_said"), [(0.0, False), (30.0, True), (-30.0, True)])
 def test_a_picture_that_was_cut_and_its_intrinsics_not_is_noticed_by_the_jaws_middle(cut, is_said):
     scene, _, finder, detector = build(plane_depth=True)
     finder.pixels = {side: rows + (cut, 0.0) for side, rows in finder.pixels.items()}
@@ -205,6 +205,19 @@ def test_a_picture_that_was_cut_and_its_intrinsics_not_is_noticed_by_the_jaws_mi
     said = detector.warnings
     assert set(said) == (set(found) if is_said else set())
     assert all("mm beside the gripper's" in text for text in said.values())
+
+
+@pytest.mark.parametrize("cut", [80.0, -80.0])
+def test_a_picture_that_was_cut_by_an_eighth_tells_of_no_jaw(cut):
+    scene, _, finder, detector = build(plane_depth=True)
+    finder.pixels = {side: rows + (cut, 0.0) for side, rows in finder.pixels.items()}
+    for number in range(5):
+        assert not detector.detect(bare_image(number / RATE, None))
+    assert detector.counts["beside"] == 5
+    assert all("mm beside the gripper's" in text for text in detector.warnings.values())
+    finder.pixels = scene.pixels()
+    found = [set(detector.detect(bare_image((5 + number) / RATE, None))) for number in range(30)]
+    assert found[-1] == {"left", "right"}
 
 
 @pytest.mark.parametrize(("hidden", "is_said"), [(0, False), (6, False), (11, True)])
