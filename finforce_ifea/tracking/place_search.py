@@ -17,6 +17,7 @@ from finforce_ifea.tracking.place_update import (
     Average,
     Residuals,
     Uncertainty,
+    blank_residuals,
     forecast_place,
     update_place,
     weigh_residuals,
@@ -212,40 +213,28 @@ _SCALARS = 3 * _VECTORS + 9 * _MATRICES  # where the single numbers begin
 _SINGLE = 22  # of them: used, known, jump, agreed of `Residuals`, and what follows `data`
 
 
-class _Room(NamedTuple):
-    """Arrays that the search writes to, for compiled code: the numbers (61,), motions, and those of `Residuals`."""
-
-    numbers: NDArray
-    motions: NDArray
-    r: NDArray
-    modes: NDArray
-    weights: NDArray
-    noise: NDArray
-    bias: NDArray
-    off: NDArray
-    off_noise: NDArray
-
-
 class PlaceRoom:
     """Where a search for the place of an object leaves what it has found.
 
     Arrays that are made anew in compiled code and handed to Python cost more than finding what they hold.
+
+    Attributes:
+        arrays: for compiled code: numbers (61,), motions (K, 3, 4) and `Residuals` as a plain tuple.
     """
 
     def __init__(self, count: int) -> None:
         """Makes room for `count` key points."""
-        shapes = (_SCALARS + _SINGLE,), (count, 3, 4), (count, 2), (count, 2, 3), (count,), (count, 2, 2)
-        self.arrays = _Room(*map(np.zeros, shapes), *(np.zeros(count) for _ in range(3)))
-        numbers, middle = self.arrays.numbers, 3 * _VECTORS
+        numbers, motions, middle = np.zeros(_SCALARS + _SINGLE), np.zeros((count, 3, 4)), 3 * _VECTORS
+        self._blank = blank_residuals(count)
+        self.arrays = numbers, motions, tuple(self._blank)
         vectors, matrices = numbers[:middle].reshape(-1, 3), numbers[middle:_SCALARS].reshape(-1, 3, 3)
-        self._views = (*vectors, *matrices, self.arrays.motions)
-        self._residuals, self._single = self.arrays[2:], numbers[_SCALARS:]
+        self._views, self._single = (*vectors, *matrices, motions), numbers[_SCALARS:]
 
     def read(self) -> FoundPlace:
         """Returns what the last search has found."""
         single = self._single.tolist()
         used, known, jump, agreed = single[:4]
-        data = Residuals(*self._residuals, int(used), int(known), jump, int(agreed))
+        data = self._blank._replace(used=int(used), known=int(known), jump=jump, agreed=int(agreed))
         ends = int(single[-3]), bool(single[-2]), bool(single[-1])
         return FoundPlace(*self._views, data, *single[4:7], bool(single[7]), *single[8:-3], *ends)
 
@@ -266,7 +255,7 @@ def find_place(
     if isinstance(contact, ReducedContact) and isinstance(probe, ReducedProbe):
         packed = contact.packed, tuple(contact.indenter.pressed), tuple(contact.rubbing.describe(_STILL))
         points = probe.points, probe.shapes, probe.compliance
-        found = _find_reduced(packed, points, tuple(state), tuple(frame), tuple(rules), tuple(room.arrays))
+        found = _find_reduced(packed, points, tuple(state), tuple(frame), tuple(rules), room.arrays)
     else:
         found = _find_place(contact, probe, state, frame, rules, room.arrays)
     return room.read() if found else None
@@ -321,7 +310,8 @@ def _weigh(contact, probe, q, state, frame, chance, place, expected):
 
 def _find_place(contact, probe, state, frame, rules, room):
     """Writes the `FoundPlace` of one image to room; returns whether enough key points agree. See `pressing`."""
-    state, frame, rules, room = PlaceState(*state), PlaceFrame(*frame), PlaceRules(*rules), _Room(*room)
+    state, frame, rules = PlaceState(*state), PlaceFrame(*frame), PlaceRules(*rules)
+    numbers, kept_motions, kept = room
     forecast = forecast_place(
         state.motion, state.spread, state.slow, frame.dt, rules.acceleration, _DEPTH_DRIFT, frame.sudden
     )
@@ -378,8 +368,8 @@ def _find_place(contact, probe, state, frame, rules, room):
     _keep(state, q, pressed.modes, reach_place(contact, place), place, update)
     depth = place[DEPTH] - touch_at(contact, place)
     last_step = (moved, iteration, settled)
-    _report(room.numbers, depth, q, last_step, pressed, data, update, forecast.place, rules.stiffness)
-    _write_residuals(tuple(room), tuple(data), motions)
+    _report(numbers, depth, q, last_step, pressed, data, update, forecast.place, rules.stiffness)
+    _keep_residuals(kept, tuple(data), kept_motions, motions)
     return True
 
 
@@ -441,21 +431,21 @@ def _report(out, depth, q, last_step, pressed, data, update, expected, stiffness
 
 
 @njit(**_OPTIONS)
-def _write_residuals(room, data, motions):
-    """Writes residuals and the motions of the key points (K, 3, 4) to room; both as plain tuples."""
-    room, data = _Room(*room), Residuals(*data)
+def _keep_residuals(kept, data, kept_motions, motions):
+    """Writes over residuals that were kept, plain tuples both, and over the motions of the key points (K, 3, 4)."""
+    kept, data = Residuals(*kept), Residuals(*data)
     for k in range(len(data.weights)):
-        room.weights[k], room.bias[k] = data.weights[k], data.bias[k]
-        room.off[k], room.off_noise[k] = data.off[k], data.off_noise[k]
+        kept.weights[k], kept.bias[k] = data.weights[k], data.bias[k]
+        kept.off[k], kept.off_noise[k] = data.off[k], data.off_noise[k]
         for a in range(2):
-            room.r[k, a] = data.r[k, a]
+            kept.r[k, a] = data.r[k, a]
             for b in range(2):
-                room.noise[k, a, b] = data.noise[k, a, b]
+                kept.noise[k, a, b] = data.noise[k, a, b]
             for i in range(3):
-                room.modes[k, a, i] = data.modes[k, a, i]
+                kept.modes[k, a, i] = data.modes[k, a, i]
         for a in range(3):
             for i in range(4):
-                room.motions[k, a, i] = motions[k, a, i]
+                kept_motions[k, a, i] = motions[k, a, i]
 
 
 # Plain tuples are handed over from Python several times as fast as named ones.

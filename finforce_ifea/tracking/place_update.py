@@ -519,6 +519,13 @@ class Residuals(NamedTuple):
     agreed: int
 
 
+def blank_residuals(count: int) -> Residuals:
+    """Returns the residuals of `count` key points of which none is used."""
+    r, modes, noise = np.zeros((count, 2)), np.zeros((count, 2, 3)), np.zeros((count, 2, 2))
+    weights, bias, off, off_noise = (np.zeros(count) for _ in range(4))
+    return Residuals(r, modes, weights, noise, bias, off, off_noise, 0, 0, 0.0, 0)
+
+
 @njit(**_OPTIONS)
 def _square_distance(r0, r1, h0, h1, noise, level, bias, depth_variance):
     """Returns the squared Mahalanobis distance of an in-plane residual, the depth being uncertain along (h0, h1).
