@@ -77,10 +77,11 @@ def compile_contact() -> None:
 
 
 def compile_detector() -> None:
-    """Compile the geometry of the key point detector."""
-    from finforce_keypoints.build import build_detector
+    """Compile the geometry of the key point detector, with the network of one finger and with that of any."""
+    from finforce_keypoints.build import ANY_FINGER, BENCH, build_detector
     from finforce_keypoints.parameters import DetectorParameters, load_jaws
 
-    parameters = DetectorParameters()
-    with suppress(MissingDependencyError):  # without its library it is not used either
-        build_detector(load_jaws(parameters), parameters).detector.warm_up()
+    for network in (BENCH, ANY_FINGER):
+        parameters = DetectorParameters(model=str(network))
+        with suppress(MissingDependencyError):  # without its library it is not used either
+            build_detector(load_jaws(parameters), parameters).detector.warm_up()

@@ -347,7 +347,8 @@ class JawEstimator:
 _STDDEV = 0.3e-3
 _NOISE = 0.05e-3
 _EACH = 3
-_BENDS = [1e-3 * bend for bend in (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 2.5, 2.0, 2.5, 3.0)]  # [m] a press, a release, a press
+# [m] a press, a release, a press, and a hold that is long enough for what is held to be weighed
+_BENDS = [1e-3 * bend for bend in (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 2.5, 2.0, 2.5, *40 * (3.0,))]
 Update = Callable[[Observation, Contact], object]
 
 

@@ -32,6 +32,30 @@ START = dedent("""
     print(compiled)
 """)
 
+GRASP = dedent("""
+    import sys
+
+    from numba.core.dispatcher import Dispatcher
+
+    from finforce_eval import preparation
+    from finforce_eval.cli.main import main
+    from finforce_eval.recordings.recording import DEMO
+
+
+    def count_compiled():
+        modules = [module for name, module in list(sys.modules.items()) if name.startswith("finforce")]
+        functions = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
+        return {function.py_func.__qualname__: len(function.overloads) for function in functions}
+
+
+    preparation.compile_solver()
+    preparation.build_equilibria("bench", "bench")
+    preparation.compile_contact()
+    before = count_compiled()
+    assert main(["evaluate", str(DEMO), "--contact", "estimate", "--set", "held=yes", "--engine", "sequential"]) == 0
+    print([name for name, count in count_compiled().items() if count > before.get(name, 0)])
+""")
+
 
 def test_after_it_a_start_compiles_nothing(capsys):
     assert main(["prepare"]) == 0
@@ -39,6 +63,11 @@ def test_after_it_a_start_compiles_nothing(capsys):
     assert all(word in said for word in ("solver compiled", "equilibria stored", "contact estimator", "detector"))
     done = subprocess.run([sys.executable, "-c", START], capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_first_grasp_that_is_held_needs_nothing_more():
+    done = subprocess.run([sys.executable, "-c", GRASP], capture_output=True, text=True, timeout=300, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 def test_every_jaw_that_is_named_has_its_equilibria_built():
