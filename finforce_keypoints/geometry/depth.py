@@ -24,7 +24,9 @@ from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.geometry.kernels import fit_shape, sample_side, undistort, weigh_samples
 
 _SPACING = 0.15e-3  # of the raster on which the finger's side is drawn [m]
-_STRIDE = 3  # every so many points of it are sampled: a pixel is 0.25 to 0.5 mm
+_STRIDES = (3, 2, 1)  # every so many points of it are sampled: a pixel is 0.25 to 0.5 mm
+_ENOUGH = 24  # samples; a thin band is sampled more densely for as many, then nearer to its edges
+_EDGE_SHARES = (1.0, 0.5, 0.0)
 _ON_SIDE = 0.2e-3  # a triangle's corners this near to the side plane are on it [m]
 _REFERENCE_RADIUS = 1.5e-3  # the reference point's holder is flat so far around it [m]
 _SMALLEST_RADIUS = 0.45e-3  # around a key point that is not on a flat side of the mesh [m]
@@ -70,6 +72,8 @@ class DepthEvidence:
 def build_side_samples(jaw: Jaw, window: float, edge: float) -> SideSamples:
     """Return places on the jaw's side, `edge` [m] inside its outline and at most `window` [m] from a key point.
 
+    Where a band is too thin for enough of them, they lie nearer to its edges.
+
     Raises:
         MeshError: the jaw's mesh is bad.
     """
@@ -95,9 +99,21 @@ def _select_places(raster: NDArray, point: NDArray, triangles: NDArray, window: 
     inside = np.zeros(raster.shape[:2], dtype=bool)
     for triangle in corners:
         inside |= _covers(triangle, raster)
-    well_inside = (distance_transform_edt(inside) * _SPACING > edge) & (np.linalg.norm(raster, axis=-1) <= window)
-    places = raster[::_STRIDE, ::_STRIDE][well_inside[::_STRIDE, ::_STRIDE]]
+    depth, near = distance_transform_edt(inside) * _SPACING, np.linalg.norm(raster, axis=-1) <= window
+    for share in _EDGE_SHARES:
+        places = _thin_out(raster, near & (depth > share * edge))
+        if len(places) >= _ENOUGH:
+            return places
     return places if len(places) else _disc(raster, _SMALLEST_RADIUS)
+
+
+def _thin_out(raster: NDArray, chosen: NDArray) -> NDArray:
+    """Return chosen places (s, 2) of a raster (a, a, 2), as sparse as leaves enough of them."""
+    for stride in _STRIDES:
+        places = raster[::stride, ::stride][chosen[::stride, ::stride]]
+        if len(places) >= _ENOUGH:
+            break
+    return places
 
 
 def _covers(triangle: NDArray, raster: NDArray) -> NDArray:
@@ -111,8 +127,7 @@ def _covers(triangle: NDArray, raster: NDArray) -> NDArray:
 
 def _disc(raster: NDArray, radius: float) -> NDArray:
     """Return the places (s, 2) of a raster (a, a, 2) within a radius [m] of its middle."""
-    places = raster[::_STRIDE, ::_STRIDE].reshape(-1, 2)
-    return places[np.linalg.norm(places, axis=1) <= radius]
+    return _thin_out(raster, np.linalg.norm(raster, axis=-1) <= radius)
 
 
 def sample_depths(
