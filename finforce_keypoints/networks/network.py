@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from finforce.errors import one_line
 from finforce.optional import import_onnxruntime
 from finforce.processors import places_of_helpers
 from finforce_keypoints.errors import DetectionError, ModelError
+from finforce_keypoints.networks.helpers import Helpers
 from finforce_keypoints.networks.trial import try_network
 
 if TYPE_CHECKING:
@@ -150,7 +152,7 @@ class Network:
 
         Args:
             path: the .onnx file.
-            threads: that one picture is computed with.
+            threads: that one picture is computed with, or that several are shared among.
             providers: onnxruntime's execution providers, best first.
 
         Raises:
@@ -158,6 +160,7 @@ class Network:
             MissingDependencyError: onnxruntime is not installed.
         """
         self._session = open_session(path, threads, providers)
+        self._open_single, self._threads = partial(open_session, path, 1, providers), threads
         self.input = find_input([(item.name, item.shape, item.type) for item in self._session.get_inputs()])
         self.output_names = tuple(item.name for item in self._session.get_outputs())
 
@@ -167,6 +170,10 @@ class Network:
         Raises:
             DetectionError: the network cannot be computed for this input.
         """
+        if len(tensor) > 1 and self._threads > 1 and self.input.batch is None:
+            single, helpers = self._shared
+            each = helpers.share(lambda number: self._run_once(tensor[number : number + 1], single), len(tensor))
+            return [np.concatenate(outputs) for outputs in zip(*each, strict=True)]
         size, parts = self.input.batch or min(len(tensor), _MOST_AT_ONCE), []
         if size == len(tensor):
             return self._run_once(tensor)
@@ -177,9 +184,14 @@ class Network:
             parts.append([output[: len(part)] for output in outputs])
         return [np.concatenate(outputs) for outputs in zip(*parts, strict=True)]
 
-    def _run_once(self, tensor: NDArray) -> list[NDArray]:
+    @cached_property
+    def _shared(self) -> tuple[InferenceSession, Helpers]:
+        """A session of one thread, and the threads that run it, each with a picture of its own."""
+        return self._open_single(), Helpers(self._threads)
+
+    def _run_once(self, tensor: NDArray, session: InferenceSession | None = None) -> list[NDArray]:
         try:
-            outputs = self._session.run(None, {self.input.name: tensor})
+            outputs = (session or self._session).run(None, {self.input.name: tensor})
         except Exception as error:  # as above
             raise DetectionError(
                 f"the network cannot be computed for an input of {tensor.shape}: {one_line(error)}"
