@@ -55,6 +55,7 @@ class RgbdFeed:
     def reset(self) -> None:
         """Forget all images; intrinsics and topic stay."""
         self._images = Synchronizer({COLOR: None, DEPTH: WAITING + 1}, self._tolerance)
+        self._read: tuple[Any, NDArray[np.uint8]] | None = None
         self._alone = self._parameters.depth == NO_DEPTH
         self._forget_colors()
 
@@ -126,7 +127,7 @@ class RgbdFeed:
         self._images.reset(COLOR)
 
     def read_color(self, message: Any) -> NDArray[np.uint8]:
-        """Return the colours (h, w, 3) of a colour image.
+        """Return the colours (h, w, 3) of a colour image; the last one is decoded once, however often it is read.
 
         Raises:
             ObservationError: the frame is another one.
@@ -134,8 +135,10 @@ class RgbdFeed:
         """
         if self.camera is None:
             raise ImageError(f"images came, but no camera_info on {self._parameters.info_topic} yet")
-        check_frame(message, self._parameters.camera_frame, "the colour image")
-        return color_from_image(message)
+        if self._read is None or self._read[0] is not message:
+            check_frame(message, self._parameters.camera_frame, "the colour image")
+            self._read = message, color_from_image(message)
+        return self._read[1]
 
     def decode(self, pair: ImagePair) -> RgbdImage:
         """Return the whole image of a pair after having refused what cannot be one.

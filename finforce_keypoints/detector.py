@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,16 @@ _BESIDE = 6e-3  # [m] by which the middle between two jaws may lie beside the gr
 _FEW, _MEMORY = 0.4, 45  # share of a jaw's key points that are too few on average, and over how many images
 _PRACTICE_SIZE, _RATE = (640, 480), 30.0  # px, Hz
 _LEAST_SCALE_STDDEV = 5e-4  # images do not err independently: no average is better than this
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Look:
+    """A picture, which jaws were looked for in it, and what was found of them."""
+
+    stamp: float
+    color: NDArray
+    sides: tuple[str, ...]
+    findings: Mapping[str, PixelFinding]
 
 
 class KeypointDetector:
@@ -72,6 +82,7 @@ class KeypointDetector:
             jaw.reset()
         self._stamp: float | None = None
         self._looked = -np.inf
+        self._begun: _Look | None = None
         self._missed = dict.fromkeys(self._jaws, 0)
         self._looks, self._shares = dict.fromkeys(self._jaws, 0), dict.fromkeys(self._jaws, 0.0)
         self._watch = StillWatch()
@@ -146,6 +157,26 @@ class KeypointDetector:
             self.counts["confirmed"] += 1
         return found
 
+    def begin(self, stamp: float, color: NDArray, camera: CameraIntrinsics) -> None:
+        """Find the pixels of a picture's key points while its depth is on its way; `detect` takes them from here.
+
+        A picture that `detect` would refuse is left to it.
+
+        Args:
+            stamp: of the image [s].
+            color: (h, w, 3) uint8; `detect` knows it by being the same array.
+            camera: its intrinsics.
+
+        Raises:
+            ImageError: colour and camera do not fit each other.
+            KeypointError: the finder cannot use it.
+        """
+        self._begun = None
+        image = RgbdImage(stamp=stamp, color=color, depth=None, camera=camera)
+        check_image(image)
+        if self._stamp is None or stamp > self._stamp:
+            self._begun = self._look(image)
+
     def detect(self, image: RgbdImage) -> Mapping[str, JawKeypoints]:
         """Return the key points of the jaws in an image; a jaw that is not found is absent.
 
@@ -167,14 +198,15 @@ class KeypointDetector:
             )
         self._drift(image.stamp)
         self._looked = image.stamp
-        expected = {side: jaw.expect(image.stamp) for side, jaw in self._jaws.items() if self._is_wanted(side)}
-        findings = self._finder.find(image, expected) if expected else {}
+        look, self._begun = self._begun, None
+        if look is None or look.stamp != image.stamp or look.color is not image.color:
+            look = self._look(image)
         self.counts["images"] += 1
-        found = self._locate(image, findings)
+        found = self._locate(image, look.findings)
         if self._beside > self.settings.largest_beside:  # intrinsics or place of a camera that bend every finger
             self.counts["beside"] += 1
             found = {}
-        for side in expected:
+        for side in look.sides:
             self._looks[side] += 1
             seen = float(found[side].valid.mean()) if side in found else 0.0
             self._shares[side] += (seen - self._shares[side]) / min(self._looks[side], _MEMORY)
@@ -182,6 +214,12 @@ class KeypointDetector:
         if not self._skips.allows(STILL):
             return found
         return self._watch.take(found if len(found) == len(self._jaws) else {}, image.color, image.camera) or found
+
+    def _look(self, image: RgbdImage) -> _Look:
+        """Return the pixels of the jaws that are looked for in a picture."""
+        expected = {side: jaw.expect(image.stamp) for side, jaw in self._jaws.items() if self._is_wanted(side)}
+        findings = self._finder.find(image, expected) if expected else {}
+        return _Look(stamp=image.stamp, color=image.color, sides=tuple(expected), findings=findings)
 
     def _is_wanted(self, side: str) -> bool:
         """Say whether a jaw is looked for in the next image; one that has long been lost is so in every few only."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from time import monotonic, perf_counter
 from typing import TYPE_CHECKING, Any
@@ -36,6 +36,8 @@ from finforce_keypoints.settings import RULES, DetectorSettings
 if TYPE_CHECKING:
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
+PROMPT = 5  # colour images in a row whose depth came, after which the next is looked at before its own has ...
+LEISURE = 3e-3  # s ... where the node has waited so long for it; otherwise the time is needed for those that are whole
 STAMPED = 12  # bytes of a serialised message up to the end of its stamp
 
 
@@ -89,6 +91,7 @@ class KeypointDetectorNode(Node):
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}
         self.rested, self.idling, self.info = float("-inf"), Idling(), b""
+        self.prompt, self.passed, self.busy = 0, 0, 0.0
         self.qos = ros.QosWatch(self, stage)
         self.out = DetectorOutputs(self.qos, parameters, names, self.card, self.skips)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
@@ -147,7 +150,10 @@ class KeypointDetectorNode(Node):
             message = read_picture(data) if is_compressed(topic) else read_image(data)
             if not (self._rest() or self._confirm(message, began)):
                 self.depth_group.open()  # what came meanwhile is read now
-                self._answer(self.feed.take_color(topic, message), began)
+                pair = self.feed.take_color(topic, message)
+                if pair is None:
+                    self._begin(message, began)
+                self._answer(pair, began)
 
     def _on_depth(self, data: bytes) -> None:
         """Take a depth image."""
@@ -182,6 +188,16 @@ class KeypointDetectorNode(Node):
         self.idling.note(stamp, True)
         return True
 
+    def _begin(self, message: Any, began: float) -> None:
+        """Look for the key points in a colour image whose depth is on its way, as it came for those before."""
+        passed, self.passed = self.passed, self.feed.passed
+        self.prompt = self.prompt + 1 if passed == self.passed else 0
+        if self.prompt < PROMPT or began < self.busy + LEISURE or self.feed.camera is None:
+            return
+        with suppress(FinforceError):  # what cannot be used is refused with its depth
+            self.detector.begin(SECOND * stamp_of(message), self.feed.read_color(message), self.feed.camera)
+        self.busy = perf_counter()
+
     def _answer(self, pair: ImagePair | None, began: float) -> None:
         """Find the key points of all jaws in an image that is whole."""
         if pair is None:
@@ -193,6 +209,7 @@ class KeypointDetectorNode(Node):
         self.found = self.detector.detect(image)
         self._publish(pair.stamp, image.color, began)
         self.idling.note(pair.stamp, False)
+        self.busy = perf_counter()
 
     def _publish(self, stamp: int, color: NDArray, began: float) -> None:
         """Publish the key points of an image, (h, w, 3), while they are fresh."""

@@ -10,6 +10,7 @@ from training.arguments import add_settings, one_line_errors, settings_from
 from training.augment import AugmentSettings
 from training.checkpoint import load_checkpoint
 from training.dataset import TRAIN, VALIDATION, load_pictures
+from training.network import FingerNetwork
 from training.recipe import Recipe
 from training.trainer import CHECKPOINT, Trainer, TrainingImages, train
 from training.weights import read_network
@@ -43,10 +44,15 @@ def run(options: argparse.Namespace) -> None:
         train=load_pictures(options.dataset, TRAIN, options.limit),
         validation=load_pictures(options.dataset, VALIDATION, recipe.validation),
     )
-    trainer = Trainer(recipe, read_network(options.network)[0] if options.network else None)
+    checkpoint = load_checkpoint(options.output / CHECKPOINT) if options.resume else None
+    if checkpoint is not None:
+        network = FingerNetwork(checkpoint.shape)
+    else:
+        network = read_network(options.network)[0] if options.network else FingerNetwork()
+    trainer = Trainer(recipe, network)
     trainer.network.coarse.requires_grad_(not options.fine)
-    if options.resume:
-        trainer.resume(load_checkpoint(options.output / CHECKPOINT))
+    if checkpoint is not None:
+        trainer.resume(checkpoint)
     print(train(trainer, pictures, settings_from(options, AugmentSettings), options.output))
 
 

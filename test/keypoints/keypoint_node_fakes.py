@@ -47,6 +47,10 @@ class FakeDetector:
         self.answer = {side: FakeKeypoints() for side in sides}
         self.images, self.resets, self.error, self.delay = [], 0, None, 0.0
         self.warnings, self.warmed, self.is_still = {}, False, False
+        self.begun = []
+
+    def begin(self, stamp, color, camera):
+        self.begun.append(color)
 
     def detect(self, image):
         self.images.append(image)

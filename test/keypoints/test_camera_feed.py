@@ -138,6 +138,7 @@ def test_a_jpeg_stream_is_decoded_and_a_damaged_one_refused():
     pair = camera.feed.take_color(topic, Picture(raw.header, data.tobytes()))
     image = camera.feed.decode(pair)
     assert np.abs(image.color.astype(int) - picture).mean() < 3.0
+    assert camera.feed.read_color(pair.color) is image.color  # decoded once
     for broken in (b"", b"no picture", data.tobytes()[:40]):
         later = color_of(camera, 2)
         with pytest.raises(ImageError, match="neither jpeg nor png|damaged"):

@@ -312,6 +312,36 @@ def test_jaws_on_the_wrong_side_are_refused():
             KeypointDetector(finder, jaws, scene.T_gripper_camera)
 
 
+def test_what_was_begun_before_the_depth_came_is_gone_on_with_and_changes_nothing():
+    answers = []
+    for begins in (False, True):
+        rng = np.random.default_rng(5)
+        scene, depth, finder, detector = build(rng=rng)
+        for n in range(3):
+            image = scene.image(n / RATE, rng, depth=depth)
+            if begins:
+                detector.begin(image.stamp, image.color, image.camera)
+                assert len(finder.expected) == n + 1
+            found = detector.detect(image)
+        assert len(finder.expected) == 3
+        answers.append(found)
+    for side in ("left", "right"):
+        np.testing.assert_array_equal(answers[0][side].points, answers[1][side].points)
+
+
+def test_another_picture_than_the_one_begun_with_is_looked_at_anew():
+    rng = np.random.default_rng(5)
+    scene, depth, finder, detector = build(rng=rng)
+    begun, whole = (scene.image(n / RATE, rng, depth=depth) for n in range(2))
+    detector.begin(begun.stamp, begun.color, begun.camera)
+    detector.detect(whole)
+    assert len(finder.expected) == 2
+    detector.begin(begun.stamp, begun.color, begun.camera)  # older than what was answered
+    assert len(finder.expected) == 2
+    with pytest.raises(ImageError, match="expected uint8"):
+        detector.begin(1.0, begun.color[:5], begun.camera)
+
+
 def test_random_findings_never_give_a_valid_point_that_is_no_number():
     rng = np.random.default_rng(0)
     scene, depth, finder, detector = build()

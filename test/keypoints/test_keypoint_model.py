@@ -7,6 +7,7 @@ import yaml
 from keypoint_scene_fakes import Fake, paint, sidecar, write_model
 
 from finforce.errors import MissingDependencyError
+from finforce_keypoints.build import BENCH
 from finforce_keypoints.errors import DetectionError, ModelError
 from finforce_keypoints.networks import network as network_module
 from finforce_keypoints.networks.metadata import parse_metadata
@@ -268,3 +269,10 @@ def test_defaults_of_absent_keys_are_those_of_deeplabcut():
 def test_metadata_are_those_that_deeplabcut_writes():
     metadata = parse_metadata(yaml.safe_load(yaml.safe_dump(sidecar(Fake()))))
     assert metadata.stride == 8.0 and metadata.has_locref and metadata.bodyparts == Fake().names
+
+
+def test_threads_that_share_pictures_find_what_one_finds():
+    pictures = np.random.default_rng(1).integers(0, 255, (3, 224, 176, 3), dtype=np.uint8)
+    one, two = (KeypointModel(BENCH, threads=threads).run(pictures) for threads in (1, 2))
+    for alone, shared in zip(one, two, strict=True):
+        np.testing.assert_allclose(shared, alone, atol=1e-6)

@@ -34,7 +34,7 @@ from finforce.health import Level
 from finforce.messages import decode_cloud, pose_from_message, stamp_of
 from finforce.ros import node as ros
 from finforce_keypoints.errors import DetectionError
-from finforce_keypoints.node import KeypointDetectorNode
+from finforce_keypoints.node import PROMPT, KeypointDetectorNode
 from finforce_keypoints.parameters import INFO_TOPIC
 
 COLUMNS = ("x", "y", "z", "likelihood", "u", "v", "valid", "reason", "stddev_x", "stddev_y", "stddev_z")
@@ -95,6 +95,28 @@ def test_the_order_of_colour_and_depth_does_not_matter(probe, first):
     for send in (bench.color, bench.depth) if first == "color" else (bench.depth, bench.color):
         send(stamp)
     bench.wait_for_clouds()
+
+
+def test_a_colour_image_is_looked_at_before_its_depth_has_come_where_that_always_came(probe):
+    bench = CameraBench(probe)
+    begun = bench.node.detector.begun
+    for count in range(1, PROMPT + 2):
+        bench.shoot()
+        bench.wait_for_clouds(count)
+    assert len(begun) == 2  # the first ones only show that depth comes
+    late = time_ns()
+    bench.color(late)
+    assert len(begun) == 3 and len(bench.node.detector.images) == PROMPT + 1
+    bench.depth(late)
+    bench.wait_for_clouds(PROMPT + 2)
+    assert bench.node.detector.images[-1].color is begun[-1]
+    bench.color(time_ns())  # its depth never comes
+    bench.shoot()
+    bench.wait_for_clouds(PROMPT + 3)
+    unused = len(begun)
+    bench.shoot()
+    bench.wait_for_clouds(PROMPT + 4)
+    assert len(begun) == unused
 
 
 def test_stamps_within_the_tolerance_belong_together_and_others_do_not(probe):

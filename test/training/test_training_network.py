@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import fields, replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -212,12 +213,22 @@ def test_a_camera_with_larger_pixels_blurs_and_keeps_the_size():
     assert np.median(detail) < 0.7 * np.abs(np.diff(sharp.astype(float), axis=0)).mean()
 
 
-def test_the_same_seed_makes_the_same_batches_whoever_makes_them():
-    pictures = draw_ladders(2, 3, 1)
-    here, there, other = (
-        next(load_batches(pictures, AugmentSettings(), LoadingSettings(size=4, workers=workers, seed=seed)))
-        for workers, seed in ((0, 1), (1, 1), (0, 2))
+def make_batch(workers, seed, path=None):
+    batch = next(
+        load_batches(draw_ladders(2, 3, 1), AugmentSettings(), LoadingSettings(size=4, workers=workers, seed=seed))
     )
+    if path is not None:
+        torch.save(batch, path)
+    return batch
+
+
+def test_the_same_seed_makes_the_same_batches_whoever_makes_them(tmp_path):
+    # a process that has threads, as this one, is not to be forked
+    apart = get_context("spawn").Process(target=make_batch, args=(1, 1, tmp_path / "batch.pt"))
+    apart.start()
+    apart.join(120.0)
+    assert apart.exitcode == 0
+    here, there, other = make_batch(0, 1), torch.load(tmp_path / "batch.pt", weights_only=False), make_batch(0, 2)
     torch.testing.assert_close(here.pictures, there.pictures)
     torch.testing.assert_close(here.places, there.places, equal_nan=True)
     assert not torch.equal(here.pictures, other.pictures)
@@ -256,6 +267,8 @@ def test_an_exported_network_is_trained_on_and_its_coarse_part_can_stay(tmp_path
     after = load_checkpoint(run / CHECKPOINT).averaged
     moved = {name for name, weights in before.named_parameters() if not torch.equal(after[name], weights)}
     assert moved and all(name.startswith("fine.") for name in moved)
+    train_main([str(dataset), "-o", str(run), "--resume", "--steps", "5", "--batch", "4", "--workers", "0"])
+    assert load_checkpoint(run / CHECKPOINT).step == 5
 
 
 def test_a_broken_checkpoint_is_refused(tmp_path):
