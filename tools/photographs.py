@@ -88,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--labels", type=float, nargs="*", default=(), metavar="MM", help="displacements whose hinges may be used"
     )
-    parser.add_argument("--minutes", type=float, default=4.0, help="of fine-tuning on the labels (4); 0: none")
+    parser.add_argument("--minutes", type=float, default=6.0, help="of fine-tuning on the labels (6); 0: none")
     parser.add_argument("--dataset", type=Path, help="shards of training.scenes, mixed in against forgetting")
     parser.add_argument("-o", "--output", type=Path, default=Path("photographs"), help="folder of pictures and results")
     options = parser.parse_args(arguments)
