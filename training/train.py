@@ -44,15 +44,13 @@ def run(options: argparse.Namespace) -> None:
         train=load_pictures(options.dataset, TRAIN, options.limit),
         validation=load_pictures(options.dataset, VALIDATION, recipe.validation),
     )
-    checkpoint = load_checkpoint(options.output / CHECKPOINT) if options.resume else None
-    if checkpoint is not None:
-        network = FingerNetwork(checkpoint.shape)
-    else:
-        network = read_network(options.network)[0] if options.network else FingerNetwork()
-    trainer = Trainer(recipe, network)
-    trainer.network.coarse.requires_grad_(not options.fine)
-    if checkpoint is not None:
+    if options.resume:
+        checkpoint = load_checkpoint(options.output / CHECKPOINT)
+        trainer = Trainer(recipe, FingerNetwork(checkpoint.shape))
         trainer.resume(checkpoint)
+    else:
+        trainer = Trainer(recipe, read_network(options.network)[0] if options.network else None)
+    trainer.network.coarse.requires_grad_(not options.fine)
     print(train(trainer, pictures, settings_from(options, AugmentSettings), options.output))
 
 

@@ -27,6 +27,7 @@ def test_a_wider_margin_at_the_edges_leaves_fewer_samples():
 def test_a_jaw_without_a_flat_side_is_sampled_next_to_its_key_points():
     jaw = load_jaw("steel")
     samples = build_side_samples(jaw, 3e-3, 0.4e-3)
+    assert (samples.used.sum(axis=1) >= 4).all()
     assert np.linalg.norm(samples.offsets[:-1], axis=2).max() <= 0.5e-3
 
 

@@ -258,6 +258,14 @@ def test_a_short_training_lowers_the_loss_and_can_go_on(tmp_path):
         Trainer(recipe, FingerNetwork(NetworkShape(fine=(16, 16)))).resume(checkpoint)
 
 
+def test_the_same_seed_trains_the_same_network(tmp_path):
+    dataset = write_ladders(tmp_path / "data")
+    for run in ("first", "again"):
+        train_main([str(dataset), "-o", str(tmp_path / run), "--steps", "2", "--batch", "4", "--workers", "0"])
+    first, again = (load_checkpoint(tmp_path / run / CHECKPOINT).network for run in ("first", "again"))
+    assert all(torch.equal(first[name], again[name]) for name in first)
+
+
 def test_an_exported_network_is_trained_on_and_its_coarse_part_can_stay(tmp_path):
     write_network(build_trained_like(), tmp_path / "network", 1.5)
     dataset, run = write_ladders(tmp_path / "data"), tmp_path / "run"
