@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -88,8 +89,12 @@ class FingerPictures:
         return FingerPictures.join([repeated.widened(points), many.widened(points)])
 
     @staticmethod
-    def join(parts: Sequence[FingerPictures]) -> FingerPictures:
+    def join(parts: Sequence[FingerPictures], picture: NDArray | None = None) -> FingerPictures:
         """Return several sets one after the other, with all their templates.
+
+        Args:
+            parts: the sets.
+            picture: their pictures one after the other, where that is so already.
 
         Raises:
             DatasetError: their pictures differ in size or in the number of points.
@@ -98,8 +103,12 @@ class FingerPictures:
             raise DatasetError("shards of several kinds (size, number of points); expected one kind")
         starts = np.cumsum([0, *(len(part.template) for part in parts[:-1])])
         columns = {
-            name: np.concatenate([getattr(part, name) for part in parts]) for name in _SHAPES if name != "finger"
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in _SHAPES
+            if name != "finger" and (name != "picture" or picture is None)
         }
+        if picture is not None:
+            columns["picture"] = picture
         fingers = [part.finger + start for part, start in zip(parts, starts, strict=True)]
         return FingerPictures(**columns, finger=np.concatenate(fingers))
 
@@ -123,9 +132,15 @@ def load_shard(path: Path) -> FingerPictures:
     Raises:
         DatasetError: the file cannot be read, or lacks an array, or its arrays do not fit each other.
     """
+    with _reading(path), np.load(path, allow_pickle=False) as content:
+        return FingerPictures(**{name: content[name] for name in _SHAPES})
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Name the file in whatever goes wrong with it in the `with` block."""
     try:
-        with np.load(path, allow_pickle=False) as content:
-            return FingerPictures(**{name: content[name] for name in _SHAPES})
+        yield
     except (OSError, EOFError, ValueError, KeyError, BadZipFile) as error:
         raise DatasetError(f"{path}: {error}; expected a shard with {', '.join(_SHAPES)}") from error
 
@@ -139,17 +154,33 @@ def load_pictures(folder: Path, part: str, limit: int | None = None) -> FingerPi
         limit: the number of pictures that is enough; all when absent.
 
     Raises:
-        DatasetError: there is no shard of this part, or one cannot be used.
+        DatasetError: there is no shard of this part, or one cannot be used, or they are of several kinds.
     """
     paths = sorted(folder.glob(f"{part}_*.npz"))
     if not paths:
         raise DatasetError(f"{folder}: no shard {part}_*.npz; make some with python -m training.scenes")
-    shards: list[FingerPictures] = []
-    for path in tqdm(paths, desc=f"read {part}", unit="shard", leave=False):
-        shards.append(load_shard(path))
-        if limit is not None and sum(map(len, shards)) >= limit:
-            break
-    return FingerPictures.join(shards)
+    counts = [_count_pictures(path) for path in paths]
+    if limit is not None:
+        paths = paths[: int(np.searchsorted(np.cumsum(counts), limit)) + 1]
+    shards, ends = [], np.cumsum(counts[: len(paths)])
+    for path, end in tqdm(list(zip(paths, ends, strict=True)), desc=f"read {part}", unit="shard", leave=False):
+        shard = load_shard(path)
+        if not shards:  # filled as shards come: joined afterwards they would need twice the memory
+            pictures = np.empty((ends[-1], *shard.picture.shape[1:]), np.uint8)
+        if shard.picture.shape[1:] != pictures.shape[1:]:
+            raise DatasetError(
+                f"{path}: pictures {shard.picture.shape[1:]}, expected {pictures.shape[1:]} as before it"
+            )
+        own = pictures[end - len(shard) : end]
+        own[:] = shard.picture
+        shards.append(replace(shard, picture=own))
+    return FingerPictures.join(shards, pictures)
+
+
+def _count_pictures(path: Path) -> int:
+    """Return how many pictures a shard has."""
+    with _reading(path), np.load(path, allow_pickle=False) as content:
+        return len(content["finger"])
 
 
 def iterate_batches(count: int, size: int, rng: np.random.Generator) -> Iterator[NDArray]:

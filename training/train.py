@@ -10,10 +10,12 @@ from training.arguments import add_settings, one_line_errors, settings_from
 from training.augment import AugmentSettings
 from training.checkpoint import load_checkpoint
 from training.dataset import TRAIN, VALIDATION, load_pictures
+from training.errors import RecipeError
 from training.network import FingerNetwork
 from training.recipe import Recipe
 from training.trainer import CHECKPOINT, Trainer, TrainingImages, train
 from training.weights import read_network
+from training.widen import widen
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -30,6 +32,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the run")
     parser.add_argument("--limit", type=int, help="train on the first so many pictures only")
     parser.add_argument("--network", type=Path, help="begin with the weights of an exported network")
+    parser.add_argument(
+        "--widen", type=_read_channels, help="give that network so many channels: coarse A,B,C,D, fine E,F"
+    )
     parser.add_argument("--fine", action="store_true", help="train the fine part alone, leave the coarse one as it is")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder of the run")
     add_settings(parser, Recipe)
@@ -49,9 +54,27 @@ def run(options: argparse.Namespace) -> None:
         trainer = Trainer(recipe, FingerNetwork(checkpoint.shape))
         trainer.resume(checkpoint)
     else:
-        trainer = Trainer(recipe, read_network(options.network)[0] if options.network else None)
+        trainer = Trainer(recipe, _begin(options))
     trainer.network.coarse.requires_grad_(not options.fine)
     print(train(trainer, pictures, settings_from(options, AugmentSettings), options.output))
+
+
+def _begin(options: argparse.Namespace) -> FingerNetwork | None:
+    """Return the network to begin with, none for one by chance."""
+    if options.network is None:
+        if options.widen:
+            raise RecipeError("--widen: there is no network to widen; expected --network FOLDER")
+        return None
+    network = read_network(options.network)[0]
+    return widen(network, options.widen[:4], options.widen[4:], options.seed) if options.widen else network
+
+
+def _read_channels(text: str) -> tuple[int, ...]:
+    """Return six whole numbers."""
+    parts = text.split(",")
+    if len(parts) != 6 or not all(part.strip().isdigit() for part in parts):
+        raise argparse.ArgumentTypeError(f"{text[:40]!r}: expected six numbers, as 32,64,96,128,24,64")
+    return tuple(int(part) for part in parts)
 
 
 if __name__ == "__main__":

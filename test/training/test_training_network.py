@@ -22,7 +22,7 @@ from finforce_keypoints.networks.side_network import COARSE, FINE, SideNetwork
 from training.augment import AugmentSettings, augment
 from training.calibrate import main as calibrate_main
 from training.checkpoint import load_checkpoint
-from training.dataset import MARGIN, TRAIN, VALIDATION, FingerPictures, iterate_batches, load_pictures
+from training.dataset import MARGIN, TRAIN, VALIDATION, FingerPictures, iterate_batches, load_pictures, save_shard
 from training.errors import CheckpointError, DatasetError, RecipeError
 from training.export import write_network
 from training.loading import LoadingSettings, load_batches
@@ -34,6 +34,7 @@ from training.scoring import Detections, fit_factor, score_detections
 from training.train import main as train_main
 from training.trainer import CHECKPOINT, Trainer, TrainingImages, compute_rate, detect, train
 from training.weights import read_network
+from training.widen import widen
 
 STILL = AugmentSettings(
     shift=2.0, scale=0.0, rotation=0.0, perspective=0.0, dim=0.0, color=0.0, gradient=0.0, blur=0.0, sharpen=0.0,
@@ -279,6 +280,31 @@ def test_an_exported_network_is_trained_on_and_its_coarse_part_can_stay(tmp_path
     assert load_checkpoint(run / CHECKPOINT).step == 5
 
 
+def test_a_wider_network_finds_the_same_until_it_learns(tmp_path):
+    network, pictures = build_trained_like(), draw_ladders(2, 2, 7)
+    wide = widen(network, (32, 48, 64, 112), (32, 64))
+    assert wide.shape.coarse == (32, 48, 64, 112) and wide.shape.fine == (32, 64)
+    for before, after in zip(*(vars(detect(some, pictures)).values() for some in (network, wide)), strict=True):
+        np.testing.assert_allclose(after, before, atol=1e-4)
+    again, other = (widen(network, (32, 48, 64, 112), (32, 64), seed).state_dict() for seed in (0, 1))
+    assert all(torch.equal(again[name], value) for name, value in wide.state_dict().items())
+    assert not all(torch.equal(other[name], value) for name, value in wide.state_dict().items())
+    write_network(network, tmp_path / "network", 1.5)
+    given = [str(write_ladders(tmp_path / "data")), "-o", str(tmp_path / "run"), "--steps", "2", "--batch", "4"]
+    given += ["--workers", "0", "--widen", "32,48,64,112,32,64"]
+    train_main([*given, "--network", str(tmp_path / "network")])
+    trained = load_checkpoint(tmp_path / "run" / CHECKPOINT).network
+    assert trained["coarse.stem.0.weight"][:, :, 1, 1].shape == (32, 6)
+    assert (trained["coarse.moves.weight"][:, 32:] != 0.0).all()  # what was added is listened to
+    for channels in ((8, 48, 64, 112), (32, 48, 64)):
+        with pytest.raises(RecipeError, match="or more"):
+            widen(network, channels, (32, 64))
+    with pytest.raises(SystemExit, match="no network to widen"):
+        train_main(given)
+    with pytest.raises(SystemExit):
+        train_main([*given[:-1], "32,48"])
+
+
 def test_a_broken_checkpoint_is_refused(tmp_path):
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(b"no checkpoint")
@@ -346,6 +372,22 @@ def test_pictures_that_do_not_fit_their_points_are_refused(tmp_path):
     (tmp_path / "train_0.npz").write_bytes(b"")
     with pytest.raises(DatasetError, match="expected a shard"):
         load_pictures(tmp_path, TRAIN)
+    save_shard(tmp_path / "train_0.npz", FingerPictures(**good))
+    save_shard(tmp_path / "train_1.npz", FingerPictures(**{**good, "picture": good["picture"][:, 1:]}))
+    with pytest.raises(DatasetError, match="train_1"):
+        load_pictures(tmp_path, TRAIN)
+
+
+def test_shards_are_read_one_after_the_other_until_there_are_enough(tmp_path):
+    shards = [draw_ladders(2, 2, seed) for seed in range(3)]
+    for number, shard in enumerate(shards):
+        save_shard(tmp_path / f"train_{number}.npz", shard)
+    joined = FingerPictures.join(shards)
+    for limit, count in ((None, 12), (12, 12), (5, 8), (4, 4)):
+        loaded = load_pictures(tmp_path, TRAIN, limit)
+        assert len(loaded) == count
+        for name in ("picture", "place", "visible", "finger"):
+            np.testing.assert_array_equal(getattr(loaded, name), getattr(joined, name)[:count])
 
 
 def test_few_pictures_are_mixed_with_many_half_and_half():
