@@ -83,6 +83,7 @@ UNSEEN: dict[str, tuple[str, dict[str, Any]]] = {
     "weight, dim": ("weight_turn_dim", {}),
 }
 FIRST_SEED = 101
+BENCH = "bench"  # the jaw that the scenes are made for
 
 
 class SmoothGripper:
@@ -171,8 +172,14 @@ def _render(scene: BenchScene, path: Path) -> None:
         write_footage(footage, path, form=RecordingForm(farthest=FARTHEST), case=case, seen=lambda _: bar.update())
 
 
-def record_unseen(name: str, seed: int, folder: Path) -> Path:
+def record_unseen(name: str, seed: int, folder: Path, jaw: str = BENCH) -> Path:
     """Record a case of `UNSEEN` with a seed into a folder, unless that was done before; return where.
+
+    Args:
+        name: of the case.
+        seed: of textures, light and noise.
+        folder: of the recordings.
+        jaw: shipped jaw or jaw file.
 
     Raises:
         FinforceError: the scene cannot be recorded.
@@ -182,9 +189,10 @@ def record_unseen(name: str, seed: int, folder: Path) -> Path:
     from finforce_twin.scenes.scenarios import build_scenario
 
     scene, changes = UNSEEN[name]
-    bag = folder / f"{name.replace(',', '').replace(' ', '_')}_{seed}"
+    label = name.replace(",", "").replace(" ", "_")
+    bag = folder / (f"{label}_{seed}" if jaw == BENCH else f"{label}_{Path(jaw).stem}_{seed}")
     if not bag.exists():
-        scenario = build_scenario(scene, **changes)
+        scenario = build_scenario(scene, **changes, jaw=jaw)
         record_scene(scenario, seed, bag, camera=parse_size(SIZE), form=RecordingForm())
     return bag
 
