@@ -1,6 +1,6 @@
 """CPU time of each node on three scenes, with the rules of what need not be done and without; table, JSON, picture.
 
-    python benchmarks/skipping.py [--json OUT] [--picture OUT.png] [--seconds 10] [--solver NAME] [--each]
+    python benchmarks/skipping.py [--json OUT] [--picture OUT.png] [--seconds 10] [--solver NAME] [--each] [--composed]
 
 It renders one grasp (two minutes, kept in the user's cache) and runs all nodes twice for half a minute. Nothing else
 should run meanwhile; the table says what did.
@@ -20,9 +20,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="of idling and of holding that are measured (10)")
     parser.add_argument("--solver", default="", help="tier of the solvers (their default)")
     parser.add_argument("--each", action="store_true", help="switch off one rule after the other, not all at once")
+    parser.add_argument("--composed", action="store_true", help="all nodes in one process")
     options = parser.parse_args()
     settings = EACH if options.each else SETTINGS
-    figures = measure(seconds=options.seconds, solver=options.solver, settings=settings)
+    figures = measure(seconds=options.seconds, solver=options.solver, settings=settings, composed=options.composed)
     print(format_each(figures) if options.each else format_table(figures))
     if options.json:
         write_figures(options.json, as_json(figures))

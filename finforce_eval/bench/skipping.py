@@ -18,6 +18,7 @@ import numpy as np
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
 from finforce.skipping import ALL, AWAY, CONTACT, EVERYWHERE, IDLE, SOLVER, STILL, UNCHANGED, UNHEARD, UNNEEDED
+from finforce.systems.processes import compose
 from finforce_eval.bench.chain import SIDES, chain_processes
 from finforce_eval.bench.scenes import OBJECT_TOPIC, BenchScene, SceneStream, Span, StreamPart, cut_sections, find_scene
 from finforce_eval.recordings.recording import read_recording
@@ -62,6 +63,7 @@ def measure(
     seconds: float | None = None,
     solver: str = "",
     settings: Mapping[str, Sequence[str]] = SETTINGS,
+    composed: bool = False,
 ) -> SkippingFigures:
     """Return what each node takes in each scene, with the rules and without.
 
@@ -70,6 +72,7 @@ def measure(
         seconds: the same time, where another one is wanted.
         solver: tier; the node's own default when empty.
         settings: rules that are off, by the name of the setting.
+        composed: whether all nodes share one process.
 
     Raises:
         MissingDependencyError: ROS 2 is not installed.
@@ -78,7 +81,8 @@ def measure(
     source = find_scene(SCENE)
     sections = cut_sections(read_playback(source), SECTIONS)
     stream = SceneStream(sections, _plan(sections, seconds or (QUICK_SECONDS if quick else USUAL_SECONDS)))
-    runs = {name: _run(_build_nodes(source, off, solver), stream, name) for name, off in settings.items()}
+    nodes = {name: _build_nodes(source, off, solver) for name, off in settings.items()}
+    runs = {name: _run(compose(own) if composed else own, stream, name) for name, own in nodes.items()}
     return SkippingFigures(
         costs=[cost for run in runs.values() for cost in run.costs],
         memory={name: run.memory for name, run in runs.items()},
