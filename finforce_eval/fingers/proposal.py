@@ -1,7 +1,9 @@
 """A jaw file from a recognized finger: key points, contact candidates, reference point, and the text of it all."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,9 @@ from finforce_ifea.jaw.section import order_rings
 _ABOVE, _AWAY, _STEP = 1e-3, 4e-3, 4e-3
 _FEWEST, _MOST = 6, 30
 _TIP = 2.5e-3
+# With fewer key points where ribs meet bands, those between them are taken, too: an object hides some.
+_FEW = 12
+BANDS = ("inner", "outer")
 # A reference point [m] below a clamp that the section does not show.
 _BELOW = -6e-3
 
@@ -45,16 +50,20 @@ def propose(finger: RecognizedFinger, name: str, material: str) -> Proposal:
     """Choose what a camera can see and where objects may touch.
 
     Key points are where the ribs meet the bands, on the side face towards the camera, inner band first, base to tip,
-    and the tip; what the clamp holds is left out, since it does not move.
+    and the tip; what the clamp holds is left out, since it does not move. Where these are few, points of the bands half
+    way between them come behind.
     """
-    points = {}
-    for band in ("inner", "outer"):
+    places = {}
+    for band in BANDS:
         for number, rib in enumerate(finger.ribs, start=1):
             x, z = getattr(rib, band)
             if z > finger.clamped_z + _ABOVE and not _is_held(finger, x, z):
-                points[f"{band}_{number}"] = _put_on_side(finger, x, z)
+                places[f"{band}_{number}"] = (x, z)
     top = finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)).centroid
-    points["tip"] = _put_on_side(finger, top.x, top.y)
+    places["tip"] = (top.x, top.y)
+    if len(places) < _FEW:
+        places |= _find_middles(finger, places)
+    points = {name: _put_on_side(finger, *place) for name, place in places.items()}
     low, high = finger.clamped_z + _AWAY, _find_face_end(finger) - _AWAY
     count = int(np.clip(round((high - low) / _STEP) + 1, _FEWEST, _MOST))
     reference, note = _choose_reference(finger)
@@ -66,6 +75,22 @@ def propose(finger: RecognizedFinger, name: str, material: str) -> Proposal:
         reference=_put_on_side(finger, *reference),
         reference_note=note,
     )
+
+
+def _find_middles(
+    finger: RecognizedFinger, places: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Return points (x, z) [m] of each band half way between clamp, key points on it, and tip, by the names of both."""
+    found = {}
+    for band in BANDS:
+        line = getattr(finger, band).line
+        ends = {name: z for name, (_, z) in places.items() if name.startswith(band)}
+        ends = {"clamp": finger.clamped_z, **ends, "tip": places["tip"][1]}
+        for (below, low), (above, high) in pairwise(ends.items()):
+            z = 0.5 * (low + high)
+            if not _is_held(finger, x := float(np.interp(z, line[:, 1], line[:, 0])), z):
+                found[f"{band}_{below.removeprefix(f'{band}_')}_{above.removeprefix(f'{band}_')}"] = (x, z)
+    return found
 
 
 def _put_on_side(finger: RecognizedFinger, x: float, z: float) -> NDArray:
@@ -136,7 +161,7 @@ def describe_jaw(finger: RecognizedFinger, proposal: Proposal, section: str, sou
         f"inner_face_x: {finger.face_x:.5g}",
         f"material: {proposal.material}  # {1e-6 * material.young_modulus:.3g} MPa +- {material.spread:.0%}, until "
         "it is calibrated",
-        "keypoints:  # where ribs meet bands, on the side that the camera sees",
+        "keypoints:  # on the side that the camera sees: where ribs meet bands, of few also between, and the tip",
         *(f"  {name}: {_list(point)}" for name, point in proposal.keypoints.items()),
         f"candidates: {{first_z: {first:.5g}, step_z: {step:.5g}, count: {count}}}",
         f"reference_point: {_list(proposal.reference)}  # {proposal.reference_note}",

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from section_fakes import BASE, LENGTH, MILLIMETRE, WIDTH, draw_polygon, make_se
 
 from finforce_eval.cli.main import main
 from finforce_eval.fingers.cad_file import read_section
+from finforce_eval.fingers.proposal import propose
 from finforce_eval.fingers.recognition import Wishes, recognize
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.jaw import load_jaw
@@ -192,15 +194,28 @@ def test_the_command_writes_a_jaw_that_loads(tmp_path, capsys, surface):
     output = tmp_path / "made" / "my_finger.yaml"
     assert main(["jaw", str(tmp_path / "my_finger.stl"), "-o", str(output), "--material", "tpu85a"]) == 0
     said = capsys.readouterr().out
-    for word in ("unit: mm", "prismatic", "inner face", "clamped below", "4 ribs", "9 key points", "tpu85a: 12 MPa"):
+    for word in ("unit: mm", "prismatic", "inner face", "clamped below", "4 ribs", "19 key points", "tpu85a: 12 MPa"):
         assert word in said
     jaw = load_jaw(output)
     assert jaw.name == "my_finger"
-    assert jaw.keypoint_names[0] == "inner_1" and jaw.keypoint_names[-1] == "tip"
+    assert jaw.keypoint_names[0] == "inner_1" and jaw.keypoint_names[8] == "tip"
     np.testing.assert_allclose(jaw.keypoints[:, 1], 0.5 * WIDTH * MILLIMETRE)
     assert 0.0 < jaw.reference_point[2] < jaw.section.clamped_z
     assert output.with_suffix(".png").stat().st_size > 20_000
-    assert len(output.read_text().splitlines()) < 25
+    assert len(output.read_text().splitlines()) < 35
+
+
+def test_of_few_key_points_those_between_are_taken_too(tmp_path, surface):
+    finger = recognize(draw_polygon(), WIDTH * MILLIMETRE, Wishes())
+    points = propose(finger, "few", "tpu95a").keypoints
+    assert list(points)[9:14] == ["inner_clamp_1", "inner_1_2", "inner_2_3", "inner_3_4", "inner_4_tip"]
+    for name, (x, _, z) in list(points.items())[9:]:
+        band, below, above = name.split("_")
+        ends = [points[end if end == "tip" else f"{band}_{end}"][2] for end in (below, above) if end != "clamp"]
+        assert z == pytest.approx(np.mean([*ends, finger.clamped_z][:2]))
+        assert finger.polygon.contains(shapely.Point(x, z))
+    many = replace(finger, ribs=finger.ribs * 2)
+    assert len(propose(many, "many", "tpu95a").keypoints) == 17
 
 
 def test_a_curved_inner_face_is_taken(tmp_path, capsys):
