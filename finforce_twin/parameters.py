@@ -29,7 +29,7 @@ class TwinParameters:
     )
     gripper_firmware: str = setting("new", "of the emulated gripper", choices=("new", "old"))
     detects: bool = setting(
-        False, "publish the true key points and poses of the jaws as a detector would, for jaws that no network knows"
+        False, "publish the true key points and poses of the jaws as a detector without errors would"
     )
     camera_frame: str = setting("camera_color_optical_frame", "frame of the images")
 

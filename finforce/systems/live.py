@@ -110,7 +110,7 @@ def simulated(options: OptionsT) -> OptionsT:
         raise ValueError(f"object_mesh_unit:={options.object_mesh_unit}: sim:=true takes meshes in m only")
     return replace(
         options,
-        images=options.jaw_file in SIM_JAWS,  # which the shipped network knows; of others the twin tells the key points
+        images=True,
         object_mesh=options.object_mesh or str(SIM_OBJECT),
         calibration_file=options.calibration_file or (SIM_CALIBRATION if options.jaw_file in SIM_JAWS else ""),
         gripper_port=options.gripper_port or emulated_port(),
@@ -127,7 +127,6 @@ def twin_processes(scene: str, options: GripperOptions) -> list[Process]:
         "object": options.object_mesh,
         "jaw_file": options.jaw_file,
         "gripper_link": options.gripper_port,
-        "detects": not options.images,
     }
     return [_node("twin_camera", asked, options)]
 

@@ -205,6 +205,13 @@ def test_without_hardware_the_twins_object_is_the_one_whose_contact_is_estimated
         build(sim=True, object_mesh="can.stl", object_mesh_unit="mm")
 
 
+def test_without_hardware_any_finger_is_seen_in_the_twins_images():
+    for jaw in ("", "bench", "umi", "mine.yaml"):
+        parts = robot(sim=True, jaw_file=jaw)
+        assert "keypoint_detector" in parts and "detects" not in parts["twin_camera"].parameters
+        assert all(parts[name].parameters.get("jaw_file", "") == jaw for name in ("twin_camera", "left_ifea_solver"))
+
+
 def test_the_object_of_the_twin_is_a_cylinder_of_25_mm_along_y_in_metres():
     vertices = load_object_mesh(SIM_OBJECT, unit="m").vertices
     # 1e-6: the file holds single precision
