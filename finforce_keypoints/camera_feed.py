@@ -19,6 +19,7 @@ from finforce_keypoints.parameters import ALIGNED, AUTO, NO_DEPTH, DetectorParam
 SILENCE = 1.0  # s without an image, after which another colour topic may be the camera's
 COLOR, DEPTH = "color", "depth"
 WAITING = 3  # colour images that may wait for their depth: a tenth of a second at 30 Hz
+PROMPT = 5  # images in a row whose depth came in time, after which that is expected of the next one
 
 
 class RgbdFeed:
@@ -44,8 +45,14 @@ class RgbdFeed:
         self.camera: CameraIntrinsics | None = None
         self.passed = 0
         self.topic: str | None = None
+        self._in_time = 0
         self._heard = clock()
         self.reset()
+
+    @property
+    def is_prompt(self) -> bool:
+        """Whether the depth of the last PROMPT colour images came before newer ones overtook them."""
+        return self._in_time >= PROMPT
 
     @property
     def source(self) -> str:
@@ -116,14 +123,15 @@ class RgbdFeed:
         if pair is None:
             return None
         color, depth = pair
-        waiting = self._images.entries(COLOR)
+        waiting, self._in_time = self._images.entries(COLOR), self._in_time + 1
         while waiting.popleft() is not color:
-            self.passed += 1
+            self.passed, self._in_time = self.passed + 1, 0
         return ImagePair(color.stamp, color.value, depth.value)
 
     def pass_over(self) -> None:
         """Forget the colour images that wait: one after them has been answered."""
-        self.passed += len(self._images.entries(COLOR))
+        if left := len(self._images.entries(COLOR)):
+            self.passed, self._in_time = self.passed + left, 0
         self._images.reset(COLOR)
 
     def read_color(self, message: Any) -> NDArray[np.uint8]:

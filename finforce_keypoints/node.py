@@ -36,8 +36,9 @@ from finforce_keypoints.settings import RULES, DetectorSettings
 if TYPE_CHECKING:
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
-PROMPT = 5  # colour images in a row whose depth came, after which the next is looked at before its own has ...
-LEISURE = 3e-3  # s ... where the node has waited so long for it; otherwise the time is needed for those that are whole
+# an image is looked at before its depth has come where the node has waited so long for it [s]; otherwise the time is
+# needed for those that are whole
+LEISURE = 3e-3
 STAMPED = 12  # bytes of a serialised message up to the end of its stamp
 
 
@@ -91,7 +92,7 @@ class KeypointDetectorNode(Node):
         self.health = {side: Health(source=source, stale_after=age) for side in parameters.sides}
         self.found: Mapping[str, JawKeypoints] = {}
         self.rested, self.idling, self.info = float("-inf"), Idling(), b""
-        self.prompt, self.passed, self.busy = 0, 0, 0.0
+        self.busy = 0.0
         self.qos = ros.QosWatch(self, stage)
         self.out = DetectorOutputs(self.qos, parameters, names, self.card, self.skips)
         self.detector.warm_up()  # before images come: those that came meanwhile would be lost
@@ -190,9 +191,7 @@ class KeypointDetectorNode(Node):
 
     def _begin(self, message: Any, began: float) -> None:
         """Look for the key points in a colour image whose depth is on its way, as it came for those before."""
-        passed, self.passed = self.passed, self.feed.passed
-        self.prompt = self.prompt + 1 if passed == self.passed else 0
-        if self.prompt < PROMPT or began < self.busy + LEISURE or self.feed.camera is None:
+        if not self.feed.is_prompt or began < self.busy + LEISURE or self.feed.camera is None:
             return
         with suppress(FinforceError):  # what cannot be used is refused with its depth
             self.detector.begin(SECOND * stamp_of(message), self.feed.read_color(message), self.feed.camera)
