@@ -17,6 +17,7 @@ from finforce_ifea.jaw.section import order_rings
 BETWEEN = 3  # beams along a band from rib to rib
 ALONG = 3  # beams along a rib
 LONGEST_STEP = 0.012  # of a boundary between two vertices, in lengths of the finger
+FEW = 12  # fewer key points where ribs meet bands, and those between are taken, too, as `finforce jaw` does
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,7 +48,7 @@ class Finger:
         taper: by how much of it the width has become less at the tip.
         clamped_z: [m], everything up to this height is held.
         solid_z: [m], from here on the tip is solid.
-        keypoints: (K, 2) [m], where ribs meet bands, and the tip.
+        keypoints: (K, 2) [m], where ribs meet bands, of few also half way between, and at last the tip.
         reference: (2,) [m], a mark on what is held.
         bolts: (b, 3) [m], x, z and radius of what is seen on its side: heads of screws.
         has_hinges: whether its ribs are bars that turn on the bands.
@@ -121,7 +122,9 @@ def _try_finger(rng: np.random.Generator) -> Finger | None:
     if not isinstance(polygon, shapely.Polygon):
         return None
     junctions = [rib.line[0] for rib in ribs] + [rib.line[-1] for rib in ribs]
-    keypoints = np.array([*junctions, [front_x[-1] - 0.5 * tip, length - rng.uniform(0.0, 0.04) * length]])
+    top = np.array([front_x[-1] - 0.5 * tip, length - rng.uniform(0.0, 0.04) * length])
+    few = len(junctions) + 1 < FEW and not steel
+    keypoints = np.array([*junctions, *(_find_middles(front, back, ribs, clamped, top[1]) if few else ()), top])
     low = max(clamped, 0.0)
     reference_z = rng.uniform(0.15, 0.85) * low if low > 0.06 * length else -rng.uniform(0.04, 0.13) * length
     at = np.interp(max(reference_z, 0.0), z, 0.5 * (front_x + back_x))
@@ -175,6 +178,16 @@ def _draw_ribs(
         ribs.append(Member(line=line, thickness=np.full(len(line), thickness)))
     backs = np.array([rib.line[-1, 1] for rib in ribs])
     return ribs if np.diff(backs).min() > 1.5 * thickness else None
+
+
+def _find_middles(front: Member, back: Member, ribs: list[Member], low: float, high: float) -> NDArray:
+    """Return the points (n, 2) [m] of both bands half way between two ribs, from a height to another."""
+    found = []
+    for band, end in ((front, 0), (back, -1)):
+        heights = np.array([low, *sorted(rib.line[end, 1] for rib in ribs), high])
+        middles = 0.5 * (heights[1:] + heights[:-1])
+        found.append(np.column_stack((np.interp(middles, band.line[:, 1], band.line[:, 0]), middles)))
+    return np.vstack(found)
 
 
 def _draw_discs(rng: np.random.Generator, base: float, low: float) -> NDArray:
