@@ -36,6 +36,7 @@ from training.fingers import BentFinger, Finger, draw_finger, outline
 from training.making import make_all
 
 SEED = 40_000_000_000  # of training's fingers begin here
+FIRST_VALIDATION = 10_000_000  # number of the first of those that judge
 STATES = 8  # pictures of a finger
 KEYPOINTS, ANYWHERE = 24, 72  # points of a picture: key points with the mark, and points anywhere on the material
 BARS = 0.35  # share of the pictures with something between camera and finger
@@ -458,7 +459,7 @@ def main() -> None:
     options = parser.parse_args()
     with one_line_errors():
         engine = read_engine(options)
-        for name, first, count in ((VALIDATION, 10_000_000, options.validation), (TRAIN, 0, options.fingers)):
+        for name, first, count in ((VALIDATION, FIRST_VALIDATION, options.validation), (TRAIN, 0, options.fingers)):
             if count:
                 start = first + options.first
                 seeds = range(start, start + count)
