@@ -105,7 +105,7 @@ def print_table(rows: Sequence[Mapping[str, Any]]) -> None:
     force = f"{'true/N':>9}{'image/N':>9}{'added':>9}{'solved%':>9}"
     print(f"{'':<{WIDTH}}{names}{force}{'ms p50':>8}{'p95':>8}{'late/ms':>9}")
     for row in rows:
-        print(format_row(f"{row['case']} {row['jaw']} {row['seed']}", row))
+        print(format_row(f"{row['case']} {Path(row['jaw']).stem} {row['seed']}", row))
     print(
         "true, image: RMSE of the force with key points that are true and that were found; late: from 0.02 N of true "
         "force to an estimate above 0.1 N."
@@ -136,16 +136,23 @@ def main() -> None:
     parser.add_argument("--jaws", nargs="+", default=[BENCH], help="shipped jaws or jaw files (bench)")
     parser.add_argument("--model", help="folder of another network than the shipped one")
     options = parser.parse_args()
-    rows = []
+    rows, failed = [], {}
     seeds = range(FIRST_SEED, FIRST_SEED + options.seeds)
     for name, jaw, seed in product(options.scenes, options.jaws, seeds):
-        rows.append(measure(name, seed, jaw, options))
+        try:
+            rows.append(measure(name, seed, jaw, options))
+        except FinforceError as error:  # a finger that cannot be used is a finding, too
+            failed[f"{name} {Path(jaw).stem} {seed}"] = str(error)
+            print(f"failed: {error}")
+            continue
         print_table(rows[-1:])
     yardstick = 1e3 * float(np.median([time_product() for _ in range(25)]))
     print_table(rows)
     print(f"Product of two matrices of 512 x 512: {yardstick:.2f} ms. {summarise(rows)}")
     if options.json:
-        write_figures(options.json, {"rows": rows, "summary": summarise(rows), "yardstick_ms": yardstick})
+        write_figures(
+            options.json, {"rows": rows, "failed": failed, "summary": summarise(rows), "yardstick_ms": yardstick}
+        )
 
 
 if __name__ == "__main__":

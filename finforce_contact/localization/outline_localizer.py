@@ -22,6 +22,8 @@ _SPACING = 0.5e-3
 _MOST_BENT = 0.6
 # Where across the width the line is averaged, as shares of the half width.
 _ACROSS = np.array([-0.8, 0.0, 0.8])
+# Least share of a triangle of the face that stands across x.
+_LEAST_FACING = 0.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,6 +97,10 @@ def build_inner_face(jaw: Jaw, density: str) -> InnerFace:
     mesh = jaw.build_mesh(density)
     on_face = jaw.face.holds(mesh.nodes)
     triangles = mesh.surface[on_face[mesh.surface].all(axis=1)]
+    corners = mesh.nodes[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # a broken edge of the face is within its tolerance, too, and may stand square to it
+    triangles = triangles[np.abs(normals[:, 0]) > _LEAST_FACING * np.linalg.norm(normals, axis=1)]
     if not len(triangles):
         raise MeshError(f"the mesh has no triangles on the inner face x = {jaw.inner_face_x:g} m; check inner_face_x")
     places = mesh.nodes[np.unique(triangles)][:, 1:]

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -51,6 +52,19 @@ def push_at(line, height, size=2.0, lean=0.0):
     x, z = (np.interp(height, INNER.heights, column) for column in line.T)
     force = size * np.array([-np.cos(lean), 0.0, np.sin(lean)])
     return force, np.array([0.0, z * force[0] - x * force[2], 0.0])
+
+
+def test_a_broken_edge_of_the_inner_face_is_none_of_it():
+    x, edge, half, top = 0.02, 0.01998, 0.01, 0.05
+    corners = [(x, -half, 0.0), (x, half, 0.0), (x, half, top), (x, -half, top), (edge, -half, top), (edge, half, top)]
+    mesh = SimpleNamespace(nodes=np.array(corners), surface=np.array([[0, 1, 2], [0, 2, 3], [3, 2, 5], [3, 5, 4]]))
+    face = SimpleNamespace(holds=lambda nodes: np.ones(len(nodes), bool), read=np.zeros_like)
+    jaw = SimpleNamespace(build_mesh=lambda density: mesh, face=face, inner_face_x=x)
+    inner = build_inner_face(jaw, "default")
+    np.testing.assert_allclose(inner.weights.sum(axis=1), 1.0)
+    np.testing.assert_allclose(
+        inner.deform(mesh.nodes), np.column_stack((np.full(len(inner.heights), x), inner.heights))
+    )
 
 
 class TestInnerFace:
