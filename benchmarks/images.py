@@ -91,7 +91,8 @@ def format_row(label: str, figures: Mapping[str, Any]) -> str:
     if images is None or truth is None:
         told = "" if truth is None else f"{truth:>9.3f}"
         return f"{label:<{WIDTH}}{'':>{11 * len(COLUMNS)}}{told:>9}{'none told':>11}"
-    sight = "".join(f"{figures['sight'][key]:>11.2f}" for _, key in COLUMNS)
+    seen = [figures["sight"][key] for _, key in COLUMNS]  # None of hidden points where none was hidden
+    sight = "".join(f"{'-':>11}" if value is None else f"{value:>11.2f}" for value in seen)
     force = f"{truth:>9.3f}{images:>9.3f}{images - truth:>+9.3f}{figures['solved_pct']['images']:>9.1f}"
     delay = figures["delay"] or {}
     late = delay.get("median_ms")
