@@ -82,10 +82,15 @@ def check_keypoint_count(recording: Recording, side: str, jaw: Any) -> None:
     Raises:
         RecordingError: the numbers of key points differ.
     """
-    count, expected = recording.jaw(side).keypoints.count, len(jaw.keypoint_names)
-    if count != expected:
-        what = f"{count} key points in /{side}/keypoints; the jaw '{jaw.name}' has {expected}"
-        raise RecordingError(f"{recording.name}: {what} (another --jaw?)")
+    track, expected = recording.jaw(side), len(jaw.keypoint_names)
+    counts = {f"key points in /{side}/keypoints": track.keypoints.count}
+    if track.sight is not None:  # beside points that were found with that jaw in the images
+        counts[f"true key points of the {side} jaw"] = track.sight.points.shape[1]
+    for what, count in counts.items():
+        if count != expected:
+            raise RecordingError(
+                f"{recording.name}: {count} {what}; the jaw '{jaw.name}' has {expected} (another --jaw?)"
+            )
 
 
 def _check_solved(result: CaseResult, recording: Recording) -> None:

@@ -12,7 +12,7 @@ from finforce_eval.evaluation.contact_source import EstimatedContact, GivenConta
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.tables import evaluation_json, format_table, markdown_contact_table, markdown_table
 from finforce_eval.recordings.objects import track_object
-from finforce_eval.recordings.tracks import JawTrack
+from finforce_eval.recordings.tracks import DetectionTruth, JawTrack
 from finforce_ifea.observation import Contact
 
 CONTACT = Contact(points=np.array([[0.014, 0.0, 0.042]]), weights=np.ones(1), free=True)
@@ -132,6 +132,17 @@ def test_recording_without_truth_is_refused():
 def test_recording_of_another_jaw_is_refused():
     with pytest.raises(RecordingError, match="5 key points in /left/keypoints; the jaw 'fake' has 4"):
         run(make_recording(keypoints=5), [])
+    recording = make_recording()
+    stamps = recording.jaw("left").keypoints.stamps
+    sight = DetectionTruth(
+        stamps=stamps,
+        points=np.zeros((len(stamps), 5, 3)),
+        pixels=np.zeros((len(stamps), 5, 2)),
+        visible=np.ones((len(stamps), 5), bool),
+    )
+    jaws = {**recording.jaws, "left": replace(recording.jaw("left"), sight=sight)}
+    with pytest.raises(RecordingError, match="5 true key points of the left jaw; the jaw 'fake' has 4"):
+        run(replace(recording, jaws=jaws), [])
 
 
 def test_recording_of_which_nothing_is_solved_is_refused_with_the_reason():
