@@ -25,6 +25,7 @@ from training.fingers import Finger, draw_finger
 from training.scenes import FIRST_VALIDATION, SEED
 
 LEAST_CLAMP = 4e-3  # m of a finger that a holder keeps; those that stand on it are none of a gripper's
+LONGEST = 0.1  # m of a finger that the camera on the twin's wrist sees as a whole
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -39,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def write_jaws(folder: Path, wanted: int, first: int) -> list[Path]:
-    """Write jaw files of random fingers of one width, held at their base; return their paths.
+    """Write jaw files of random fingers of one width, held at their base and not too long; return their paths.
 
     Args:
         folder: of the files.
@@ -53,7 +54,7 @@ def write_jaws(folder: Path, wanted: int, first: int) -> list[Path]:
             return written
         finger = draw_finger(np.random.default_rng((SEED, FIRST_VALIDATION + number)))
         path = folder / f"random_{number}.yaml"
-        if finger.has_hinges or finger.taper or finger.clamped_z < LEAST_CLAMP:
+        if finger.has_hinges or finger.taper or finger.clamped_z < LEAST_CLAMP or finger.length > LONGEST:
             continue
         try:
             make_jaw(
