@@ -123,16 +123,23 @@ class RgbdFeed:
         if pair is None:
             return None
         color, depth = pair
-        waiting, self._in_time = self._images.entries(COLOR), self._in_time + 1
+        self._in_time += 1
+        waiting, overtaken = self._images.entries(COLOR), 0
         while waiting.popleft() is not color:
-            self.passed, self._in_time = self.passed + 1, 0
+            overtaken += 1
+        self._count_passed(overtaken)
         return ImagePair(color.stamp, color.value, depth.value)
 
     def pass_over(self) -> None:
         """Forget the colour images that wait: one after them has been answered."""
-        if left := len(self._images.entries(COLOR)):
-            self.passed, self._in_time = self.passed + left, 0
+        self._count_passed(len(self._images.entries(COLOR)))
         self._images.reset(COLOR)
+
+    def _count_passed(self, count: int) -> None:
+        """Note that so many colour images were overtaken while they waited."""
+        self.passed += count
+        if count:
+            self._in_time = 0
 
     def read_color(self, message: Any) -> NDArray[np.uint8]:
         """Return the colours (h, w, 3) of a colour image; the last one is decoded once, however often it is read.

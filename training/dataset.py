@@ -102,15 +102,11 @@ class FingerPictures:
         if len({(part.picture.shape[1:], part.rest.shape[1:]) for part in parts}) != 1:
             raise DatasetError("shards of several kinds (size, number of points); expected one kind")
         starts = np.cumsum([0, *(len(part.template) for part in parts[:-1])])
-        columns = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in _SHAPES
-            if name != "finger" and (name != "picture" or picture is None)
-        }
-        if picture is not None:
-            columns["picture"] = picture
         fingers = [part.finger + start for part, start in zip(parts, starts, strict=True)]
-        return FingerPictures(**columns, finger=np.concatenate(fingers))
+        columns = {"finger": np.concatenate(fingers)} | ({} if picture is None else {"picture": picture})
+        for name in _SHAPES.keys() - columns.keys():
+            columns[name] = np.concatenate([getattr(part, name) for part in parts])
+        return FingerPictures(**columns)
 
 
 def save_shard(path: Path, pictures: FingerPictures) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from finforce_eval.fingers.proposal import FEW
 from finforce_ifea.fem.factorisation import factorise_banded
 from finforce_ifea.fem.frame import BeamPoints, Beams, add_beams, point_positions, shape_weights
 from finforce_ifea.jaw.section import order_rings
@@ -17,7 +18,6 @@ from finforce_ifea.jaw.section import order_rings
 BETWEEN = 3  # beams along a band from rib to rib
 ALONG = 3  # beams along a rib
 LONGEST_STEP = 0.012  # of a boundary between two vertices, in lengths of the finger
-FEW = 12  # fewer key points where ribs meet bands, and those between are taken, too, as `finforce jaw` does
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

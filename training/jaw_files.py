@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from finforce_eval.cli.parser import whole_number
 from finforce_eval.fingers.make_jaw import make_jaw
 from finforce_eval.fingers.recognition import Wishes
 from finforce_ifea.errors import JawFileError
@@ -32,8 +33,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Write jaw files until there are enough."""
     parser = argparse.ArgumentParser(prog="python -m training.jaw_files", description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="of the jaw files")
-    parser.add_argument("--count", type=int, default=10, help="jaw files (10)")
-    parser.add_argument("--first", type=int, default=30000, help="number of the first finger, as of `scenes` (30000)")
+    parser.add_argument("--count", type=whole_number(1, 10**6), default=10, help="jaw files (10)")
+    parser.add_argument(
+        "--first", type=whole_number(0, 10**9), default=30000, help="number of the first finger, as of `scenes` (30000)"
+    )
     options = parser.parse_args(arguments)
     with one_line_errors():
         write_jaws(options.folder, options.count, options.first)

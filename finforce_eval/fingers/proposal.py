@@ -19,7 +19,7 @@ _ABOVE, _AWAY, _STEP = 1e-3, 4e-3, 4e-3
 _FEWEST, _MOST = 6, 30
 _TIP = 2.5e-3
 # With fewer key points where ribs meet bands, those between them are taken, too: an object hides some.
-_FEW = 12
+FEW = 12
 BANDS = ("inner", "outer")
 # A reference point [m] below a clamp that the section does not show.
 _BELOW = -6e-3
@@ -61,7 +61,7 @@ def propose(finger: RecognizedFinger, name: str, material: str) -> Proposal:
                 places[f"{band}_{number}"] = (x, z)
     top = finger.polygon.intersection(shapely.box(-1.0, finger.length - _TIP, 1.0, 1.0)).centroid
     places["tip"] = (top.x, top.y)
-    if len(places) < _FEW:
+    if len(places) < FEW:
         places |= _find_middles(finger, places)
     points = {name: _put_on_side(finger, *place) for name, place in places.items()}
     low, high = finger.clamped_z + _AWAY, _find_face_end(finger) - _AWAY
