@@ -1,13 +1,18 @@
 """Rigid poses as (4, 4) matrices: checked, from and to quaternions, inverted, compared."""
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from finforce.errors import PoseError
 
 # What single precision, or six printed digits, leave of an orthogonal matrix or of a unit quaternion.
 _TOLERANCE = 1e-3
+# What a product of rotations in double precision may be off by, and how often an error of the tolerance is squared
+# until it is less: Newton's way to the nearest rotation, N. Higham, Computing the polar decomposition, 1986.
+_ROUNDING, _STEPS = 1e-14, 3
+_UNIT, _LAST = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def check_pose(T: ArrayLike, what: str = "pose") -> NDArray:
@@ -34,14 +39,16 @@ def check_pose(T: ArrayLike, what: str = "pose") -> NDArray:
             f"{what}: got NaN or infinite entries, expected a rigid pose; drop such samples at their source"
         )
     R = T[:3, :3]
-    error = np.abs(R.T @ R - np.eye(3)).max()
-    if error > _TOLERANCE or np.linalg.det(R) < 0.0 or np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
+    scaling, turned = R.T @ R, _determinant(R)
+    error = float(np.abs(scaling - _UNIT).max())
+    if error > _TOLERANCE or turned < 0.0 or np.abs(T[3] - _LAST).max() > 1e-9:
         raise PoseError(
-            f"{what}: got a matrix that is no rigid motion (R^T R off by {error:.2g}, det R {np.linalg.det(R):.4g}, "
+            f"{what}: got a matrix that is no rigid motion (R^T R off by {error:.2g}, det R {turned:.4g}, "
             f"last row {T[3].tolist()}), expected [[R, t], [0, 1]] without scale or mirroring"
         )
-    T[:3, :3] = _nearest_rotation(R)
-    T[3] = 0.0, 0.0, 0.0, 1.0
+    for _ in range(_STEPS if error > _ROUNDING else 0):
+        R[:] = R @ (1.5 * _UNIT - 0.5 * R.T @ R)
+    T[3] = _LAST
     return T
 
 
@@ -69,29 +76,15 @@ def pose_from_quaternion(position: ArrayLike, quaternion: ArrayLike) -> NDArray:
     norm = np.linalg.norm(quaternion)
     if abs(norm - 1.0) > _TOLERANCE:
         raise PoseError(f"pose: got a quaternion of norm {norm:.4g}, expected 1; (0, 0, 0, 0) is an unset message")
-    x, y, z, w = (quaternion / norm).tolist()
     T = np.eye(4)
-    T[0, :3] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
-    T[1, :3] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
-    T[2, :3] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)
+    T[:3, :3] = _rotation(*(quaternion / norm).tolist())
     T[:3, 3] = position
     return T
 
 
 def quaternion_from_pose(T: ArrayLike) -> NDArray:
     """Returns the quaternion x, y, z, w (4,) of a pose (4, 4), with w >= 0; raises PoseError as `check_pose` does."""
-    R = check_pose(T)[:3, :3]
-    # of the four ways the one without cancellation: K. Shoemake, Animating rotation with quaternion curves, 1985
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-    ways = (
-        (1.0 + a - e - i, b + d, g + c, h - f),
-        (b + d, 1.0 - a + e - i, f + h, c - g),
-        (g + c, f + h, 1.0 - a - e + i, d - b),
-        (h - f, c - g, d - b, 1.0 + a + e + i),
-    )
-    quaternion = np.array(max(enumerate(ways), key=lambda way: way[1][way[0]])[1])
-    quaternion /= np.copysign(np.linalg.norm(quaternion), quaternion[3])
-    return quaternion
+    return np.array(_quaternion(check_pose(T)[:3, :3]))
 
 
 def pose_numbers(T: ArrayLike) -> tuple[float, ...]:
@@ -124,16 +117,51 @@ def move_pose(T: NDArray, step: NDArray) -> NDArray:
     """
     moved = T.copy()
     moved[:3, 3] += step[:3]
-    moved[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ T[:3, :3]
+    x, y, z = step[3:].tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    factor = math.sin(0.5 * angle) / angle if angle else 0.5
+    moved[:3, :3] = np.array(_rotation(factor * x, factor * y, factor * z, math.cos(0.5 * angle))) @ T[:3, :3]
     return moved
 
 
 def step_between(T_from: NDArray, T_to: NDArray) -> NDArray:
     """Returns the step (6,) [m, rad] with `move_pose(T_from, step)` = T_to, both (4, 4)."""
-    turn = Rotation.from_matrix(T_to[:3, :3] @ T_from[:3, :3].T).as_rotvec()
-    return np.concatenate([T_to[:3, 3] - T_from[:3, 3], turn])
+    x, y, z, w = _quaternion(T_to[:3, :3] @ T_from[:3, :3].T)
+    sine = math.sqrt(x * x + y * y + z * z)
+    factor = 2.0 * math.atan2(sine, w) / sine if sine else 2.0
+    (a, b, c), (d, e, f) = T_from[:3, 3].tolist(), T_to[:3, 3].tolist()
+    return np.array([d - a, e - b, f - c, factor * x, factor * y, factor * z])
 
 
-def _nearest_rotation(R: NDArray) -> NDArray:
-    left, _, right = np.linalg.svd(R)
-    return left @ right
+def _determinant(R: NDArray) -> float:
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    return a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+
+
+def _rotation(x: float, y: float, z: float, w: float) -> list[list[float]]:
+    """Returns the matrix (3, 3) of a unit quaternion."""
+    return [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+
+
+def _quaternion(R: NDArray) -> tuple[float, float, float, float]:
+    """Returns x, y, z, w with w >= 0 of a rotation (3, 3).
+
+    Of the four ways the one without cancellation: K. Shoemake, Animating rotation with quaternion curves, 1985.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    x, y, z, w = 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i
+    largest = max(x, y, z, w)
+    if w == largest:
+        x, y, z = h - f, c - g, d - b
+    elif x == largest:
+        y, z, w = b + d, g + c, h - f
+    elif y == largest:
+        x, z, w = b + d, f + h, c - g
+    else:
+        x, y, w = g + c, f + h, d - b
+    norm = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), w)
+    return x / norm, y / norm, z / norm, w / norm

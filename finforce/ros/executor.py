@@ -11,16 +11,19 @@ from contextlib import ExitStack, contextmanager, suppress
 from time import sleep
 from typing import Any, NamedTuple
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 from finforce.skipping import UNCHANGED, UNHEARD, Skips
 
 MOST_AT_ONCE = 20  # messages of one topic, after which the others have their turn
 LEAST_SLEEP = 2e-3  # s; to fall asleep and wake up takes time, too
+GROUPS = (MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup)  # that are free while no coroutine is under way
 ADDERS = {
     "subscriptions": "add_subscription",
     "timers": "add_timer",
@@ -45,9 +48,9 @@ class KeepingExecutor(SingleThreadedExecutor):
     """Answers as its base does, for half of the time or less.
 
     The base makes a list and a wait set of all that a node has, twice for each message. Here both are kept until the
-    node says that something came or went, and messages go to plain callbacks at once. Whatever else is ready, as a
-    timer, a service or a coroutine under way, is left to the base, and so is a node with actions. A connection that
-    does not come about is noticed with the next timer. While a node has time to spare, all of that waits.
+    node says that something came or went; messages and timers go to plain callbacks at once. Whatever else is ready, as
+    a service or a coroutine under way, is left to the base, and so is a node with actions. A connection that does not
+    come about is noticed with the next timer. While a node has time to spare, all of that waits.
 
     It reads what rclpy promises nobody. Where a release of rclpy has that otherwise, it says so once and is its base.
 
@@ -91,7 +94,7 @@ class KeepingExecutor(SingleThreadedExecutor):
         if (spare := self._spare_time()) > LEAST_SLEEP:
             sleep(spare)  # what comes meanwhile is taken at once
         with self._own_work():
-            ready = self._keep().wait((self._guard.handle, self._sigint_gc.handle), self.can_execute)
+            ready = self._keep().wait((self._guard.handle, self._sigint_gc.handle))
             is_changed = self._guard.handle.pointer in ready.guards
         if not self.context.ok():
             raise ExternalShutdownException
@@ -100,6 +103,8 @@ class KeepingExecutor(SingleThreadedExecutor):
         for subscription in ready.messages:
             if self.can_execute(subscription):
                 self._hand_over(subscription)
+        for timer in ready.timers:
+            self._tick(timer)
         if ready.has_more:
             super().spin_once(0.0)
 
@@ -148,6 +153,15 @@ class KeepingExecutor(SingleThreadedExecutor):
                 if not self.can_execute(subscription):
                     return
 
+    def _tick(self, timer: Timer) -> None:
+        """Call back for a timer that is still due: a callback before may have put it off, or taken it away."""
+        with suppress(InvalidHandle), (handle := timer.handle):
+            with self._own_work():
+                if not (handle.is_timer_ready() and self.can_execute(timer)):
+                    return
+                handle.call_timer()
+            timer.callback()
+
     def remove_node(self, node: Node) -> None:
         """Let go of a node and of all that it has."""
         self._release()
@@ -165,9 +179,10 @@ class KeepingExecutor(SingleThreadedExecutor):
 
 
 class _Ready(NamedTuple):
-    """What a wait has ended with: subscriptions with plain callbacks, pointers of guards, whether there is more."""
+    """What a wait has ended with: what has plain callbacks, pointers of guards, whether there is more."""
 
     messages: Sequence[Subscription]
+    timers: Sequence[Timer]
     guards: Collection[int]
     has_more: bool
 
@@ -192,8 +207,12 @@ class _KeptSet:
         self._set = rclpy_implementation.WaitSet(
             sizes["subscriptions"], 2, sizes["timers"], sizes["clients"], sizes["services"], 0, context.handle
         )
-        self._entities = [(item, getattr(self._set, ADDERS[kind])) for kind, items in found.items() for item in items]
+        entities = [(item, getattr(self._set, ADDERS[kind])) for kind, items in found.items() for item in items]
+        self._adds = [(add, item.handle) for item, add in entities if type(item.callback_group) in GROUPS]
+        self._gated = [(item, add) for item, add in entities if type(item.callback_group) not in GROUPS]
         self._plain = {item.handle.pointer: item for item in found["subscriptions"] if _is_plain(item)}
+        timers = [item for item in found["timers"] if not inspect.iscoroutinefunction(item.callback)]
+        self._timers = {item.handle.pointer: item for item in timers}
 
     def _hold(self, entity: Any) -> bool:
         """Keep an entity's handle until `release`; return whether it still had one."""
@@ -207,21 +226,24 @@ class _KeptSet:
         """Let go of all handles."""
         self._stack.close()
 
-    def wait(self, guards: Sequence[Any], can_execute: Callable[[Any], bool]) -> _Ready:
-        """Wait until something is ready that may be executed, or a guard is triggered."""
+    def wait(self, guards: Sequence[Any]) -> _Ready:
+        """Wait until something is ready, or a guard is triggered."""
         waiting = self._set
         waiting.clear_entities()
         for guard in guards:
             waiting.add_guard_condition(guard)
-        for entity, add in self._entities:
-            if can_execute(entity):
+        for add, handle in self._adds:
+            add(handle)
+        for entity, add in self._gated:
+            if entity.callback_group.can_execute(entity):
                 add(entity.handle)
         waiting.wait(-1)
         look = waiting.get_ready_entities
-        pointers = look("subscription")
+        pointers, due = look("subscription"), look("timer")
         messages = [self._plain[pointer] for pointer in pointers if pointer in self._plain]
-        has_more = len(messages) < len(pointers) or any(map(look, ("timer", "client", "service")))
-        return _Ready(messages, look("guard_condition"), has_more)
+        timers = [self._timers[pointer] for pointer in due if pointer in self._timers]
+        is_all = len(messages) == len(pointers) and len(timers) == len(due)
+        return _Ready(messages, timers, look("guard_condition"), not is_all or any(map(look, ("client", "service"))))
 
 
 def _is_plain(subscription: Subscription) -> bool:

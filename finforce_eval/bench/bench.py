@@ -78,6 +78,12 @@ PARTS = (
         usual=False,
     ),
     BenchPart(
+        name="endurance",
+        module="finforce_eval.bench.endurance",
+        title="An hour of grasps: growth of memory, drift of the force, lost images",
+        usual=False,
+    ),
+    BenchPart(
         name="skipping",
         module="finforce_eval.bench.skipping",
         title="Share of a core that each node takes on three scenes, with what need not be done and without",

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from os import getpid
 from time import monotonic, time_ns
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
@@ -109,6 +109,7 @@ def run_nodes(
     *,
     heard: Sequence[str] | None = None,
     detector: bool = False,
+    watch: Callable[[Mapping[str, int], RawMessage], Any] = lambda pids, message: None,
 ) -> NodeRun:
     """Play a stream to processes in real time, stamps shifted to now; nothing outlives the call.
 
@@ -119,6 +120,7 @@ def run_nodes(
         awaited: topics that somebody has to listen to before the stream begins; without any those of our own nodes.
         heard: jaws whose own results are heard beside the grasp force, which makes them work for it; all without.
         detector: whether the results of a key point detector are heard, too.
+        watch: called with the process ids, by label, before each message leaves.
 
     Raises:
         ProcessError: a process cannot be started, ended early, or does not listen.
@@ -143,7 +145,12 @@ def run_nodes(
         log.begin(offset)
         busy = busy_seconds()
         meter.sample()
-        player.play(stream, offset=offset, sent=lambda message: _note(log, message))
+
+        def note(message: RawMessage) -> None:
+            watch(pids, message)
+            log.take_sent(message.topic, message.stamp, monotonic())
+
+        player.play(stream, offset=offset, sent=note)
         meter.sample()
         busy = busy_seconds() - busy
         memory = {name: resident_bytes(pid) for name, pid in pids.items()}
@@ -159,11 +166,6 @@ def run_nodes(
         others=max(0.0, 100.0 * busy / meter.elapsed - sum(shares.values())),
         seconds=meter.elapsed,
     )
-
-
-def _note(log: ReplayLog, message: RawMessage) -> None:
-    """Note when a message leaves."""
-    log.take_sent(message.topic, message.stamp, monotonic())
 
 
 LISTENER = """

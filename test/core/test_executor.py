@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -110,6 +111,45 @@ def test_messages_wait_while_the_node_has_time_to_spare(probe, working):
     work(probe, working, lambda: len(worker.heard) == 4)
     assert worker.heard == list("0123")
     assert bool(worker.slept) is worker.skips.allows(UNCHANGED)
+
+
+class Gate(MutuallyExclusiveCallbackGroup):
+    """A group that lets messages wait."""
+
+    is_open = False
+
+    def can_execute(self, entity):
+        return self.is_open and super().can_execute(entity)
+
+
+def test_what_a_group_lets_wait_wakes_nobody_and_is_not_lost(probe, working):
+    worker, executor = working
+    gate = Gate()
+    worker.create_subscription(
+        String, "gated", lambda message: worker.heard.append(message.data), 10, callback_group=gate
+    )
+    out = probe.speak("gated", String)
+    work(probe, working, out.get_subscription_count)
+    out.publish(String(data="late"))
+    before, turns = worker.ticks, 0
+    while worker.ticks < before + 10:
+        executor.spin_once()
+        turns += 1
+    assert turns <= 20 and not worker.heard
+    gate.is_open = True
+    work(probe, working, lambda: worker.heard)
+    assert worker.heard == ["late"]
+
+
+def test_timers_are_called_at_their_times_and_may_be_taken_away(probe, working):
+    worker, _ = working
+    once = worker.create_timer(0.05, lambda: (worker.heard.append("once"), worker.destroy_timer(once)))
+    off = worker.create_timer(0.01, lambda: worker.heard.append("never"))
+    off.cancel()
+    begin, before = monotonic(), worker.ticks
+    work(probe, working, lambda: worker.ticks >= before + 20)
+    assert monotonic() - begin >= 19 * 0.02
+    assert worker.heard == ["once"]
 
 
 def test_a_topic_is_wanted_while_somebody_subscribes(probe):
