@@ -270,8 +270,8 @@ def decode_depth(
         raise ImageError(f"depth image: shape {image.shape}; expected (height, width)")
     if encoding != "32FC1":
         depth = np.multiply(image, np.float32(scale), dtype=np.float32)
-        depth[image == 0] = np.nan
-        return depth
+        with np.errstate(invalid="ignore"):  # 0 / 0 is NaN, and an eighth of the price of an index
+            return np.divide(depth, image != 0, out=depth)
     depth = image.astype(np.float32)
     depth[~(np.isfinite(depth) & (depth > 0.0))] = np.nan
     return depth

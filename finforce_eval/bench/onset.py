@@ -1,12 +1,13 @@
 """How long after its true onset a force shows, at 30 and 90 Hz, through all stages in one process.
 
 Short grasps that begin at other times between two images are played from images in real time. A force sets in where
-the true grasp force crosses 0.02 N, and shows when a grasp force above 0.1 N has arrived.
+the true grasp force crosses 0.02 N, and shows when a grasp force above 0.1 N has arrived. From the one to the other the
+true force takes its time, the shorter the faster the gripper closes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,7 +25,24 @@ if TYPE_CHECKING:
     from finforce_eval.replay.live import ReplayLog
 
 GRASPS = 7
-CLEARANCE, LATER = 5e-3, 0.13e-3  # [m] of the first grasp, and what each begins later by: 6.5 ms at 20 mm/s
+
+
+class Closing(NamedTuple):
+    """How a gripper closes: speed of each jaw [m/s], clearance of the first grasp [m] and what each has more [m]."""
+
+    speed: float
+    clearance: float
+    more: float
+
+    def changes(self, grasp: int) -> dict[str, float]:
+        """Return what is changed in the scene of a grasp; the usual speed is not."""
+        faster = {} if self.speed == USUAL_SPEED else {"closing_speed": self.speed}
+        return {**faster, "clearance": self.clearance + grasp * self.more}
+
+
+USUAL_SPEED = 0.02
+# a quarter of a second to the first touch, 6.5 ms more for each grasp
+CLOSINGS = (Closing(USUAL_SPEED, 5e-3, 0.13e-3), Closing(0.06, 15e-3, 0.39e-3))
 SHORT = {"settle": 0.2, "record": 0.2, "displacement": 0.002}
 PHASES = tuple(slot for slot in EVERY_RATE if slot % 2 == 0)  # of the images of 30 Hz among those of 90 Hz
 
@@ -35,11 +53,13 @@ class OnsetRow:
 
     Attributes:
         rate: of the images [Hz].
+        speed: at which each jaw closes [m/s].
         delays: of the force after its true onsets.
         others: CPU use of everything else but nodes and player [% of a core]; it should be small.
     """
 
     rate: int
+    speed: float
     delays: DelayStats
     others: float
 
@@ -52,17 +72,19 @@ class OnsetFigures:
 
 
 def measure(quick: bool) -> OnsetFigures:
-    """Return how long forces take to show: of 21 grasps at each rate, of three when `quick`.
+    """Return how long forces take to show: of 21 grasps at each rate and speed, of three when `quick`.
 
     Raises:
         MissingDependencyError: ROS 2 is not installed.
         FinforceError: a scene cannot be rendered, or a node ended early.
     """
     rows = []
-    for rate, phases in ((30, PHASES), (90, (0,) * len(PHASES))):
-        runs = [_play(grasp, rate, phases) for grasp in range(1 if quick else GRASPS)]
-        delays = [delay for run in runs for delay in run.delays]
-        rows.append(OnsetRow(rate=rate, delays=delay_stats(delays), others=max(run.others for run in runs)))
+    for closing in CLOSINGS:
+        for rate, phases in ((30, PHASES), (90, (0,) * len(PHASES))):
+            runs = [_play(closing.changes(grasp), rate, phases) for grasp in range(1 if quick else GRASPS)]
+            delays = delay_stats([delay for run in runs for delay in run.delays])
+            others = max(run.others for run in runs)
+            rows.append(OnsetRow(rate=rate, speed=closing.speed, delays=delays, others=others))
     return OnsetFigures(rows=rows)
 
 
@@ -73,10 +95,9 @@ class _Played(NamedTuple):
     others: float
 
 
-def _play(grasp: int, rate: int, phases: Sequence[int]) -> _Played:
+def _play(changes: Mapping[str, float], rate: int, phases: Sequence[int]) -> _Played:
     """Play a grasp at a rate [Hz], once from each phase of the images."""
-    changes = {**SHORT, "clearance": CLEARANCE + grasp * LATER}
-    path = find_scene(BenchScene(scenario="grasp_cylinder", seed=101, changes=changes, slots=EVERY_RATE))
+    path = find_scene(BenchScene(scenario="grasp_cylinder", seed=101, changes=SHORT | changes, slots=EVERY_RATE))
     recording = read_recording(path)
     truth, played = true_grasp(recording), _Played([], 0.0)
     for phase in phases:
@@ -98,11 +119,11 @@ def find_delays(log: ReplayLog, truth: TrueGrasp) -> list[Delay]:
 def format_table(figures: OnsetFigures) -> str:
     """Return the rows as a table in Markdown."""
     lines = [
-        "| Hz | onsets | missed | shows after: median/ms | max | the true force itself/ms |",
-        "|---|---|---|---|---|---|",
+        "| closing/mm/s | Hz | onsets | missed | shows after: median/ms | max | the true force itself/ms |",
+        "|---|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| {row.rate} | {row.delays.n} | {row.delays.missed} | {row.delays.median_ms or np.nan:.0f} "
+        f"| {1e3 * row.speed:.0f} | {row.rate} | {row.delays.n} | {row.delays.missed} | {row.delays.median_ms or np.nan:.0f} "
         f"| {row.delays.max_ms or np.nan:.0f} | {row.delays.rise_ms or np.nan:.0f} |"
         for row in figures.rows
     ]

@@ -35,5 +35,5 @@ def test_a_force_shows_with_the_first_image_beyond_a_tenth_of_a_newton_and_its_l
 
 def test_the_table_says_what_was_missed():
     delays = [bench.Delay(shown=0.040, risen=0.01), bench.Delay(shown=np.nan, risen=0.02)]
-    rows = [bench.OnsetRow(rate=30, delays=delay_stats(delays), others=3.0)]
-    assert "| 30 | 1 | 1 | 40 | 40 | 15 |" in bench.format_table(bench.OnsetFigures(rows=rows))
+    rows = [bench.OnsetRow(rate=30, speed=0.02, delays=delay_stats(delays), others=3.0)]
+    assert "| 20 | 30 | 1 | 1 | 40 | 40 | 15 |" in bench.format_table(bench.OnsetFigures(rows=rows))
