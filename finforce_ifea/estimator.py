@@ -267,8 +267,7 @@ class JawEstimator:
         response, used = self._rolling.response, np.isfinite(points[:, 0])
         deviations = points - self.jaw.keypoints - self._taring.tare.offsets
         stddev = response.bound_force(deviations, self.settings.offset_stddev)
-        return replace(
-            blank_solution(self._stamp, "unloaded", message, used),
+        return blank_solution(self._stamp, "unloaded", message, used)._replace(
             converged=True,
             force_stddev=stddev * np.array([1.0, 0.0, UNSEEN_ALONG]),
             torque_stddev=np.array([0.0, stddev * response.heights[-1], 0.0]),

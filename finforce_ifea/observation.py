@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -72,8 +73,7 @@ class Contact:
         return cls(points=np.array([[jaw.face.read(z), 0.0, z]]), weights=np.ones(1), free=True)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Solution:
+class Solution(NamedTuple):
     """One estimate and how good it is; only a trusted one may be published.
 
     Attributes:

@@ -123,8 +123,9 @@ def format_table(figures: OnsetFigures) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| {1e3 * row.speed:.0f} | {row.rate} | {row.delays.n} | {row.delays.missed} | {row.delays.median_ms or np.nan:.0f} "
-        f"| {row.delays.max_ms or np.nan:.0f} | {row.delays.rise_ms or np.nan:.0f} |"
+        f"| {1e3 * row.speed:.0f} | {row.rate} | {row.delays.n} | {row.delays.missed} "
+        f"| {row.delays.median_ms or np.nan:.0f} | {row.delays.max_ms or np.nan:.0f} "
+        f"| {row.delays.rise_ms or np.nan:.0f} |"
         for row in figures.rows
     ]
     return "\n".join([*lines, describe_load(row.others for row in figures.rows)])

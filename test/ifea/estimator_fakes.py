@@ -3,7 +3,7 @@
 data/pressed_bench.npz is described in test_truth.py.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -140,8 +140,8 @@ def statuses(solutions):
 
 def assert_identical(first, second):
     for left, right in zip(first, second, strict=True):
-        for field in fields(Solution):
-            np.testing.assert_array_equal(getattr(left, field.name), getattr(right, field.name), err_msg=field.name)
+        for name in Solution._fields:
+            np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name)
 
 
 STDDEV = np.array([1e-4, 1e-4, 3e-3])
