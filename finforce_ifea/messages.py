@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -118,21 +119,23 @@ def outline_from_columns(columns: Mapping[str, NDArray], previous: ObjectOutline
     """
     if not len(columns["x"]):
         return None
-    if not all(np.isfinite(columns[name]).all() for name in COLUMNS):
+    values = np.array([columns[name] for name in COLUMNS], dtype=float)
+    if not np.isfinite(values).all():
         raise ContactError("the outline has numbers that are not finite")
-    now, cut = (np.stack([columns[a], columns[b]], axis=1).astype(float) for a, b in (("x", "z"), ("u", "v")))
-    about_now, about_cut = now - now.mean(0), cut - cut.mean(0)
-    (xx, xz), (zx, zz) = about_cut.T @ about_now
-    tilt = float(np.arctan2(xz - zx, xx + zz))
-    turn = np.array([[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]])
-    if not np.abs(about_now - about_cut @ turn).max() < _RIGID:
+    now, cut, polygon = values[:2], values[2:4], values[4]
+    middle_now, middle_cut = now.mean(1), cut.mean(1)
+    about_now, about_cut = now - middle_now[:, None], cut - middle_cut[:, None]
+    (xx, xz), (zx, zz) = (about_cut @ about_now.T).tolist()
+    tilt = math.atan2(xz - zx, xx + zz)
+    turn = np.array([[math.cos(tilt), -math.sin(tilt)], [math.sin(tilt), math.cos(tilt)]])
+    if not np.abs(about_now - turn @ about_cut).max() < _RIGID:
         raise ContactError("the corners of the outline are no turned and shifted copy of the outline as it was cut")
-    polygons = np.split(cut, 1 + np.flatnonzero(np.diff(columns["polygon"].astype(int))))
+    polygons = np.split(np.ascontiguousarray(cut.T), 1 + np.flatnonzero(np.diff(polygon)))
     return ObjectOutline(
         polygons=_known_polygons(tuple(polygons), previous),
-        origin=now.mean(0) - cut.mean(0) @ turn,
+        origin=middle_now - turn @ middle_cut,
         tilt=tilt,
-        stddev=np.array([columns[name][0] for name in STDDEVS], dtype=float),
+        stddev=values[5:, 0].copy(),
         across=np.array([columns[name][0] for name in ACROSS], float) if set(ACROSS) <= set(columns) else None,
     )
 
