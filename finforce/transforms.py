@@ -41,7 +41,7 @@ def check_pose(T: ArrayLike, what: str = "pose") -> NDArray:
     R = T[:3, :3]
     scaling, turned = R.T @ R, _determinant(R)
     error = float(np.abs(scaling - _UNIT).max())
-    if error > _TOLERANCE or turned < 0.0 or np.abs(T[3] - _LAST).max() > 1e-9:
+    if not error <= _TOLERANCE or turned < 0.0 or np.abs(T[3] - _LAST).max() > 1e-9:
         raise PoseError(
             f"{what}: got a matrix that is no rigid motion (R^T R off by {error:.2g}, det R {turned:.4g}, "
             f"last row {T[3].tolist()}), expected [[R, t], [0, 1]] without scale or mirroring"
@@ -112,7 +112,7 @@ def rotation_between(T_a: NDArray, T_b: NDArray) -> float:
 def move_pose(T: NDArray, step: NDArray) -> NDArray:
     """Returns a pose (4, 4) moved by a small twist, turned about its own origin in the outer frame's axes.
 
-    t' = t + step[:3], R' = exp(step[3:]) R: the step (6,) is x, y, z [m] and rotation vector [rad], which is also
+    t' = t + step[:3], R' = exp(step[3:]) R: the finite step (6,) is x, y, z [m] and rotation vector [rad], also
     the order and the meaning of the (6, 6) covariances of poses here and in ROS.
     """
     moved = T.copy()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from time import sleep
+from time import monotonic, sleep
 from typing import Any, NamedTuple
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -22,6 +22,7 @@ from rclpy.timer import Timer
 from finforce.skipping import UNCHANGED, UNHEARD, Skips
 
 MOST_AT_ONCE = 20  # messages of one topic, after which the others have their turn
+EVENTS_EVERY = 1.0  # s; events of the middleware, as of a connection that does not come about, are the base's
 LEAST_SLEEP = 2e-3  # s; to fall asleep and wake up takes time, too
 GROUPS = (MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup)  # that are free while no coroutine is under way
 ADDERS = {
@@ -50,7 +51,7 @@ class KeepingExecutor(SingleThreadedExecutor):
     The base makes a list and a wait set of all that a node has, twice for each message. Here both are kept until the
     node says that something came or went; messages and timers go to plain callbacks at once. Whatever else is ready, as
     a service or a coroutine under way, is left to the base, and so is a node with actions. A connection that does not
-    come about is noticed with the next timer. While a node has time to spare, all of that waits.
+    come about is noticed with a timer, once a second. While a node has time to spare, all of that waits.
 
     It reads what rclpy promises nobody. Where a release of rclpy has that otherwise, it says so once and is its base.
 
@@ -63,6 +64,7 @@ class KeepingExecutor(SingleThreadedExecutor):
         self._skips: Sequence[Skips] = ()
         self._spare_time: Callable[[], float] = lambda: 0.0
         self._kept: _KeptSet | None = None
+        self._look_at_events = 0.0
         self._is_strange = False
 
     def obey(self, nodes: Sequence[Any]) -> None:
@@ -105,7 +107,8 @@ class KeepingExecutor(SingleThreadedExecutor):
                 self._hand_over(subscription)
         for timer in ready.timers:
             self._tick(timer)
-        if ready.has_more:
+        if ready.has_more or (ready.timers and monotonic() >= self._look_at_events):
+            self._look_at_events = monotonic() + EVENTS_EVERY
             super().spin_once(0.0)
 
     @contextmanager
@@ -141,25 +144,29 @@ class KeepingExecutor(SingleThreadedExecutor):
 
     def _hand_over(self, subscription: Subscription) -> None:
         """Call back with all messages that wait, until the subscription is gone or its group busy."""
-        with suppress(InvalidHandle), (handle := subscription.handle):
-            for _ in range(MOST_AT_ONCE):
-                with self._own_work():
-                    taken = handle.take_message(subscription.msg_type, subscription.raw)
-                if taken is None:
-                    return
-                for skips in self._skips[:1]:
-                    skips.count(UNCHANGED)
-                subscription.callback(taken[0])
-                if not self.can_execute(subscription):
-                    return
+        for _ in range(MOST_AT_ONCE):
+            if (taken := self._take(subscription)) is None:
+                return
+            for skips in self._skips[:1]:
+                skips.count(UNCHANGED)
+            subscription.callback(taken[0])
+            if not self.can_execute(subscription):
+                return
+
+    def _take(self, subscription: Subscription) -> tuple[Any, Any] | None:
+        """Return a message that waits, with what is known of it; None without one, or when the subscription is gone."""
+        with suppress(InvalidHandle), (handle := subscription.handle), self._own_work():
+            return handle.take_message(subscription.msg_type, subscription.raw)
+        return None
 
     def _tick(self, timer: Timer) -> None:
-        """Call back for a timer that is still due: a callback before may have put it off, or taken it away."""
-        with suppress(InvalidHandle), (handle := timer.handle):
-            with self._own_work():
-                if not (handle.is_timer_ready() and self.can_execute(timer)):
-                    return
+        """Call back for a timer, unless a callback before has put it off or taken it away."""
+        is_due = False
+        with suppress(InvalidHandle), (handle := timer.handle), self._own_work():
+            is_due = handle.is_timer_ready() and self.can_execute(timer)
+            if is_due:
                 handle.call_timer()
+        if is_due:
             timer.callback()
 
     def remove_node(self, node: Node) -> None:

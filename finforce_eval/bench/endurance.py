@@ -19,6 +19,7 @@ from finforce.skipping import IDLE
 from finforce.stamps import NANOSECONDS
 from finforce_eval.bench.chain import SIDES, TARE, TrueGrasp, chain_processes
 from finforce_eval.bench.scenes import GRASP, find_scene
+from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.scoring import rms
 from finforce_eval.figures.time_error import TimeStats, time_stats
 from finforce_eval.recordings.recording import read_recording
@@ -105,11 +106,16 @@ def measure(quick: bool, *, minutes: float | None = None) -> EnduranceFigures:
 
     Raises:
         MissingDependencyError: ROS 2 is not installed.
+        OptionError: the time is none.
         FinforceError: the scene cannot be rendered, or the process ended early.
     """
+    if minutes is None:
+        minutes = QUICK_MINUTES if quick else MINUTES
+    if not 0.0 < minutes < np.inf:
+        raise OptionError(f"{minutes:g} minutes of grasps; expected a time above zero")
     path = find_scene(GRASP)
     recording, once = read_recording(path), stream_images(path, RATE)
-    wanted = 60.0 * (minutes or (QUICK_MINUTES if quick else MINUTES)) * NANOSECONDS
+    wanted = 60.0 * minutes * NANOSECONDS
     stream = replace(once, repeats=max(SETTLED + 1, round(wanted / once.period)))
     watch = _MemoryWatch(stream)
     processes = chain_processes(recording, images=True, off=(IDLE,))

@@ -8,6 +8,7 @@ import pytest
 from finforce.stamps import NANOSECONDS
 from finforce_eval.bench import endurance
 from finforce_eval.bench.chain import TARE, TrueGrasp
+from finforce_eval.errors import OptionError
 from finforce_eval.figures.time_error import time_stats
 from finforce_eval.recordings.tracks import WrenchTrack
 from finforce_eval.replay.live import ReplayLog
@@ -77,3 +78,9 @@ def test_memory_is_read_where_a_grasp_begins(monkeypatch):
     for time in (0, 1, PERIOD // 2, PERIOD, PERIOD + 1, 2 * PERIOD + 5):
         watch.look({"pipeline": 7}, SimpleNamespace(time=START + time))
     assert watch.memory_MB == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("minutes", [0.0, -1.0, np.inf, np.nan])
+def test_a_time_that_is_none_is_refused(minutes):
+    with pytest.raises(OptionError, match="minutes of grasps; expected a time above zero"):
+        endurance.measure(False, minutes=minutes)
