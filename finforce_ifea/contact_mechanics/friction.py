@@ -200,5 +200,6 @@ def _rub(contact, points, stiffness, rubbing):
         for a in range(2):
             pushed[p, 2 * a] = out[a, _FORCE]
             stiff[p, 2 * a, 0], stiff[p, 2 * a, 2] = out[a, _SPRING], out[a, _SPRING + 1]
-            changes[p, 2 * a] = out[a, _CHANGE:]
+            for i in range(4):
+                changes[p, 2 * a, i] = out[a, _CHANGE + i]
     return RubbedContact(pushed, stiff, changes, shear, total / allowed if allowed > 0.0 else 0.0)

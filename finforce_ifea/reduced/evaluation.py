@@ -607,12 +607,13 @@ def linearize_reduced(jaw, pressed, rubbing, q, place):
     steps, moved = _solve_rows(q, jaw.compliance, contact.loads, contact.stiffness)
     size = moved / LARGEST_MOVE
     if touches and size > 1.0:
-        steps[:, 0] /= size
+        for k in range(len(steps)):
+            steps[k, 0] /= size
     nearest = _step_grid(jaw, q, moves, steps, size, contact)
     correction, modes = np.zeros(count + 2), np.zeros((count + 2, 4))
     turned = max(abs(nearest[0]), abs(nearest[1])) / LARGEST_GRID_STEP
     if size <= _CALM:
-        correction[count:] = nearest[:2]
+        correction[count], correction[count + 1] = nearest[0], nearest[1]
     size = max(size, turned)
     force, force_modes = np.zeros(3), np.zeros((3, 4))
     _hold_base(jaw, q, contact, steps, force, force_modes)
@@ -625,7 +626,8 @@ def linearize_reduced(jaw, pressed, rubbing, q, place):
             force_modes[axis, c] += steps[k, c + 1]
     if touches and size > _LARGE_STEP and correction[count] == 0.0 and correction[count + 1] == 0.0:
         share = _find_share(jaw, pressed, pose, rubbing, points, moves, q, correction)
-        correction *= share
+        for k in range(len(correction)):
+            correction[k] *= share
         for axis in range(0, 3, 2):
             force[axis] = share * force[axis] + (1.0 - share) * q[axis // 2 : count : 2].sum()
     away = nearest[2] / jaw.farthest

@@ -177,10 +177,16 @@ def _expect_weight(gravity: NDArray) -> NDArray:
 @njit(**_OPTIONS)
 def _age(information, vector, dt):
     """Returns information (7, 7) and vector (7,) a time later, when T and S have gone on at their speeds."""
-    back, kept = np.eye(len(vector)), np.exp(-dt / _AVERAGED)
+    kept = np.exp(-dt / _AVERAGED)
+    aged, later = kept * information, kept * vector
     for force in range(2):
-        back[_T + force, _UNKNOWN - 2 + force] = -dt
-    return kept * (back.T @ information @ back), kept * (back.T @ vector)
+        now, speed = _T + force, _UNKNOWN - 2 + force
+        later[speed] -= dt * later[now]
+        for i in range(len(vector)):
+            aged[i, speed] -= dt * aged[i, now]
+        for i in range(len(vector)):
+            aged[speed, i] -= dt * aged[now, i]
+    return aged, later
 
 
 @njit(**_OPTIONS)

@@ -376,8 +376,10 @@ def _find_place(contact, probe, state, frame, rules, room):
 @register_jitable(**_BOTH)
 def _keep(state, q, modes, reached, place, update):
     """Writes what the next frame starts from."""
-    state.q[:] = q
-    state.modes[:] = modes[:, :3]
+    for k in range(len(q)):
+        state.q[k] = q[k]
+        for i in range(3):
+            state.modes[k, i] = modes[k, i]
     state.motion[0], state.motion[1] = place[DEPTH], update.speed
     for i in range(3):
         state.reached[i] = reached[i]

@@ -54,7 +54,7 @@ def project_side(lens, T, side, places):
     for i in range(len(places)):
         x, z = places[i, 0], places[i, 1]
         y = side[0] + side[1] * x + side[2] * z
-        pixels[i] = project_point(
+        pixels[i, 0], pixels[i, 1] = project_point(
             lens,
             T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
             T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
@@ -99,7 +99,9 @@ def fill_between(knots, width, height, step):
     line = np.empty(knots.shape[1:], np.float32)
     for r in range(height):
         i, down = r // step, np.float32((r % step) / step)
-        line[:] = knots[i] + down * (knots[i + 1] - knots[i])
+        for j in range(len(line)):
+            for k in range(2):
+                line[j, k] = knots[i, j, k] + down * (knots[i + 1, j, k] - knots[i, j, k])
         for c in range(width):
             j, across = c // step, np.float32((c % step) / step)
             for k in range(2):
@@ -129,7 +131,8 @@ def undistort(lens, pixels, steps, tolerance):
             if change < tolerance:
                 break
         found = found and not change >= tolerance
-        rays[i] = u, v, (1.0 if np.isfinite(u) and np.isfinite(v) else np.nan)
+        rays[i, 0], rays[i, 1] = u, v
+        rays[i, 2] = 1.0 if np.isfinite(u) and np.isfinite(v) else np.nan
     return rays, found
 
 
