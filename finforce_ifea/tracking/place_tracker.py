@@ -195,6 +195,12 @@ class PlaceTracker:
         for average in (state.residuals, state.by_place, state.count):
             average[:] = 0.0
 
+    def _put_down(self) -> None:
+        """Takes the next object as one of which nothing hangs on the jaw yet: weights are those of one hold."""
+        if self.settings.held == "yes":
+            self._held.reset()
+            self.contact.rubbing.lean = 0.0
+
     def update(self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None) -> Track | None:
         """Takes the key points (K, 3) [m], NaN where unused, dt [s] after the last; None when too few agree.
 
@@ -222,6 +228,7 @@ class PlaceTracker:
         self._released = self._released + 1 if found.pressed < TOUCH_DEPTH else 0
         if self._released >= _FRAMES_RELEASED:  # the next object may be any again
             self._forget_place()
+            self._put_down()
         if found.settled and self._is_known:
             self._learn_friction(found, noise.gain, dt)
         track = self._report(found)

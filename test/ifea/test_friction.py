@@ -22,6 +22,7 @@ from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.friction_estimate import Coefficient, FrictionEstimate
+from finforce_ifea.tracking.held_weight import HeldWeight
 from finforce_ifea.tracking.place_tracker import find_upright_lean
 from finforce_ifea.tracking.slip_history import SlipHistory, leave_play
 
@@ -255,3 +256,33 @@ class TestHeld:
         along = np.array([held[number].force[2] for number in settled])
         assert np.sqrt(np.mean(along**2)) < 0.15
         assert estimator.friction == FrictionEstimate(estimator.settings, CALIBRATED).coefficient
+
+    @pytest.mark.parametrize("weight", [0.7, -0.4])
+    def test_what_hung_on_the_jaw_is_forgotten_once_it_has_let_go(self, monkeypatch, weight):
+        """A grasp is found the same after one in which something pulled along the finger and after one without."""
+        depths, moved = SMOOTH["25_lower_depth"], 1e-3 * (SMOOTH["25_lower_keypoints"] - SMOOTH["keypoints0"])
+        pressed, way = moved[np.abs(depths - 6.0).argmin()], np.linspace(0.0, 1.0, 30)[:, None, None]
+        grasp = np.concatenate([pressed * way, np.tile(pressed, (45, 1, 1)), pressed * way[::-1]])
+        points = BENCH.keypoints + np.concatenate([np.zeros((75, 15, 3)), grasp, np.zeros((30, 15, 3)), grasp])
+        points += 0.05e-3 * np.random.default_rng(3).standard_normal(points.shape)
+        contact, one = contact_with(circle(0.0125), HEIGHTS["lower"]), slice(75 + 60, 75 + 75)
+        two = slice(one.start + 135, one.stop + 135)
+
+        def weigh(held, *_):
+            held.force = weight
+
+        def find_forces():
+            estimator = JawEstimator(BENCH, calibration=CALIBRATION, settings=EstimatorSettings(held="yes"))
+            forces = []
+            for number, seen in enumerate(points):
+                if number == one.stop:
+                    monkeypatch.undo()
+                seen = Observation(stamp=PERIOD * number, points=seen, likelihood=np.ones(15))
+                forces.append(estimator.update(seen, contact).force)
+            return np.array(forces)
+
+        free = find_forces()
+        monkeypatch.setattr(HeldWeight, "_compare", weigh)
+        pulled = find_forces()
+        assert (pulled[one, 2] - free[one, 2]).mean() == pytest.approx(weight, abs=0.1)
+        np.testing.assert_allclose(pulled[two], free[two], atol=0.02)
