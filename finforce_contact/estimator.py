@@ -232,6 +232,10 @@ class ContactEstimator:
         self._counts["late pose"] += outcome == "late"
         self._counts["odd pose"] += outcome == "aside"
 
+    def carry(self, T: NDArray) -> None:
+        """Takes the jaw's own motion since the last pose: T (4, 4) leads from its frame then to its frame now."""
+        self._poses.carry(T)
+
     def update(
         self, stamp: float, surface: NDArray | None = None, wrench: tuple[NDArray, NDArray] | None = None
     ) -> ContactEstimate:

@@ -194,6 +194,7 @@ class JawContact(ContactLoop):
         self._passed: deque[PassedImage] = deque(maxlen=DEPTH)
         self._over: deque[int] = deque(maxlen=DEPTH)
         self._is_driven = False
+        self._jaw: NDArray | None = None
 
     def set_object(self, mesh: ObjectMesh | None) -> None:
         """Take another object; its pose is not known yet.
@@ -270,12 +271,29 @@ class JawContact(ContactLoop):
         """Hand poses on and update for the images that are due."""
         estimates = []
         for step in steps:
-            if step.T_jaw_object is not None:
+            T_jaw_object = self._carry(step)
+            if T_jaw_object is not None:
                 covariance = turn_covariance(step.covariance, step.T_jaw_camera)
-                self.take_pose(step.stamp, step.T_jaw_object, covariance, step.T_jaw_camera[:3, 3])
+                self.take_pose(step.stamp, T_jaw_object, covariance, step.T_jaw_camera[:3, 3])
             if step.is_due:
                 estimates += self._due(step.stamp)
         return estimates
+
+    def _carry(self, step: PoseStep) -> NDArray | None:
+        """Take the jaw's own motion; return the object's pose (4, 4), if there is one, as the jaw is now.
+
+        Between two poses of the object, which may be rare, the jaw goes on: what is known goes with the camera.
+        """
+        if self._jaw is None:
+            self._jaw = step.T_jaw_camera
+        if np.abs(step.T_jaw_camera - self._jaw).max() <= UNMOVED:
+            return step.T_jaw_object
+        motion = step.T_jaw_camera @ invert_pose(self._jaw)
+        if step.is_due:
+            self.estimator.carry(motion)
+            self._jaw = step.T_jaw_camera
+            return step.T_jaw_object
+        return None if step.T_jaw_object is None else invert_pose(motion) @ step.T_jaw_object
 
     def _due(self, stamp: int) -> list[TimedEstimate]:
         estimate = self.update(stamp)

@@ -97,6 +97,12 @@ class PoseFilter:
         self.believed = stamp
         return "used"
 
+    def carry(self, T: NDArray) -> None:
+        """Takes the motion of the frame itself: T (4, 4) leads from where it was to where it is."""
+        if self.stamp is not None:
+            self._T = T @ self._T
+            self._aside = deque(((stamp, T @ aside) for stamp, aside in self._aside), maxlen=self._aside.maxlen)
+
     def slide(self, T: NDArray, velocity: NDArray) -> None:
         """Takes an object for one that slides: this pose, the last that came, is near it, and it goes on so.
 

@@ -6,6 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from finforce_contact.estimator import blank_estimate
 from finforce_contact.jaw_contact import JawContact, PosePairing, turn_covariance
+from finforce_contact.pose.filter import PoseFilter
+from finforce_contact.settings import ContactSettings
 
 MS = 1_000_000
 FRAME = 33 * MS
@@ -117,12 +119,17 @@ class FakeEstimator:
 
     def __init__(self):
         self.poses, self.updates = [], []
+        self.filter = PoseFilter(ContactSettings())
 
     def reset(self):
         self.poses.clear()
 
+    def carry(self, T):
+        self.filter.carry(T)
+
     def take_pose(self, stamp, T_jaw_object, covariance=None, *, camera=None):
         self.poses.append((stamp, T_jaw_object, covariance, camera))
+        self.filter.update(stamp, T_jaw_object)
 
     def update(self, stamp, surface=None, wrench=None):
         self.updates.append((stamp, surface, wrench))
@@ -143,6 +150,31 @@ def test_surface_and_wrench_are_used_while_they_are_fresh(jaw):
     (_, first, pulled), (_, later, none) = jaw.estimator.updates
     assert first is surface and pulled is wrench
     assert later is None and none is None
+
+
+def test_the_object_stays_where_it_is_while_the_jaw_closes(jaw):
+    """Its pose comes once in three images; a jaw that tilts and moves by 2 mm an image meets it there."""
+    for number in range(7):
+        T_camera_jaw = moved(2e-3 * number, 0.0, 0.2, turn=(0.0, 0.0, 2e-3 * number))
+        if number % 3 == 0:
+            jaw.take_object_pose(number * FRAME, moved(0.03, 0.0, 0.24))
+        jaw.take_jaw_pose(number * FRAME, T_camera_jaw)
+        known = T_camera_jaw @ jaw.estimator.filter.at(1e-9 * number * FRAME).T
+        np.testing.assert_allclose(known[:3, 3], [0.03, 0.0, 0.24], atol=1e-9)
+
+
+def test_a_pose_that_comes_late_is_taken_as_the_jaw_is_now(jaw):
+    jaw.take_jaw_pose(0, moved(0.0, 0.0, 0.2))
+    jaw.take_jaw_pose(FRAME, moved(5e-3, 0.0, 0.2))
+    jaw.take_object_pose(0, moved(0.03, 0.0, 0.24))
+    np.testing.assert_allclose(jaw.estimator.filter.at(1e-9 * FRAME).T[:3, 3], [0.025, 0.0, 0.04], atol=1e-9)
+
+
+def test_what_a_jaw_at_rest_is_seen_to_tremble_moves_nothing(jaw):
+    jaw.take_object_pose(0, moved(0.03, 0.0, 0.24))
+    jaw.take_jaw_pose(0, moved(0.0, 0.0, 0.2))
+    jaw.take_jaw_pose(FRAME, moved(0.1e-3, 0.0, 0.2))
+    np.testing.assert_array_equal(jaw.estimator.filter.at(1e-9 * FRAME).T, moved(0.03, 0.0, 0.24 - 0.2))
 
 
 def test_the_camera_stands_where_the_jaw_sees_it(jaw):
