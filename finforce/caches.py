@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import shutil
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
 
 # Packages whose functions are compiled, and days after which what nobody has used is removed.
 _COMPILED = ("finforce", "finforce_contact", "finforce_ifea", "finforce_keypoints")
 _UNUSED = 30.0
+_ROOT = Path(__file__).parents[1]
 
 
 def cache_folder() -> Path:
@@ -31,7 +35,7 @@ def keep_compiled() -> None:
     """
     if os.environ.get("NUMBA_CACHE_DIR"):
         return
-    folder = cache_folder() / "compiled" / _name_sources(Path(__file__).parents[1])
+    folder = cache_folder() / "compiled" / _name_sources(_ROOT)
     with suppress(OSError, RuntimeError):
         if not folder.is_dir():
             folder.mkdir(parents=True, exist_ok=True)
@@ -40,6 +44,37 @@ def keep_compiled() -> None:
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(folder)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Keep other processes that lock the same file from doing the same; where locks cannot be had, all do it."""
+    with ExitStack() as stack:
+        with suppress(ImportError, OSError):
+            import fcntl
+
+            path.parent.mkdir(parents=True, exist_ok=True)
+            fcntl.flock(stack.enter_context(path.open("w")), fcntl.LOCK_EX)
+        yield
+
+
+def find_prepared() -> Path:
+    """Return the file that says that all is compiled: for these sources, processor, Python and Numba."""
+    from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+
+    features = get_host_cpu_features().flatten()
+    parts = (_name_sources(_ROOT), platform.python_version(), version("numba"), get_host_cpu_name(), features)
+    name = hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]
+    return Path(os.environ["NUMBA_CACHE_DIR"]) / f"prepared-{name}"
+
+
+def note_prepared() -> None:
+    """Note that all is compiled; a folder that cannot be written costs nothing."""
+    keep_compiled()
+    with suppress(OSError):
+        path = find_prepared()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
 
 
 def _name_sources(root: Path) -> str:

@@ -17,9 +17,9 @@ def list_tasks(jaws: Sequence[str], calibration: str) -> list[Task]:
     """Return what is to be done for jaws, by file or name; an empty calibration is none."""
     return [
         (compile_solver, ()),
-        *((build_equilibria, (jaw, calibration)) for jaw in jaws),
-        (compile_contact, ()),
         (compile_detector, ()),
+        (compile_contact, ()),
+        *((build_equilibria, (jaw, calibration)) for jaw in jaws),
     ]
 
 

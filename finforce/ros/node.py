@@ -41,6 +41,7 @@ from finforce.health import Level, Outcome, Report
 from finforce.messages import CloudColumns
 from finforce.processors import free_caller
 from finforce.ros.executor import KeepingExecutor, is_wanted  # noqa: F401 - for those who publish
+from finforce.ros.first_start import end_preparation, prepare_first_start  # noqa: F401 - for those who compile
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     KeptMessage,
     cloud_message,
@@ -445,6 +446,7 @@ def _ending_with_context() -> Iterator[None]:
     def watch() -> None:
         while not built.wait(_GLANCE):
             if not rclpy.ok():
+                end_preparation()
                 sys.stdout.flush()
                 sys.stderr.flush()
                 os._exit(0)

@@ -6,6 +6,7 @@ import argparse
 
 from tqdm import tqdm
 
+from finforce.caches import note_prepared
 from finforce_eval.preparation import list_tasks, run_tasks
 
 WORDS = {
@@ -31,3 +32,4 @@ def run(options: argparse.Namespace) -> None:
         for name in run_tasks(tasks):
             bar.update()
             bar.write(WORDS[name])
+    note_prepared()

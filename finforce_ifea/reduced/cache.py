@@ -10,8 +10,8 @@ import logging
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from weakref import WeakValueDictionary
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce.caches import cache_folder
+from finforce.caches import cache_folder, locked
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.fem.frame import FrameModel
 from finforce_ifea.fem.plane import PlaneModel
@@ -60,7 +60,7 @@ def fetch_manifold(key: str, build: Callable[[], Manifold]) -> Manifold:
     found = _read(path)
     if found is not None:
         return found
-    with _locked(path):
+    with locked(path.with_suffix(".lock")):
         found = _read(path)
         if found is None:
             found = build()
@@ -96,18 +96,6 @@ def _write(path: Path, manifold: Manifold) -> None:
         with suppress(OSError):
             part.unlink(missing_ok=True)
         _LOG.warning("the equilibria cannot be stored in %s (%s); the next start builds them anew", path.parent, error)
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Keeps other processes from building the same; where locks cannot be had, both build."""
-    with ExitStack() as stack:
-        with suppress(ImportError, OSError):
-            import fcntl
-
-            path.parent.mkdir(parents=True, exist_ok=True)
-            fcntl.flock(stack.enter_context(path.with_suffix(".lock").open("w")), fcntl.LOCK_EX)
-        yield
 
 
 def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mechanics:
