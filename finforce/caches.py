@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from importlib.metadata import version
 from pathlib import Path
 
 # Packages whose functions are compiled, and days after which what nobody has used is removed.
@@ -61,9 +60,10 @@ def locked(path: Path) -> Iterator[None]:
 def find_prepared() -> Path:
     """Return the file that says that all is compiled: for these sources, processor, Python and Numba."""
     from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+    from numba import __version__ as numba_version
 
     features = get_host_cpu_features().flatten()
-    parts = (_name_sources(_ROOT), platform.python_version(), version("numba"), get_host_cpu_name(), features)
+    parts = (_name_sources(_ROOT), platform.python_version(), numba_version, get_host_cpu_name(), features)
     name = hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]
     return Path(os.environ["NUMBA_CACHE_DIR"]) / f"prepared-{name}"
 

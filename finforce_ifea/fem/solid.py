@@ -18,7 +18,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from finforce_ifea.fem.elements import centre_gradient, elasticity_matrix, hex_stiffness, tet_stiffness
-from finforce_ifea.fem.factorisation import Factor, SparseFactor, factorise_banded, sparse_from_banded
+from finforce_ifea.fem.factorisation import Factor, SparseFactor, factorise_banded, order_unknowns, sparse_from_banded
 from finforce_ifea.fem.model import LARGEST_MOVE, Across, Linearization
 from finforce_ifea.jaw.attachment import attach_points
 from finforce_ifea.jaw.jaw_file import Material
@@ -107,24 +107,30 @@ class SolidModel:
 
     def _plan_assembly(self) -> None:
         """Prepares where each lower entry of each element matrix goes in the stored tangent."""
+        source, high, low = self._find_entries()
+        self.bandwidth = int((high - low).max())
+        self.banded = self.size * self.bandwidth**2 < self._banded_limit
+        if self.banded:
+            self._source, self._row, self._col = source, high - low, low
+            return
+        self.dof = np.append(order_unknowns(high, low, self.size), self.size)[self.dof]
+        source, high, low = self._find_entries()
+        # both triangles, column by column: the pattern stays, only values change
+        keys = np.concatenate([low * self.size + high, (high * self.size + low)[high > low]])
+        self._keys, self._slot = np.unique(keys, return_inverse=True)
+        self._source = np.concatenate([source, source[high > low]])
+        self._pointer = np.searchsorted(self._keys // self.size, np.arange(self.size + 1))
+        self._index = self._keys % self.size
+
+    def _find_entries(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Returns the lower entries of all element matrices: where they are stored there, and their two unknowns."""
         dof = self.dof[self._elements].reshape(len(self._elements), -1)
         i, j = np.nonzero(np.arange(dof.shape[1])[:, None] // 3 >= np.arange(dof.shape[1]) // 3)
         row, col = dof[:, i], dof[:, j]
         keep = (row < self.size) & (col < self.size) & ((i // 3 > j // 3) | (row >= col))
         e, entry = np.nonzero(keep)
-        high, low = np.maximum(row, col)[keep], np.minimum(row, col)[keep]
-        self.bandwidth = int((high - low).max())
-        self.banded = self.size * self.bandwidth**2 < self._banded_limit
-        self._source = (e * dof.shape[1] + i[entry]) * dof.shape[1] + j[entry]
-        if self.banded:
-            self._row, self._col = high - low, low
-            return
-        # both triangles, column by column: the pattern stays, only values change
-        keys = np.concatenate([low * self.size + high, (high * self.size + low)[high > low]])
-        self._keys, self._slot = np.unique(keys, return_inverse=True)
-        self._source = np.concatenate([self._source, self._source[high > low]])
-        self._pointer = np.searchsorted(self._keys // self.size, np.arange(self.size + 1))
-        self._index = self._keys % self.size
+        source = (e * dof.shape[1] + i[entry]) * dof.shape[1] + j[entry]
+        return source, np.maximum(row, col)[keep], np.minimum(row, col)[keep]
 
     def expand(self, q: NDArray) -> NDArray:
         """Returns the displacements (nodes, 3) [m] of all mesh nodes for unknowns q (size,)."""
@@ -159,7 +165,7 @@ class SolidModel:
     def factorise(self, tangent: NDArray | sparse.csc_matrix) -> Factor:
         """Factorises a stored tangent; Cholesky, or LU where the state is not stable or the band is wide."""
         if not self.banded:
-            return SparseFactor(tangent)
+            return SparseFactor(tangent, ordered=True)
         return factorise_banded(tangent) or SparseFactor(sparse_from_banded(tangent))
 
     def sparse_tangent(self, tangent: NDArray | sparse.csc_matrix) -> sparse.csc_matrix:

@@ -32,7 +32,7 @@ from finforce_ifea.reduced.equilibria import Manifold
 from finforce_ifea.reduced.evaluation import ReducedContact, ReducedModel, scale_manifold
 
 # To be raised when what is stored, or how it is found, changes.
-VERSION = 5
+VERSION = 6
 # What reading a damaged archive raises, one or the other by where the damage is.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, struct.error, zlib.error)
 # By name and modulus [Pa]; two jaws of a gripper are each other's mirror image, for which the equilibria are the same.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mechanics_fakes import BENCH, EDGE, TPU, bench_mechanics, block, unknowns_from_displacements, wobble
 
-from finforce_ifea.fem.factorisation import SparseFactor
+from finforce_ifea.fem.factorisation import SparseFactor, order_unknowns
 from finforce_ifea.fem.solid import SolidModel
 
 
@@ -35,6 +35,20 @@ def test_factor_solves_with_the_tangent(pressed, wide):
         b = np.random.default_rng(1).normal(size=model.size)
         left = model.sparse_tangent(tangent) @ model.factorise(tangent).solve(b) - b
         assert np.abs(left).max() < 1e-7
+
+
+def test_unknowns_are_numbered_for_little_fill_once_and_for_all(wide):
+    tangent = wide.linearize(np.zeros(wide.size)).tangent
+    numbered = SparseFactor(tangent, ordered=True)
+    # as little as an order found for this very matrix; by rows and columns of the block it is more
+    assert numbered._lu.L.nnz <= 1.02 * SparseFactor(tangent)._lu.L.nnz
+    points = np.lexsort(wide.mesh.nodes.T)
+    dof = wide.dof[points].ravel()
+    rows = np.unique(dof[dof < wide.size], return_index=True)[1]
+    by_rows = dof[dof < wide.size][np.sort(rows)]
+    assert SparseFactor(tangent[by_rows][:, by_rows].tocsc(), ordered=True)._lu.L.nnz > 1.3 * numbered._lu.L.nnz
+    place = order_unknowns(*tangent.nonzero(), wide.size)
+    assert sorted(place) == list(range(wide.size))
 
 
 def test_tangent_beyond_a_buckling_point_is_still_factorised(pressed):
