@@ -3,36 +3,39 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
 from multiprocessing import get_context
+from typing import TYPE_CHECKING
 
 from finforce.errors import MissingDependencyError
 
-Task = tuple[Callable[..., None], tuple[str, ...]]
+if TYPE_CHECKING:
+    from finforce_ifea.jaw.jaw import Jaw
+    from finforce_ifea.reduced.build import Share
 
 
-def list_tasks(jaws: Sequence[str], calibration: str) -> list[Task]:
-    """Return what is to be done for jaws, by file or name; an empty calibration is none."""
-    return [
-        (compile_solver, ()),
-        (compile_detector, ()),
-        (compile_contact, ()),
-        *((build_equilibria, (jaw, calibration)) for jaw in jaws),
-    ]
+def prepare(jaws: Sequence[str], calibration: str) -> Iterator[str]:
+    """Compile everything and build the equilibria of jaws in as many processes as there are processors.
 
+    Args:
+        jaws: files or shipped names.
+        calibration: of the fingers, a file or a shipped name; none when empty.
 
-def run_tasks(tasks: Sequence[Task]) -> Iterator[str]:
-    """Do tasks in as many processes as there are processors; yield the name of each when it is done.
+    Yields:
+        What is done.
 
     Raises:
-        FinforceError: a task ended in one.
+        FinforceError: a jaw or the calibration cannot be used.
     """
-    workers = min(len(tasks), os.cpu_count() or 1)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        running: dict[Future[None], str] = {pool.submit(work, *given): work.__name__ for work, given in tasks}
+    found = [_load(jaw, calibration) for jaw in jaws]
+    with ProcessPoolExecutor(os.cpu_count() or 1, mp_context=get_context("spawn")) as pool:
         try:
+            running = {pool.submit(work): done for work, done in COMPILED.items()}
+            for jaw in found:
+                _store_equilibria(jaw, pool.map)
+                yield f"equilibria of {jaw.name} stored"
             for future in as_completed(running):
                 future.result()
                 yield running[future]
@@ -51,16 +54,28 @@ def compile_solver() -> None:
 
 
 def build_equilibria(jaw: str, calibration: str) -> None:
-    """Build the stored equilibria of a jaw, and compile what they need.
+    """Build the stored equilibria of a jaw in this process, and compile what they need; see `prepare`."""
+    _store_equilibria(_load(jaw, calibration), map)
 
-    Raises:
-        FinforceError: the jaw or the calibration cannot be used.
-    """
-    from finforce_ifea.estimator import JawEstimator
+
+def _load(name: str, calibration: str) -> Jaw:
+    """Return a jaw with its calibration, an empty one being none; raises FinforceError where one cannot be used."""
     from finforce_ifea.jaw.calibration import load_calibration
     from finforce_ifea.jaw.jaw import load_jaw
 
-    JawEstimator(load_jaw(jaw), calibration=load_calibration(calibration) if calibration else None)
+    jaw = load_jaw(name)
+    return load_calibration(calibration).apply(jaw) if calibration else jaw
+
+
+def _store_equilibria(jaw: Jaw, share: Share) -> None:
+    """Build the stored equilibria of a jaw; of one that cannot be pressed there are none, which its solver says."""
+    from finforce_ifea.errors import ContactError
+    from finforce_ifea.mechanics import build_mechanics, choose_full
+    from finforce_ifea.reduced.cache import store_manifold
+    from finforce_ifea.settings import EstimatorSettings
+
+    with suppress(ContactError):
+        store_manifold(build_mechanics(jaw, choose_full(EstimatorSettings())), jaw, share)
 
 
 def compile_contact() -> None:
@@ -85,3 +100,11 @@ def compile_detector() -> None:
         parameters = DetectorParameters(model=str(network))
         with suppress(MissingDependencyError):  # without its library it is not used either
             build_detector(load_jaws(parameters), parameters).detector.warm_up()
+
+
+# The longest first; what equilibria need has been compiled when it is their turn.
+COMPILED = {
+    compile_solver: "solver compiled",
+    compile_detector: "detector compiled",
+    compile_contact: "contact estimator compiled",
+}

@@ -7,14 +7,7 @@ import argparse
 from tqdm import tqdm
 
 from finforce.caches import note_prepared
-from finforce_eval.preparation import list_tasks, run_tasks
-
-WORDS = {
-    "compile_solver": "solver compiled",
-    "build_equilibria": "equilibria stored",
-    "compile_contact": "contact estimator compiled",
-    "compile_detector": "detector compiled",
-}
+from finforce_eval.preparation import COMPILED, prepare
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -27,9 +20,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Compile and build under a progress bar."""
-    tasks = list_tasks(options.jaws, options.calibration)
-    with tqdm(total=len(tasks), desc="preparing", unit="part", disable=None, leave=False) as bar:
-        for name in run_tasks(tasks):
+    with tqdm(total=len(COMPILED) + len(options.jaws), desc="preparing", unit="part", disable=None, leave=False) as bar:
+        for done in prepare(options.jaws, options.calibration):
             bar.update()
-            bar.write(WORDS[name])
+            bar.write(done)
     note_prepared()

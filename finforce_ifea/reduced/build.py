@@ -3,8 +3,10 @@
 Each equilibrium comes with what loads on the rows of the jaw's inner face do to it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +98,10 @@ class Face:
             shape_compliance=self.basis.T @ responses,
         )
 
+    def describe_all(self, states: NDArray) -> list[FaceTangent]:
+        """Returns the equilibria of unknowns (n, size); see `describe`."""
+        return [self.describe(q) for q in states]
+
     def find_basis(self, states: NDArray, count: int) -> None:
         """Sets the basis to the `count` shapes that say most of equilibria (m, size) and of what loads do to them."""
         parts, largest = [], 0.0
@@ -175,24 +181,30 @@ class _Equilibrium:
     state: PressedState
 
 
-def build_manifold(mechanics: Mechanics, young_modulus: float, progress: Callable[[float], None]) -> Manifold:
+Share = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+
+
+def build_manifold(
+    mechanics: Mechanics, young_modulus: float, progress: Callable[[float], None], share: Share = map
+) -> Manifold:
     """Presses a rod into the jaw at every height and stores equilibria and compliances.
 
     Args:
         mechanics: of the jaw.
         young_modulus: of its material [Pa].
         progress: called with the share that is done.
+        share: `map`, or that of an executor of processes; the outcome is the same to rounding.
 
     Raises:
         ContactError: the jaw cannot be pressed at enough heights.
     """
-    grid = _press_everywhere(mechanics.contact, lambda share: progress(0.5 * share))
+    grid = _press_everywhere(mechanics.contact, lambda done: progress(0.5 * done), share)
     heights = _choose_rows(mechanics)
     face, parts = Face(mechanics, heights[1:]), []
     face.find_basis(grid.q.reshape(-1, grid.q.shape[-1]), SHAPES)
-    for number, row in enumerate(grid.q):
-        parts.append([face.describe(state) for state in row])
-        progress(0.5 + 0.5 * (number + 1) / len(grid.q))
+    for row in share(face.describe_all, grid.q):
+        parts.append(row)
+        progress(0.5 + 0.5 * len(parts) / len(grid.q))
     return _store(young_modulus, grid, heights, parts, face)
 
 
@@ -214,27 +226,42 @@ class _Grid:
     q: NDArray
 
 
-def _press_everywhere(contact: RollingContact, progress: Callable[[float], None]) -> _Grid:
+def _press_everywhere(contact: RollingContact, progress: Callable[[float], None], share: Share) -> _Grid:
     """Returns the equilibria under rods at all heights."""
     low, high = contact.surface.heights[[0, -1]]
-    share = np.linspace(0.0, 1.0, HEIGHTS)
-    share = share - _DENSER * np.sin(2.0 * np.pi * share) / (2.0 * np.pi)
-    heights = low + (_LOWEST + (1.0 - _TOP - _LOWEST) * share) * (high - low)
-    rods = [_Rod(contact, height) for height in heights]
-    hardest = _HARDEST * float(np.linalg.norm(rods[HEIGHTS // 2].press(np.inf)[-1].state.force))
+    place = np.linspace(0.0, 1.0, HEIGHTS)
+    place = place - _DENSER * np.sin(2.0 * np.pi * place) / (2.0 * np.pi)
+    heights = low + (_LOWEST + (1.0 - _TOP - _LOWEST) * place) * (high - low)
+    (middle,) = share(partial(_press_fully, contact), [heights[HEIGHTS // 2]])
+    hardest = _HARDEST * float(np.linalg.norm(middle.state.force))
     depths, states = [], []
-    for number, rod in enumerate(rods):
-        path, divided = rod.press(hardest), None
-        while divided is None:
-            depth = _find_depth(path, hardest)
-            divided = rod.divide(path, depth, DEPTHS)
-            path = path[: _KEPT * len(path) // 4]
-            if divided is None and not path:
-                raise ContactError(f"the jaw cannot be pressed evenly at a height of {1e3 * heights[number]:.1f} mm")
+    for depth, divided in share(partial(_press_rod, contact, hardest), heights):
         depths.append(depth)
         states.append(divided)
-        progress((number + 1) / HEIGHTS)
+        progress(len(depths) / HEIGHTS)
     return _Grid(rods=heights, depths=np.array(depths), q=np.array(states).transpose(1, 0, 2))
+
+
+def _press_fully(contact: RollingContact, height: float) -> _Equilibrium:
+    """Returns the deepest equilibrium under a rod at a height [m]."""
+    return _Rod(contact, height).press(np.inf)[-1]
+
+
+def _press_rod(contact: RollingContact, hardest: float, height: float) -> tuple[float, list[NDArray]]:
+    """Returns the largest depth [m] of a rod at one height [m], and the equilibria (T, size) that divide its path.
+
+    Raises:
+        ContactError: the jaw cannot be pressed there.
+    """
+    rod, divided = _Rod(contact, height), None
+    path = rod.press(hardest)
+    while divided is None:
+        depth = _find_depth(path, hardest)
+        divided = rod.divide(path, depth, DEPTHS)
+        path = path[: _KEPT * len(path) // 4]
+        if divided is None and not path:
+            raise ContactError(f"the jaw cannot be pressed evenly at a height of {1e3 * height:.1f} mm")
+    return depth, divided
 
 
 def _find_depth(path: list[_Equilibrium], hardest: float) -> float:

@@ -27,7 +27,7 @@ from finforce_ifea.fem.frame import FrameModel
 from finforce_ifea.fem.plane import PlaneModel
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.reduced import build as manifold_build
-from finforce_ifea.reduced.build import build_manifold, build_rest
+from finforce_ifea.reduced.build import Share, build_manifold, build_rest
 from finforce_ifea.reduced.equilibria import Manifold
 from finforce_ifea.reduced.evaluation import ReducedContact, ReducedModel, scale_manifold
 
@@ -152,7 +152,16 @@ def name_manifold(full: Mechanics, jaw: Jaw) -> str:
     return hash_parts(type(full.model).__name__, *map(str, manifold_build.GRID), *parts)
 
 
-def _build_watched(full: Mechanics, jaw: Jaw) -> Manifold:
+def store_manifold(full: Mechanics, jaw: Jaw, share: Share) -> None:
+    """Builds and stores the manifold of a jaw, unless it is stored, its work shared among processes.
+
+    Raises:
+        ContactError: The jaw cannot be pressed.
+    """
+    fetch_manifold(name_manifold(full, jaw), lambda: _build_watched(full, jaw, share))
+
+
+def _build_watched(full: Mechanics, jaw: Jaw, share: Share = map) -> Manifold:
     """Builds the manifold under a progress bar."""
     with tqdm(total=100, desc=f"equilibria of {jaw.name}, once", unit="%", disable=None, leave=False) as bar:
-        return build_manifold(full, jaw.material.young_modulus, lambda share: bar.update(int(100 * share) - bar.n))
+        return build_manifold(full, jaw.material.young_modulus, lambda done: bar.update(int(100 * done) - bar.n), share)

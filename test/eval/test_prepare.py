@@ -6,8 +6,8 @@ from textwrap import dedent
 
 import pytest
 
+from finforce_eval import preparation
 from finforce_eval.cli.main import main
-from finforce_eval.preparation import build_equilibria, compile_solver, list_tasks
 
 START = dedent("""
     from numba.core import event
@@ -60,7 +60,7 @@ GRASP = dedent("""
 def test_after_it_a_start_compiles_nothing(capsys):
     assert main(["prepare"]) == 0
     said = capsys.readouterr().out
-    assert all(word in said for word in ("solver compiled", "equilibria stored", "contact estimator", "detector"))
+    assert all(word in said for word in ("solver compiled", "equilibria of bench", "contact estimator", "detector"))
     done = subprocess.run([sys.executable, "-c", START], capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -70,11 +70,14 @@ def test_a_first_grasp_that_is_held_needs_nothing_more():
     assert done.stdout.splitlines()[-1] == "[]"
 
 
-def test_every_jaw_that_is_named_has_its_equilibria_built():
-    tasks = list_tasks(["bench", "mine.yaml"], "bench")
-    assert (build_equilibria, ("bench", "bench")) in tasks
-    assert (build_equilibria, ("mine.yaml", "bench")) in tasks
-    assert (compile_solver, ()) in tasks
+def test_every_jaw_that_is_named_has_its_equilibria_built(monkeypatch):
+    built = []
+    monkeypatch.setattr(preparation, "COMPILED", {})
+    monkeypatch.setattr(preparation, "_store_equilibria", lambda jaw, share: built.append(jaw))
+    assert list(preparation.prepare(["bench", "umi"], "")) == ["equilibria of bench stored", "equilibria of umi stored"]
+    assert [jaw.name for jaw in built] == ["bench", "umi"]
+    list(preparation.prepare(["bench"], "bench"))
+    assert built[0].material.young_modulus != built[2].material.young_modulus
 
 
 @pytest.mark.parametrize("words", [["nowhere"], ["bench", "--calibration", "nowhere"]])

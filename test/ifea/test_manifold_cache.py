@@ -1,7 +1,9 @@
 """Claims about stored equilibria of jaws on disk: built once, found again, never believed when they are not whole."""
 
 import logging
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields, replace
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from mechanics_fakes import BENCH, bench_mechanics
 
 from finforce_ifea.jaw.drawing import Drawing
 from finforce_ifea.mechanics import build_mechanics
+from finforce_ifea.reduced import build as manifold_build
 from finforce_ifea.reduced import cache as manifold_cache
 from finforce_ifea.reduced.build import build_rest
 from finforce_ifea.reduced.cache import cache_folder, fetch_manifold, hash_parts, name_manifold
@@ -157,7 +160,7 @@ def test_models_and_meshes_have_equilibria_of_their_own():
 
 
 def test_both_jaws_of_a_gripper_share_their_equilibria(folder, monkeypatch):
-    monkeypatch.setattr(manifold_cache, "build_manifold", lambda full, modulus, _: build_rest(full, modulus))
+    monkeypatch.setattr(manifold_cache, "build_manifold", lambda full, modulus, *_: build_rest(full, modulus))
     left = replace(BENCH, material=replace(BENCH.material, poisson_ratio=0.377))
     stiff = replace(left, material=replace(left.material, young_modulus=5e7))
     first, second, stiffer = (build_mechanics(jaw, COARSE) for jaw in (left, left.mirrored(), stiff))
@@ -168,3 +171,17 @@ def test_both_jaws_of_a_gripper_share_their_equilibria(folder, monkeypatch):
         stiffer.model.manifold.compliance, first.model.manifold.compliance / ratio, rtol=1e-6, atol=1e-9
     )
     assert len(list(folder.glob("*.npz"))) == 1
+
+
+def test_equilibria_are_the_same_of_one_process_and_of_two(monkeypatch):
+    monkeypatch.setattr(manifold_build, "HEIGHTS", 5)
+    full, modulus = build_mechanics(BENCH, EstimatorSettings(mesh="coarse", solver="solid")), 3e7
+    alone, told = manifold_build.build_manifold(full, modulus, lambda done: None), []
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        shared = manifold_build.build_manifold(full, modulus, told.append, pool.map)
+    for name in ("heights", "rods", "depths", "loads", "moves", "compliance"):
+        values = getattr(alone, name)  # to rounding: linear algebra's depends on where arrays lie
+        np.testing.assert_allclose(getattr(shared, name), values, rtol=0, atol=1e-6 * np.abs(values).max())
+    stretched = [manifold.shapes @ manifold.basis.T for manifold in (alone, shared)]
+    np.testing.assert_allclose(*stretched, rtol=0, atol=1e-6 * np.abs(stretched[0]).max())
+    assert told == sorted(told) and told[-1] == 1.0
