@@ -72,6 +72,12 @@ PARTS = (
     ),
     BenchPart(name="chain", module="finforce_eval.bench.chain", title="Latency against force error of the whole chain"),
     BenchPart(
+        name="start",
+        module="finforce_eval.bench.first_start",
+        title="From a node's start to its being ready, and its memory",
+        usual=False,
+    ),
+    BenchPart(
         name="onset",
         module="finforce_eval.bench.onset",
         title="From a force's onset to its showing",

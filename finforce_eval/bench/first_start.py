@@ -1,0 +1,177 @@
+"""From a node's start to its being ready, and the memory that it then has: with nothing compiled, and as ever after.
+
+The first start compiles and builds into an empty folder, which the later ones find full.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import monotonic, sleep
+from typing import IO, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from finforce.ros.transport import free_domain
+from finforce.systems.processes import PIPELINE, SINGLE_THREAD, Process, ReplayOptions, merge, replay_processes
+from finforce_eval.recordings.objects import find_mesh
+from finforce_eval.recordings.recording import DEMO, read_recording
+from finforce_eval.replay.processes import PATIENCE, ProcessError, last_words, resident_bytes
+
+READY = b" ready"  # every node says so once, when it takes messages
+LONGEST = 600.0  # [s]
+TIMES = 5
+_GLANCE = 0.005  # [s]
+IMPORT = "import time; begin = time.perf_counter(); import finforce; print(time.perf_counter() - begin)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartRow:
+    """One kind of start.
+
+    Attributes:
+        name: of the executable.
+        compiled: whether what it needs was compiled before.
+        n: starts.
+        seconds: until all its nodes were ready, median [s].
+        most: the longest [s].
+        memory_MB: resident then, median.
+    """
+
+    name: str
+    compiled: bool
+    n: int
+    seconds: float
+    most: float
+    memory_MB: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstStartFigures:
+    """What was measured; importing finforce by itself takes `import_ms`."""
+
+    rows: Sequence[StartRow]
+    import_ms: float
+
+
+def measure(quick: bool) -> FirstStartFigures:
+    """Return the times of all starts, each once when `quick`.
+
+    Raises:
+        MissingDependencyError: ROS 2 is not installed.
+        ProcessError: a node ended, or was not ready after ten minutes.
+    """
+    times, nodes = 1 if quick else TIMES, list_nodes()
+    pipeline, seen = merge(nodes), {node.executable: node for node in nodes}
+    rows = []
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        tqdm(total=1 + times * (1 + len(seen)), unit="start", disable=None, leave=False) as bar,
+    ):
+        rows.append(_start(pipeline, 1, folder, bar.update, compiled=False))
+        rows += [_start(node, times, folder, bar.update) for node in (pipeline, *seen.values())]
+    took = [float(subprocess.check_output([sys.executable, "-c", IMPORT])) for _ in range(times)]
+    return FirstStartFigures(rows=rows, import_ms=1e3 * float(np.median(took)))
+
+
+def list_nodes() -> list[Process]:
+    """Return the nodes of both jaws, from images to the grasp force, with the object of the embedded recording."""
+    options = ReplayOptions(
+        jaws="both",
+        jaw_file="bench",
+        calibration_file="bench",
+        object_mesh=str(find_mesh(read_recording(DEMO)).resolve()),
+        images=True,
+        use_sim_time=False,
+        composed=False,
+    )
+    return replay_processes(options, Path())
+
+
+def _start(
+    process: Process, times: int, folder: str, progress: Callable[[], Any], *, compiled: bool = True
+) -> StartRow:
+    """Start a process several times, one after the other, with a folder for what it keeps."""
+    surroundings = {**os.environ, **SINGLE_THREAD, "FINFORCE_CACHE": folder, "NUMBA_CACHE_DIR": ""}
+    name = "all in one process" if process.executable == PIPELINE else process.executable
+    seconds, memory = [], []
+    for _ in range(times):
+        took, taken = time_start(process.command(), count_nodes(process), surroundings)
+        seconds.append(took)
+        memory.append(1e-6 * taken)
+        progress()
+    return StartRow(
+        name=name,
+        compiled=compiled,
+        n=times,
+        seconds=float(np.median(seconds)),
+        most=max(seconds),
+        memory_MB=float(np.median(memory)),
+    )
+
+
+def count_nodes(process: Process) -> int:
+    """Return how many nodes a process has."""
+    return len(process.arguments) if process.executable == PIPELINE else 1
+
+
+def time_start(command: Sequence[str], nodes: int, surroundings: Mapping[str, str]) -> tuple[float, int]:
+    """Start a command and end it as soon as it is ready.
+
+    Args:
+        command: that runs nodes.
+        nodes: of these, how many.
+        surroundings: its environment.
+
+    Returns:
+        The time until then [s], and its resident memory [bytes].
+
+    Raises:
+        ProcessError: it ended, or was not ready after ten minutes.
+    """
+    surroundings = {**surroundings, "ROS_DOMAIN_ID": str(free_domain())}
+    with tempfile.TemporaryFile() as log:
+        begin = monotonic()
+        child = subprocess.Popen(command, env=surroundings, stdout=log, stderr=subprocess.STDOUT)
+        try:
+            while _count(log) < nodes:
+                if child.poll() is not None or monotonic() - begin > LONGEST:
+                    raise ProcessError(f"{' '.join(command[1:4])} is not ready: {last_words(log)}")
+                sleep(_GLANCE)
+            return monotonic() - begin, resident_bytes(child.pid)
+        finally:
+            for number, patience in PATIENCE:
+                child.send_signal(number)
+                try:
+                    child.wait(patience)
+                    break
+                except subprocess.TimeoutExpired:
+                    continue
+
+
+def _count(log: IO[bytes]) -> int:
+    """Return how many nodes have said in a log that they are ready."""
+    log.seek(0)
+    return sum(READY in line for line in log.read().splitlines())
+
+
+def format_table(figures: FirstStartFigures) -> str:
+    """Return the rows as a table in Markdown."""
+    lines = ["| start of | compiled | n | ready after: median/s | at most/s | memory/MB |", "|---|---|---|---|---|---|"]
+    lines += [
+        f"| {row.name} | {'before' if row.compiled else 'meanwhile'} | {row.n} | {row.seconds:.2f} | {row.most:.2f} "
+        f"| {row.memory_MB:.0f} |"
+        for row in figures.rows
+    ]
+    return "\n".join([*lines, f"`import finforce` takes {figures.import_ms:.1f} ms."])
+
+
+def as_json(figures: FirstStartFigures) -> dict[str, Any]:
+    """Return the figures as plain values."""
+    return asdict(figures)
