@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import monotonic, sleep
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -136,11 +136,12 @@ def time_start(command: Sequence[str], nodes: int, surroundings: Mapping[str, st
         ProcessError: it ended, or was not ready after ten minutes.
     """
     surroundings = {**surroundings, "ROS_DOMAIN_ID": str(free_domain())}
-    with tempfile.TemporaryFile() as log:
+    # read by its name: what it is opened with is where the child writes
+    with tempfile.NamedTemporaryFile() as log:
         begin = monotonic()
         child = subprocess.Popen(command, env=surroundings, stdout=log, stderr=subprocess.STDOUT)
         try:
-            while _count(log) < nodes:
+            while _count_ready(Path(log.name)) < nodes:
                 if child.poll() is not None or monotonic() - begin > LONGEST:
                     raise ProcessError(f"{' '.join(command[1:4])} is not ready: {last_words(log)}")
                 sleep(_GLANCE)
@@ -155,10 +156,9 @@ def time_start(command: Sequence[str], nodes: int, surroundings: Mapping[str, st
                     continue
 
 
-def _count(log: IO[bytes]) -> int:
+def _count_ready(log: Path) -> int:
     """Return how many nodes have said in a log that they are ready."""
-    log.seek(0)
-    return sum(READY in line for line in log.read().splitlines())
+    return sum(READY in line for line in log.read_bytes().splitlines())
 
 
 def format_table(figures: FirstStartFigures) -> str:
