@@ -15,7 +15,7 @@ from pathlib import Path
 # Packages whose functions are compiled, and days after which what nobody has used is removed.
 _COMPILED = ("finforce", "finforce_contact", "finforce_ifea", "finforce_keypoints")
 _UNUSED = 30.0
-_ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[1]
 
 
 def cache_folder() -> Path:
@@ -34,7 +34,7 @@ def keep_compiled() -> None:
     """
     if os.environ.get("NUMBA_CACHE_DIR"):
         return
-    folder = cache_folder() / "compiled" / _name_sources(_ROOT)
+    folder = cache_folder() / "compiled" / _name_sources(ROOT)
     with suppress(OSError, RuntimeError):
         if not folder.is_dir():
             folder.mkdir(parents=True, exist_ok=True)
@@ -59,11 +59,12 @@ def locked(path: Path) -> Iterator[None]:
 
 def find_prepared() -> Path:
     """Return the file that says that all is compiled: for these sources, processor, Python and Numba."""
-    from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+    from llvmlite.binding import get_host_cpu_name
     from numba import __version__ as numba_version
+    from numba.core.codegen import get_host_cpu_features
 
-    features = get_host_cpu_features().flatten()
-    parts = (_name_sources(_ROOT), platform.python_version(), numba_version, get_host_cpu_name(), features)
+    processor = (get_host_cpu_name(), get_host_cpu_features())
+    parts = (_name_sources(ROOT), platform.python_version(), numba_version, *processor)
     name = hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]
     return Path(os.environ["NUMBA_CACHE_DIR"]) / f"prepared-{name}"
 
@@ -75,6 +76,7 @@ def note_prepared() -> None:
         path = find_prepared()
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
+        path.with_suffix(".failed").unlink(missing_ok=True)
 
 
 def _name_sources(root: Path) -> str:

@@ -10,14 +10,17 @@ from multiprocessing import get_context
 from typing import TYPE_CHECKING
 
 from finforce.errors import MissingDependencyError
+from finforce.processors import ALL
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_ifea.reduced.build import Share
 
+_MOST = 8  # processes, each of some 300 MB
+
 
 def prepare(jaws: Sequence[str], calibration: str) -> Iterator[str]:
-    """Compile everything and build the equilibria of jaws in as many processes as there are processors.
+    """Compile everything and build the equilibria of jaws in as many processes as there are processors, up to eight.
 
     Args:
         jaws: files or shipped names.
@@ -30,12 +33,12 @@ def prepare(jaws: Sequence[str], calibration: str) -> Iterator[str]:
         FinforceError: a jaw or the calibration cannot be used.
     """
     found = [_load(jaw, calibration) for jaw in jaws]
-    with ProcessPoolExecutor(os.cpu_count() or 1, mp_context=get_context("spawn")) as pool:
+    workers = min(len(ALL) or os.cpu_count() or 1, _MOST)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         try:
             running = {pool.submit(work): done for work, done in COMPILED.items()}
             for jaw in found:
-                _store_equilibria(jaw, pool.map)
-                yield f"equilibria of {jaw.name} stored"
+                yield _store_equilibria(jaw, pool.map)
             for future in as_completed(running):
                 future.result()
                 yield running[future]
@@ -62,20 +65,28 @@ def _load(name: str, calibration: str) -> Jaw:
     """Return a jaw with its calibration, an empty one being none; raises FinforceError where one cannot be used."""
     from finforce_ifea.jaw.calibration import load_calibration
     from finforce_ifea.jaw.jaw import load_jaw
+    from finforce_ifea.settings import EstimatorSettings
 
     jaw = load_jaw(name)
-    return load_calibration(calibration).apply(jaw) if calibration else jaw
+    if not calibration:
+        return jaw
+    found = load_calibration(calibration)
+    found.expect_error(jaw, EstimatorSettings().solver)
+    return found.apply(jaw)
 
 
-def _store_equilibria(jaw: Jaw, share: Share) -> None:
-    """Build the stored equilibria of a jaw; of one that cannot be pressed there are none, which its solver says."""
+def _store_equilibria(jaw: Jaw, share: Share) -> str:
+    """Build the stored equilibria of a jaw; return what came of it."""
     from finforce_ifea.errors import ContactError
     from finforce_ifea.mechanics import build_mechanics, choose_full
     from finforce_ifea.reduced.cache import store_manifold
     from finforce_ifea.settings import EstimatorSettings
 
-    with suppress(ContactError):
+    try:
         store_manifold(build_mechanics(jaw, choose_full(EstimatorSettings())), jaw, share)
+    except ContactError as error:
+        return f"no equilibria of {jaw.name}, every step is slower: {error}"
+    return f"equilibria of {jaw.name} stored"
 
 
 def compile_contact() -> None:
@@ -102,7 +113,7 @@ def compile_detector() -> None:
             build_detector(load_jaws(parameters), parameters).detector.warm_up()
 
 
-# The longest first; what equilibria need has been compiled when it is their turn.
+# The longest first. On two processors what equilibria need has been compiled when it is their turn.
 COMPILED = {
     compile_solver: "solver compiled",
     compile_detector: "detector compiled",

@@ -5,26 +5,37 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import tempfile
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from subprocess import DEVNULL, Popen
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
-from finforce.caches import find_prepared, keep_compiled, locked
+from finforce.caches import ROOT, find_prepared, keep_compiled
 
 if TYPE_CHECKING:
     from rclpy.impl.rcutils_logger import RcutilsLogger
 
-COMMAND = (sys.executable, "-m", "finforce_eval.cli.main", "prepare", "--calibration", "bench")
-WORDS = "compiles what a first start needs, most of a minute; 'finforce prepare' does it ahead"
+# These very sources, wherever the node was started: `python -m` would look into the present folder first.
+_MAIN = """
+import sys
+root = sys.argv.pop(1)
+sys.path[:] = [*([] if root in sys.path else [root]), *filter(None, sys.path)]
+from finforce_eval.cli.main import main
+sys.exit(main())
+"""
+COMMAND = (sys.executable, "-c", _MAIN, str(ROOT), "prepare", "--once", "--calibration", "bench")
+WORDS = "waits until what a first start needs is compiled, most of a minute; 'finforce prepare' does it ahead"
+_AGAIN = 3600.0  # [s] after which what has failed is tried again
 _RUNNING: list[Popen] = []
 
 
 def prepare_first_start(log: RcutilsLogger, command: Sequence[str] = COMMAND) -> None:
     """Compile everything, unless that was done before; of several processes one does, and the others wait.
 
-    What hinders it is left to the node, which compiles by itself what it misses.
+    What hinders it is said and left to the node, which compiles by itself what it misses.
 
     Args:
         log: where it is said.
@@ -32,12 +43,14 @@ def prepare_first_start(log: RcutilsLogger, command: Sequence[str] = COMMAND) ->
     """
     keep_compiled()
     prepared = find_prepared()
-    if prepared.exists() or not _can_write(prepared.parent):
+    failed = prepared.with_suffix(".failed")
+    if prepared.exists() or _has_failed(failed) or not _can_write(prepared.parent):
         return
-    with locked(prepared.with_suffix(".lock")):
-        if not prepared.exists():
-            log.info(WORDS)
-            _run(log, command)
+    log.info(WORDS)
+    fault = _run(command)
+    if fault:
+        failed.touch()
+        log.warning(f"nothing was compiled ahead, this node compiles by itself: {fault}")
 
 
 def end_preparation() -> None:
@@ -47,22 +60,41 @@ def end_preparation() -> None:
             os.killpg(run.pid, signal.SIGKILL)
 
 
-def _run(log: RcutilsLogger, command: Sequence[str]) -> None:
-    """Run a command with all its processes in a group of their own."""
+def _run(command: Sequence[str]) -> str:
+    """Run a command with all its processes in a group of their own; return its last words where it fails."""
+    with tempfile.TemporaryFile() as said:
+        try:
+            run = Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=said, start_new_session=True)
+        except OSError as error:
+            return f"{command[0]}: {error.strerror}"
+        _RUNNING.append(run)
+        try:
+            status = run.wait()
+        except BaseException:
+            end_preparation()
+            raise
+        finally:
+            _RUNNING.remove(run)
+        return f"status {status}, {_read_last(said)}" if status else ""
+
+
+def _read_last(said: IO[bytes]) -> str:
+    """Return the last line of what was said."""
+    said.seek(0)
+    lines = said.read().decode(errors="replace").strip().splitlines()
+    return lines[-1] if lines else "without a word"
+
+
+def _has_failed(failed: Path) -> bool:
+    """Say whether it has failed of late."""
     try:
-        run = Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL, start_new_session=True)
-    except OSError as error:
-        log.warning(f"{command[0]} cannot be started ({error.strerror}): this node compiles by itself")
-        return
-    _RUNNING.append(run)
-    status = run.wait()
-    _RUNNING.remove(run)
-    if status:
-        log.warning(f"{' '.join(command)} ended with status {status}: this node compiles by itself")
+        return time.time() - failed.stat().st_mtime < _AGAIN
+    except OSError:
+        return False
 
 
 def _can_write(folder: Path) -> bool:
     """Say whether what is compiled can be kept in a folder."""
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
-    return os.access(folder, os.W_OK)
+    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)

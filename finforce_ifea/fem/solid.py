@@ -47,8 +47,9 @@ class SolidProbe:
 class SolidModel:
     """A co-rotational solid; see `finforce_ifea.fem.model.JawModel` for what its methods take and return.
 
-    The unknowns q (size,) [m] are the free nodal displacements in an order of small bandwidth. A mesh that mirrors
-    itself in y = 0 is halved unless `symmetric` is False: loads and shapes are symmetric then.
+    The unknowns q (size,) [m] are the free nodal displacements in an order of small bandwidth or, where the band is
+    wide, of little fill. A mesh that mirrors itself in y = 0 is halved unless `symmetric` is False: loads and shapes
+    are symmetric then.
     """
 
     _banded_limit = _BANDED_COST_LIMIT

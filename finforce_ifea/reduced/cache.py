@@ -25,6 +25,7 @@ from finforce.caches import cache_folder, locked
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.fem.frame import FrameModel
 from finforce_ifea.fem.plane import PlaneModel
+from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.reduced import build as manifold_build
 from finforce_ifea.reduced.build import Share, build_manifold, build_rest
@@ -142,6 +143,8 @@ def name_manifold(full: Mechanics, jaw: Jaw) -> str:
     parts = [mesh.nodes, mesh.elements, mesh.clamped, jaw.material.poisson_ratio, full.contact.face_x]
     if not full.contact.face.is_flat:
         parts.append(full.contact.face.x)
+    if isinstance(model, SolidModel):
+        parts.append(model.dof)  # the basis is numbered so
     if isinstance(model, PlaneModel):  # one for both sides
         parts[:2] = [model.plane.points, model.plane.triangles, jaw.section.width]
         parts += [jaw.section.taper] if jaw.section.taper.any() else []

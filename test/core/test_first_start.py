@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 from textwrap import dedent
 
 import pytest
@@ -39,12 +40,26 @@ def python(text):
 
 # notes that it ran, and that all is compiled, as `finforce prepare` does at its end
 WORK = """
-    import os, pathlib, time
+    import os
     from finforce import caches
-    time.sleep(0.5)
     with open(os.path.join(os.environ["NUMBA_CACHE_DIR"], "runs"), "a") as file:
         file.write("x")
     caches.note_prepared()
+"""
+# `finforce prepare --once`, with something quicker to compile
+ONCE = """
+    import os, sys, time
+    from finforce_eval import preparation
+    from finforce_eval.cli import main, prepare
+
+    def work(jaws, calibration):
+        time.sleep(1.0)
+        with open(os.path.join(os.environ["NUMBA_CACHE_DIR"], "runs"), "a") as file:
+            file.write("x")
+        return iter(())
+
+    prepare.prepare = work
+    sys.exit(main.main(["prepare", *sys.argv[1:]]))
 """
 
 
@@ -57,16 +72,22 @@ def test_only_the_first_start_compiles(folder):
 
 
 def test_of_two_processes_one_compiles_and_the_other_waits(folder):
-    start = f"""
-        import logging
-        from finforce.ros import first_start
-        first_start.prepare_first_start(logging.getLogger(), {python(WORK)!r})
-        from finforce.caches import find_prepared
-        assert find_prepared().exists()
-    """
-    running = [subprocess.Popen(python(start)) for _ in range(2)]
+    folder.mkdir()
+    running = [subprocess.Popen([*python(ONCE), "--once"]) for _ in range(2)]
     assert [process.wait(timeout=START_PATIENCE) for process in running] == [0, 0]
     assert (folder / "runs").read_text() == "x"
+    # who asks for it by hand has it done again
+    assert subprocess.run(python(ONCE), timeout=START_PATIENCE, check=False).returncode == 0
+    assert (folder / "runs").read_text() == "xx"
+
+
+def test_the_same_sources_are_compiled_wherever_a_node_is_started(folder, tmp_path, monkeypatch):
+    (tmp_path / "finforce_eval").mkdir()
+    (tmp_path / "finforce_eval" / "__init__.py").write_text("raise SystemExit('of the present folder')")
+    monkeypatch.chdir(tmp_path)
+    caches.note_prepared()
+    done = subprocess.run(first_start.COMMAND, capture_output=True, text=True, timeout=START_PATIENCE, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_another_processor_or_source_compiles_again(folder, monkeypatch):
@@ -80,12 +101,46 @@ def test_another_processor_or_source_compiles_again(folder, monkeypatch):
     assert not caches.find_prepared().exists()
 
 
-@pytest.mark.parametrize("command", [python("raise SystemExit(3)"), ("/nowhere/finforce",)])
-def test_what_fails_is_said_and_left_to_the_node(folder, command):
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        (python("raise SystemExit('no memory')"), "status 1, no memory"),
+        (python("raise SystemExit(3)"), "status 3, without a word"),
+        (("/nowhere/finforce",), "/nowhere/finforce: No such file"),
+    ],
+)
+def test_what_fails_is_said_once_and_left_to_the_node(folder, command, reason):
     log = Log()
-    first_start.prepare_first_start(log, command)
-    assert len(log.warned) == 1 and "compiles by itself" in log.warned[0]
+    for _ in range(2):
+        first_start.prepare_first_start(log, command)
+    assert len(log.warned) == 1 and "compiles by itself" in log.warned[0] and reason in log.warned[0]
     assert not caches.find_prepared().exists()
+    # after an hour, or once it was done by hand, that is forgotten
+    (failed,) = folder.glob("*.failed")
+    os.utime(failed, (time.time() - 4000.0,) * 2)
+    first_start.prepare_first_start(log, python(WORK))
+    assert caches.find_prepared().exists() and not failed.exists()
+
+
+@pytest.mark.parametrize(
+    ("module", "kind"),
+    [
+        ("finforce_ifea.node", "IfeaSolverNode"),
+        ("finforce_contact.node", "ContactEstimatorNode"),
+        ("finforce_keypoints.node", "KeypointDetectorNode"),
+        ("finforce_twin.node", "TwinCameraNode"),
+    ],
+)
+def test_every_node_that_compiles_has_it_done_ahead(probe, module, kind, monkeypatch):
+    class AskedError(Exception):
+        pass
+
+    def ask(log):
+        raise AskedError
+
+    monkeypatch.setattr("finforce.ros.node.prepare_first_start", ask)
+    with pytest.raises(AskedError):
+        getattr(import_module(module), kind)(context=probe.context)
 
 
 def test_where_nothing_can_be_kept_nothing_is_compiled_ahead(tmp_path, monkeypatch):

@@ -2,7 +2,6 @@
 
 import os
 import sys
-import time
 from textwrap import dedent
 
 import pytest
@@ -20,10 +19,9 @@ def test_a_start_lasts_until_all_nodes_are_ready():
     slow = (
         "import time; print('one ready', flush=True); time.sleep(0.4); print('two, ready', flush=True); time.sleep(99)"
     )
-    begin = time.monotonic()
     one, _ = bench.time_start(python(slow), 1, os.environ)
     two, memory = bench.time_start(python(slow), 2, os.environ)
-    assert one + 0.3 < two < time.monotonic() - begin
+    assert one + 0.3 < two < 30.0
     assert memory > 1e6
 
 

@@ -2,12 +2,16 @@
 
 import subprocess
 import sys
+from pathlib import Path
 from textwrap import dedent
 
 import pytest
 
 from finforce_eval import preparation
 from finforce_eval.cli.main import main
+from finforce_ifea.errors import ContactError
+from finforce_ifea.jaw import calibration
+from finforce_ifea.jaw.jaw import load_jaw
 
 START = dedent("""
     from numba.core import event
@@ -73,11 +77,32 @@ def test_a_first_grasp_that_is_held_needs_nothing_more():
 def test_every_jaw_that_is_named_has_its_equilibria_built(monkeypatch):
     built = []
     monkeypatch.setattr(preparation, "COMPILED", {})
-    monkeypatch.setattr(preparation, "_store_equilibria", lambda jaw, share: built.append(jaw))
-    assert list(preparation.prepare(["bench", "umi"], "")) == ["equilibria of bench stored", "equilibria of umi stored"]
+    monkeypatch.setattr(preparation, "_store_equilibria", lambda jaw, share: built.append(jaw) or jaw.name)
+    assert list(preparation.prepare(["bench", "umi"], "")) == ["bench", "umi"]
     assert [jaw.name for jaw in built] == ["bench", "umi"]
     list(preparation.prepare(["bench"], "bench"))
     assert built[0].material.young_modulus != built[2].material.young_modulus
+
+
+def test_a_jaw_that_cannot_be_pressed_is_said(monkeypatch, tmp_path):
+    def refuse(function, items):
+        raise ContactError("it gives way")
+
+    monkeypatch.setenv("FINFORCE_CACHE", str(tmp_path))
+    said = preparation._store_equilibria(load_jaw("bench"), refuse)
+    assert said == "no equilibria of bench, every step is slower: it gives way"
+
+
+def test_a_calibration_that_a_node_would_refuse_is_refused(tmp_path, capsys):
+    text = (
+        (Path(calibration.__file__).parent / "calibrations" / "bench.yaml")
+        .read_text()
+        .replace("solver: solid", "solver: paper")
+    )
+    assert "solver: paper" in text
+    (tmp_path / "paper.yaml").write_text(text)
+    assert main(["prepare", "bench", "--calibration", str(tmp_path / "paper.yaml")]) == 2
+    assert "paper" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [["nowhere"], ["bench", "--calibration", "nowhere"]])

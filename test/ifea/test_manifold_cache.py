@@ -10,6 +10,7 @@ import pytest
 from mechanics_fakes import BENCH, bench_mechanics
 
 from finforce_ifea.jaw.drawing import Drawing
+from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.reduced import build as manifold_build
 from finforce_ifea.reduced import cache as manifold_cache
@@ -173,9 +174,11 @@ def test_both_jaws_of_a_gripper_share_their_equilibria(folder, monkeypatch):
     assert len(list(folder.glob("*.npz"))) == 1
 
 
-def test_equilibria_are_the_same_of_one_process_and_of_two(monkeypatch):
+@pytest.mark.parametrize(("name", "solver"), [("bench", "solid"), ("ssg48_fin_ray_1", "plane"), ("steel", "frame")])
+def test_equilibria_are_the_same_of_one_process_and_of_two(name, solver, monkeypatch):
     monkeypatch.setattr(manifold_build, "HEIGHTS", 5)
-    full, modulus = build_mechanics(BENCH, EstimatorSettings(mesh="coarse", solver="solid")), 3e7
+    jaw = load_jaw(name)
+    full, modulus = build_mechanics(jaw, EstimatorSettings(mesh="coarse", solver=solver)), jaw.material.young_modulus
     alone, told = manifold_build.build_manifold(full, modulus, lambda done: None), []
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         shared = manifold_build.build_manifold(full, modulus, told.append, pool.map)
