@@ -59,11 +59,10 @@ def locked(path: Path) -> Iterator[None]:
 
 def find_prepared() -> Path:
     """Return the file that says that all is compiled: for these sources, processor, Python and Numba."""
-    from llvmlite.binding import get_host_cpu_name
     from numba import __version__ as numba_version
-    from numba.core.codegen import get_host_cpu_features
+    from numba.core import codegen
 
-    processor = (get_host_cpu_name(), get_host_cpu_features())
+    processor = (codegen.ll.get_host_cpu_name(), codegen.get_host_cpu_features())
     parts = (_name_sources(ROOT), platform.python_version(), numba_version, *processor)
     name = hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]
     return Path(os.environ["NUMBA_CACHE_DIR"]) / f"prepared-{name}"

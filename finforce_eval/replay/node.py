@@ -15,7 +15,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
@@ -92,7 +92,10 @@ class PlayerNode(Node):
         try:
             while (left := due - monotonic()) > 0.0:
                 self._spinner.spin_once(timeout_sec=left)
-        except ExternalShutdownException:
+        except Exception:
+            if self.context.ok():
+                raise
+            # a signal has taken the context away, between two looks at it or under the executor's hands
             raise KeyboardInterrupt from None
 
     def play(

@@ -22,6 +22,7 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay import replay as replaying
 from finforce_eval.replay.live import JawLog, ReplayLog, live_result, point_of_application
+from finforce_eval.replay.node import open_player
 
 SHIPPED = Path(replaying.__file__).parents[1] / "data" / "bench_cyl25_middle"
 MESH = SHIPPED.parent / "objects" / "cylinder_25.stl"
@@ -68,6 +69,21 @@ def test_every_image_of_a_recording_comes_back_as_a_wrench_with_its_stamp(short,
     assert case["frames"] == 120 and case["solved"] > 60
     assert 0.0 < case["step_ms"]["p50"] < 200.0
     assert "grasp_wrench" in done.stdout
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_context_that_a_signal_has_taken_away_is_no_fault(ended, monkeypatch):
+    """The middleware's own error comes where the signal falls between the look at the context and the wait."""
+    with open_player(free_domain()) as player:
+
+        def fail(**_):
+            if ended:
+                player.context.shutdown()
+            raise RuntimeError("failed to initialize wait set")
+
+        monkeypatch.setattr(player._spinner, "spin_once", fail)
+        with pytest.raises(KeyboardInterrupt if ended else RuntimeError):
+            player.spin_until(monotonic() + 1.0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
