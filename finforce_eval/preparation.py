@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, as_completed, wait
 from contextlib import suppress
 from multiprocessing import get_context
 from typing import TYPE_CHECKING
@@ -37,6 +37,7 @@ def prepare(jaws: Sequence[str], calibration: str) -> Iterator[str]:
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         try:
             running = {pool.submit(work): done for work, done in COMPILED.items()}
+            wait(running, return_when=FIRST_COMPLETED)  # else this process compiles what the first of these does
             for jaw in found:
                 yield _store_equilibria(jaw, pool.map)
             for future in as_completed(running):
@@ -113,7 +114,7 @@ def compile_detector() -> None:
             build_detector(load_jaws(parameters), parameters).detector.warm_up()
 
 
-# The longest first. On two processors what equilibria need has been compiled when it is their turn.
+# The longest first.
 COMPILED = {
     compile_solver: "solver compiled",
     compile_detector: "detector compiled",
