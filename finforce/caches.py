@@ -62,6 +62,7 @@ def find_prepared() -> Path:
     from numba import __version__ as numba_version
     from numba.core import codegen
 
+    keep_compiled()
     processor = (codegen.ll.get_host_cpu_name(), codegen.get_host_cpu_features())
     parts = (_name_sources(ROOT), platform.python_version(), numba_version, *processor)
     name = hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]
@@ -70,7 +71,6 @@ def find_prepared() -> Path:
 
 def note_prepared() -> None:
     """Note that all is compiled; a folder that cannot be written costs nothing."""
-    keep_compiled()
     with suppress(OSError):
         path = find_prepared()
         path.parent.mkdir(parents=True, exist_ok=True)

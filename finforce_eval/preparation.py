@@ -57,11 +57,6 @@ def compile_solver() -> None:
         JawEstimator(load_jaw("bench"), settings=EstimatorSettings(solver="linear", held=held)).warm_up()
 
 
-def build_equilibria(jaw: str, calibration: str) -> None:
-    """Build the stored equilibria of a jaw in this process, and compile what they need; see `prepare`."""
-    _store_equilibria(_load(jaw, calibration), map)
-
-
 def _load(name: str, calibration: str) -> Jaw:
     """Return a jaw with its calibration, an empty one being none; raises FinforceError where one cannot be used."""
     from finforce_ifea.jaw.calibration import load_calibration

@@ -13,7 +13,7 @@ from pathlib import Path
 from subprocess import DEVNULL, Popen
 from typing import IO, TYPE_CHECKING
 
-from finforce.caches import ROOT, find_prepared, keep_compiled
+from finforce.caches import ROOT, find_prepared
 
 if TYPE_CHECKING:
     from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -41,7 +41,6 @@ def prepare_first_start(log: RcutilsLogger, command: Sequence[str] = COMMAND) ->
         log: where it is said.
         command: what compiles, and notes when it is done.
     """
-    keep_compiled()
     prepared = find_prepared()
     failed = prepared.with_suffix(".failed")
     if prepared.exists() or _has_failed(failed) or not _can_write(prepared.parent):

@@ -19,7 +19,15 @@ import numpy as np
 from tqdm import tqdm
 
 from finforce.ros.transport import free_domain
-from finforce.systems.processes import PIPELINE, SINGLE_THREAD, Process, ReplayOptions, merge, replay_processes
+from finforce.systems.processes import (
+    PIPELINE,
+    SINGLE_THREAD,
+    Process,
+    ReplayOptions,
+    executables_of,
+    merge,
+    replay_processes,
+)
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.replay.processes import PATIENCE, ProcessError, last_words, resident_bytes
@@ -102,7 +110,7 @@ def _start(
     name = "all in one process" if process.executable == PIPELINE else process.executable
     seconds, memory = [], []
     for _ in range(times):
-        took, taken = time_start(process.command(), count_nodes(process), surroundings)
+        took, taken = time_start(process.command(), len(executables_of([process])), surroundings)
         seconds.append(took)
         memory.append(1e-6 * taken)
         progress()
@@ -114,11 +122,6 @@ def _start(
         most=max(seconds),
         memory_MB=float(np.median(memory)),
     )
-
-
-def count_nodes(process: Process) -> int:
-    """Return how many nodes a process has."""
-    return len(process.arguments) if process.executable == PIPELINE else 1
 
 
 def time_start(command: Sequence[str], nodes: int, surroundings: Mapping[str, str]) -> tuple[float, int]:

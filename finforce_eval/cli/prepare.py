@@ -6,7 +6,7 @@ import argparse
 
 from tqdm import tqdm
 
-from finforce.caches import find_prepared, keep_compiled, locked, note_prepared
+from finforce.caches import find_prepared, locked, note_prepared
 from finforce_eval.preparation import COMPILED, prepare
 
 
@@ -22,7 +22,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Compile and build under a progress bar; of two such commands one does, and the other waits."""
-    keep_compiled()
     prepared = find_prepared()
     with locked(prepared.with_suffix(".lock")):
         if options.once and prepared.exists():

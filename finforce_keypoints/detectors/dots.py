@@ -345,7 +345,7 @@ def _grow(pattern: _Pattern, dots: NDArray, gate: float, field: NDArray, growth:
 
 def _assign(distances: NDArray) -> tuple[NDArray, float]:
     """Return the dot of each point (n,), -1 for none, of distances (n, m) in gates, and the cost, 1 per missing dot."""
-    from scipy.optimize import linear_sum_assignment  # 16 MB that a detector with a network need not have
+    from scipy.optimize import linear_sum_assignment  # 7 MB that a detector with a network need not have
 
     count = len(distances)
     costs = np.minimum(np.nan_to_num(distances, nan=np.inf), 1.0) ** 2

@@ -53,7 +53,7 @@ GRASP = dedent("""
 
 
     preparation.compile_solver()
-    preparation.build_equilibria("bench", "bench")
+    preparation._store_equilibria(preparation._load("bench", "bench"), map)
     preparation.compile_contact()
     before = count_compiled()
     assert main(["evaluate", str(DEMO), "--contact", "estimate", "--set", "held=yes", "--engine", "sequential"]) == 0
