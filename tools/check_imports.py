@@ -7,7 +7,7 @@ import sys
 
 PACKAGES = (
     "finforce", "finforce_ifea", "finforce_contact", "finforce_keypoints", "finforce_driver", "finforce_eval",
-    "finforce_twin",
+    "finforce_sim",
 )  # fmt: skip
 
 

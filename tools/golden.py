@@ -50,14 +50,16 @@ def freeze_forces(folder: Path, bags: list[str], source: str) -> None:
 
 def freeze_stress(folder: Path) -> None:
     """Keep the figures of every stress family at seed 0."""
-    run_tool("-m", "finforce_eval.cli.main", "stress", "--seed", "0", "--count", "60", "--json", str(folder / "stress.json"))
+    run_tool(
+        "-m", "finforce_eval.cli.main", "stress", "--seed", "0", "--count", "60", "--json", str(folder / "stress.json")
+    )
 
 
 def freeze_driver(folder: Path) -> None:
     """Keep the tallies of faults between driver and gripper, alone and in grasps by force."""
     faults, grasps = str(folder / "driver_faults.json"), str(folder / "grasp_faults.json")
-    run_tool("benchmarks/driver_faults.py", "--faults", "2000", "--json", faults)
-    run_tool("benchmarks/grasp_faults.py", "--cases", "400", "--json", grasps)
+    run_tool("-m", "lab.benchmarks.driver_faults", "--faults", "2000", "--json", faults)
+    run_tool("-m", "lab.benchmarks.grasp_faults", "--cases", "400", "--json", grasps)
 
 
 def freeze_chain(folder: Path, bags: list[str]) -> None:

@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--labels", type=float, nargs="*", default=(), metavar="MM", help="displacements whose hinges may be used"
     )
     parser.add_argument("--minutes", type=float, default=6.0, help="of fine-tuning on the labels (6); 0: none")
-    parser.add_argument("--dataset", type=Path, help="shards of training.scenes, mixed in against forgetting")
+    parser.add_argument("--dataset", type=Path, help="shards of lab.training.scenes, mixed in against forgetting")
     parser.add_argument("-o", "--output", type=Path, default=Path("photographs"), help="folder of pictures and results")
     options = parser.parse_args(arguments)
     options.output.mkdir(parents=True, exist_ok=True)
@@ -212,9 +212,9 @@ def find_hinges(
 
 def refine_network(options: argparse.Namespace, jaw: Jaw, labelled: list[Photograph], place: FingerPlace) -> Path:
     """Train the network further on labelled photographs and return its folder."""
-    from training.dataset import TRAIN, FingerPictures, load_pictures
-    from training.rectification import LabelledImage, cut_picture
-    from training.refinement import refine
+    from lab.training.dataset import TRAIN, FingerPictures, load_pictures
+    from lab.training.rectification import LabelledImage, cut_picture
+    from lab.training.refinement import refine
 
     pictures = []
     for one in labelled:

@@ -13,9 +13,9 @@ NODES = {
     "keypoint_detector": "finforce_keypoints.node",
     "pipeline": "finforce.ros.composition",
     "gripper_driver": "finforce_driver.node",
-    "emulated_gripper": "finforce_driver.emulator.pty_port",
+    "emulated_gripper": "finforce_sim.emulator.pty_port",
     "recording_player": "finforce_eval.replay.node",
-    "twin_camera": "finforce_twin.node",
+    "twin_camera": "finforce_sim.node",
 }
 STOPS = (signal.SIGINT, signal.SIGTERM)
 

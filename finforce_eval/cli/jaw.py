@@ -31,8 +31,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Read a finger, say what was found, and write jaw file, section and picture."""
     from finforce_eval.errors import OptionError
-    from finforce_eval.fingers.make_jaw import make_jaw
-    from finforce_eval.fingers.recognition import Wishes
+    from finforce_ifea.jaw.cad.make_jaw import make_jaw
+    from finforce_ifea.jaw.cad.recognition import Wishes
 
     for name in ("width", "clamp", "face_x"):
         value = getattr(options, name)

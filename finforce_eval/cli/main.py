@@ -7,9 +7,12 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
+from types import ModuleType
 
 from finforce.errors import one_line
 from finforce_eval.cli.parser import Parser
+from finforce_eval.errors import OptionError
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 COMMANDS = {
@@ -36,6 +39,23 @@ COMMANDS = {
     "reconstruct": "make an object's mesh in metres, and its pose, from a masked depth image",
     "version": "print the version",
 }
+LAB = ("bench", "experiment", "stress")  # these judge the product, and are in its checkout alone
+CHECKOUT = Path(__file__).parents[2]
+
+
+def load_command(name: str) -> ModuleType:
+    """Return the module of a subcommand, from the checkout for those of the lab.
+
+    Raises:
+        OptionError: The installed package comes without the lab.
+    """
+    if name not in LAB:
+        return import_module(f"{__package__}.{name.replace('-', '_')}")
+    if not (CHECKOUT / "lab" / "cli").is_dir():
+        raise OptionError(f"finforce {name} needs a checkout of the repository: clone it and run `make bench` there")
+    if str(CHECKOUT) not in sys.path:
+        sys.path.append(str(CHECKOUT))
+    return import_module(f"lab.cli.{name}")
 
 
 def read_command(words: Sequence[str]) -> str:
@@ -50,7 +70,7 @@ def read_command(words: Sequence[str]) -> str:
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command line, with `run`, the function that carries it out."""
     command = read_command(words)
-    module = import_module(f"{__package__}.{command.replace('-', '_')}")
+    module = load_command(command)
     parser = Parser(prog=f"finforce {command}", description=COMMANDS[command])
     parser.set_defaults(run=getattr(module, "run", None))
     module.add_options(parser)

@@ -12,10 +12,10 @@ from finforce_contact.mesh.object_mesh import prepare_object_mesh
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_twin.rendering.depth_camera import build_d405
-from finforce_twin.scenes.guesses import GuessError, draw_guess, place_mesh
-from finforce_twin.scenes.objects import build_object
-from finforce_twin.scenes.pose_sequences import draw_scene
+from finforce_sim.rendering.depth_camera import build_d405
+from finforce_sim.scenes.guesses import GuessError, draw_guess, place_mesh
+from finforce_sim.scenes.objects import build_object
+from finforce_sim.scenes.pose_sequences import draw_scene
 
 JAW = load_jaw("bench")
 FACE = JAW.inner_face_x

@@ -13,8 +13,8 @@ from finforce_contact.pose.alignment import Effort, MeshAligner
 from finforce_contact.pose.depth_image import DepthImage, Samples, Visibility
 from finforce_contact.pose.tracker import spread_rotations
 from finforce_contact.settings import TrackerSettings
-from finforce_twin.rendering.depth_camera import build_d405
-from finforce_twin.scenes.objects import build_object
+from finforce_sim.rendering.depth_camera import build_d405
+from finforce_sim.scenes.objects import build_object
 
 CAMERA = build_d405(step=2)
 

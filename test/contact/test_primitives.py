@@ -11,8 +11,8 @@ from finforce_contact.reconstruction.completion import complete_surface
 from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_contact.reconstruction.primitives import HANDICAP, build_primitive, fit_primitive, spread_directions
 from finforce_contact.reconstruction.reconstruction import reconstruct
-from finforce_twin.rendering.depth_camera import build_d405
-from finforce_twin.scenes.pose_sequences import draw_scene
+from finforce_sim.rendering.depth_camera import build_d405
+from finforce_sim.scenes.pose_sequences import draw_scene
 
 
 def make_ball(radius):

@@ -20,8 +20,8 @@ from finforce_contact.reconstruction.paper_alignment import (
 from finforce_contact.reconstruction.reconstruction import reconstruct
 from finforce_contact.reconstruction.result import GeneratedMesh, ShapeScore, check_agreement, score_shape
 from finforce_contact.reconstruction.shape_search import Placement
-from finforce_twin.scenes.guesses import place_mesh
-from finforce_twin.scenes.objects import build_object
+from finforce_sim.scenes.guesses import place_mesh
+from finforce_sim.scenes.objects import build_object
 
 # at a quarter of the pixels the robust way stays below 0.4 mm; the aim at full size is 1 mm
 NEAR_MM = 0.6

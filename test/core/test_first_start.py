@@ -128,7 +128,7 @@ def test_what_fails_is_said_once_and_left_to_the_node(folder, command, reason):
         ("finforce_ifea.node", "IfeaSolverNode"),
         ("finforce_contact.node", "ContactEstimatorNode"),
         ("finforce_keypoints.node", "KeypointDetectorNode"),
-        ("finforce_twin.node", "TwinCameraNode"),
+        ("finforce_sim.node", "TwinCameraNode"),
     ],
 )
 def test_every_node_that_compiles_has_it_done_ahead(probe, module, kind, monkeypatch):

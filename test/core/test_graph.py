@@ -28,7 +28,7 @@ from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.detectors.dots import DotSettings
 from finforce_keypoints.parameters import DetectorParameters
 from finforce_keypoints.settings import DetectorSettings
-from finforce_twin.parameters import TwinParameters
+from finforce_sim.parameters import TwinParameters
 
 ROOT = Path(__file__).resolve().parents[2]
 SOLVER_PARAMETERS = {entry.name for entry in fields(NodeParameters)}

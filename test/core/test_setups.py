@@ -21,7 +21,7 @@ from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.parameters import ContactParameters
 from finforce_driver.parameters import DriverParameters
 from finforce_keypoints.parameters import DetectorParameters
-from finforce_twin.parameters import TwinParameters
+from finforce_sim.parameters import TwinParameters
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = {

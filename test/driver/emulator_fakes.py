@@ -2,7 +2,6 @@
 
 import os
 import select
-import sys
 import tty
 from collections.abc import Callable
 from pathlib import Path
@@ -16,15 +15,15 @@ from std_srvs.srv import Trigger
 from finforce_driver.can.bus import Bus, CanMessage
 from finforce_driver.can.protocol import Reply, decode_move
 from finforce_driver.can.slcan import decode_line, encode_message
-from finforce_driver.emulator.adapter import EmulatedAdapter
-from finforce_driver.emulator.faults import FaultyAdapter
-from finforce_driver.emulator.firmware import EmulatedGripper
-from finforce_driver.emulator.pty_port import PtyPort
-from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
 from finforce_driver.errors import CanMessageError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import Phase
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.faults import FaultyAdapter
+from finforce_sim.emulator.firmware import EmulatedGripper
+from finforce_sim.emulator.pty_port import PtyPort
+from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
 
 VARIANTS = ("new", "old")
 CLEAR, ESTOP, IDLE, RESET, CALIBRATE = "t0020", "t0000", "t0180", "t01C0", "t07C0"
@@ -170,7 +169,6 @@ def receive_until(bus: Bus, condition: Callable[[], bool]) -> list[CanMessage]:
 
 
 COUNT = 0.048 / 255  # [m]
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))  # for the oracle
 
 
 class Later:

@@ -3,10 +3,10 @@
 import math
 from collections import deque
 
-from finforce_driver.emulator.virtual import VirtualClock
 from finforce_driver.joint.gripper import JointGripper
 from finforce_driver.joint.settings import JointSettings
 from finforce_driver.settings import GripperSettings
+from finforce_sim.emulator.virtual import VirtualClock
 
 # As their makers and drivers have them: 85 mm and 0.8 rad in 255 steps, polled at 100 Hz; 70 mm and 1.7 rad in steps
 # of 1.5 mrad, at 30 Hz, late, and without a speed.

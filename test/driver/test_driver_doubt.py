@@ -9,7 +9,7 @@ from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, spring
 from finforce.errors import ObservationError
 from finforce.ros.messages import force_stddev
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
-from finforce_eval.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
+from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 
 
 def build(force=2.0, stddev=0.0, share=1.0, **parts):

@@ -1,12 +1,11 @@
 """Claims about the driver under random faults, against the emulator's truth."""
 
-import emulator_fakes  # noqa: F401  (finds the benchmarks)
 import pytest
-from driver_faults import FaultRun, choose_kinds
 
-from finforce_driver.emulator.faults import FaultKind
 from finforce_driver.machine.exchange import Exchange
 from finforce_driver.machine.knowledge import ReplyFilter
+from finforce_sim.emulator.faults import FaultKind
+from lab.benchmarks.driver_faults import FaultRun, choose_kinds
 
 
 def total(tally):

@@ -7,15 +7,15 @@ from itertools import count
 import numpy as np
 import pytest
 
-from finforce_driver.emulator.adapter import EmulatedAdapter
-from finforce_driver.emulator.firmware import EmulatedGripper
-from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
 from finforce_driver.errors import GraspError
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
 from finforce_driver.grasp.session import ForceInbox, hold_force
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase
 from finforce_driver.gripper import Gripper
 from finforce_driver.state import Phase
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.firmware import EmulatedGripper
+from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
 
 STIFFNESS, WIDTH, LATENCY, NOISE = 1300.0, 0.025, 0.06, 0.05
 

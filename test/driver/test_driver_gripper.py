@@ -9,14 +9,14 @@ from emulator_fakes import COUNT, VARIANTS, Rig
 
 from finforce_driver.can.protocol import Flag
 from finforce_driver.can.serial_bus import SerialBus
-from finforce_driver.emulator.adapter import EmulatedAdapter
-from finforce_driver.emulator.faults import FaultKind
-from finforce_driver.emulator.firmware import EmulatedGripper
-from finforce_driver.emulator.pty_port import PtyPort
 from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, TargetError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import MoveOutcome, Phase
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.faults import FaultKind
+from finforce_sim.emulator.firmware import EmulatedGripper
+from finforce_sim.emulator.pty_port import PtyPort
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
 

@@ -6,12 +6,12 @@ import pytest
 from emulator_fakes import VARIANTS, Rig
 
 from finforce_driver.can.protocol import Command
-from finforce_driver.emulator.faults import FaultKind
-from finforce_driver.emulator.virtual import VirtualBus
 from finforce_driver.errors import GripperStateError, LinkError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import MoveOutcome, Phase
+from finforce_sim.emulator.faults import FaultKind
+from finforce_sim.emulator.virtual import VirtualBus
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
 

@@ -6,9 +6,9 @@ import pytest
 from emulator_fakes import COUNT, VARIANTS, Rig
 
 from finforce_driver.can.protocol import Command, Flag
-from finforce_driver.emulator.faults import FaultKind
 from finforce_driver.errors import TargetError
 from finforce_driver.state import MoveOutcome, Phase
+from finforce_sim.emulator.faults import FaultKind
 
 GO = Flag.ACTIVATE | Flag.GO
 both_variants = pytest.mark.parametrize("variant", VARIANTS)

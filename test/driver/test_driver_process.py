@@ -8,9 +8,9 @@ from time import monotonic, sleep
 import pytest
 from node_fakes import START_PATIENCE, command_of, run_node, stop_when_ready
 
-from finforce_driver.emulator.adapter import EmulatedAdapter
-from finforce_driver.emulator.firmware import EmulatedGripper
-from finforce_driver.emulator.pty_port import PtyPort
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.firmware import EmulatedGripper
+from finforce_sim.emulator.pty_port import PtyPort
 
 
 def wait_for(condition):

@@ -4,10 +4,10 @@ import pytest
 from emulator_fakes import VARIANTS
 
 from finforce_driver.can.protocol import Command, Flag
-from finforce_driver.emulator.faults import FaultKind
-from finforce_driver.emulator.firmware import Fault
 from finforce_driver.errors import GripperStateError
 from finforce_driver.state import MoveOutcome, Phase
+from finforce_sim.emulator.faults import FaultKind
+from finforce_sim.emulator.firmware import Fault
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)
 LATCHED = {Fault.ESTOP_COMMAND, Fault.ESTOP_FLAG}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finforce_driver.state import Phase
-from finforce_eval.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
+from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 
 
 class FrozenSensor:

@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 
 from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.slcan import decode_line, encode_message
-from finforce_driver.emulator.adapter import EmulatedAdapter
-from finforce_driver.emulator.firmware import EmulatedGripper
 from finforce_driver.errors import TargetError
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.firmware import EmulatedGripper
 
 REPLY = b"t078400000030\r"
 POLL = b"t07A0\r"

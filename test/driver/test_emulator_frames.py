@@ -4,9 +4,9 @@ import pytest
 from emulator_fakes import CALIBRATE, CLEAR, ESTOP, IDLE, VARIANTS, Host, calibrated_host, code_of, current_of
 
 from finforce_driver.can.bus import CanMessage
-from finforce_driver.emulator.control import Endpoints, Mode, Order
-from finforce_driver.emulator.firmware import EmulatedGripper, Fault
 from finforce_driver.errors import TargetError
+from finforce_sim.emulator.control import Endpoints, Mode, Order
+from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 
 
 @pytest.fixture(params=VARIANTS)

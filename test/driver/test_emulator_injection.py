@@ -2,10 +2,10 @@ import pytest
 from emulator_fakes import VARIANTS
 
 from finforce_driver.can.bus import CanMessage
-from finforce_driver.emulator.adapter import EmulatedAdapter
-from finforce_driver.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, PlannedFault, draw_plan
-from finforce_driver.emulator.firmware import EmulatedGripper, Fault
 from finforce_driver.errors import TargetError
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, PlannedFault, draw_plan
+from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 
 REPLY = b"t078400000030\r"
 POLL = b"t07A0\r"

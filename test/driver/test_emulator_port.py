@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 import serial
 
-from finforce_driver.emulator.adapter import EmulatedAdapter
-from finforce_driver.emulator.faults import FaultKind, FaultyAdapter
-from finforce_driver.emulator.firmware import EmulatedGripper
-from finforce_driver.emulator.pty_port import PtyPort, build_adapter, build_parser, main
 from finforce_driver.errors import LinkError, TargetError
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.faults import FaultKind, FaultyAdapter
+from finforce_sim.emulator.firmware import EmulatedGripper
+from finforce_sim.emulator.pty_port import PtyPort, build_adapter, build_parser, main
 
 REPLY = b"t078400000030\r"
 POLL = b"t07A0\r"
@@ -170,7 +170,7 @@ def test_impossible_node_ends_with_one_line(capsys):
 
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT])
 def test_program_says_its_path_and_ends_cleanly(link, end):
-    command = [sys.executable, "-m", "finforce_driver.emulator", "--link", str(link)]
+    command = [sys.executable, "-m", "finforce_sim.emulator", "--link", str(link)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout.readline().strip() == str(link)

@@ -1,9 +1,9 @@
 import pytest
 from emulator_fakes import CALIBRATE, CLEAR, ESTOP, RESET, VARIANTS, Host, calibrated_host
 
-from finforce_driver.emulator.control import Mode
-from finforce_driver.emulator.firmware import Fault
-from finforce_driver.emulator.settings import EmulatorSettings
+from finforce_sim.emulator.control import Mode
+from finforce_sim.emulator.firmware import Fault
+from finforce_sim.emulator.settings import EmulatorSettings
 
 
 @pytest.fixture(params=VARIANTS)

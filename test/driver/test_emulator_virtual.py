@@ -4,11 +4,11 @@ import pytest
 from emulator_fakes import VARIANTS
 
 from finforce_driver.can.bus import CanMessage
-from finforce_driver.emulator.adapter import EmulatedAdapter
-from finforce_driver.emulator.faults import FaultKind, FaultyAdapter
-from finforce_driver.emulator.firmware import EmulatedGripper
-from finforce_driver.emulator.virtual import VirtualBus, VirtualClock
 from finforce_driver.errors import LinkError
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.faults import FaultKind, FaultyAdapter
+from finforce_sim.emulator.firmware import EmulatedGripper
+from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
 
 POLL = CanMessage(id=0x07A)
 REPLY = CanMessage(id=0x078, data=bytes.fromhex("00000030"))

@@ -13,8 +13,8 @@ from finforce_driver.grasp.session import hold_force
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
 from finforce_driver.joint.settings import JointSettings
 from finforce_driver.state import MoveOutcome, Phase
-from finforce_eval.experiments.grasp_world import TERMS, build_spring
 from finforce_ifea.relaxation import Relaxation
+from lab.experiments.grasp_world import TERMS, build_spring
 
 MAKERS = pytest.mark.parametrize("maker", [ROBOTIQ, LEROBOT], ids=["robotiq", "lerobot"])
 

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, PoseTrack, Recording, WrenchTrack, parse_phases
-from finforce_eval.stress.stress import Family, Trial, attempt
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.face import FaceLine
 from finforce_ifea.observation import Contact
+from lab.stress.stress import Family, Trial, attempt
 
 PERIOD = 33_333_333
 START = 1_000_000_000_000

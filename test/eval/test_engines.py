@@ -8,11 +8,11 @@ from test_experiments import Counting
 from finforce_eval.cli.main import main
 from finforce_eval.engine.engines import EngineOptions
 from finforce_eval.engine.tasks import Task
-from finforce_eval.experiments.experiment import run_experiment
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording
-from training.errors import DatasetError
-from training.making import make_all
+from lab.experiments.experiment import run_experiment
+from lab.training.errors import DatasetError
+from lab.training.making import make_all
 
 
 def without_times(content):

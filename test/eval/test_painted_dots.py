@@ -7,11 +7,11 @@ from rgbd_fakes import CAMERA
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import quaternion_from_pose
-from finforce_eval.bench.detection import paint_dots
 from finforce_eval.recordings.tracks import DetectionTruth, JawTrack, KeypointTrack, PoseTrack
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detectors.dots import DotSettings, find_dots
 from finforce_keypoints.images import RgbdImage
+from lab.bench.detection import paint_dots
 
 LENS = CameraIntrinsics(width=640, height=480, fx=430.0, fy=430.0, cx=319.5, cy=239.5, distortion=CAMERA.distortion)
 JAW = load_jaw("bench")

@@ -8,7 +8,6 @@ from rgbd_fakes import CAMERA, MESH, FakeGripper, FakePhotographer
 
 from finforce.gripper_frames import BENCH_CAMERA
 from finforce.messages import read_stamp
-from finforce_eval.bench.scenes import EVERY_RATE, SmoothGripper
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import IMAGE
 from finforce_eval.recordings.twin_writer import write_footage
@@ -23,8 +22,9 @@ from finforce_eval.replay.synthetic_stream import (
     thin_messages,
 )
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_twin.gripper.footage import Footage
-from finforce_twin.rendering.photographer import SceneSetting
+from finforce_sim.gripper.footage import Footage
+from finforce_sim.rendering.photographer import SceneSetting
+from lab.bench.scenes import EVERY_RATE, SmoothGripper
 
 
 def message(slot, topic="/left/keypoints"):

@@ -17,7 +17,7 @@ from finforce_eval.evaluation.tables import evaluation_json, format_sight, forma
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
 from finforce_keypoints.images import ImageWatch
-from finforce_twin.scenes.scenarios import SCENARIOS
+from finforce_sim.scenes.scenarios import SCENARIOS
 
 
 @pytest.fixture

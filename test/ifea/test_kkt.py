@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finforce_eval.stress.mechanics import KINDS, draw_program, judge_program, run_programs
-from finforce_eval.stress.stress import Plan
 from finforce_ifea import quadratic_program as program_module
 from finforce_ifea.errors import UnobservableError
 from finforce_ifea.quadratic_program import KKT_LIMIT, UNBOUNDED, solve_by_active_set, solve_program
+from lab.stress.mechanics import KINDS, draw_program, judge_program, run_programs
+from lab.stress.stress import Plan
 
 
 def enumerate_active_sets(H, g, bounded):

@@ -20,7 +20,7 @@ from finforce_keypoints.geometry.side_picture import find_side, intersect_plane
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.pixel_finder import PixelFinding
 from finforce_keypoints.settings import DetectorSettings
-from finforce_twin.rendering.depth_camera import D405_DISTORTION, DepthNoise, disturb_depth
+from finforce_sim.rendering.depth_camera import D405_DISTORTION, DepthNoise, disturb_depth
 
 STRIDE = 8
 LOCREF_STD = 7.2801

@@ -11,8 +11,8 @@ from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import DetectorParameters
-from finforce_twin.gripper.footage import build_footage
-from finforce_twin.scenes.scenarios import build_scenario
+from finforce_sim.gripper.footage import build_footage
+from finforce_sim.scenes.scenarios import build_scenario
 
 IMAGES = 16  # half a second: what is said by then is said within three
 

@@ -8,7 +8,7 @@ from finforce_keypoints.geometry import jaw_localizer as reference_patch
 from finforce_keypoints.geometry.jaw_localizer import TEMPLATE_IMAGES, ReferencePatch, build_matcher
 from finforce_keypoints.geometry.jaw_pose import Origin
 from finforce_keypoints.geometry.side_picture import find_side, intersect_plane
-from finforce_twin.rendering.depth_camera import build_d405_vga
+from finforce_sim.rendering.depth_camera import build_d405_vga
 
 CAMERA = build_d405_vga()
 RNG = np.random.default_rng(3)

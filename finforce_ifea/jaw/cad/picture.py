@@ -1,0 +1,135 @@
+"""The picture of a recognized finger: its section with all that was found, and the finger in three dimensions."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.jaw.cad.proposal import Proposal
+from finforce_ifea.jaw.cad.recognition import RecognizedFinger, find_reach
+from finforce_ifea.jaw.mesh import VolumeMesh
+from finforce_ifea.jaw.section import order_rings
+
+_VIEW, _LIGHT, _PIXELS = np.array([0.75, 1.0, 0.35]), np.array([0.9, 0.5, 0.6]), 900
+_MATERIAL, _HELD, _INNER, _OUTER, _RIB = "#d9dee6", "#8a93a3", "#c0392b", "#2d6cb5", "#3a8f4d"
+
+
+def draw_finger(finger: RecognizedFinger, proposal: Proposal, mesh: VolumeMesh, path: Path) -> None:
+    """Draw a finger into a PNG file.
+
+    Args:
+        finger: what was recognized.
+        proposal: key points, candidates, reference point.
+        mesh: of the jaw, for the preview.
+        path: of the picture.
+    """
+    from matplotlib.figure import Figure
+
+    size = np.array([np.ptp(np.array(finger.polygon.exterior.coords)[:, 0]), finger.length])
+    figure = Figure(figsize=(13.0, 9.0), layout="constrained")
+    flat = figure.add_subplot(1, 2, 1)
+    solid = figure.add_subplot(1, 2, 2)
+    _draw_section(flat, finger)
+    _draw_walls(flat, finger)
+    _draw_points(flat, finger, proposal, size)
+    flat.set(xlabel="x / mm, towards the object", ylabel="z / mm, base to tip", aspect="equal")
+    widths = finger.read_width(np.array(finger.polygon.exterior.coords))
+    flat.set_title(f"{proposal.name}: {1e3 * size[0]:.1f} x {_say(widths)} x {1e3 * size[1]:.1f} mm")
+    flat.legend(loc="upper left", fontsize=8, framealpha=0.9)
+    _draw_solid(solid, mesh)
+    figure.savefig(path, dpi=110)
+
+
+def _draw_section(axes, finger: RecognizedFinger) -> None:
+    """Draw the material, and what is clamped in a darker tone."""
+    from matplotlib.patches import Circle, PathPatch
+    from matplotlib.path import Path as Curve
+
+    vertices, codes = [], []
+    for ring in order_rings(finger.polygon):
+        vertices.append(1e3 * np.vstack([ring, ring[:1]]))
+        codes.append(np.r_[Curve.MOVETO, np.full(len(ring) - 1, Curve.LINETO), Curve.CLOSEPOLY])
+    curve = Curve(np.concatenate(vertices), np.concatenate(codes))
+    patch = PathPatch(curve, facecolor=_MATERIAL, edgecolor="black", linewidth=0.7)
+    axes.add_patch(patch)
+    bounds = 1e3 * np.array(finger.polygon.bounds)
+    held = axes.axhspan(bounds[1] - 1.0, 1e3 * finger.clamped_z, facecolor=_HELD, label="clamped")
+    held.set_clip_path(patch)
+    for x, z, radius in 1e3 * finger.clamped_circles:
+        around = axes.add_patch(Circle((x, z), radius, facecolor=_HELD))
+        around.set_clip_path(patch)
+    margin = 0.06 * (bounds[3] - bounds[1])
+    axes.set_xlim(bounds[0] - 3.0 * margin, bounds[2] + 3.0 * margin)
+    axes.set_ylim(bounds[1] - margin, bounds[3] + margin)
+
+
+def _draw_walls(axes, finger: RecognizedFinger) -> None:
+    """Draw the centre lines with their thickness."""
+    for wall, colour, name in ((finger.inner, _INNER, "inner band"), (finger.outer, _OUTER, "outer band")):
+        free = wall.line[:, 1] > finger.clamped_z
+        label = f"{name}, {_say(wall.thickness[free])} mm"
+        axes.plot(*(1e3 * wall.line[free].T), color=colour, linewidth=1.2, label=label)
+    for number, rib in enumerate(finger.ribs):
+        ends = 1e3 * np.array([rib.inner, rib.outer])
+        label = f"{len(finger.ribs)} ribs, {_say([rib.wall.usual for rib in finger.ribs])} mm"
+        axes.plot(*ends.T, color=_RIB, linewidth=1.2, label=None if number else label)
+
+
+def _say(values) -> str:
+    low, high = 1e3 * np.percentile(values, [5, 95]) if len(values) else (np.nan, np.nan)
+    return f"{low:.2f}" if high - low < 0.1 else f"{low:.2f} to {high:.2f}"
+
+
+def _draw_points(axes, finger: RecognizedFinger, proposal: Proposal, size: NDArray) -> None:
+    """Draw key points with their names, candidates, reference point and bolts."""
+    points = 1e3 * np.array(list(proposal.keypoints.values()))
+    axes.plot(points[:, 0], points[:, 2], "o", color="black", markersize=5, label=f"{len(points)} key points")
+    middle = float(np.mean(points[:, 0]))
+    for name, (x, _, z) in zip(proposal.keypoints, points, strict=True):
+        right = name.startswith("inner") or (name == "tip" and x >= middle)
+        axes.annotate(
+            name,
+            (x, z),
+            xytext=(7 if right else -7, 0),
+            textcoords="offset points",
+            ha="left" if right else "right",
+            va="center",
+            fontsize=7,
+        )
+    first, step, count = proposal.candidates
+    heights = 1e3 * (first + step * np.arange(count))
+    axes.plot(
+        [1e3 * find_reach(finger.polygon, 1e-3 * height) for height in heights],
+        heights,
+        "<",
+        color=_INNER,
+        markersize=4,
+        label=f"{count} contact candidates",
+    )
+    axes.plot(*(1e3 * proposal.reference[[0, 2]]), "+", color="black", markersize=11, label="reference point")
+    for x, z, radius in 1e3 * finger.bolts:
+        axes.annotate(f"Ø{2.0 * radius:.2f}", (x, z), ha="center", va="center", fontsize=6)
+
+
+def _draw_solid(axes, mesh: VolumeMesh) -> None:
+    """Draw a mesh as seen from the camera's side, lit from there; parallel rays find what is in front."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(mesh.nodes.astype(np.float32), mesh.surface.astype(np.uint32))
+    view = _VIEW / np.linalg.norm(_VIEW)
+    right = np.cross([0.0, 0.0, 1.0], view)
+    right = right / np.linalg.norm(right)
+    up = np.cross(view, right)
+    flat = np.stack([mesh.nodes @ right, mesh.nodes @ up], axis=1)
+    low, high = flat.min(axis=0) - 1e-3, flat.max(axis=0) + 1e-3
+    step = (high - low).max() / _PIXELS
+    across, along = (np.arange(low[k], high[k], step) for k in (0, 1))
+    starts = across[None, :, None] * right + along[::-1, None, None] * up + 0.5 * view
+    rays = np.concatenate([starts, np.broadcast_to(-view, starts.shape)], axis=2).astype(np.float32)
+    hits = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays)))
+    normals, seen = hits["primitive_normals"].numpy(), np.isfinite(hits["t_hit"].numpy())
+    light = 0.35 + 0.6 * np.clip(normals @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0, 1.0)
+    picture = np.where(seen[:, :, None], light[:, :, None] * np.array([0.87, 0.9, 1.0]), 1.0)
+    axes.imshow(picture, extent=1e3 * np.array([low[0], high[0], low[1], high[1]]), interpolation="bilinear")
+    axes.set_axis_off()

@@ -1,0 +1,203 @@
+"""What the firmware does in its control loop: moves and their object code, and the calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from finforce_sim.emulator.mechanism import Jaws
+from finforce_sim.emulator.settings import Firmware
+
+AT_POSITION = 3  # object code
+_SLOWEST, _SPEED_RANGE = 40, 79960  # [ticks/s] of the speed bytes 0 and 255
+_LARGEST = 255
+
+
+class Mode(Enum):
+    """What the control loop does."""
+
+    IDLE = 0
+    GRIPPER = 6
+    CALIBRATE = 7
+
+
+def divide(dividend: int, divisor: int) -> int:
+    """Return an integer quotient, truncated towards zero as in C."""
+    quotient = abs(dividend) // abs(divisor)
+    return quotient if (dividend < 0) == (divisor < 0) else -quotient
+
+
+@dataclass
+class Endpoints:
+    """Encoder counts that the firmware takes for the end stops; before a calibration they are mere defaults."""
+
+    open: int = 10329
+    closed: int = -229
+
+    def target(self, position: int) -> int:
+        """Return the count of a position byte."""
+        return divide(position * (self.closed - self.open), _LARGEST) + self.open
+
+    def position(self, count: int) -> int:
+        """Return the position byte of a count; 0 where calibration found no way between the stops."""
+        if self.closed == self.open:
+            return 0
+        return min(max(divide((count - self.open) * _LARGEST, self.closed - self.open), 0), _LARGEST)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """The five bytes of a move.
+
+    Attributes:
+        position: 0 open to 255 closed.
+        speed: 0 to 255.
+        current: limit [mA], as it came: signed.
+        flags: activate 0x80, action 0x40, emergency stop 0x20.
+    """
+
+    position: int = 0
+    speed: int = 0
+    current: int = 0
+    flags: int = 0
+
+    @classmethod
+    def read(cls, data: bytes) -> Order:
+        """Return the order in five bytes."""
+        return cls(
+            position=data[0], speed=data[1], current=int.from_bytes(data[2:4], "big", signed=True), flags=data[4]
+        )
+
+    @property
+    def activated(self) -> bool:
+        """Return whether the power stage may move the jaws."""
+        return bool(self.flags & 0x80)
+
+    @property
+    def action(self) -> bool:
+        """Return whether to go to the position."""
+        return bool(self.flags & 0x40)
+
+    @property
+    def estop(self) -> bool:
+        """Return whether it asks for an emergency stop."""
+        return bool(self.flags & 0x20)
+
+    @property
+    def ticks_per_second(self) -> float:
+        """Return the commanded speed [ticks/s]."""
+        return float(_SLOWEST + divide(self.speed * _SPEED_RANGE, _LARGEST))
+
+
+class MoveControl:
+    """Follows the last order, and remembers having reached its target until another order comes.
+
+    Attributes:
+        order: the last five bytes.
+        object_code: 0 moving, 1 and 2 contact, 3 at position.
+        latched: the target was reached; what follows is position control without a speed.
+    """
+
+    def __init__(self, firmware: Firmware) -> None:
+        self._firmware = firmware
+        self.order = Order()
+        self.object_code = AT_POSITION
+        self.latched = False
+
+    def take(self, order: Order) -> None:
+        """Follow an order; the same one again changes nothing, not even after an interruption."""
+        if order != self.order:
+            self.latched = False
+        self.order = order
+
+    def step(self, jaws: Jaws, endpoints: Endpoints, position: int, may_move: bool) -> None:
+        """Go on for one step.
+
+        Args:
+            jaws: to move.
+            endpoints: that the orders are meant in.
+            position: the present position byte.
+            may_move: calibrated, and configured as a gripper.
+        """
+        if not (may_move and self.order.activated and self.order.action):
+            jaws.rest()
+            if self._firmware.tick_tolerance:  # older ones keep the last code
+                self.object_code = 0
+            return
+        target = endpoints.target(self.order.position)
+        self.latched = self.latched or self._reached(jaws, target, position)
+        if self.latched:
+            self.object_code = AT_POSITION
+            jaws.hold(target, self.order.current)
+            return
+        error = target - jaws.encoder
+        # byte equality may want one tick more than the target, and the sign of the speed is kept there
+        reach = abs(error) + (0 if self._firmware.tick_tolerance else 1)
+        speed = self.order.ticks_per_second
+        jaws.drive(speed if error > 0 else -speed, self.order.current, reach)
+        self.object_code = self._contact_code(jaws)
+
+    def _reached(self, jaws: Jaws, target: int, position: int) -> bool:
+        if self._firmware.tick_tolerance:
+            return abs(target - jaws.encoder) < self._firmware.tick_tolerance
+        return position == self.order.position
+
+    def _contact_code(self, jaws: Jaws) -> int:
+        if abs(jaws.velocity) > self._firmware.contact_speed or not self._strains(abs(jaws.current)):
+            return 0
+        return self._firmware.opening_code if jaws.current > 0.0 else self._firmware.closing_code
+
+    def _strains(self, current: float) -> bool:
+        if self._firmware.contact_ratio:
+            return current > self._firmware.contact_ratio * self.order.current
+        return abs(current - self.order.current) <= self._firmware.contact_margin
+
+
+class FirmwareCalibration:
+    """Looks for the open stop, then for the closed one; an abort leaves it where it was.
+
+    Attributes:
+        finished: the last step completed it.
+        failed: the last step gave it up.
+    """
+
+    _PAUSE = 20  # [ms] between the two ways
+
+    def __init__(self, firmware: Firmware) -> None:
+        self._firmware = firmware
+        self._restart()
+        self.finished = self.failed = False
+
+    def step(self, jaws: Jaws, endpoints: Endpoints) -> None:
+        """Go on for one step, and write found stops into `endpoints`."""
+        self.finished = self.failed = False
+        self._elapsed += 1
+        if self._open_found and self._pause == 0:
+            self.finished = self._seek(jaws, -1.0)
+            if self.finished:
+                endpoints.closed = jaws.encoder
+        elif self._open_found:
+            self._pause -= 1
+            jaws.drive(0.0, 0.0)
+        elif self._seek(jaws, 1.0):
+            endpoints.open = jaws.encoder
+            self._open_found = True
+        self.failed = not self.finished and self._elapsed >= self._firmware.calibration_timeout
+        if self.finished or self.failed:
+            self._restart()
+
+    def _seek(self, jaws: Jaws, direction: float) -> bool:
+        """Drive towards a stop and return whether it was felt for long enough."""
+        firmware = self._firmware
+        jaws.drive(direction * firmware.calibration_speed, firmware.calibration_current)
+        strains = abs(abs(jaws.current) - firmware.calibration_current) <= firmware.calibration_margin
+        self._felt = self._felt + 1 if strains and abs(jaws.velocity) <= 700.0 else 0
+        if self._felt < firmware.confirm_time:
+            return False
+        self._felt = 0
+        return True
+
+    def _restart(self) -> None:
+        self._open_found = False
+        self._pause = self._PAUSE
+        self._elapsed = self._felt = 0

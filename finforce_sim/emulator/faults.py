@@ -1,0 +1,269 @@
+"""What can go wrong on the way to a gripper and in it, injected by name or by a seeded plan."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from random import Random
+
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.errors import TargetError
+from finforce_sim.emulator import broken_lines
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.firmware import Fault
+
+_LINE = re.compile(rb"[^\r\a]*[\r\a]")  # of the adapter
+_COMMAND = re.compile(rb"[^\r]*\r|[^\r]+")  # of the host
+_MESSAGE_LINES = (b"t", b"r")
+
+
+class FaultKind(Enum):
+    """What can be injected: the first ones spoil lines of the adapter, the others happen on the bus or the gripper."""
+
+    LOST = "lost"
+    LATE = "late"
+    DOUBLED = "doubled"
+    BELL = "bell"
+    SPLIT = "split"
+    GARBAGE = "garbage"
+    TRUNCATED = "truncated"
+    WRONG_LENGTH = "wrong length"
+    FOREIGN = "foreign node"
+    HEARTBEAT = "heartbeat"
+    FLIPPED = "flipped digit"
+    STALE_CODE = "stale code"
+    REQUEST_LOST = "request lost"
+    BLIP = "contact blip"
+    REBOOT = "reboot"
+    OVERHEATED = "overheated"
+    SUPPLY = "supply"
+    ENCODER = "encoder"
+    WATCHDOG = "watchdog"
+    SLIPPING = "calibration time-out"
+    STUCK = "stuck position"
+    UNPLUGGED = "unplugged"
+    OTHER_MASTER = "other master"
+
+
+LINE_FAULTS: dict[FaultKind, Callable[[bytes, Random], broken_lines.Pieces]] = {
+    FaultKind.LOST: broken_lines.lose,
+    FaultKind.LATE: broken_lines.delay,
+    FaultKind.DOUBLED: broken_lines.double,
+    FaultKind.BELL: broken_lines.refuse,
+    FaultKind.SPLIT: broken_lines.split,
+    FaultKind.GARBAGE: broken_lines.litter,
+    FaultKind.TRUNCATED: broken_lines.truncate,
+    FaultKind.WRONG_LENGTH: broken_lines.change_length,
+    FaultKind.FOREIGN: broken_lines.intersperse_foreign,
+    FaultKind.HEARTBEAT: broken_lines.intersperse_heartbeat,
+    FaultKind.FLIPPED: broken_lines.flip,
+    FaultKind.STALE_CODE: broken_lines.set_stale_code,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedFault:
+    """One fault to come.
+
+    Attributes:
+        time: when it is injected, on the adapter's clock [s].
+        kind: what it is.
+        count: lines that it spoils in a row, for the kinds that spoil lines.
+        duration: for which it lasts, for the kinds that end again [s].
+    """
+
+    time: float
+    kind: FaultKind
+    count: int = 1
+    duration: float = 0.5
+
+
+def draw_plan(
+    seed: int, count: int, period: float, kinds: Sequence[FaultKind] = tuple(FaultKind)
+) -> list[PlannedFault]:
+    """Return `count` random faults, one in each `period` [s], the same ones for the same seed."""
+    random = Random(seed)
+    return [
+        PlannedFault(
+            time=(index + random.random()) * period,
+            kind=random.choice(kinds),
+            count=random.choice((1, 1, 1, 2, 3, 8)),
+            duration=random.uniform(0.05, 1.0),
+        )
+        for index in range(count)
+    ]
+
+
+class FaultyAdapter:
+    """An adapter with faults: those of a plan as time passes, and those injected at once.
+
+    Attributes:
+        adapter: the sound one within.
+        injected: all faults so far with their times [s].
+    """
+
+    def __init__(self, adapter: EmulatedAdapter, plan: Sequence[PlannedFault] = (), seed: int = 0) -> None:
+        """Wrap an adapter.
+
+        Args:
+            adapter: a sound one.
+            plan: faults to come.
+            seed: of the details: where a line is cut, which digit flips.
+        """
+        self.adapter = adapter
+        self.injected: list[PlannedFault] = []
+        self._plan = deque(sorted(plan, key=lambda fault: fault.time))
+        self._random = Random(seed)
+        self._armed: deque[FaultKind] = deque()
+        self._requests_to_lose = 0
+        self._output: deque[tuple[float, bytes]] = deque()
+        self._lasting: dict[FaultKind, tuple[float, Callable[[], None]]] = {}
+        gripper = adapter.gripper
+        self._happenings: dict[FaultKind, Callable[[PlannedFault], None]] = {
+            FaultKind.REQUEST_LOST: self._lose_requests,
+            FaultKind.BLIP: lambda _fault: gripper.blip(),
+            FaultKind.REBOOT: lambda _fault: gripper.reboot(),
+            FaultKind.OVERHEATED: lambda fault: self._hold(fault, gripper.protection, "temperature", 91.0),
+            FaultKind.SUPPLY: lambda fault: self._hold(fault, gripper.protection, "voltage", 8.2),
+            FaultKind.ENCODER: lambda fault: self._hold(fault, gripper.protection, "magnet", False),
+            FaultKind.WATCHDOG: lambda _fault: gripper.faults.add(Fault.WATCHDOG),
+            FaultKind.SLIPPING: lambda fault: self._hold(fault, gripper.jaws, "slips", True),
+            FaultKind.STUCK: lambda fault: self._hold(fault, gripper, "configured", False),
+            FaultKind.UNPLUGGED: self._unplug,
+            FaultKind.OTHER_MASTER: self._command_otherwise,
+        }
+
+    @property
+    def plugged(self) -> bool:
+        """Return whether the host sees the adapter."""
+        return self.adapter.plugged
+
+    @property
+    def has_output(self) -> bool:
+        """Return whether bytes wait for the host."""
+        return bool(self._output) or self.adapter.has_output
+
+    @property
+    def pending(self) -> bool:
+        """Return whether a fault is armed or lasts."""
+        return bool(self._armed or self._lasting or self._requests_to_lose or self._output)
+
+    def inject(self, kind: FaultKind, count: int = 1, duration: float = 0.5) -> None:
+        """Inject a fault at once, or into the next lines.
+
+        Args:
+            kind: what happens.
+            count: lines that it spoils in a row.
+            duration: after which it ends [s], where it ends by itself.
+
+        Raises:
+            TargetError: count or duration is not positive.
+        """
+        if count < 1 or not duration > 0.0:
+            raise TargetError(f"fault {kind.value}: got count {count}, duration {duration}, expected positive ones")
+        fault = PlannedFault(time=self.adapter.now, kind=kind, count=count, duration=duration)
+        self.injected.append(fault)
+        if kind in LINE_FAULTS:
+            self._armed.extend([kind] * count)
+        else:
+            self._happenings[kind](fault)
+
+    def heal(self) -> None:
+        """End all that lasts and disarm the rest; what the gripper has latched stays latched."""
+        self._armed.clear()
+        self._requests_to_lose = 0
+        self._end_lasting(math.inf)
+
+    def unplug(self) -> None:
+        """Take the adapter off the host."""
+        self._output.clear()
+        self.adapter.unplug()
+
+    def replug(self) -> None:
+        """Plug the adapter in again, closed."""
+        self.adapter.replug()
+
+    def write(self, data: bytes) -> None:
+        """Take bytes from the host, whole lines of which may get lost."""
+        if not self._requests_to_lose:
+            self.adapter.write(data)
+            return
+        for line in _COMMAND.findall(data):
+            if self._requests_to_lose and line[:1] in _MESSAGE_LINES:
+                self._requests_to_lose -= 1
+            else:
+                self.adapter.write(line)
+
+    def read(self) -> bytes:
+        """Return the bytes for the host that are due."""
+        data = self.adapter.read()
+        if self._armed or self._output:
+            for line in _LINE.findall(data):
+                self._spoil(line)
+            data = b""
+            while self._output and self._output[0][0] <= self.adapter.now + 1e-9:
+                data += self._output.popleft()[1]
+        return data
+
+    def step(self, dt: float) -> None:
+        """Let `dt` [s] pass, inject what the plan holds and end what lasted long enough."""
+        self.adapter.step(dt)
+        now = self.adapter.now
+        while self._plan and self._plan[0].time <= now:
+            fault = self._plan.popleft()
+            self.inject(fault.kind, fault.count, fault.duration)
+        if self._lasting:
+            self._end_lasting(now)
+
+    def _spoil(self, line: bytes) -> None:
+        """Queue a line, spoiled if a fault is armed and the line is a message; later ones wait for it."""
+        pieces: broken_lines.Pieces = [(0.0, line)]
+        if self._armed and line[:1] in _MESSAGE_LINES:
+            pieces = LINE_FAULTS[self._armed.popleft()](line, self._random)
+        time = self.adapter.now
+        for delay, data in pieces:
+            time += delay
+            self._output.append((time, data))
+
+    def _hold(self, fault: PlannedFault, owner: object, name: str, value: object) -> None:
+        """Set an attribute for the duration of a fault."""
+        before = getattr(owner, name)
+        setattr(owner, name, value)
+        self._end_later(fault, lambda: setattr(owner, name, before))
+
+    def _end_later(self, fault: PlannedFault, end: Callable[[], None]) -> None:
+        """Plan the end of a fault; one that lasts already lasts longer, and ends as it would have."""
+        until = self.adapter.now + fault.duration
+        if fault.kind in self._lasting:
+            earlier, end = self._lasting[fault.kind]
+            until = max(until, earlier)
+        self._lasting[fault.kind] = (until, end)
+
+    def _end_lasting(self, now: float) -> None:
+        for kind in [kind for kind, (until, _) in self._lasting.items() if until <= now]:
+            _, end = self._lasting.pop(kind)
+            end()
+
+    def _lose_requests(self, fault: PlannedFault) -> None:
+        self._requests_to_lose += fault.count
+
+    def _unplug(self, fault: PlannedFault) -> None:
+        self.unplug()
+        self._end_later(fault, self.replug)
+
+    def _command_otherwise(self, _fault: PlannedFault) -> None:
+        """Let another master move, stop, clear or switch off the gripper."""
+        node = self.adapter.gripper.node_id << 7
+        position = self._random.randrange(256)
+        commands = [
+            CanMessage(id=node | 0x7A, data=bytes([position, 50, 0x01, 0xF4, 0xC0])),
+            CanMessage(id=node | 0x7A, data=bytes([position, 50, 0x01, 0xF4, 0x00])),
+            CanMessage(id=node | 0x00),
+            CanMessage(id=node | 0x02),
+            CanMessage(id=node | 0x18),
+        ]
+        self.adapter.put_on_bus(self._random.choice(commands))

@@ -1,0 +1,398 @@
+"""The gripper's controller: CAN messages in, messages out, in steps of a millisecond; faults that it latches."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+
+from finforce_driver.can.bus import CanMessage
+from finforce_driver.errors import TargetError
+from finforce_sim.emulator.conduct import list_violations
+from finforce_sim.emulator.control import Endpoints, FirmwareCalibration, Mode, MoveControl, Order
+from finforce_sim.emulator.mechanism import STEP, Jaws
+from finforce_sim.emulator.settings import VARIANTS, EmulatorSettings, StoredConfiguration
+
+_REPLY, _ORDER = 60, 61
+_FIFO = 3  # messages that the CAN controller keeps while the firmware is busy
+_ADVISED_BURST = 2
+
+
+class EmulatedGripper:
+    """An SSG-48 on its own clock.
+
+    What it does follows the maker's firmware to the byte; `violations` counts what a careful driver never sends.
+
+    Attributes:
+        jaws: mechanism with the truth: opening, object, wall, load.
+        protection: temperature, supply, encoder and the latched faults.
+        node_id: on the CAN bus.
+        mode: of the control loop.
+        calibrated: whether the firmware believes in its end stops.
+        configured: as a gripper; else it calibrates, but never moves nor changes its position byte.
+        heartbeat_period: [ms]; 0: none.
+        violations: of good practice by name.
+    """
+
+    def __init__(
+        self,
+        variant: str = "new",
+        node_id: int = 0,
+        object_opening: float | None = None,
+        load: Callable[[float], float] | None = None,
+        settings: EmulatorSettings | None = None,
+    ) -> None:
+        """Make a gripper that has been powered for long.
+
+        Args:
+            variant: "new" or "old" firmware.
+            node_id: on the CAN bus, 0 to 15.
+            object_opening: at which a rigid object stops the closing jaws [m].
+            load: elastic grip force [N] of what is between the jaws at an opening [m].
+            settings: of build and environment.
+
+        Raises:
+            TargetError: there is no such variant or node.
+        """
+        if variant not in VARIANTS:
+            raise TargetError(f"variant: got {variant!r}, expected one of {', '.join(VARIANTS)}")
+        if not 0 <= node_id <= 15:
+            raise TargetError(f"node_id: got {node_id!r}, expected 0 to 15")
+        self.variant = variant
+        self.settings = settings or EmulatorSettings()
+        self.jaws = Jaws(self.settings)
+        self.jaws.object_opening, self.jaws.load = object_opening, load
+        self.protection = Protection(self.settings.supply_limit)
+        self.violations: Counter[str] = Counter()
+        self.configured = True
+        self._firmware = VARIANTS[variant]
+        self._stored = StoredConfiguration(node_id=node_id)
+        self._steps = self._deaf_until = self._last_sent = 0
+        self._rest = 0.0
+        self._blip_until = self._received = 0
+        self._blip_current = 0.0
+        self._orders = self._list_orders()
+        self._questions = self._list_questions()
+        self._power_up()
+
+    @property
+    def now(self) -> float:
+        """Return the gripper's own time [s]."""
+        return self._steps * STEP
+
+    @property
+    def booting(self) -> bool:
+        """Return whether it is deaf and mute because it boots or writes its configuration."""
+        return self._steps < self._deaf_until
+
+    @property
+    def true_opening(self) -> float:
+        """Return the true opening between the undeformed inner faces [m]."""
+        return self.jaws.opening
+
+    @property
+    def ticks(self) -> int:
+        """Return the encoder's count [ticks]."""
+        return self.jaws.encoder
+
+    @property
+    def faults(self) -> set[Fault]:
+        """Return what is latched."""
+        return self.protection.faults
+
+    @property
+    def order(self) -> Order:
+        """Return the last order of five bytes."""
+        return self._control.order
+
+    @property
+    def object_code(self) -> int:
+        """Return the firmware's own object code: 0 moving, 1 and 2 contact, 3 at position."""
+        return self._control.object_code
+
+    @property
+    def reported_current(self) -> int:
+        """Return the current as it is reported [mA]."""
+        current = self._blip_current if self._steps < self._blip_until else self.jaws.current
+        return max(min(int(current), 0x7FFF), -0x8000)
+
+    def step(self, dt: float = STEP) -> list[CanMessage]:
+        """Go on for `dt` [s] in whole milliseconds, keeping the rest; return the heartbeats sent meanwhile."""
+        self._rest += dt
+        self._received = 0
+        count = int(self._rest / STEP + 1e-6)
+        self._rest -= count * STEP
+        heartbeats = []
+        for _ in range(count):
+            self._step_once()
+            if self.heartbeat_period and self._steps - self._last_sent >= self.heartbeat_period and not self.booting:
+                heartbeats.append(self._send(9, b""))
+        return heartbeats
+
+    def handle(self, message: CanMessage) -> list[CanMessage]:
+        """Take a message from the bus and return the answers."""
+        if self.booting or (message.id >> 7) & 0xF != self.node_id:
+            return []
+        self._received += 1
+        if self._received > _ADVISED_BURST:
+            self.violations["burst"] += 1
+        if self._received > _FIFO:
+            return []
+        command = (message.id >> 1) & 0x3F
+        if message.remote:
+            if command not in self._questions:
+                return []
+            self.protection.feed()
+            return [self._send(command, self._questions[command]())]
+        if command == _ORDER:
+            return [self._take_order(message.data)]
+        if command in self._orders:
+            self._orders[command](message.data)
+        return []
+
+    def reboot(self) -> None:
+        """Reset: silence while booting, then the state after power-up; whole encoder turns are lost."""
+        self._power_up()
+        self.jaws.reset_encoder()
+        self._deaf_until = self._steps + round(self.settings.boot_time / STEP)
+
+    def blip(self, duration: float = 0.01) -> None:
+        """Report contact with a high current for some time [s], as can happen at the start of a move."""
+        closes = self.endpoints.target(self.order.position) < self.jaws.encoder
+        self._blip_current = (-0.9 if closes else 0.9) * abs(self.order.current)
+        self._blip_until = self._steps + round(duration / STEP)
+
+    def _list_orders(self) -> dict[int, Callable[[bytes], None]]:
+        """Return what obeys the commands that nothing answers."""
+        return {
+            0: self._take_estop,
+            1: self._clear_errors,
+            2: self._feed_watchdog,
+            4: self._feed_watchdog,
+            11: self._set_node,
+            12: self._go_idle,
+            13: self._save,
+            14: lambda _data: self.reboot(),
+            15: self._set_watchdog,
+            30: self._set_heartbeat,
+            62: self._start_calibration,
+        }
+
+    def _list_questions(self) -> dict[int, Callable[[], bytes]]:
+        """Return what answers the remote messages."""
+        answers: dict[int, Callable[[], bytes]] = {
+            10: lambda: b"",
+            23: lambda: struct.pack(">h", self.protection.reported_temperature),
+            24: lambda: struct.pack(">H", round(1000.0 * self.protection.voltage)),
+            25: lambda: struct.pack(">BBBi", 1, 1, 101, 48),
+            26: lambda: self.protection.error_bytes,
+            27: lambda: struct.pack(">h", self.reported_current),
+            28: lambda: struct.pack(">ii", self.jaws.encoder, round(self.jaws.velocity)),
+        }
+        if self._firmware.has_torque_constant:
+            answers[33] = lambda: struct.pack(">f", 0.325)
+        return answers
+
+    def _power_up(self) -> None:
+        self.node_id = self._stored.node_id
+        self.heartbeat_period = self._stored.heartbeat
+        self.protection.restart()
+        self.protection.watchdog_period = self._stored.watchdog
+        self.calibrated = False
+        self.mode = Mode.IDLE
+        self.endpoints = Endpoints()
+        self._control = MoveControl(self._firmware)
+        self._calibration = FirmwareCalibration(self._firmware)
+        self._position = self.endpoints.position(self.jaws.encoder) if self.configured else 0
+        self._last_sent = self._steps
+
+    def _step_once(self) -> None:
+        self._steps += 1
+        if self.booting and self.mode is Mode.IDLE:
+            self.jaws.rest()
+            return
+        if self.protection.step():
+            self.mode = Mode.IDLE
+        if self.configured:
+            self._position = self.endpoints.position(self.jaws.encoder)
+        if self.mode is Mode.GRIPPER:
+            self._control.step(self.jaws, self.endpoints, self._position, self.calibrated and self.configured)
+        elif self.mode is Mode.CALIBRATE:
+            self._calibrate()
+        else:
+            self.jaws.rest()
+
+    def _calibrate(self) -> None:
+        self._calibration.step(self.jaws, self.endpoints)
+        if self._calibration.finished or self._calibration.failed:
+            self.calibrated = self._calibration.finished
+            self.mode = Mode.IDLE
+
+    def _send(self, command: int, data: bytes) -> CanMessage:
+        self._last_sent = self._steps
+        return CanMessage(id=(self.node_id & 0xF) << 7 | command << 1 | bool(self.faults), data=data)
+
+    def _take_order(self, data: bytes) -> CanMessage:
+        if len(data) in (0, 5):
+            self.protection.feed()
+        if len(data) == 5:
+            order = Order.read(data)
+            self.violations.update(list_violations(order, self._control, self.mode))
+            if self.settings.resets_integrators:
+                self.jaws.current = 0.0
+            self._control.take(order)
+            self.protection.estop_flag = order.estop
+            if not self.faults:
+                self.mode = Mode.GRIPPER
+        return self._send(_REPLY, self._reply())
+
+    def _reply(self) -> bytes:
+        code = self._control.object_code
+        if self._steps < self._blip_until:
+            code = self._firmware.closing_code if self._blip_current < 0.0 else self._firmware.opening_code
+        status = (
+            0x80 * self.order.activated
+            | 0x40 * self.order.action
+            | 0x20 * (code & 1)
+            | 0x10 * (code >> 1)
+            | self.protection.reply_bits
+            | self.calibrated
+        )
+        return struct.pack(">BhB", self._position, self.reported_current, status)
+
+    def _take_estop(self, _data: bytes) -> None:
+        self.faults.add(Fault.ESTOP_COMMAND)
+
+    def _clear_errors(self, _data: bytes) -> None:
+        self.faults.clear()
+        self.mode = Mode.IDLE
+
+    def _feed_watchdog(self, _data: bytes) -> None:
+        self.violations["raw motor command"] += 1
+        self.protection.feed()
+
+    def _go_idle(self, _data: bytes) -> None:
+        self.mode = Mode.IDLE
+
+    def _start_calibration(self, data: bytes) -> None:
+        if not data:
+            self.mode = Mode.CALIBRATE
+
+    def _set_node(self, data: bytes) -> None:
+        if len(data) == 1:
+            if data[0] > 15:
+                self.violations["node id out of range"] += 1
+            self.node_id = data[0]
+
+    def _set_watchdog(self, data: bytes) -> None:
+        if len(data) == self._firmware.watchdog_length:
+            self.protection.watchdog_period = int.from_bytes(data[:4], "big", signed=True)
+            self.protection.feed()
+
+    def _set_heartbeat(self, data: bytes) -> None:
+        if len(data) == 4:
+            self.heartbeat_period = max(int.from_bytes(data, "big", signed=True), 0)
+
+    def _save(self, _data: bytes) -> None:
+        watchdog = self.protection.watchdog_period
+        self._stored = StoredConfiguration(node_id=self.node_id, watchdog=watchdog, heartbeat=self.heartbeat_period)
+        self._deaf_until = self._steps + round(self.settings.save_time / STEP)
+
+
+_COLDEST, _HOTTEST = -20.0, 75.0  # [deg C] of the motor
+_LEAST_SUPPLY = 9.0  # [V]
+
+
+class Fault(Enum):
+    """What can be latched."""
+
+    TEMPERATURE = "temperature"
+    ENCODER = "encoder"
+    SUPPLY = "supply"
+    ESTOP_COMMAND = "estop command"
+    ESTOP_FLAG = "estop flag"
+    WATCHDOG = "watchdog"
+    MOTOR_UNCALIBRATED = "motor uncalibrated"
+
+
+_FIRST_BYTE = {Fault.TEMPERATURE: 0x40, Fault.ENCODER: 0x20, Fault.SUPPLY: 0x10, Fault.ESTOP_COMMAND: 0x01}
+
+
+@dataclass
+class Protection:
+    """The environment that the firmware watches, and what it has latched.
+
+    Attributes:
+        supply_limit: above which the supply is a fault [V].
+        temperature: of the motor [deg C].
+        thermistor: whether it is enabled; else the firmware says 23 deg C and watches nothing.
+        voltage: of the supply [V].
+        magnet: whether the encoder sees its magnet.
+        motor_calibrated: whether the motor itself was ever calibrated.
+        estop_flag: of the last order; it latches its fault again and again.
+        watchdog_period: longest silence [ms]; 0: any.
+        faults: that are latched.
+    """
+
+    supply_limit: float
+    temperature: float = 26.0
+    thermistor: bool = True
+    voltage: float = 24.0
+    magnet: bool = True
+    motor_calibrated: bool = True
+    estop_flag: bool = False
+    watchdog_period: int = 0
+    faults: set[Fault] = field(default_factory=set)
+    silence: int = 0
+
+    def feed(self) -> None:
+        """Restart the watchdog."""
+        self.silence = 0
+
+    def restart(self) -> None:
+        """Forget what does not outlive a reset."""
+        self.faults = set()
+        self.estop_flag = False
+        self.silence = 0
+
+    def step(self) -> bool:
+        """Watch for one millisecond and return whether a fault is latched."""
+        self.silence += 1
+        if self.watchdog_period > 0 and self.silence >= self.watchdog_period:
+            self.faults.add(Fault.WATCHDOG)
+        if self.thermistor and not _COLDEST <= self.temperature <= _HOTTEST:
+            self.faults.add(Fault.TEMPERATURE)
+        if not _LEAST_SUPPLY <= self.voltage <= self.supply_limit:
+            self.faults.add(Fault.SUPPLY)
+        if not self.magnet:
+            self.faults.add(Fault.ENCODER)
+        if self.estop_flag:
+            self.faults.add(Fault.ESTOP_FLAG)
+        if not self.motor_calibrated:
+            self.faults.add(Fault.MOTOR_UNCALIBRATED)
+        return bool(self.faults)
+
+    @property
+    def reply_bits(self) -> int:
+        """Return the fault bits of the gripper's reply."""
+        faults = self.faults
+        return (
+            0x08 * (Fault.TEMPERATURE in faults)
+            | 0x04 * (Fault.WATCHDOG in faults)
+            | 0x02 * (Fault.ESTOP_FLAG in faults)
+        )
+
+    @property
+    def error_bytes(self) -> bytes:
+        """Return the two bytes of the error state."""
+        first = 0x80 * bool(self.faults)
+        for fault in self.faults:
+            first |= _FIRST_BYTE.get(fault, 0)
+        return bytes([first, 0x80 * self.motor_calibrated | 0x20 * (Fault.WATCHDOG in self.faults)])
+
+    @property
+    def reported_temperature(self) -> int:
+        """Return what the firmware says of the temperature [deg C]."""
+        return round(self.temperature) if self.thermistor else 23

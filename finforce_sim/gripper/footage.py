@@ -1,0 +1,261 @@
+"""A scenario as its wrist camera and an object tracker would record it, image by image, ready for messages."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from finforce.camera import CameraIntrinsics
+from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, HALF_TURN, ROBOT_CAMERA
+from finforce.stamps import NANOSECONDS
+from finforce.transforms import invert_pose
+from finforce_sim.errors import ScenarioError
+from finforce_sim.gripper.gripper import TwinGripper, TwinState
+from finforce_sim.mechanics.assembly import Assembly
+from finforce_sim.rendering.bodies import DrawnJaw
+from finforce_sim.rendering.depth_camera import D405, LENSES, build_d405_vga
+from finforce_sim.rendering.photographer import Photographer, SceneSetting, Shot
+from finforce_sim.scenes.scenarios import Scenario
+
+FINGER = 0  # seed of the material for which the package has a calibration, `twin`
+START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
+TRACKING_PERIOD = 0.1  # [s]; in the first image of each the object is tracked
+POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
+ANGLE_STDDEV = np.radians(0.3)  # about each axis
+CAMERAS = {
+    "robot": ROBOT_CAMERA,
+    "turned": ROBOT_CAMERA @ HALF_TURN,
+    "front": FRONT_CAMERA,
+    "bench": BENCH_CAMERA,
+}
+LEAST_SIZE, LARGEST_SIZE = 16, 4096  # [px]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrueJaw:
+    """The truth about one jaw in one image.
+
+    Attributes:
+        T_camera_jaw: (4, 4).
+        points: key points (K, 3) [m], jaw frame.
+        pixels: (K, 2) column and row in the raw image [px].
+        visible: (K,) bool.
+        force: (3,) [N] that the object applies to the jaw, jaw frame.
+        torque: (3,) [N m] about the origin of the jaw frame.
+    """
+
+    T_camera_jaw: NDArray
+    points: NDArray
+    pixels: NDArray
+    visible: NDArray
+    force: NDArray
+    torque: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TwinFrame:
+    """One image and all that is recorded with it.
+
+    Attributes:
+        stamp: image time [ns].
+        phase: as in `/bench/phase`.
+        color: (h, w, 3) uint8 RGB.
+        depth: (h, w) float32 [m], NaN invalid.
+        jaws: by side.
+        T_camera_object: (4, 4) as a tracker measures it; None where it did not, or without an object.
+    """
+
+    stamp: int
+    phase: str
+    color: NDArray
+    depth: NDArray
+    jaws: Mapping[str, TrueJaw]
+    T_camera_object: NDArray | None
+
+
+class RenderedGripper(Protocol):
+    """What is rendered; `TwinGripper` is one."""
+
+    def __len__(self) -> int:
+        """Return the number of states."""
+
+    def states(self) -> Iterator[TwinState]:
+        """Yield the states, always from the beginning."""
+
+
+class MountedCamera(Protocol):
+    """What renders; `Photographer` is one."""
+
+    def shoot(self, state: TwinState) -> Shot:
+        """Return the image of a state."""
+
+
+class Footage:
+    """The images of a gripper; every iteration takes them anew and the same.
+
+    Attributes:
+        camera: intrinsics.
+        T_gripper_camera: (4, 4).
+        mesh: of the object in its own frame; None without one.
+        depth_step: of the depth images [m].
+
+    Args:
+        gripper: what is rendered.
+        photographer: that renders it.
+        setting: what stands before the camera, and where the camera is.
+        seed: of the object tracker's noise.
+    """
+
+    def __init__(self, gripper: RenderedGripper, photographer: MountedCamera, setting: SceneSetting, seed: int) -> None:
+        self._gripper, self._photographer, self._seed = gripper, photographer, seed
+        self.camera, self.T_gripper_camera, self.mesh = setting.camera, setting.T_gripper_camera, setting.mesh
+        self.depth_step = setting.depth_step
+
+    def __len__(self) -> int:
+        return len(self._gripper)
+
+    def __iter__(self) -> Iterator[TwinFrame]:
+        rng = np.random.default_rng((self._seed, 3))
+        T_camera_gripper = invert_pose(self.T_gripper_camera)
+        last = -1
+        for state in self._gripper.states():
+            period = int(state.stamp / TRACKING_PERIOD + 1e-5)
+            tracked = state.T_gripper_object is not None and period > last
+            last = period if tracked else last
+            shot = self._photographer.shoot(state)
+            yield TwinFrame(
+                stamp=START + round(state.stamp * NANOSECONDS),
+                phase=state.phase,
+                color=shot.color,
+                depth=shot.depth,
+                jaws={side: true_jaw(state, shot, side) for side in state.jaws},
+                T_camera_object=disturb_pose(T_camera_gripper @ state.T_gripper_object, rng) if tracked else None,
+            )
+
+
+def build_footage(
+    scenario: Scenario,
+    seed: int,
+    camera: CameraIntrinsics | None = None,
+    *,
+    finger: int = FINGER,
+    depth_step: float = 1e-3,
+) -> Footage:
+    """Return the footage of a scenario.
+
+    Args:
+        scenario: what happens, in which light, before which camera.
+        seed: of textures, light and noise.
+        camera: intrinsics; those of a D405 at 640 x 480 when absent.
+        finger: seed of the jaws' material; what shows the same finger can share a calibration.
+        depth_step: of the depth images [m].
+
+    Raises:
+        FinforceError: the scenario's object or jaw cannot be used, or a library is missing.
+    """
+    gripper = TwinGripper(scenario, finger)
+    setting = set_stage(gripper, camera or build_d405_vga(), depth_step)
+    return Footage(gripper, Photographer(setting, seed), setting, seed)
+
+
+def set_stage(assembly: Assembly, camera: CameraIntrinsics, depth_step: float) -> SceneSetting:
+    """Return jaws and object before the scenario's camera, with depth images in steps [m]."""
+    return SceneSetting(
+        shapes={
+            side: DrawnJaw(jaw=jaw, rest=assembly.rest_vertices(side), triangles=assembly.triangles(side))
+            for side, jaw in assembly.jaws.items()
+        },
+        mesh=assembly.object_mesh,
+        camera=camera,
+        T_gripper_camera=CAMERAS[assembly.scenario.camera],
+        light=assembly.scenario.light,
+        readout=assembly.scenario.readout,
+        depth_step=depth_step,
+    )
+
+
+def parse_size(text: str, lens: str = D405) -> CameraIntrinsics:
+    """Return a colour camera with images of a size such as 640x480.
+
+    The lens stays: other sizes are those of the 640 x 480 image scaled to the width and cut, or extended, about its
+    principal point.
+
+    Raises:
+        ScenarioError: the text is no size, or there is no such lens.
+    """
+    if lens not in LENSES:
+        raise ScenarioError(f"lens {lens!r}: expected one of {', '.join(LENSES)}")
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    width, height = (int(number) for number in found.groups()) if found else (0, 0)
+    if not (LEAST_SIZE <= width <= LARGEST_SIZE and LEAST_SIZE <= height <= LARGEST_SIZE):
+        raise ScenarioError(f"size {text!r}: expected WIDTHxHEIGHT, each {LEAST_SIZE} to {LARGEST_SIZE} pixels")
+    plain = LENSES[lens]
+    scale = width / plain.width
+    shift = 0.5 * (height - scale * plain.height)
+    return replace(
+        plain,
+        width=width,
+        height=height,
+        fx=scale * plain.fx,
+        fy=scale * plain.fy,
+        cx=scale * (plain.cx + 0.5) - 0.5,
+        cy=scale * (plain.cy + 0.5) - 0.5 + shift,
+    )
+
+
+def true_jaw(state: TwinState, shot: Shot, side: str) -> TrueJaw:
+    """Return the truth about a jaw, without its reference point."""
+    truth, jaw = shot.truth[side], state.jaws[side]
+    return TrueJaw(
+        T_camera_jaw=truth.T_camera_jaw,
+        points=truth.points[:-1],
+        pixels=truth.pixels[:-1],
+        visible=truth.visible[:-1],
+        force=jaw.force,
+        torque=jaw.torque,
+    )
+
+
+def disturb_pose(T: NDArray, rng: np.random.Generator) -> NDArray:
+    """Return a pose (4, 4) as a tracker measures it."""
+    measured = T.copy()
+    measured[:3, :3] = Rotation.from_rotvec(rng.normal(0.0, ANGLE_STDDEV, 3)).as_matrix() @ T[:3, :3]
+    measured[:3, 3] += rng.normal(0.0, POSITION_STDDEV, 3)
+    return measured
+
+
+FARTHEST = 65535.0  # steps in 16 bits
+
+
+def encode_depth(depth: NDArray, step: float = 1e-3) -> NDArray[np.uint16]:
+    """Return a depth image (h, w) [m] in steps [m], 0 where it is NaN or too far for 16 bits."""
+    steps = np.round(np.nan_to_num(np.asarray(depth, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0) / step)
+    return np.where((steps > 0.0) & (steps <= FARTHEST), steps, 0.0).astype(np.uint16)
+
+
+def info_fields(camera: CameraIntrinsics) -> dict[str, Any]:
+    """Return the numbers of a sensor_msgs/CameraInfo: size, model, d, k, r, p."""
+    k = np.array([camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0])
+    p = np.array([camera.fx, 0.0, camera.cx, 0.0, 0.0, camera.fy, camera.cy, 0.0, 0.0, 0.0, 1.0, 0.0])
+    return {
+        "height": camera.height,
+        "width": camera.width,
+        "distortion_model": camera.model,
+        "d": np.array(camera.distortion, dtype=np.float64),
+        "k": k,
+        "r": np.eye(3).ravel(),
+        "p": p,
+    }
+
+
+def detection_truth_columns(jaw: TrueJaw) -> dict[str, NDArray]:
+    """Return the columns of a cloud of true key points: x y z [m] jaw frame, u v [px], visible."""
+    columns = {axis: jaw.points[:, i].astype(np.float32) for i, axis in enumerate("xyz")}
+    columns |= {name: jaw.pixels[:, i].astype(np.float32) for i, name in enumerate("uv")}
+    return {**columns, "visible": jaw.visible.astype(np.uint8)}

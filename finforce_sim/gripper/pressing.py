@@ -1,0 +1,196 @@
+"""A grasp as a function of the jaws' opening, solved once and then read off.
+
+The opening w is the gap between the undeformed inner faces; a jaw's origin is at w / 2 + inner_face_x from the middle.
+A bench has one jaw, which stands where the object of two jaws would meet it: the object comes by half the closing.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.grasp_force import Wrench
+from finforce_ifea.jaw.drawing import MeshDensity
+from finforce_sim.errors import BalanceError, ScenarioError
+from finforce_sim.gripper.footage import FINGER
+from finforce_sim.gripper.gripper import JawState, TwinState
+from finforce_sim.mechanics.assembly import Assembly, RelaxedWrench
+from finforce_sim.mechanics.pressed_jaw import TWIN_DENSITY, JawShape
+from finforce_sim.scenes.scenarios import Posture, Scenario
+
+STEP = 1e-4  # [m] of each jaw from one solved grasp to the next
+JAMMED = 5e4  # [N/m] of opening, by which the force grows where jaws find no equilibrium any more
+_DOWN = np.array([0.0, 0.0, 1.0])
+
+
+class PressedGrasp:
+    """A scenario's jaws and object, shut as far as one likes; no weight is lifted and nothing slides.
+
+    Attributes:
+        assembly: the jaws and the object.
+        touch_opening: at which the object just fits [m]; -inf without an object.
+        least_opening: down to which the grasp is solved [m]; below it the jaws jam.
+    """
+
+    def __init__(
+        self, scenario: Scenario, seed: int = FINGER, density: MeshDensity | str = TWIN_DENSITY, step: float = STEP
+    ) -> None:
+        """Solves the grasp from first touch on, until the jaws' faces would meet or no equilibrium is left.
+
+        Args:
+            scenario: jaws, object and where it lies.
+            seed: of the material.
+            density: of the jaws' meshes, where they are drawings.
+            step: of each jaw from one solved grasp to the next [m], at most.
+
+        Raises:
+            FinforceError: The scenario's object or jaw cannot be used.
+            BalanceError: The jaws cannot shut on the object at all.
+        """
+        self.assembly = assembly = Assembly(scenario, seed, density)
+        self._reach = assembly.touch_origin - assembly.inner_face_x  # of each jaw, from touch to closed
+        solved = _solve_grasps(assembly, step)
+        self._closings = np.array([one.closing for one in solved])
+        self._places = np.array([one.x for one in solved])
+        self._tables = {side: _stack_shapes([one.shapes[side] for one in solved]) for side in assembly.jaws}
+        sizes = np.array([np.linalg.norm(table.force, axis=1) for table in self._tables.values()])
+        self._forces = sizes.min(axis=0)
+        is_empty = assembly.object_mesh is None
+        self.touch_opening = -np.inf if is_empty else 2.0 * self._reach
+        self.least_opening = 0.0 if is_empty else float(2.0 * (self._reach - self._closings[-1]))
+
+    def closing_at(self, opening: float) -> float:
+        """Returns how far each jaw is beyond first touch [m] at an opening [m], negative before."""
+        return self._reach - 0.5 * opening
+
+    def elastic_force(self, opening: float) -> float:
+        """Returns the grasp force [N] at an opening [m] before anything relaxes: that of the jaw pressed less."""
+        if not opening < self.touch_opening:
+            return 0.0
+        jammed = JAMMED * max(self.least_opening - opening, 0.0)
+        return float(np.interp(self.closing_at(opening), self._closings, self._forces)) + jammed
+
+    def find_closing(self, force: float) -> float:
+        """Returns how far beyond first touch [m] each jaw goes for an elastic grasp force [N].
+
+        Raises:
+            ScenarioError: The jaws meet before they press that hard.
+        """
+        if not force <= self._forces[-1]:
+            name, most = self.assembly.scenario.name, self._forces[-1]
+            raise ScenarioError(f"{name}: {force:g} N, expected at most {most:.1f} N, with which the jaws have met")
+        return float(np.interp(force, np.maximum.accumulate(self._forces), self._closings))
+
+    def wrenches(self, opening: float) -> Mapping[str, Wrench]:
+        """Returns the elastic wrench on each jaw at an opening [m]."""
+        growth = self._find_growth(opening)
+        return {
+            side: Wrench(
+                force=growth * self._read(table.force, opening), torque=growth * self._read(table.torque, opening)
+            )
+            for side, table in self._tables.items()
+        }
+
+    def state(self, opening: float, stamp: float = 0.0) -> TwinState:
+        """Returns jaws and object at an opening [m], with elastic wrenches, as of a stamp [s]."""
+        wrenches, closing = self.wrenches(opening), self.closing_at(opening)
+        posture = Posture(closing=closing)
+        jaws = {
+            side: JawState(
+                origin_x=self.assembly.origin_x(side, posture),
+                vertices=self._read(table.vertices, opening),
+                keypoints=self._read(table.keypoints, opening),
+                reference=self.assembly.jaws[side].reference_point,
+                force=wrenches[side].force,
+                torque=wrenches[side].torque,
+            )
+            for side, table in self._tables.items()
+        }
+        return TwinState(stamp=stamp, phase="", jaws=jaws, T_gripper_object=self.object_pose(opening), gravity=_DOWN)
+
+    def object_pose(self, opening: float) -> NDArray | None:
+        """Returns T_gripper_object (4, 4) at an opening [m]; None without an object."""
+        closing = self.closing_at(opening)
+        return self.assembly.object_pose(Posture(closing=closing), self._place_object(closing))
+
+    def _find_growth(self, opening: float) -> float:
+        """Returns by which factor forces exceed the table's last ones; 0 without contact, for that has no force."""
+        if not opening < self.touch_opening:
+            return 0.0
+        return 1.0 + JAMMED * max(self.least_opening - opening, 0.0) / max(self._forces[-1], 1e-9)
+
+    def _place_object(self, closing: float) -> float:
+        """Returns the object's x [m]: solved in contact; before, where it lay unless a jaw has pushed it."""
+        if closing >= 0.0:
+            return float(np.interp(closing, self._closings, self._places))
+        pushed = self._places[0]
+        return float(np.clip(self.assembly.scenario.offset, pushed + closing, pushed - closing))
+
+    def _read(self, rows: NDArray, opening: float) -> NDArray:
+        """Returns what lies between two rows of a table (m, ...) at an opening [m]."""
+        place = np.interp(self.closing_at(opening), self._closings, np.arange(len(self._closings)))
+        low = min(int(place), max(len(rows) - 2, 0))
+        share, high = place - low, min(low + 1, len(rows) - 1)
+        return (1.0 - share) * rows[low] + share * rows[high]
+
+
+class RelaxedGrasp:
+    """The wrenches of a grasp as the jaws' material gives way in time."""
+
+    def __init__(self, grasp: PressedGrasp) -> None:
+        """Starts relaxed and without load."""
+        self._grasp = grasp
+        terms = grasp.assembly.material.terms
+        self._filters = {side: RelaxedWrench(terms) for side in grasp.assembly.jaws}
+        self.wrenches: Mapping[str, Wrench] = {
+            side: Wrench(force=np.zeros(3), torque=np.zeros(3)) for side in self._filters
+        }
+
+    def update(self, opening: float, dt: float) -> Mapping[str, Wrench]:
+        """Returns the wrench on each jaw at an opening [m], reached on a straight way in dt [s]."""
+        elastic = self._grasp.wrenches(opening)
+        relaxed = {}
+        for side, wrench in elastic.items():
+            force, torque = self._filters[side].update(wrench.force, wrench.torque, dt)
+            relaxed[side] = Wrench(force=force, torque=torque)
+        self.wrenches = relaxed
+        return relaxed
+
+    @property
+    def force(self) -> float:
+        """The grasp force [N] of the last update: that of the jaw pressed less."""
+        return float(min(np.linalg.norm(wrench.force) for wrench in self.wrenches.values()))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _SolvedGrasp:
+    """A closing beyond touch [m], the object's x [m] and the jaws' shapes there."""
+
+    closing: float
+    x: float
+    shapes: Mapping[str, JawShape]
+
+
+def _solve_grasps(assembly: Assembly, step: float) -> list[_SolvedGrasp]:
+    """Returns grasps from first touch on, at most `step` [m] of closing apart; the jaws at rest without an object."""
+    held, solved = assembly.hold_object(), []
+    if held is None:
+        return [_SolvedGrasp(closing=0.0, x=0.0, shapes=assembly.rest_shapes())]
+    reach = assembly.touch_origin - assembly.inner_face_x
+    for closing in np.linspace(0.0, reach, int(np.ceil(reach / step)) + 1):
+        posture = Posture(closing=float(closing))
+        try:
+            shapes = held.follow(assembly.setting_of(posture))
+        except BalanceError:
+            if len(solved) < 2:
+                raise
+            break
+        solved.append(_SolvedGrasp(closing=float(closing), x=held.x, shapes=shapes))
+    return solved
+
+
+def _stack_shapes(shapes: Sequence[JawShape]) -> JawShape:
+    """Returns shapes of one jaw as rows of arrays: vertices (m, n, 3), keypoints (m, K, 3), force and torque (m, 3)."""
+    names = ("vertices", "keypoints", "force", "torque")
+    return JawShape(**{name: np.stack([getattr(shape, name) for shape in shapes]) for name in names})

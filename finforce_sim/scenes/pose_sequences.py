@@ -1,0 +1,218 @@
+"""An object on a table before the wrist camera, still or with the hand moving and plates that come in between."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
+
+from finforce.camera import CameraIntrinsics, compute_rays
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.views import MeshView
+from finforce_sim.rendering.depth_camera import DepthNoise, disturb_depth, smooth_field
+
+PERIOD = 1.0 / 30.0  # [s] from one image to the next
+FARTHEST = 1.0  # [m], where the table ends
+PLATE_GAP = 0.012  # [m] from the plates to the object's nearest point
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SequenceImage:
+    """One image of a sequence, with the truth.
+
+    Attributes:
+        stamp: [s].
+        depth: (h, w) as the camera gives it [m], NaN where nothing was measured.
+        mask: (h, w) bool, the object's visible pixels.
+        T_camera_object: (4, 4) true pose.
+        hidden: share of the object's pixels that the plates hide.
+    """
+
+    stamp: float
+    depth: NDArray
+    mask: NDArray
+    T_camera_object: NDArray
+    hidden: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """How the hand moves, and how much the plates hide.
+
+    Attributes:
+        speed: greatest speed of the object in the camera frame [m/s].
+        turn_rate: greatest rate at which it turns there [rad/s].
+        distance: from the camera to the object [m].
+        hidden: share of its pixels that the plates hide while they are in, 0 to below 1.
+        frames: number of images.
+    """
+
+    speed: float = 0.1
+    turn_rate: float = np.deg2rad(30.0)
+    distance: float = 0.22
+    hidden: float = 0.0
+    frames: int = 120
+
+
+def render_sequence(
+    mesh: ObjectMesh, camera: CameraIntrinsics, motion: Motion, seed: int, noise: DepthNoise | None = None
+) -> Iterator[SequenceImage]:
+    """Yields the images of a sequence, 30 a second.
+
+    The object sways along one axis and about another. From a third of the sequence on, plates come in from both sides
+    within half a second, stay, and go out again in the last sixth.
+
+    Args:
+        mesh: the object, z upwards, its origin inside.
+        camera: intrinsics.
+        motion: how fast, how far, how much hidden.
+        seed: of view, axes and noise.
+        noise: of the depth; that of a D405 when absent.
+    """
+    rng = np.random.default_rng(seed)
+    path, view = draw_path(motion, rng), MeshView(mesh)
+    lowest = float(mesh.vertices[:, 2].min())
+    for index, T in enumerate(path):
+        seen = view.render(T, camera).depth
+        covered = np.isfinite(seen)
+        truth = np.where(covered, seen, _table_depth(T, lowest, camera))
+        plates = _place_plates(covered, _hidden_share(index, motion))
+        truth[plates] = np.nanmin(seen) - PLATE_GAP
+        yield SequenceImage(
+            stamp=1.0 + index * PERIOD,
+            depth=disturb_depth(truth, camera, rng, noise),
+            mask=covered & ~plates,
+            T_camera_object=T,
+            hidden=float((plates & covered).sum() / max(covered.sum(), 1)),
+        )
+
+
+def draw_path(motion: Motion, rng: np.random.Generator) -> NDArray:
+    """Returns the true poses (frames, 4, 4): a view from above, swaying with the greatest speeds of the motion."""
+    downward = np.deg2rad(rng.uniform(20.0, 60.0))
+    start = Rotation.from_euler("x", 0.5 * np.pi + downward) * Rotation.from_euler("z", rng.uniform(0.0, 2.0 * np.pi))
+    time = np.arange(motion.frames) * PERIOD
+    axes = rng.standard_normal((2, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    rates = 2.0 * np.pi * rng.uniform(0.4, 0.7, 2)
+    path = np.tile(np.eye(4), (motion.frames, 1, 1))
+    turns = np.outer(np.sin(rates[1] * time), axes[1] * motion.turn_rate / rates[1])
+    path[:, :3, :3] = (Rotation.from_rotvec(turns) * start).as_matrix()
+    path[:, :3, 3] = np.outer(np.sin(rates[0] * time), axes[0] * motion.speed / rates[0]) + (0.0, 0.0, motion.distance)
+    return path
+
+
+def _hidden_share(index: int, motion: Motion) -> float:
+    time, length = index * PERIOD, motion.frames * PERIOD
+    coming, going = (time - length / 3.0) / 0.5, (length * 5.0 / 6.0 - time) / 0.5
+    return motion.hidden * float(np.clip(min(coming, going), 0.0, 1.0))
+
+
+def _place_plates(covered: NDArray, hidden: float) -> NDArray:
+    """Returns the pixels (h, w) of two plates, from left and right, over the given share of the covered pixels."""
+    plates = np.zeros(covered.shape, bool)
+    columns = np.sort(np.nonzero(covered)[1])
+    if hidden > 0.0 and len(columns):
+        margin = int(0.5 * hidden * len(columns))
+        plates[:, max(columns[0] - 60, 0) : columns[margin]] = True
+        plates[:, columns[-1 - margin] + 1 : columns[-1] + 60] = True
+    return plates
+
+
+def _table_depth(T: NDArray, height: float, camera: CameraIntrinsics) -> NDArray:
+    """Returns the depths (h, w) of the plane z = height of the object's frame, and the farthest beyond it."""
+    normal = T[:3, 2]
+    with np.errstate(divide="ignore"):
+        depth = (normal @ T[:3, 3] + height) / (compute_rays(camera) @ normal)
+    return np.where((depth > 0.0) & (depth < FARTHEST), depth, FARTHEST)
+
+
+OCCLUDER_GAP = 0.02  # [m] from the object's nearest point to what hides it
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TableScene:
+    """One image of an object, with the truth.
+
+    Attributes:
+        camera: intrinsics.
+        depth: (h, w) as the camera gives it [m], NaN invalid.
+        mask: (h, w) bool, the object's visible pixels.
+        mesh: the object, in its own frame.
+        T_camera_object: (4, 4) its true pose.
+    """
+
+    camera: CameraIntrinsics
+    depth: NDArray
+    mask: NDArray
+    mesh: ObjectMesh
+    T_camera_object: NDArray
+
+
+def draw_scene(
+    mesh: ObjectMesh,
+    camera: CameraIntrinsics,
+    rng: np.random.Generator,
+    noise: DepthNoise | None = None,
+    hidden: float = 0.0,
+) -> TableScene:
+    """Return an image of an object that stands on a table, seen from 0.22 to 0.32 m away and from above.
+
+    Args:
+        mesh: the object, z upwards.
+        camera: intrinsics.
+        rng: source of the view and of the noise.
+        noise: of the depth; that of a D405 when absent.
+        hidden: share of the object's pixels that a bar before it hides, from 0 to below 1.
+    """
+    T = draw_pose(rng)
+    seen = MeshView(mesh).render(T, camera)
+    table = _table_depth(T, float(mesh.vertices[:, 2].min()), camera)
+    covered = np.isfinite(seen.depth)
+    truth = np.where(covered, seen.depth, table)
+    bar = _draw_bar(covered, hidden, rng)
+    truth[bar] = np.nanmin(seen.depth) - OCCLUDER_GAP
+    depth = disturb_depth(truth, camera, rng, noise)
+    return TableScene(camera=camera, depth=depth, mask=covered & ~bar, mesh=mesh, T_camera_object=T)
+
+
+def draw_pose(rng: np.random.Generator) -> NDArray:
+    """Return a pose (4, 4) of an object near the optical axis, turned at random about its z axis."""
+    downward = np.deg2rad(rng.uniform(20.0, 60.0))
+    upright = Rotation.from_euler("x", 0.5 * np.pi + downward)
+    roll = Rotation.from_euler("z", rng.normal(0.0, 0.15))
+    T = np.eye(4)
+    T[:3, :3] = (roll * upright * Rotation.from_euler("z", rng.uniform(0.0, 2.0 * np.pi))).as_matrix()
+    T[:3, 3] = (*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.22, 0.32))
+    return T
+
+
+def _draw_bar(covered: NDArray, hidden: float, rng: np.random.Generator) -> NDArray:
+    """Return the pixels (h, w) of an upright or lying bar over the given share of the covered pixels."""
+    bar = np.zeros(covered.shape, dtype=bool)
+    if hidden <= 0.0:
+        return bar
+    axis = int(rng.integers(2))
+    places = np.sort(np.nonzero(covered)[axis])
+    begin = rng.integers(0, max(1, int((1.0 - hidden) * len(places))))
+    low, high = places[begin], places[min(begin + int(hidden * len(places)), len(places) - 1)]
+    bar[(slice(low, high), slice(None)) if axis == 0 else (slice(None), slice(low, high))] = True
+    return bar
+
+
+def roughen_mask(mask: NDArray, rng: np.random.Generator, stddev: float = 1.0, width: float = 6.0) -> NDArray:
+    """Return a mask (h, w) whose outline wanders, as that of a segmentation does.
+
+    Args:
+        mask: (h, w) bool.
+        rng: source of the error.
+        stddev: of the outline's distance from the true one [px].
+        width: over which neighbouring errors are alike [px].
+    """
+    inside = distance_transform_edt(mask)
+    distance = np.where(mask, 0.5 - inside, distance_transform_edt(~mask) - 0.5)
+    return distance < stddev * smooth_field(mask.shape, width, rng)

@@ -1,0 +1,294 @@
+"""What happens in a synthetic recording, as numbers with names, and how it goes on over time."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from finforce.settings import check_bounds, setting
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_sim.errors import ScenarioError
+
+CAMERAS = ("robot", "turned", "front", "bench")
+RATE = 30.0  # [Hz] of the images, unless a scene says otherwise
+LIGHTS = ("bright", "dim", "any")
+HELD = 1e-6  # [kg] of mass from which on an object is lifted
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """A course of one or two jaws and an object, every number of which can be overridden.
+
+    The robot's two jaws close alike on an object that is free along x; the bench's left jaw stays where it is and the
+    object comes to it. The object lies with the middle of its bounding box at (offset, shift, height).
+    """
+
+    name: str
+    jaw: str = setting("bench", "a shipped jaw's name or a jaw file", "")
+    object: str = setting("rod25", "a name of finforce_sim.scenes.objects or a mesh file; empty for none", "")
+    unit: str = setting("m", "of the coordinates of a mesh file", choices=("m", "mm", "cm", "inch"))
+    scale: float = setting(1.0, "by which the object is enlarged", "", 0.05, 20.0)
+    turn_x: float = setting(0.0, "turn of the object about the gripper's x, before y and z", "rad", -np.pi, np.pi)
+    turn_y: float = setting(0.0, "turn of the object about the gripper's y", "rad", -np.pi, np.pi)
+    turn_z: float = setting(0.0, "turn of the object about the gripper's z", "rad", -np.pi, np.pi)
+    height: float = setting(0.042, "z of the object's middle at first", "m", 0.0, 0.2)
+    offset: float = setting(0.0, "x of the object's middle at first, between two jaws", "m", -0.05, 0.05)
+    shift: float = setting(0.0, "y of the object's middle", "m", -0.05, 0.05)
+    camera: str = setting(
+        "robot",
+        "two jaws before the wrist camera, that one upside down, or one beyond the tips, or one jaw before that of the "
+        "bench",
+        choices=CAMERAS,
+    )
+    light: str = setting("bright", "how the scene is lit", choices=LIGHTS)
+    rate: float = setting(RATE, "of the images", "Hz", 1.0, 240.0)
+    readout: float = setting(0.0, "from an image's first row to its last one, which the stamp is of", "s", 0.0, 0.1)
+    clearance: float = setting(0.008, "from each jaw to first touch while open", "m", 5e-4, 0.06)
+    closing_speed: float = setting(0.020, "of each jaw", "m/s", 5e-4, 0.3)
+    displacement: float = setting(0.006, "of each jaw beyond first touch, at most", "m", 0.0, 0.02)
+    levels: int = setting(1, "equal steps up to the displacement, and down again", "", 1, 20)
+    cycles: int = setting(1, "how often the object is grasped", "", 1, 20)
+    tare: float = setting(1.7, "of stillness without load at the beginning", "s", 1.7, 60.0)
+    settle: float = setting(0.5, "of rest at each level before it is recorded", "s", 0.0, 60.0)
+    record: float = setting(0.7, "of record at each level", "s", 0.1, 60.0)
+    mass: float = setting(0.0, "of the object that is lifted", "kg", 0.0, 2.0)
+    friction: float = setting(0.9, "share of the pressure that the jaws hold without a slip", "", 0.05, 2.0)
+    drag: float = setting(0.0, "of an object that slides all the same; 0: an error", "N s/m", 0.0, 1e4)
+    turn_angle: float = setting(0.0, "by which the wrist turns with the object", "rad", -2.0 * np.pi, 2.0 * np.pi)
+    turn_rate: float = setting(0.8, "at which it does", "rad/s", 0.05, 10.0)
+    turn_heading: float = setting(0.0, "of the wrist's axis in the x-y plane, from x to y", "rad", -np.pi, np.pi)
+    turn_tilt: float = setting(0.0, "of the wrist's axis out of that plane, to z", "rad", -0.5 * np.pi, 0.5 * np.pi)
+    pitch: float = setting(0.0, "of a gripper that does not look down, about its x", "rad", -np.pi, np.pi)
+    slide: float = setting(0.0, "by which a hand draws the held object along z, and back", "m", -0.03, 0.03)
+    rock: float = setting(0.0, "by which a hand tilts the held object from x to z, and back", "rad", -0.4, 0.4)
+    shift_time: float = setting(1.5, "which each way of that takes", "s", 0.1, 60.0)
+
+    def __post_init__(self) -> None:
+        """Refuses numbers beyond their bounds, and what cannot be together.
+
+        Raises:
+            ScenarioError: a value is out of its bounds, an image takes longer than there is to the next, or a weight is
+                lifted while a hand holds it, on the bench, or without an object.
+        """
+        check_bounds(self, ScenarioError)
+        lifted = self.mass > HELD
+        if lifted and (self.slide or self.rock or self.camera == "bench" or not self.object):
+            raise ScenarioError(
+                f"{self.name}: got a mass of {self.mass:g} kg to lift together with a slide, a rock, the bench or no "
+                "object; set mass to 0, or slide and rock to 0 with the robot's camera and an object"
+            )
+        if self.readout * self.rate > 1.0:
+            raise ScenarioError(
+                f"{self.name}: got a readout of {self.readout:g} s at {self.rate:g} Hz; expected no more than the "
+                f"{1.0 / self.rate:g} s between two images"
+            )
+        if self.turn_angle and not lifted:
+            raise ScenarioError(f"{self.name}: the wrist turns with nothing held, expected a mass above 0")
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """The jaws that there are."""
+        return ("left",) if self.camera == "bench" else ("left", "right")
+
+    @property
+    def is_guided(self) -> bool:
+        """Whether the object is held by something else than the jaws."""
+        return bool(self.camera == "bench" or self.slide or self.rock)
+
+
+_BENCH = {"camera": "bench", "closing_speed": 0.002, "clearance": 0.001, "levels": 3, "height": 0.040}
+_TURN = {"object": "rod25", "displacement": 0.007, "mass": 0.08, "turn_angle": 0.5 * np.pi, "turn_heading": 0.6}
+_SLIP = {"height": 0.036, "mass": 0.25, "friction": 0.3, "drag": 150.0, "record": 1.0}
+_ALL = (
+    Scenario(name="bench_cylinder", object="rod25", **_BENCH),
+    Scenario(name="bench_cylinder_upper", object="rod15", **{**_BENCH, "height": 0.058}),
+    Scenario(name="bench_cylinder_lower", object="rod35", **{**_BENCH, "height": 0.024}),
+    Scenario(name="bench_cube", object="block", **_BENCH),
+    Scenario(name="grasp_cylinder", object="rod25"),
+    Scenario(name="grasp_cube", object="block"),
+    Scenario(name="grasp_asymmetric", object="wedge", offset=0.003),
+    Scenario(name="hold", object="rod35", displacement=0.007, record=6.0),
+    Scenario(name="weight_turn", **_TURN),
+    Scenario(name="weight_turn_dim", light="dim", **_TURN),
+    Scenario(name="shifting", object="rod15", slide=0.012, height=0.038),
+    Scenario(name="slipping", object="block", displacement=0.005, **_SLIP),
+    Scenario(name="rocking", object="block", rock=0.12, displacement=0.005),
+    Scenario(name="fast_close", object="rod25", closing_speed=0.06, clearance=0.015, cycles=3, record=0.4, settle=0.2),
+    Scenario(name="empty_close", object="", clearance=0.028, displacement=0.0, cycles=2),
+)
+SCENARIOS: dict[str, Scenario] = {scenario.name: scenario for scenario in _ALL}
+
+
+def build_scenario(name: str, **overrides: Any) -> Scenario:
+    """Returns the scenario of a name with some of its fields replaced.
+
+    Raises:
+        ScenarioError: There is no such scenario or field, or a value is out of its bounds.
+        JawFileError: There is no such jaw.
+    """
+    if name not in SCENARIOS:
+        raise ScenarioError(f"scenario {name!r}: expected one of {', '.join(SCENARIOS)}")
+    unknown = [key for key in overrides if key not in Scenario.__dataclass_fields__]
+    if unknown:
+        known = ", ".join(Scenario.__dataclass_fields__)
+        raise ScenarioError(f"scenario {name!r}: got the field {unknown[0]!r}, expected one of {known}")
+    return replace(SCENARIOS[name], **_fit_jaw(SCENARIOS[name], overrides), **overrides)
+
+
+def _fit_jaw(scenario: Scenario, overrides: dict[str, Any]) -> dict[str, float]:
+    """Returns height and displacement for another jaw than the scene's, where they are not given.
+
+    The object meets the same share of the jaw's candidates, and a shorter jaw is pressed as much less.
+    """
+    if overrides.get("jaw", scenario.jaw) == scenario.jaw:
+        return {}
+    own, other = (load_jaw(name).candidates[:, 2] for name in (scenario.jaw, overrides["jaw"]))
+    share = (scenario.height - own.min()) / np.ptp(own)
+    fitted = {
+        "height": float(other.min() + share * np.ptp(other)),
+        "displacement": scenario.displacement * min(float(np.ptp(other) / np.ptp(own)), 1.0),
+    }
+    return {key: value for key, value in fitted.items() if key not in overrides}
+
+
+GRAVITY = 9.81  # [m/s^2]
+_DOWN = np.array([0.0, 0.0, 1.0])  # of a gripper that looks down
+_LIFT_TIME = 0.6
+_TARE_RECORD = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Posture:
+    """Where everything stands at one instant.
+
+    Attributes:
+        closing: of each jaw beyond first touch [m], negative while open.
+        slide: of the object along z [m].
+        rock: of the object from x to z [rad].
+        lifted: share [-] of the object's weight that the jaws carry.
+        turn: of the wrist [rad].
+    """
+
+    closing: float
+    slide: float = 0.0
+    rock: float = 0.0
+    lifted: float = 0.0
+    turn: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScriptStep:
+    """A straight way from the last posture to the next; its phase is that of `/bench/phase`."""
+
+    phase: str
+    duration: float
+    end: Posture
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Script:
+    """The course at every image, n of them.
+
+    Attributes:
+        stamps: (n,) [s], from 0 on.
+        phases: n words.
+        postures: n of them.
+        gravity: (n, 3) unit vectors in `gripper_base`.
+        weight: (n, 3) [N] that the jaws carry, in `gripper_base`.
+    """
+
+    stamps: NDArray
+    phases: tuple[str, ...]
+    postures: tuple[Posture, ...]
+    gravity: NDArray
+    weight: NDArray
+
+
+def write_script(scenario: Scenario) -> Script:
+    """Returns the course of a scenario, sampled at its `rate`."""
+    start = Posture(closing=-scenario.clearance)
+    steps = list(_plan_steps(scenario, start))
+    ends = np.concatenate([[0.0], np.cumsum([step.duration for step in steps])])
+    stamps = np.arange(int(round(ends[-1] * scenario.rate)) + 1) / scenario.rate
+    corners = np.array([list(vars(posture).values()) for posture in (start, *(step.end for step in steps))])
+    courses = [np.interp(stamps, ends, column) for column in corners.T]
+    # an image between two steps belongs to the later one, whatever the rounding
+    running = np.clip(np.searchsorted(ends, stamps + 1e-9) - 1, 0, len(steps) - 1)
+    postures = tuple(Posture(**dict(zip(vars(start), row, strict=True))) for row in np.stack(courses, axis=1).tolist())
+    heading, tilt = scenario.turn_heading, scenario.turn_tilt
+    axis = np.array([np.cos(tilt) * np.cos(heading), np.cos(tilt) * np.sin(heading), np.sin(tilt)])
+    begin = Rotation.from_rotvec([scenario.pitch, 0.0, 0.0]).apply(_DOWN)
+    gravity = Rotation.from_rotvec(np.outer([posture.turn for posture in postures], axis)).apply(begin)
+    lifted = np.array([posture.lifted for posture in postures])
+    return Script(
+        stamps=stamps,
+        phases=tuple(steps[i].phase for i in running),
+        postures=postures,
+        gravity=gravity,
+        weight=scenario.mass * GRAVITY * lifted[:, None] * gravity,
+    )
+
+
+def _plan_steps(scenario: Scenario, start: Posture) -> Iterator[ScriptStep]:
+    """Yields still, close, load level by level, what is done while held, unload, open; the middle for each cycle."""
+    yield ScriptStep(phase="0:load:0:settle", duration=scenario.tare - _TARE_RECORD, end=start)
+    yield ScriptStep(phase="0:load:0:record", duration=_TARE_RECORD, end=start)
+    levels = scenario.displacement * np.arange(scenario.levels + 1) / scenario.levels
+    levels = levels if scenario.displacement > 0.0 else levels[:1]
+    for cycle in range(scenario.cycles):
+        closed = Posture(closing=0.0)
+        approach = scenario.clearance / scenario.closing_speed
+        yield ScriptStep(phase=f"{cycle}:load:0:ramp", duration=approach, end=closed)
+        for level in levels[1:]:
+            yield from _hold_level(scenario, f"{cycle}:load", level, closed)
+            closed = replace(closed, closing=float(level))
+        yield from _plan_manipulation(scenario, f"{cycle}:load:{_millimetres(levels[-1])}", closed)
+        for level in levels[-2:0:-1]:
+            yield from _hold_level(scenario, f"{cycle}:unload", level, closed)
+            closed = replace(closed, closing=float(level))
+        yield from _release(scenario, f"{cycle}:unload:0", closed, start)
+
+
+def _release(scenario: Scenario, phase: str, held: Posture, start: Posture) -> Iterator[ScriptStep]:
+    """Yields the way back to first touch, the opening beyond it, and the rest there."""
+    speed = scenario.closing_speed
+    yield ScriptStep(phase=f"{phase}:ramp", duration=held.closing / speed, end=replace(held, closing=0.0))
+    yield ScriptStep(phase=f"{phase}:settle", duration=scenario.clearance / speed, end=start)
+    yield ScriptStep(phase=f"{phase}:settle", duration=scenario.settle, end=start)
+    yield ScriptStep(phase=f"{phase}:record", duration=scenario.record, end=start)
+
+
+def _hold_level(scenario: Scenario, prefix: str, level: float, before: Posture) -> Iterator[ScriptStep]:
+    """Yields the way to a level [m] and the rest there."""
+    phase, end = f"{prefix}:{_millimetres(level)}", replace(before, closing=float(level))
+    yield ScriptStep(phase=f"{phase}:ramp", duration=abs(level - before.closing) / scenario.closing_speed, end=end)
+    yield ScriptStep(phase=f"{phase}:settle", duration=scenario.settle, end=end)
+    yield ScriptStep(phase=f"{phase}:record", duration=scenario.record, end=end)
+
+
+def _plan_manipulation(scenario: Scenario, phase: str, held: Posture) -> Iterator[ScriptStep]:
+    """Yields lifting, turning there and back and setting down; or drawing the object aside and back."""
+    record = f"{phase}:record"
+    if scenario.mass > HELD:
+        lifted = replace(held, lifted=1.0)
+        turned = replace(lifted, turn=scenario.turn_angle)
+        yield ScriptStep(phase=record, duration=_LIFT_TIME, end=lifted)
+        if scenario.turn_angle:
+            duration = abs(scenario.turn_angle) / scenario.turn_rate
+            yield ScriptStep(phase=record, duration=duration, end=turned)
+            yield ScriptStep(phase=record, duration=scenario.record, end=turned)
+            yield ScriptStep(phase=record, duration=duration, end=lifted)
+        yield ScriptStep(phase=record, duration=scenario.record, end=lifted)
+        yield ScriptStep(phase=record, duration=_LIFT_TIME, end=held)
+    if scenario.slide or scenario.rock:
+        moved = replace(held, slide=scenario.slide, rock=scenario.rock)
+        yield ScriptStep(phase=record, duration=scenario.shift_time, end=moved)
+        yield ScriptStep(phase=record, duration=scenario.record, end=moved)
+        yield ScriptStep(phase=record, duration=scenario.shift_time, end=held)
+
+
+def _millimetres(length: float) -> str:
+    return f"{1e3 * length:.3g}"

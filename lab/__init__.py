@@ -1,0 +1,1 @@
+"""What judges the product: benchmarks, stress, the paper's experiments and training; not installed."""

@@ -1,0 +1,301 @@
+"""Time against pixel error of the ways to find key points, on rendered images with truth.
+
+All ways look at a second of images each, one way after the other, so that a busy machine slows all of them alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.camera import ImageError, project
+from finforce.skipping import ALL, Skips
+from finforce.transforms import pose_from_quaternion
+from finforce_eval.evaluation.keypoint_source import Detector, KeypointSource, SideLog, build_records, with_detections
+from finforce_eval.evaluation.results import DetectionErrors, DetectionStats, compare_detection, detection_stats
+from finforce_eval.figures.time_error import ErrorPoint, ErrorSeries, TimeStats, draw_time_error, time_stats
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import JawTrack, Recording
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_keypoints.build import build_detector
+from finforce_keypoints.errors import KeypointError
+from finforce_keypoints.images import RgbdImage
+from finforce_keypoints.parameters import load_jaws
+from finforce_keypoints.settings import RULES
+from lab.bench.scenes import DIM, GRASP, BenchScene, find_scene
+
+QUICK_IMAGES = 45
+BLOCK = 30  # images that one way sees in a row
+
+
+@dataclass(frozen=True, kw_only=True)
+class Way:
+    """One way to find key points.
+
+    Attributes:
+        name: for tables.
+        parameters: of the detector node, where they differ from the defaults.
+        searches: whether the jaws are looked for anew in every image, not where they were before.
+        rests: whether it leaves out what an image does not need, by the detector's rules.
+        dots: whether it looks at images with printed dots.
+    """
+
+    name: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    searches: bool = False
+    rests: bool = False
+    dots: bool = False
+
+
+WAYS = (
+    Way(name="network"),
+    Way(name="network, 1 thread", parameters={"threads": 1}),
+    Way(name="network, searching", searches=True),
+    Way(name="network, resting", rests=True),
+    Way(name="dots", parameters={"finder": "dots"}, dots=True),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectionRow:
+    """One way, from image to key points of both jaws.
+
+    Attributes:
+        name: of the way.
+        time: wall times.
+        cpu: CPU times of all threads, which a busy machine hardly changes.
+        cpu_mean_ms: the mean of them, which shows what rests save.
+        sight: how well the key points were seen.
+    """
+
+    name: str
+    time: TimeStats
+    cpu: TimeStats
+    cpu_mean_ms: float
+    sight: DetectionStats
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectionFigures:
+    """What was measured, and a yardstick of the machine [ms]."""
+
+    rows: Sequence[DetectionRow]
+    yardstick: TimeStats
+
+
+@dataclass(kw_only=True)
+class _DetectionRun:
+    """A way at work on one recording: its detector, and what it said of each jaw."""
+
+    way: Way
+    detector: Detector
+    logs: dict[str, SideLog]
+    seconds: list[float] = field(default_factory=list)
+    cpu: list[float] = field(default_factory=list)
+
+    def look(self, stamp: int, image: RgbdImage) -> None:
+        """Let it look at an image, and keep the time and the answer."""
+        begin, used = perf_counter(), process_time()
+        if self.way.searches:
+            self.detector.reset()
+        found: Mapping[str, Any] = {}
+        with suppress(KeypointError, ImageError):
+            found = self.detector.detect(image)
+        self.seconds.append(perf_counter() - begin)
+        self.cpu.append(process_time() - used)
+        for side, log in self.logs.items():
+            log.step_ms[stamp] = 1e3 * self.seconds[-1]
+            if side in found:
+                log.found[stamp] = found[side]
+
+
+def measure(quick: bool) -> DetectionFigures:
+    """Return times and pixel errors of every way.
+
+    Args:
+        quick: look at the first images of one scene only.
+
+    Raises:
+        FinforceError: a scene cannot be rendered.
+    """
+    return measure_ways(WAYS, [GRASP] if quick else [GRASP, DIM], QUICK_IMAGES if quick else None)
+
+
+def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int | None = None) -> DetectionFigures:
+    """Return times and pixel errors of some ways on scenes.
+
+    Args:
+        ways: to be compared.
+        scenes: whose images they look at.
+        count: images of each scene at most; all without.
+    """
+    seconds: dict[str, list[float]] = {way.name: [] for way in ways}
+    cpu: dict[str, list[float]] = {way.name: [] for way in ways}
+    series: dict[str, list[DetectionErrors]] = {way.name: [] for way in ways}
+    yardstick: list[float] = []
+    for scene in scenes:
+        recording = read_recording(find_scene(scene))
+        recording = replace(recording, images=recording.images.at(recording.images.stamps[:count]))
+        for run in _look_at(recording, ways, yardstick):
+            # the first image compiles, and finds the jaws
+            seconds[run.way.name] += run.seconds[1:]
+            cpu[run.way.name] += run.cpu[1:]
+            detected = with_detections(recording, run.logs)
+            series[run.way.name] += [
+                compare_detection(track.detection, track.sight) for track in detected.jaws.values()
+            ]
+    rows = [
+        DetectionRow(
+            name=name,
+            time=time_stats(spent),
+            cpu=time_stats(cpu[name]),
+            cpu_mean_ms=1e3 * float(np.mean(cpu[name])),
+            sight=detection_stats(series[name]),
+        )
+        for name, spent in seconds.items()
+    ]
+    return DetectionFigures(rows=rows, yardstick=time_stats(yardstick))
+
+
+def _look_at(recording: Recording, ways: Sequence[Way], yardstick: list[float]) -> list[_DetectionRun]:
+    """Return what each way said of the images of a recording; times of the yardstick [s] go to a list."""
+    from tqdm import tqdm
+
+    jaws = {side: load_jaw("bench", side) for side in recording.jaws}
+    runs = [_begin(way, recording) for way in ways]
+    images = iter(tqdm(recording.images, unit="image", desc="key points", disable=None, leave=False))
+    while block := list(islice(images, BLOCK)):
+        dotted = [(stamp, paint_dots(image, stamp, jaws, recording.jaws)) for stamp, image in block]
+        for run in runs:
+            for stamp, image in dotted if run.way.dots else block:
+                run.look(stamp, image)
+            yardstick.append(time_product())
+    return runs
+
+
+def _begin(way: Way, recording: Recording) -> _DetectionRun:
+    """Return a way that is ready to look at a recording."""
+    records = build_records(KeypointSource(parameters=way.parameters).node_parameters(recording))
+    skips = Skips(RULES, () if way.rests else (ALL,))
+    detector = build_detector(load_jaws(records.parameters), *records, skips).detector
+    detector.warm_up()
+    return _DetectionRun(way=way, detector=detector, logs={side: SideLog() for side in recording.jaws})
+
+
+def time_product(size: int = 512) -> float:
+    """Return the time [s] of a product of two square matrices in single precision."""
+    matrix = np.random.default_rng(0).standard_normal((size, size)).astype(np.float32)
+    begin = perf_counter()
+    matrix @ matrix
+    return perf_counter() - begin
+
+
+def format_table(figures: DetectionFigures) -> str:
+    """Return the rows as a table in Markdown, with the yardstick below."""
+    return "\n".join(_lines(figures))
+
+
+def _lines(figures: DetectionFigures) -> Iterator[str]:
+    yield (
+        "| key points of both jaws | images | p50/ms | p95 | p99 | of CPU: p50/ms | mean | pixels: median | p95 "
+        "| points: median/mm | p95 | hidden accepted/% | visible lost/% |"
+    )
+    yield "|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+    for row in figures.rows:
+        wall, cpu = row.time, row.cpu
+        time = f"{wall.n} | {wall.p50:.2f} | {wall.p95:.2f} | {wall.p99:.2f} | {cpu.p50:.2f} | {row.cpu_mean_ms:.2f}"
+        numbers = [value for name, value in asdict(row.sight).items() if not name.startswith("n_")]
+        yield f"| {row.name} | {time} | {' | '.join('-' if value is None else f'{value:.2f}' for value in numbers)} |"
+    yield f"Product of two matrices of 512 x 512 in the same run: p50 {figures.yardstick.p50:.2f} ms."
+
+
+def as_json(figures: DetectionFigures) -> dict[str, Any]:
+    """Return the figures as plain values; times in ms."""
+    return asdict(figures)
+
+
+def draw(figures: DetectionFigures, path: Path | str) -> None:
+    """Draw time against the 95th percentile of the pixel error; hollow: a tenth or more of what is visible is lost."""
+    series = []
+    for row in figures.rows:
+        if row.sight.pixel_p95_px is None:
+            continue
+        lost = row.sight.visible_lost_pct or 0.0
+        point = ErrorPoint(text="", time=row.time.p50, slow=row.time.p99, error=row.sight.pixel_p95_px)
+        label = f"{row.name}\n(lost {lost:.1f} %)"
+        series.append(ErrorSeries(name=label, points=[point], complete=lost < 10.0))
+    draw_time_error(
+        series,
+        path,
+        title="Key points: time against error; in brackets: visible points that were lost",
+        error="pixel error, 95th percentile [px]",
+        time="time for one image, both jaws [ms]",
+        log_error=True,
+    )
+
+
+DIAMETER = 0.003  # [m]
+COLOUR = np.array([40.0, 200.0, 60.0])  # of 255, where the image is of medium brightness
+_MEDIUM = 120.0
+_REACH = 20  # [px] around a dot that are painted at most
+_STEP = 1e-4  # [m], of the differences that give a dot's shape in the image
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Disc:
+    """A dot in the image: its centre [px], and what maps pixels from it onto the jaw's side (2, 2) [m/px]."""
+
+    centre: NDArray
+    onto_side: NDArray
+
+
+def paint_dots(image: RgbdImage, stamp: int, jaws: Mapping[str, Jaw], tracks: Mapping[str, JawTrack]) -> RgbdImage:
+    """Return an image with a dot on every visible key point and on the reference points.
+
+    A dot is as bright as what it is printed on, with the image's own noise.
+
+    Args:
+        image: rendered.
+        stamp: of it [ns].
+        jaws: by side.
+        tracks: the truth by side.
+    """
+    color = image.color.astype(np.float32)
+    for side, track in tracks.items():
+        row = int(np.searchsorted(track.sight.stamps, stamp))
+        pose = pose_from_quaternion(track.true_pose.position[row], track.true_pose.quaternion[row])
+        points = track.sight.points[row][track.sight.visible[row]]
+        for point in (*points, jaws[side].reference_point):
+            _paint(color, _place(point, pose, image))
+    return replace(image, color=np.round(np.clip(color, 0.0, 255.0)).astype(np.uint8))
+
+
+def _place(point: NDArray, pose: NDArray, image: RgbdImage) -> _Disc:
+    """Return the disc about a point (3,) [m] of the jaw's side, y = const."""
+    places = point + np.array([[0.0, 0.0, 0.0], [_STEP, 0.0, 0.0], [0.0, 0.0, _STEP]])
+    pixels = project(places @ pose[:3, :3].T + pose[:3, 3], image.camera)
+    return _Disc(centre=pixels[0], onto_side=np.linalg.inv((pixels[1:] - pixels[0]).T / _STEP))
+
+
+def _paint(color: NDArray, disc: _Disc) -> None:
+    """Paint a disc into an image (h, w, 3), its rim's pixels by the part that is covered."""
+    column, row = (int(value) for value in np.round(disc.centre))
+    rows = slice(max(row - _REACH, 0), max(row + _REACH + 1, 0))
+    columns = slice(max(column - _REACH, 0), max(column + _REACH + 1, 0))
+    part = color[rows, columns]
+    if not part.size:
+        return
+    grid = np.stack(np.meshgrid(np.arange(part.shape[1]), np.arange(part.shape[0])), axis=-1)
+    away = (grid + (columns.start, rows.start) - disc.centre) @ disc.onto_side.T
+    pitch = np.sqrt(abs(np.linalg.det(disc.onto_side)))
+    cover = np.clip(0.5 + (0.5 * DIAMETER - np.linalg.norm(away, axis=-1)) / pitch, 0.0, 1.0)[..., None]
+    brightness = part.mean(axis=2, keepdims=True) / _MEDIUM
+    part += cover * (COLOUR * brightness - part)

@@ -1,0 +1,1 @@
+"""The subcommands of `finforce` that only a checkout has."""

@@ -1,0 +1,87 @@
+"""The subcommand `experiment`: the letter's experiments on the twin or on recordings of one's own."""
+
+from __future__ import annotations
+
+import argparse
+from importlib import import_module
+from pathlib import Path
+
+from finforce_eval.cli.parser import SOURCES, add_engine_options, read_engine
+from finforce_eval.errors import OptionError
+from lab.experiments.experiment import PAGE, Experiment, format_tables, run_experiment
+from lab.experiments.runs import RunOptions
+
+TWIN = "twin"
+QUICK_SIZE = "320x240"
+
+
+# what each does, its module and its class
+EXPERIMENTS = {
+    "bench": ("Table I: nine cylinders pressed on one jaw", "letter_tables", "BenchExperiment"),
+    "places": ("Table II: what knowing the place is worth", "letter_tables", "PlacesExperiment"),
+    "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp", "GraspExperiment"),
+    "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation", "ManipulationExperiment"),
+    "chip": ("what breaks at 5.43 N, grasped to 5 N by force, position and current", "chip", "ChipExperiment"),
+    "network": ("an end-to-end network on what it has seen and what it has not", "network", "NetworkExperiment"),
+    "shape": ("generated meshes brought to scale, in two file formats", "shape", "ShapeExperiment"),
+    "pose": ("poses of the object that are late, flipped or lost", "pose", "PoseExperiment"),
+}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the subcommand."""
+    names = "; ".join(f"{name}: {text}" for name, (text, *_) in EXPERIMENTS.items())
+    parser.add_argument("name", choices=tuple(EXPERIMENTS), metavar="NAME", help=names)
+    text = "twin, or recordings with measured forces (twin)"
+    parser.add_argument("--on", nargs="+", default=[TWIN], metavar="twin|BAG", help=text)
+    text = "folder for figures, pictures and a page; what is done there is not done again (report)"
+    parser.add_argument("--report", default="report", metavar="DIR", help=text)
+    parser.add_argument("--quick", action="store_true", help="few, short and small cases: two minutes")
+    parser.add_argument("--from", dest="source", default="", choices=SOURCES, help="key points (images of the twin)")
+    parser.add_argument("--jaw", default="bench", metavar="FILE", help="jaw file, or a shipped name (bench)")
+    text = "calibration file, or a shipped name; empty for the jaw file's own material (twin; of recordings none)"
+    parser.add_argument("--calibration", metavar="FILE", help=text)
+    parser.add_argument("--seed", type=int, default=100, help="of the first scene (100)")
+    parser.add_argument("--size", metavar="WxH", help="of the twin's images (640x480; 320x240 with --quick)")
+    text = "end-to-end network of lab.training.baseline (the shipped one)"
+    parser.add_argument("--network", default="", metavar="FILE", help=text)
+    parser.add_argument("--keep", action="store_true", help="keep the twin's recordings, some 20 MB a grasp")
+    add_engine_options(parser)
+
+
+def read_options(options: argparse.Namespace) -> RunOptions:
+    """Return what the options of a command line say.
+
+    Raises:
+        OptionError: they contradict each other, or a number is out of its bounds.
+    """
+    bags = [bag for bag in options.on if bag != TWIN]
+    if bags and len(bags) < len(options.on):
+        raise OptionError(f"--on {' '.join(options.on)}: expected twin or recordings, not both")
+    if options.seed < 0:
+        raise OptionError(f"--seed {options.seed}: expected a number from 0")
+    calibration = options.calibration
+    return RunOptions(
+        bags=tuple(bags),
+        jaw=options.jaw,
+        calibration=("" if bags else "twin") if calibration is None else calibration,
+        source=options.source,
+        seed=options.seed,
+        size=options.size or (QUICK_SIZE if options.quick else RunOptions.size),
+        keep=options.keep,
+        quick=options.quick,
+        network=options.network,
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run an experiment, print its tables, name its page."""
+    _, module, kind = EXPERIMENTS[options.name]
+    build = getattr(import_module(f"lab.experiments.{module}"), kind)
+    experiment: Experiment = build(options=read_options(options))
+    findings = run_experiment(experiment, Path(options.report), read_engine(options), options.shard)
+    if findings is None:
+        print(f"Part {options.shard} is done; without --shard all parts are put on a page")
+        return
+    print(format_tables(findings))
+    print(f"Page: {Path(options.report) / experiment.name / PAGE}")

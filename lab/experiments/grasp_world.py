@@ -1,0 +1,230 @@
+"""A gripper, fingers about an object and a camera in stepped time, for grasps by force.
+
+The emulated gripper answers on the virtual bus as firmware does; its true opening bends the fingers, whose force
+relaxes; a camera of 30 Hz tells it late. How it is told is a sensor's matter: noise on the truth, or an estimator.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Protocol
+
+import numpy as np
+
+from finforce_driver.grasp.load_watch import ForceSample, TouchSample
+from finforce_driver.grasp.session import hold_force
+from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
+from finforce_driver.gripper import Gripper
+from finforce_driver.state import Phase
+from finforce_ifea.relaxation import Relaxation, RelaxationTerm
+from finforce_sim.emulator.adapter import EmulatedAdapter
+from finforce_sim.emulator.faults import FaultyAdapter, PlannedFault
+from finforce_sim.emulator.firmware import EmulatedGripper
+from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
+
+IMAGES = 30.0  # [Hz]
+LOST = 0.02  # share of the images
+WIDTH = 0.025  # [m] of the objects between springs
+CLEARANCE = 0.003  # [m] of the opening before first touch
+HOLDING = 10.0  # [s]
+BLIND = 8.0  # [s] that a grasp without a camera is watched
+# shares and times in the middle of what the twin draws for its fingers
+TERMS = (RelaxationTerm(share=0.065, time_constant=2.2), RelaxationTerm(share=0.065, time_constant=10.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plant:
+    """Fingers about an object: elastic force [N] at an opening [m], first touch [m], relaxation."""
+
+    name: str
+    force_at: Callable[[float], float]
+    touch_opening: float = WIDTH
+    terms: Sequence[RelaxationTerm] = TERMS
+
+
+class Sensor(Protocol):
+    """What makes a force [N] of an image; None where it does not trust itself.
+
+    Attributes:
+        touching: whether the jaws were said to touch in the last image; None where nobody says it.
+        stddev: that is stated of the last force [N].
+    """
+
+    touching: bool | None
+    stddev: float
+
+    def measure(self, stamp: float, force: float, opening: float) -> float | None:
+        """Return what an image at `stamp` [s] shows of a true force [N] at an opening [m]."""
+
+
+class NoisySensor:
+    """The true force with white noise [N], as a magnitude: never negative."""
+
+    touching = None
+    stddev = 0.0
+
+    def __init__(self, noise: float, seed: int) -> None:
+        self._noise, self._random = noise, np.random.default_rng(seed)
+
+    def measure(self, stamp: float, force: float, opening: float) -> float | None:
+        """Return force and noise."""
+        return abs(force + self._noise * self._random.standard_normal())
+
+
+def build_spring(stiffness: float, rise: float = 1.0, over: float = 0.004) -> Callable[[float], float]:
+    """Return the force [N] at an opening [m] of a spring [N/m] whose stiffness grows `rise` times within `over` [m]."""
+
+    def force_at(opening: float) -> float:
+        way = max(0.0, WIDTH - opening)
+        part = min(way, over)
+        return stiffness * (way + (rise - 1.0) * (0.5 * part**2 / over + way - part))
+
+    return force_at
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspCase:
+    """One grasp: what is held, how hard and how fast, and how late the camera is."""
+
+    plant: Plant
+    force: float
+    speed: float
+    latency: float
+    seed: int
+    variant: str = "new"
+
+
+@dataclass(kw_only=True)
+class GraspTrace:
+    """What happened: true force and opening over time, and the controller's words."""
+
+    times: list[float] = field(default_factory=list)
+    forces: list[float] = field(default_factory=list)
+    statuses: list[tuple[float, GraspStatus]] = field(default_factory=list)
+    held_at: float = math.nan
+    touched_at: float = math.nan
+    violations: dict[str, int] = field(default_factory=dict)
+    error: str = ""
+
+
+class World:
+    """One emulated gripper with fingers and camera; it is the force source of `hold_force`, too.
+
+    A grasp by force is watched until it has held for `holding` seconds.
+    """
+
+    def __init__(
+        self,
+        case: GraspCase,
+        sensor: Sensor,
+        settings: GraspSettings | None = None,
+        plan: Sequence[PlannedFault] = (),
+        holding: float = HOLDING,
+    ) -> None:
+        self._holding = holding
+        self._case, self._sensor, self._settings = case, sensor, settings
+        self.emulated = EmulatedGripper(case.variant, load=case.plant.force_at)
+        self.clock = VirtualClock()
+        self.adapter = FaultyAdapter(EmulatedAdapter(self.emulated), plan, case.seed)
+        self.bus = VirtualBus(self.adapter, self.clock)
+        self.gripper = Gripper(self.bus, clock=self.clock)
+        self._relaxation = Relaxation(case.plant.terms)
+        self._random = np.random.default_rng([case.seed, 1])
+        self._arrivals: list[tuple[float, int, ForceSample | TouchSample]] = []
+        self._order = count()
+        self._next_image = 0.0
+        self.force = 0.0
+        self.course = GraspTrace()
+
+    def step(self, dt: float) -> None:
+        """Bend and relax the fingers, and take an image where one is due."""
+        now, opening = self.clock.now(), self.emulated.true_opening
+        elastic = np.array([self._case.plant.force_at(opening), 0.0, 0.0])
+        self.force = float(self._relaxation.update(elastic, dt)[0])
+        self.course.times.append(now)
+        self.course.forces.append(self.force)
+        if math.isnan(self.course.touched_at) and self.force > 0.02:
+            self.course.touched_at = now
+        if now >= self._next_image:
+            self._next_image = now + 1.0 / IMAGES
+            self._photograph(now, opening)
+
+    def take(self) -> Sequence[ForceSample | TouchSample]:
+        """Return the forces that have arrived."""
+        ready = []
+        while self._arrivals and self._arrivals[0][0] <= self.clock.now():
+            ready.append(heapq.heappop(self._arrivals)[2])
+        return ready
+
+    def run(self) -> GraspTrace:
+        """Calibrate, open, grasp, hold, and return what happened."""
+        self._prepare()
+        # an estimator has its tare to make first
+        self.gripper.wait(lambda state: bool(self._arrivals), 5.0)
+        goal = GraspGoal(force=self._case.force, speed=self._case.speed)
+        try:
+            hold_force(self.gripper, self, goal, self._settings, until=self._is_over)
+        except Exception as error:  # whatever ends a grasp is a result of the benchmark
+            self.course.error = str(error)
+        self.course.violations = dict(self.emulated.violations)
+        return self.course
+
+    def run_blind(self, opening: float, current: float) -> GraspTrace:
+        """Calibrate, open, and go to an opening [m] with a limit of the motor's current [A], whatever is there."""
+        self._prepare()
+        try:
+            self.gripper.move(opening, self._case.speed, current=current)
+            end = self.clock.now() + BLIND
+            self.gripper.wait(lambda state: self.clock.now() > end, BLIND + 1.0)
+        except Exception as error:  # whatever ends a grasp is a result of the benchmark
+            self.course.error = str(error)
+        self.course.violations = dict(self.emulated.violations)
+        return self.course
+
+    def _prepare(self) -> None:
+        """Make the gripper ready and leave it open before the object, with the camera on."""
+        gripper, plant = self.gripper, self._case.plant
+        load, self.emulated.jaws.load = self.emulated.jaws.load, None
+        self._make_ready()
+        gripper.move(plant.touch_opening + self._clearance(), speed=0.1)
+        gripper.wait(lambda state: state.phase is Phase.READY and state.at_target, 10.0)
+        self.emulated.jaws.load = load
+        self.clock.attach(self)
+
+    def _make_ready(self) -> None:
+        """Calibrate the gripper."""
+        self.gripper.wait(lambda state: state.phase is Phase.UNCALIBRATED, 5.0)
+        self.gripper.calibrate()
+        self.gripper.wait(lambda state: state.phase is Phase.READY, 40.0)
+
+    def _clearance(self) -> float:
+        """Return how far before the first touch the jaws stand [m]; seeds begin at other places between two steps."""
+        return CLEARANCE + float(np.random.default_rng(self._case.seed).uniform(0.0, 0.002))
+
+    def _photograph(self, now: float, opening: float) -> None:
+        """Send what an image shows on its way, if it does not get lost."""
+        measured = self._sensor.measure(now, self.force, opening)
+        late = max(0.005, self._case.latency + 0.008 * self._random.standard_normal())
+        if self._random.uniform() < LOST:
+            return
+        if measured is not None:
+            self._send(
+                now + late, ForceSample(stamp=now, arrived=now + late, force=measured, stddev=self._sensor.stddev)
+            )
+        if self._sensor.touching is not None:
+            self._send(now + late, TouchSample(stamp=now, touching=self._sensor.touching))
+
+    def _send(self, due: float, sample: ForceSample | TouchSample) -> None:
+        heapq.heappush(self._arrivals, (due, next(self._order), sample))
+
+    def _is_over(self, status: GraspStatus) -> bool:
+        """Keep the status, and say whether the force was held for long enough."""
+        now = self.clock.now()
+        self.course.statuses.append((now, status))
+        if math.isnan(self.course.held_at) and status.phase is GraspPhase.HOLDING:
+            self.course.held_at = now
+        return now > self.course.held_at + self._holding

@@ -1,0 +1,221 @@
+"""The letter's static evaluations: cylinders at three places (Table I), and what knowing the place is worth (II)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.contact_source import ContactChoice
+from finforce_eval.evaluation.evaluate import Evaluation
+from finforce_eval.evaluation.results import ONSET
+from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
+from finforce_eval.recordings.tracks import Recording
+from lab.experiments.experiment import Case, Findings, ResultTable
+from lab.experiments.runs import RunOptions, build_setup
+
+# Ø [mm] and height of the axis [mm] of the twin's cylinders, whose finger the letter's heights do not fit
+DIAMETERS = (15, 25, 35)
+HEIGHTS = {"upper": 58.0, "middle": 40.0, "lower": 24.0}
+BENCH_HEIGHTS = {"upper": 60.0, "middle": 40.0, "lower": 20.0}  # of the bench recordings [mm]
+QUICK_CASES = ((15, "upper"), (25, "middle"), (15, "lower"))
+SHORT = {"levels": 1, "settle": 0.3, "record": 0.5, "displacement": 0.004}
+# RMSE [N] of the letter, Table I by place and diameter, and Table II by real and assumed place
+TABLE_I = {"upper": (0.22, 0.52, 0.57), "middle": (0.24, 0.28, 0.24), "lower": (0.69, 0.62, 1.21)}
+TABLE_II = {
+    "upper": {"estimate": 0.20, "upper": 0.22, "middle": 1.21, "lower": 5.91},
+    "middle": {"estimate": 0.26, "upper": 0.93, "middle": 0.24, "lower": 4.93},
+    "lower": {"estimate": 0.61, "upper": 4.40, "middle": 3.61, "lower": 0.69},
+}
+ESTIMATE = "estimate"
+LEAST_SOLVED = 1.0  # [%] of the images under load, below which nothing is said of a contact
+OTHERS = {"closest": "closest point", "paper": "Algorithm 1"}
+
+
+def list_cylinders(options: RunOptions, chosen: Sequence[tuple[int, str]]) -> list[Case]:
+    """Return cylinders on the twin's bench, or the bench recordings of one's own that are some of these.
+
+    Raises:
+        RecordingError: a recording does not say what is pressed on, and where.
+    """
+    if options.bags:
+        return _list_own(options, chosen)
+    cases = []
+    for number, (diameter, place) in enumerate(chosen):
+        changes = {"object": f"rod{diameter}", "height": 1e-3 * HEIGHTS[place]} | (SHORT if options.quick else {})
+        words = {"diameter": diameter, "place": place, "height_mm": HEIGHTS[place]}
+        cases.append(options.scene_case(f"cyl{diameter}_{place}", "bench_cylinder", changes, number, words=words))
+    return cases
+
+
+def _list_own(options: RunOptions, chosen: Sequence[tuple[int, str]]) -> list[Case]:
+    cases = []
+    for case, recording in options.read_bags(needed=("left",)):
+        shape = recording.case.get("object")
+        diameter, z = (shape.get(key) if isinstance(shape, Mapping) else None for key in ("diameter", "z"))
+        place = next((place for place, height in BENCH_HEIGHTS.items() if height == z), None)
+        if place is None or diameter not in DIAMETERS:
+            sizes, heights = (", ".join(f"{v:g}" for v in values) for values in (DIAMETERS, BENCH_HEIGHTS.values()))
+            raise RecordingError(
+                f"{case.settings['bag']}: object.diameter {diameter!r} and object.z {z!r} in its case.json; expected a "
+                f"cylinder of {sizes} mm at {heights} mm"
+            )
+        if (diameter, place) in chosen:
+            words = {"diameter": diameter, "place": place, "height_mm": z}
+            cases.append(replace(case, settings={**case.settings, "words": words}))
+    if not cases:
+        raise RecordingError(f"none of {len(options.bags)} recordings is one of {chosen}")
+    return cases
+
+
+def measure_contacts(
+    options: RunOptions, case: Case, folder: Path, contacts: Mapping[str, ContactChoice]
+) -> dict[str, Any]:
+    """Return what `score_contact` says of a cylinder under each contact, by name."""
+    with options.open_case(case, folder) as recording:
+        return {
+            "contacts": {
+                name: score_contact(recording, build_setup(case.settings, contact))
+                for name, contact in contacts.items()
+            }
+        }
+
+
+def score_contact(recording: Recording, setup: EvaluationSetup) -> dict[str, Any]:
+    """Return RMSE, its spread over the cycles, bias and solved share of a recording, or why there are none."""
+    try:
+        evaluation = evaluate_all([recording], setup)
+    except RecordingError as error:
+        return {"rmse_N": float("nan"), "solved_pct": 0.0, "reason": str(error)}
+    score = evaluation.total
+    cycles = {phase: score.cycles[phase].rmse_N for phase in ("all", "load", "unload")}
+    return {
+        "rmse_N": score.all.rmse_N,
+        "std_N": cycles["all"].std,
+        "load_N": cycles["load"].mean,
+        "unload_N": cycles["unload"].mean,
+        "nrmsd_pct": score.cycles["all"].nrmsd_pct.mean,
+        "bias_N": score.all.bias_N,
+        "solved_pct": _share_solved(evaluation),
+        "place_median_mm": score.place.median_mm,
+        "place_p95_mm": score.place.p95_mm,
+    }
+
+
+def _share_solved(evaluation: Evaluation) -> float:
+    """Return the share of the scored images with a true force that was answered [%]."""
+    loaded = [
+        (result.scored & (result.true_magnitude > ONSET), result.solved) for result in evaluation.results.values()
+    ]
+    answered = sum(int((rows & solved).sum()) for rows, solved in loaded)
+    return 100.0 * answered / max(sum(int(rows.sum()) for rows, _ in loaded), 1)
+
+
+def _fixed(height_mm: float) -> ContactChoice:
+    return ContactChoice(mode="fixed", height_mm=height_mm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchExperiment:
+    """Nine cylinders pressed on one jaw: Table I."""
+
+    options: RunOptions
+    name: str = "bench"
+    title: str = "Table I: cylinders pressed on one jaw"
+    about: str = (
+        "The letter presses cylinders of 15, 25 and 35 mm on one jaw at three places, in three levels up and down, "
+        "three times, and gives the place to its solver. Here the same is done with the place given and with it "
+        "estimated from the object's mesh and pose. On `twin` everything is rendered, and seen by the detector."
+    )
+
+    def list_cases(self) -> Sequence[Case]:
+        """Return the cylinders; see `Experiment`."""
+        every = [(diameter, place) for diameter in DIAMETERS for place in HEIGHTS]
+        return list_cylinders(self.options, QUICK_CASES if self.options.quick else every)
+
+    def run(self, case: Case, folder: Path) -> dict[str, Any]:
+        """Return the errors on a cylinder; see `Experiment`."""
+        own = _fixed(case.settings["words"]["height_mm"])
+        contacts = {"given": own, ESTIMATE: ContactChoice(mode="estimate")}
+        return measure_contacts(self.options, case, folder, contacts)
+
+    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
+        """Return Table I; see `Experiment`."""
+        tables, summary = [], {}
+        for contact, words in (("given", "the place given, as in the letter"), (ESTIMATE, "the place estimated")):
+            rows = []
+            for place in HEIGHTS:
+                cells = [_find_cell(figures, diameter, place, contact) for diameter in DIAMETERS]
+                letter = TABLE_I[place]
+                rows.append((place, *(f"{_format(one)} ({own:.2f})" for one, own in zip(cells, letter, strict=True))))
+            known = [row["contacts"][contact]["rmse_N"] for row in figures.values()]
+            known = [value for value in known if value is not None]
+            note = ""
+            if known:
+                summary[contact] = one = {"mean_N": float(np.mean(known)), "worst_N": float(np.max(known))}
+                note = f"Mean {one['mean_N']:.3f} N, worst {one['worst_N']:.3f} N; the letter's in brackets."
+            head = ("RMSE/N", *(f"Ø{diameter}" for diameter in DIAMETERS))
+            tables.append(ResultTable(title=f"**With {words}**", head=head, rows=rows, note=note))
+        return Findings(figures={"summary": summary, "cylinders": figures}, tables=tables)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacesExperiment:
+    """A cylinder of 15 mm at three places, each solved as if it were at all of them: Table II."""
+
+    options: RunOptions
+    name: str = "places"
+    title: str = "Table II: what knowing the place is worth"
+    about: str = (
+        "The letter presses a cylinder of 15 mm at three places and solves each with the place fixed at all three, and "
+        "with its contact estimator. A place at which the key points do not fit is refused here, rather than answered; "
+        "such a cell shows what was answered."
+    )
+
+    def list_cases(self) -> Sequence[Case]:
+        """Return the places; see `Experiment`."""
+        places = ("middle",) if self.options.quick else tuple(HEIGHTS)
+        return list_cylinders(self.options, [(DIAMETERS[0], place) for place in places])
+
+    def run(self, case: Case, folder: Path) -> dict[str, Any]:
+        """Return the errors at a place; see `Experiment`."""
+        heights = BENCH_HEIGHTS if self.options.bags else HEIGHTS
+        contacts = {mode: ContactChoice(mode=mode) for mode in (ESTIMATE, *OTHERS)}
+        contacts |= {place: _fixed(height) for place, height in heights.items()}
+        return measure_contacts(self.options, case, folder, contacts)
+
+    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
+        """Return Table II; see `Experiment`."""
+        rows = []
+        for place, letter in TABLE_II.items():
+            cells = {contact: _find_cell(figures, DIAMETERS[0], place, contact) for contact in letter}
+            if any(cells.values()):
+                others = (_format(_find_cell(figures, DIAMETERS[0], place, contact)) for contact in OTHERS)
+                ours = (f"{_format(cells[contact])} ({own:.2f})" for contact, own in letter.items())
+                rows.append((place, *ours, *others))
+        head = ("really at", "estimated", *(f"fixed {place}" for place in HEIGHTS), *OTHERS.values())
+        note = "RMSE [N] over the record phases, the letter's in brackets; %: share of the images that was answered."
+        table = ResultTable(title="**Ø15**", head=head, rows=rows, note=note)
+        return Findings(figures={"cylinders": figures}, tables=[table])
+
+
+def _find_cell(
+    figures: Mapping[str, Mapping[str, Any]], diameter: int, place: str, contact: str
+) -> Mapping[str, Any] | None:
+    """Return what was measured on a cylinder under a contact; None where it was not."""
+    for row in figures.values():
+        if (row["diameter"], row["place"]) == (diameter, place):
+            return row["contacts"].get(contact)
+    return None
+
+
+def _format(cell: Mapping[str, Any] | None) -> str:
+    if cell is None:
+        return "-"
+    if cell["rmse_N"] is None or not np.isfinite(cell["rmse_N"]) or cell["solved_pct"] < LEAST_SOLVED:
+        return "refused"
+    return f"{cell['rmse_N']:.2f}" + ("" if cell["solved_pct"] > 99.9 else f", {cell['solved_pct']:.0f} %")

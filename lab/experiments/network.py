@@ -1,0 +1,150 @@
+"""The letter's comparison: an end-to-end network, on what it was trained on and on what it was not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.scoring import rms
+from finforce_eval.evaluation.setup import evaluate_all
+from lab.experiments.experiment import Case, Findings, ResultTable, leave_out
+from lab.experiments.force_network import ForceNetwork
+from lab.experiments.grasp import join_jaws
+from lab.experiments.runs import RunOptions, build_setup
+
+GRASP = {"settle": 0.2, "record": 0.6, "clearance": 0.003, "closing_speed": 0.004}
+FIRM, SOFT, SLIGHT = 0.006, 0.004, 0.0015  # [m] of each jaw beyond first touch
+SEEN, OBJECT, PLACE, LIGHT = "as trained", "another object", "another place", "dim light"
+# group, name, scene, what is changed; trained is on rod25 and block, 28 to 54 mm, bright
+GRASPS = (
+    (SEEN, "cylinder_firm", "grasp_cylinder", {"displacement": FIRM, "height": 0.040}),
+    (SEEN, "cylinder_soft", "grasp_cylinder", {"displacement": SOFT, "height": 0.046}),
+    (SEEN, "cube_firm", "grasp_cube", {"displacement": FIRM, "height": 0.040}),
+    (SEEN, "cube_soft", "grasp_cube", {"displacement": SOFT, "height": 0.034}),
+    (OBJECT, "asymmetric_firm", "grasp_asymmetric", {"displacement": FIRM, "height": 0.040}),
+    (OBJECT, "asymmetric_soft", "grasp_asymmetric", {"displacement": SOFT, "height": 0.046}),
+    (OBJECT, "rod15_firm", "grasp_cylinder", {"displacement": FIRM, "height": 0.040, "object": "rod15"}),
+    (OBJECT, "rod35_soft", "grasp_cylinder", {"displacement": SOFT, "height": 0.040, "object": "rod35"}),
+    (PLACE, "cylinder_upper", "grasp_cylinder", {"displacement": FIRM, "height": 0.061}),
+    (PLACE, "cylinder_lower", "grasp_cylinder", {"displacement": SOFT, "height": 0.022}),
+    (PLACE, "cube_upper", "grasp_cube", {"displacement": FIRM, "height": 0.061}),
+    (PLACE, "cube_lower", "grasp_cube", {"displacement": SLIGHT, "height": 0.022}),
+    (LIGHT, "cylinder_dim", "grasp_cylinder", {"displacement": FIRM, "height": 0.040, "light": "dim"}),
+    (LIGHT, "cylinder_soft_dim", "grasp_cylinder", {"displacement": SOFT, "height": 0.046, "light": "dim"}),
+    (LIGHT, "cube_dim", "grasp_cube", {"displacement": FIRM, "height": 0.040, "light": "dim"}),
+    (LIGHT, "cube_soft_dim", "grasp_cube", {"displacement": SOFT, "height": 0.034, "light": "dim"}),
+)
+QUICK = ("cylinder_firm", "asymmetric_firm", "cube_upper", "cylinder_dim")
+QUICK_GRASP = {"settle": 0.1, "record": 0.3, "clearance": 0.001, "closing_speed": 0.008}
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkExperiment:
+    """Grasps that are judged by finforce and by an end-to-end network; of the twin, or recordings with images."""
+
+    options: RunOptions
+    name: str = "network"
+    title: str = "Against an end-to-end network"
+    about: str = (
+        "The letter trains a network on images and forces alone (ResNet-50 features of ten images, a transformer), and "
+        "finds that it fails on what it has not seen. The network here is of the same kind, with a smaller encoder, "
+        "trained on rendered grasps of a cylinder and a cube in bright light; both methods see the same images. "
+        "finforce also has the object's mesh and poses, and the finger's model; the network has neither."
+    )
+
+    @cached_property
+    def _network(self) -> ForceNetwork:
+        return ForceNetwork(self.options.network) if self.options.network else ForceNetwork()
+
+    def list_cases(self) -> Sequence[Case]:
+        """Return the grasps; see `Experiment`."""
+        used = {"network": self._network.sha256}
+        if self.options.bags:
+            read = self.options.read_bags()
+            blind = [case.settings["bag"] for case, recording in read if recording.images is None]
+            if blind:
+                raise RecordingError(f"{blind[0]}: this experiment needs colour images, which are not in it")
+            return [replace(case, settings={**case.settings, **used}) for case, _ in read]
+        times = QUICK_GRASP if self.options.quick else GRASP
+        return [
+            self.options.scene_case(name, scene, times | changes, number, words={"group": group}, **used)
+            for number, (group, name, scene, changes) in enumerate(GRASPS)
+            if name in QUICK or not self.options.quick
+        ]
+
+    def run(self, case: Case, folder: Path) -> dict[str, Any]:
+        """Return the errors of both on one grasp; see `Experiment`."""
+        with self.options.open_case(case, folder) as recording:
+            stamps, forces = self._network.follow(recording.images.colors_alone())
+            course = join_jaws(evaluate_all([recording], build_setup(case.settings)), recording.name)
+        told = dict(zip(stamps.tolist(), forces.tolist(), strict=True))
+        theirs = np.array([told.get(stamp, np.nan) for stamp in course.stamps.tolist()])
+        held = course.phases["all"] & np.isfinite(theirs)
+        both = held & np.isfinite(course.found)
+        span = float(np.ptp(course.truth[held])) if held.any() else float("nan")
+        series = {"seconds": course.seconds, "truth": course.truth, "found": course.found, "network": theirs}
+        return {
+            "peak_N": float(np.nanmax(course.truth, initial=0.0)),
+            "span_N": span,
+            "rmse_N": rms((course.found - course.truth)[both]),
+            "network_rmse_N": rms((theirs - course.truth)[held]),
+            "network_bias_N": float((theirs - course.truth)[held].mean()) if held.any() else float("nan"),
+            "answered_pct": 100.0 * float(both.sum() / max(held.sum(), 1)),
+            "course": {name: np.round(values, 4).tolist() for name, values in series.items()},
+        }
+
+    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
+        """Return both methods' errors by what the network had seen; see `Experiment`."""
+        from lab.experiments.pictures import draw_networks
+
+        draw_networks(figures).savefig(folder / "network.png")
+        groups = list(dict.fromkeys(row.get("group", "recordings") for row in figures.values()))
+        summary = {}
+        for group in groups:
+            rows = [row for row in figures.values() if row.get("group", "recordings") == group]
+            summary[group] = _compare(rows)
+        head = ("grasps", "n", "peak/N", "finforce/N", "NRMSD/%", "network/N", "NRMSD/%", "network : finforce")
+        rows = [
+            (group, str(one["n"]), f"{one['peak_N']:.2f}", f"{one['rmse_N']:.3f}", f"{one['nrmsd_pct']:.1f}",
+             f"{one['network_rmse_N']:.3f}", f"{one['network_nrmsd_pct']:.1f}", f"{one['ratio']:.1f}")
+            for group, one in summary.items()
+        ]  # fmt: skip
+        note = (
+            "Mean over the grasps of each one's RMSE of min(|F_left|, |F_right|) while the true force is above 0.02 N; "
+            "NRMSD of each grasp's own range."
+        )
+        first = ResultTable(title="**By what the network has seen**", head=head, rows=rows, note=note)
+        cells = [
+            (name, f"{row['peak_N']:.2f}", f"{row['rmse_N']:.3f}", f"{row['network_rmse_N']:.3f}",
+             f"{row['network_bias_N']:+.3f}", f"{row['answered_pct']:.1f}")
+            for name, row in figures.items()
+        ]  # fmt: skip
+        head = ("grasp", "peak/N", "finforce/N", "network/N", "network's bias/N", "answered/%")
+        second = ResultTable(title="**Each grasp**", head=head, rows=cells)
+        return Findings(
+            figures={"groups": summary, "trained": dict(self._network.about), "grasps": leave_out(figures, "course")},
+            tables=[first, second],
+            pictures={"Measured force (dashed), finforce (blue), network (orange)": "network.png"},
+        )
+
+
+def _compare(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return the mean errors of both methods over some grasps."""
+    ours, theirs, span, peak = (
+        np.array([row[key] for row in rows], dtype=float) for key in ("rmse_N", "network_rmse_N", "span_N", "peak_N")
+    )
+    return {
+        "n": len(rows),
+        "peak_N": float(np.nanmean(peak)),
+        "rmse_N": float(np.nanmean(ours)),
+        "nrmsd_pct": 100.0 * float(np.nanmean(ours / span)),
+        "network_rmse_N": float(np.nanmean(theirs)),
+        "network_nrmsd_pct": 100.0 * float(np.nanmean(theirs / span)),
+        "ratio": float(np.nanmean(theirs) / np.nanmean(ours)),
+    }

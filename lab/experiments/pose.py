@@ -1,0 +1,158 @@
+"""What poses of the object are worth as they come: late, with gaps, and with flips of things that look alike turned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from finforce_eval.evaluation.contact_source import ContactChoice
+from finforce_eval.evaluation.setup import evaluate_all
+from finforce_eval.evaluation.tables import format_number
+from finforce_eval.recordings.tracks import Recording
+from lab.experiments.experiment import Case, Findings, ResultTable
+from lab.experiments.grasp import join_jaws, score_course
+from lab.experiments.runs import RunOptions, build_setup, keep_poses
+from lab.experiments.tracked_poses import score_poses, track_object, true_poses
+
+SCENES = {
+    "cylinder": ("grasp_cylinder", {}),
+    "cube": ("grasp_cube", {}),
+    "asymmetric": ("grasp_asymmetric", {}),
+    "fast": ("fast_close", {"cycles": 1}),
+    "drawn": ("shifting", {}),
+    "rocked": ("rocking", {}),
+}
+QUICK_SCENES = ("asymmetric",)
+MILLISECOND = 1_000_000  # [ns]
+DELAYS = {"on time": 0, "100 ms late": 100 * MILLISECOND, "200 ms late": 200 * MILLISECOND}
+FLIPPED = 0.1  # share of the poses that are turned
+GAP, GAPS_EVERY = 0.8, 2.0  # [s] without poses, and from one such gap to the next
+WORST, TRACKER = "200 ms late, flips, gaps", "built-in tracker"
+SOURCES = {"on time": "recorded poses", WORST: "as FoundationPose, at its worst", TRACKER: "built-in tracker, CPU"}
+POSE_FIGURES = ("rate_Hz", "delay_ms", "position_median_mm", "position_p95_mm", "rotation_median_deg",
+                "rotation_p95_deg")  # fmt: skip
+
+
+def flip_poses(recording: Recording, seed: int) -> Recording:
+    """Return a recording in which some poses of the object are turned by half a turn about one of its axes."""
+    track, rng = recording.object_pose, np.random.default_rng(seed)
+    turned = rng.random(len(track.stamps)) < FLIPPED
+    axes = np.eye(3)[rng.integers(3, size=len(turned))]
+    turns = Rotation.from_rotvec(np.pi * turned[:, None] * axes)
+    quaternion = (Rotation.from_quat(track.quaternion) * turns).as_quat()
+    return replace(recording, object_pose=replace(track, quaternion=quaternion))
+
+
+def drop_poses(recording: Recording) -> Recording:
+    """Return a recording whose object is lost for a while now and then."""
+    stamps = recording.object_pose.stamps
+    seconds = 1e-9 * (stamps - stamps[0])
+    return keep_poses(recording, np.mod(seconds, GAPS_EVERY) < GAPS_EVERY - GAP)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseExperiment:
+    """Grasps, whose object's poses come in several ways."""
+
+    options: RunOptions
+    name: str = "pose"
+    title: str = "Poses of the object: late, flipped, lost"
+    about: str = (
+        "The letter takes the object's pose from FoundationPose, which is late, takes a thing that looks the same when "
+        "turned for turned, and now and then loses it. Here the poses of the twin's tracker (10 Hz, 0.3 mm and 0.3° of "
+        "noise) arrive 0, 100 and 200 ms after their image, a tenth of them is turned by half a turn about an axis of "
+        "the object, and for 0.8 s in every 2 s there are none; the built-in tracker follows the object in the same "
+        "depth images. The key points are those of the images, the same each time."
+    )
+
+    def list_cases(self) -> Sequence[Case]:
+        """Return the grasps; see `Experiment`."""
+        if self.options.bags:
+            return self.options.bag_cases()
+        names = QUICK_SCENES if self.options.quick else tuple(SCENES)
+        numbers = {name: number for number, name in enumerate(SCENES)}
+        return [self.options.scene_case(name, *SCENES[name], numbers[name]) for name in names]
+
+    def run(self, case: Case, folder: Path) -> dict[str, Any]:
+        """Return the figures of a grasp in each way; see `Experiment`."""
+        with self.options.open_case(case, folder) as recording:
+            flipped, lost = flip_poses(recording, self.options.seed), drop_poses(recording)
+            ways = {name: (recording, delay) for name, delay in DELAYS.items()}
+            ways |= {"flips": (flipped, 0), "gaps": (lost, 0), WORST: (drop_poses(flipped), DELAYS["200 ms late"])}
+            truth, found, seen_mm = {} if self.options.bags else true_poses(case.settings), {}, {}
+            if recording.images is not None and recording.images.has_depth:
+                tracked = track_object(recording)
+                ways[TRACKER] = (tracked.recording, tracked.delay)
+            for way in set(SOURCES) & set(ways):
+                seen, delay = ways[way]
+                seen_mm[way] = {"delay_ms": 1e-6 * delay, **score_poses(seen, truth)}
+            for way, (seen, delay) in ways.items():
+                setup = build_setup(case.settings, ContactChoice(mode="estimate", pose_delay=delay))
+                evaluation = evaluate_all([seen], setup)
+                places = [score.solved_place.median_mm for score in evaluation.scores.values()]
+                known = [place for place in places if place is not None]
+                score = score_course(join_jaws(evaluation, recording.name))
+                found[way] = {**score, "place_median_mm": max(known) if known else float("nan")}
+        return {"ways": found, "poses": seen_mm}
+
+    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
+        """Return what each way adds to the error; see `Experiment`."""
+        ways = [
+            way for way in next(iter(figures.values()))["ways"] if all(way in row["ways"] for row in figures.values())
+        ]
+        summary, rows = {}, []
+        base = _errors(figures, "on time")
+        for way in ways:
+            errors = _errors(figures, way)
+            answered = [row["ways"][way]["answered_pct"] for row in figures.values()]
+            places = [row["ways"][way]["place_median_mm"] for row in figures.values()]
+            added = errors - base
+            summary[way] = one = {
+                "rmse_N": float(errors.mean()),
+                "added_N": float(added.mean()),
+                "most_added_N": float(added.max()),
+                "answered_pct": float(np.mean(answered)),
+                "place_worst_median_mm": float(max((place for place in places if place is not None), default=0.0)),
+            }
+            rows.append((way, *(f"{one[key]:.3f}" for key in ("rmse_N", "added_N", "most_added_N")),
+                         f"{one['place_worst_median_mm']:.2f}", f"{one['answered_pct']:.1f}"))  # fmt: skip
+        head = ("poses", "RMSE/N", "added/N", "most added/N", "place: worst median/mm", "answered/%")
+        note = "Grasp force, mean over the grasps of each one's RMSE while the true force is above 0.02 N."
+        first = ResultTable(title="**By way**", head=head, rows=rows, note=note)
+        cells = [(name, *(f"{row['ways'][way]['rmse_N']['all']:.3f}" for way in ways)) for name, row in figures.items()]
+        second = ResultTable(title="**Each grasp, RMSE [N]**", head=("grasp", *ways), rows=cells)
+        return Findings(
+            figures={"ways": summary, "grasps": figures}, tables=[first, _source_table(figures, summary), second]
+        )
+
+
+def _source_table(figures: Mapping[str, Mapping[str, Any]], summary: Mapping[str, Mapping[str, float]]) -> ResultTable:
+    """Return what poses and forces are worth by where the poses come from."""
+    rows = []
+    for way, words in SOURCES.items():
+        known = [row["poses"][way] for row in figures.values() if way in row["poses"]]
+        if known:
+            cells = [np.mean([one.get(key, np.nan) for one in known]) for key in POSE_FIGURES]
+            rows.append(
+                (
+                    words,
+                    *(format_number(None if np.isnan(cell) else cell) for cell in cells),
+                    f"{summary[way]['rmse_N']:.3f}",
+                )
+            )
+    head = ("source", "rate/Hz", "delay/ms", "position: median/mm", "95 %/mm", "turn: median/°", "95 %/°", "force/N")
+    note = (
+        "Means over the grasps. FoundationPose needs a GPU and is not run: its figures are those of a publisher that "
+        "behaves like it. Delay of the built-in tracker: the median of its computation here."
+    )
+    return ResultTable(title="**By source**", head=head, rows=rows, note=note)
+
+
+def _errors(figures: Mapping[str, Mapping[str, Any]], way: str) -> np.ndarray:
+    """Return the RMSE (n,) [N] of the grasps whose poses come in a way."""
+    return np.array([row["ways"][way]["rmse_N"]["all"] for row in figures.values()], dtype=float)

@@ -1,0 +1,158 @@
+"""What experiments on grasps share: scenes of the twin or recordings of one's own, read with key points and scored."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+from numpy.typing import NDArray
+
+from finforce.gripper_frames import SIDES
+from finforce_eval.engine.settings import hash_files
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.contact_source import ContactChoice
+from finforce_eval.evaluation.keypoint_source import KeypointSource
+from finforce_eval.evaluation.setup import EvaluationSetup
+from finforce_eval.machine import commit, write_json
+from finforce_eval.recordings.bags import bag_source
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.tracks import Recording
+from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
+from finforce_ifea.jaw.calibration import load_calibration
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.settings import EstimatorSettings
+from finforce_sim.gripper.footage import parse_size
+from finforce_sim.scenes.scenarios import build_scenario
+from lab.experiments.experiment import Case
+
+RECORDINGS, SCENE = "recordings", "scene.json"
+FARTHEST = 0.3  # [m] of depth that is kept; jaws are nearer
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """How recordings are solved.
+
+    Attributes:
+        bags: recordings of one's own; none for scenes of the twin.
+        jaw: shipped name or jaw file.
+        calibration: shipped name or file; empty for the jaw file's own material.
+        source: of the key points, see `KeypointSource`; empty for images of the twin, and for what bags have.
+        seed: of the first scene.
+        size: of the twin's images, WIDTHxHEIGHT.
+        keep: keep the twin's recordings when they have been scored.
+        quick: few and small cases.
+        network: file of the end-to-end network; empty for the shipped one.
+    """
+
+    bags: Sequence[str] = ()
+    jaw: str = "bench"
+    calibration: str = "twin"
+    source: str = ""
+    seed: int = 100
+    size: str = "640x480"
+    keep: bool = False
+    quick: bool = False
+    network: str = ""
+
+    @property
+    def shared(self) -> dict[str, Any]:
+        """The settings that every case has."""
+        files = hash_files((self.jaw, self.calibration))
+        return {"jaw": self.jaw, "calibration": self.calibration, "source": self.source, "files": files}
+
+    def scene_case(self, name: str, scene: str, changes: Mapping[str, Any], number: int, **more: Any) -> Case:
+        """Return a case that is a scene of the twin; `more` is kept in its settings, too."""
+        made = {"scene": scene, "changes": dict(changes), "seed": self.seed + number, "size": self.size}
+        return Case(name=name, settings=self.shared | made | more)
+
+    def bag_cases(self, needed: Sequence[str] = SIDES) -> list[Case]:
+        """Return the recordings of one's own as cases; see `read_bags`."""
+        return [case for case, _ in self.read_bags(needed)]
+
+    def read_bags(self, needed: Sequence[str] = SIDES) -> list[tuple[Case, Recording]]:
+        """Return the recordings of one's own, each as a case and as it was read.
+
+        Args:
+            needed: jaws whose measured force, and about which the object's poses, an experiment cannot do without.
+
+        Raises:
+            RecordingError: a recording lacks something, and which it is.
+        """
+        read = []
+        for bag in self.bags:
+            recording = read_recording(bag)
+            missing = list_missing(recording, needed)
+            if missing:
+                raise RecordingError(f"{bag}: this experiment needs {'; '.join(missing)}, which is not in it")
+            source = bag_source(Path(bag))
+            files = sorted(source.glob("*")) if source.is_dir() else [source]
+            size = sum(path.stat().st_size for path in files)
+            settings = self.shared | {"bag": str(bag), "bytes": size}
+            read.append((Case(name=recording.name, settings=settings), recording))
+        return read
+
+    @contextmanager
+    def open_case(self, case: Case, folder: Path) -> Iterator[Recording]:
+        """Give the recording of a case with its key points; a scene is rendered first, and forgotten once it is scored.
+
+        Raises:
+            FinforceError: the scene cannot be rendered, the recording not be read, or no key points are found.
+        """
+        settings, source = case.settings, case.settings["source"]
+        is_own = "bag" in settings
+        bag = Path(settings["bag"]) if is_own else folder / RECORDINGS / case.name
+        if not is_own:
+            render_scene(settings, bag)
+            source = source or "images"
+        yield KeypointSource(source=source, jaw_file=settings["jaw"]).apply(read_recording(bag))
+        if not is_own and not self.keep:
+            rmtree(bag, ignore_errors=True)
+
+
+def list_missing(recording: Recording, needed: Sequence[str]) -> list[str]:
+    """Return what a recording lacks: measured forces of jaws, or the object's poses."""
+    sides = [side for side in needed if side not in recording.jaws or recording.jaws[side].truth is None]
+    missing = [f"/{side}/ground_truth_wrench" for side in sides]
+    return missing if recording.object_pose is not None else [*missing, "/object_pose"]
+
+
+def build_setup(settings: Mapping[str, Any], contact: ContactChoice | None = None) -> EvaluationSetup:
+    """Return the setup that a case's settings name.
+
+    Raises:
+        FinforceError: jaw or calibration cannot be used.
+    """
+    return EvaluationSetup(
+        jaw=load_jaw(settings["jaw"]),
+        settings=EstimatorSettings(),
+        calibration=load_calibration(settings["calibration"]) if settings["calibration"] else None,
+        contacts=contact or ContactChoice(mode="estimate"),
+        about={},
+    )
+
+
+def render_scene(settings: Mapping[str, Any], bag: Path) -> None:
+    """Write the recording of a scene, unless it is there: of the same scene, seed, size and code."""
+    made = {key: settings[key] for key in ("scene", "changes", "seed", "size")} | {"commit": commit()}
+    told = bag / SCENE
+    with suppress(OSError, ValueError):
+        if json.loads(told.read_text(encoding="utf-8")) == made:
+            return
+    rmtree(bag, ignore_errors=True)  # another scene of that name, or what a killed run has left
+    scenario = build_scenario(settings["scene"], **settings["changes"])
+    form = RecordingForm(farthest=FARTHEST)
+    record_scene(scenario, settings["seed"], bag, camera=parse_size(settings["size"]), form=form)
+    write_json(told, made)  # last: where it stands all of the recording is there
+
+
+def keep_poses(recording: Recording, seen: NDArray) -> Recording:
+    """Return a recording with those poses of the object (n,) alone that are seen."""
+    track = recording.object_pose
+    kept = {name: getattr(track, name)[seen] for name in ("stamps", "position", "quaternion")}
+    return replace(recording, object_pose=replace(track, **kept))

@@ -1,0 +1,280 @@
+"""Stress of contact place and solver together: hard objects at given poses, approached, pressed in and held."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_contact.estimator import ContactEstimator
+from finforce_contact.localization.section import cut_outline
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.settings import ContactSettings
+from finforce_ifea.contact_mechanics.forward_press import PressState, press_jaw
+from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
+from finforce_ifea.contact_mechanics.penalty import PenaltyContact
+from finforce_ifea.errors import ContactError
+from finforce_ifea.observation import Solution
+from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, SessionStep, judge, noise_of, update
+from lab.stress.stress import Family, Plan, Trial, attempt
+
+APPROACH, RISE, HOLD = 10, 20, 20
+CLEAR = 0.02
+# Noise of the poses [m], white on each axis.
+POSE_NOISE = 1e-4
+
+
+class PressedOutline:
+    """A rigid outline for the forward problem; depth counts from first touch with the undeformed jaw."""
+
+    def __init__(self, polygons: tuple[NDArray, ...], length: float) -> None:
+        """Builds the field of polygons (n, 2) [m] for a jaw of some length [m]; raises ContactError if too small."""
+        self._indenter, self._length = OutlineIndenter(polygons), length
+
+    def find_origin(self, face_x: float, depth: float, height: float) -> float:
+        """Returns x [m] of the outline's origin at a depth and height [m]."""
+        return face_x + self._indenter.field.front - float(self._place(depth, height)[0])
+
+    def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
+        """See `finforce_ifea.contact_mechanics.forward_press.RigidObject`."""
+        return self._indenter.press(points, stiffness, face_x, self._place(depth, height))
+
+    def _place(self, depth: float, height: float) -> NDArray:
+        place = np.array([0.0, 0.0, height])
+        place[0] = depth + self._indenter.find_touch(place, flat_profile(0.0, self._length))
+        return place
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PressedImage:
+    """What is true in one image: pose T_jaw_object (4, 4), key points (K, 3) [m], force [N] and torque [N m] (3,)."""
+
+    T: NDArray
+    points: NDArray
+    force: NDArray
+    torque: NDArray
+
+
+def plan_depths(scene: HardScene) -> NDArray:
+    """Returns the depth of the object in each image (n,) [m], from well clear of the jaw on."""
+    last = min(scene.depth, 0.0)
+    approach = np.linspace(-CLEAR + last, last, APPROACH)
+    rise = np.linspace(0.0, scene.depth, RISE + 1)[1:] if scene.depth > 0.0 else np.full(RISE, last)
+    return np.concatenate([approach, rise, np.full(HOLD, scene.depth)])
+
+
+def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
+    """Returns what is true in each image; an object that no outline describes leaves the jaw as it is.
+
+    Raises:
+        ContactError: The jaw has no equilibrium with the object.
+    """
+    R, jaw, surface = rotation_of(scene.tilt), bench.jaw, bench.mechanics.contact.surface
+    polygons = cut_outline(scene.mesh, R, float(surface.high[0]), scene.across)
+    try:
+        rigid = PressedOutline(polygons, float(surface.high[1]))
+    except ContactError:
+        rigid = None
+    depths, presses = plan_depths(scene), {}
+    if rigid is not None and not scene.is_impossible:
+        rising = np.unique(depths[depths > 0.0])
+        found = press_jaw(bench.mechanics.model, surface, jaw.inner_face_x, rigid, scene.height, rising)
+        presses = {press.depth: press for press in found}
+    leading = min(polygon[:, 0].min() for polygon in polygons)
+    frames = []
+    for depth in depths.tolist():
+        T = np.eye(4)
+        T[:3, :3] = R
+        flat = jaw.inner_face_x - leading - depth
+        x = flat if rigid is None else rigid.find_origin(jaw.inner_face_x, depth, scene.height)
+        T[:3, 3] = x, scene.across, scene.height
+        frames.append(_frame_of(bench, T, presses.get(depth)))
+    return frames
+
+
+def _frame_of(bench: Bench, T: NDArray, press: PressState | None) -> PressedImage:
+    """Returns the truth at a pose, with the jaw at rest without a press."""
+    if press is None:
+        return PressedImage(T=T, points=bench.jaw.keypoints, force=np.zeros(3), torque=np.zeros(3))
+    model = bench.mechanics.model
+    points = model.positions(model.attach(bench.jaw.keypoints, 1.0), press.q)
+    return PressedImage(T=T, points=points, force=press.force, torque=press.torque)
+
+
+def rotation_of(tilt: float) -> NDArray:
+    """Returns the turn (3, 3) by a tilt [rad] from x to z."""
+    c, s = np.cos(tilt), np.sin(tilt)
+    return np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+
+
+class Chain:
+    """Contact estimator and solver of one jaw, fed as their nodes are."""
+
+    def __init__(self, bench: Bench, scene: HardScene, random: np.random.Generator) -> None:
+        """Starts both anew and lets the solver tare while the object is clear."""
+        self._bench, self._random = bench, random
+        self._contact = ContactEstimator(bench.jaw, mesh=scene.mesh, settings=ContactSettings(mesh=bench.plan.mesh))
+        self._offsets = OFFSET * random.normal(size=bench.jaw.keypoints.shape)
+        self._stamp, self._last = 10.0, None
+        bench.estimator.reset()
+
+    def see(self, frame: PressedImage) -> SessionStep:
+        """Returns the next image of what is true, with noise; the contact is not known yet."""
+        self._stamp += PERIOD
+        noise = noise_of(self._random, (len(frame.points),))
+        return SessionStep(
+            stamp=self._stamp,
+            points=frame.points + self._offsets + noise,
+            likelihood=np.full(len(frame.points), LIKELIHOOD),
+            contact=None,
+            force=frame.force,
+            torque=frame.torque,
+        )
+
+    def solve(self, step: SessionStep, T: NDArray) -> Solution:
+        """Returns what both make of an image and a pose T_jaw_object (4, 4)."""
+        T = T.copy()
+        T[:3, 3] += POSE_NOISE * self._random.normal(size=3)
+        self._contact.take_pose(step.stamp, T)
+        last = self._last
+        wrench = (last.force, last.torque) if last is not None and last.trusted else None
+        surface = None if last is None else self._bench.estimator.surface()
+        estimate = self._contact.update(step.stamp, surface, wrench)
+        self._last = None
+        self._last = update(self._bench, replace(step, contact=estimate.contact))
+        return self._last
+
+
+def run_objects(plan: Plan) -> Iterator[Trial]:
+    """Yields every scene, image by image."""
+    bench = Bench(plan)
+    for scene in build_scenes():
+        frames = press_scene(bench, scene)
+        for seed in range(plan.share(2)):
+            yield from play_scene(bench, scene, frames, seed)
+
+
+def play_scene(bench: Bench, scene: HardScene, frames: list[PressedImage], seed: int) -> Iterator[Trial]:
+    """Yields the images of a scene after the tare, each a step of contact estimator and solver."""
+    chain = Chain(bench, scene, bench.plan.random("objects", scene.name, seed))
+    tare = [frames[0]] * bench.estimator.settings.tare_frames
+    for index, frame in enumerate([*tare, *frames]):
+        step = chain.see(frame)
+        trial = attempt(
+            seed,
+            lambda s=step, f=frame: chain.solve(s, f.T),
+            lambda got, s=step: judge(got, s),
+            level=scene.name,
+        )
+        if index >= len(tare):
+            yield trial
+
+
+FAMILIES = (
+    Family(
+        name="objects", what="objects grazing, flat, sharp, tiny, huge, thin, open", run=run_objects, least_sure=0.5
+    ),
+)
+
+
+AROUND = 96
+LENGTH = 0.06
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HardScene:
+    """An object and where it presses.
+
+    Attributes:
+        name: of the scene.
+        mesh: of the object.
+        height: of its origin along the jaw [m].
+        tilt: its turn from x to z [rad].
+        depth: of the press below the undeformed surface [m]; negative: it stays away.
+        across: of its origin along the width [m].
+        is_impossible: whether no press is like this: the jaw stays at rest, whatever the poses say.
+    """
+
+    name: str
+    mesh: ObjectMesh
+    height: float = 0.04
+    tilt: float = 0.0
+    depth: float = 3e-3
+    across: float = 0.0
+    is_impossible: bool = False
+
+
+def build_prism(section: NDArray, length: float = LENGTH) -> ObjectMesh:
+    """Returns the closed prism along y over a convex section (n, 2) of x and z [m], counterclockwise from x to z."""
+    count = len(section)
+    ring = np.stack([section[:, 0], np.full(count, -0.5 * length), section[:, 1]], axis=1)
+    a, b = np.arange(count), (np.arange(count) + 1) % count
+    sides = np.stack([a, a + count, b, b, a + count, b + count], axis=1).reshape(-1, 3)
+    low = np.stack([a, b, np.full(count, 2 * count)], axis=1)
+    high = np.stack([b, a, np.full(count, 2 * count + 1)], axis=1) + [count, count, 0]
+    middle = section.mean(axis=0)
+    ends = [[middle[0], y, middle[1]] for y in (-0.5 * length, 0.5 * length)]
+    vertices = np.vstack([ring, ring + [0.0, length, 0.0], ends])
+    triangles = np.concatenate([sides, low, high]).astype(np.int32)
+    return ObjectMesh(vertices=vertices, triangles=triangles, watertight=True, name="prism")
+
+
+def circle(radius: float) -> NDArray:
+    """Returns a round section (n, 2) [m]."""
+    angles = 2.0 * np.pi * np.arange(AROUND) / AROUND
+    return radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def rectangle(size_x: float, size_z: float) -> NDArray:
+    """Returns a rectangular section (4, 2) [m]."""
+    return 0.5 * np.array([[-size_x, -size_z], [size_x, -size_z], [size_x, size_z], [-size_x, size_z]])
+
+
+def leave_open(mesh: ObjectMesh) -> ObjectMesh:
+    """Returns a mesh without some triangles of its ends."""
+    kept = mesh.triangles[: int(0.9 * len(mesh.triangles))]
+    return ObjectMesh(vertices=mesh.vertices, triangles=kept, watertight=False, name="open prism")
+
+
+def in_single_precision(mesh: ObjectMesh) -> ObjectMesh:
+    """Returns a mesh with vertices in single precision."""
+    return replace(mesh, vertices=mesh.vertices.astype(np.float32))
+
+
+def build_scenes() -> tuple[HardScene, ...]:
+    """Returns the scenes."""
+    rod, bar = build_prism(circle(0.0125)), build_prism(rectangle(0.03, 0.03))
+    return (
+        HardScene(name="rod", mesh=rod),
+        HardScene(name="rod, single precision", mesh=in_single_precision(rod)),
+        HardScene(name="rod near the base", mesh=rod, height=0.018),
+        HardScene(name="rod near the tip", mesh=rod, height=0.066),
+        HardScene(name="rod grazing by 0.05 mm", mesh=rod, depth=5e-5),
+        HardScene(name="rod grazing by 0.2 mm", mesh=rod, depth=2e-4),
+        HardScene(name="rod 0.3 mm away", mesh=rod, depth=-3e-4),
+        HardScene(name="rod far away", mesh=rod, depth=-3e-2),
+        HardScene(name="coplanar face", mesh=bar, depth=2e-4),
+        HardScene(name="coplanar face, deeper", mesh=bar, depth=3e-3),
+        HardScene(name="wall along the jaw", mesh=build_prism(rectangle(0.03, 0.2)), depth=1e-4),
+        HardScene(name="edge", mesh=bar, tilt=np.pi / 4),
+        HardScene(name="edge of a leaning bar", mesh=bar, tilt=0.12),
+        HardScene(name="bar over the tip", mesh=bar, height=0.085, depth=1e-3),
+        HardScene(name="wire of 0.5 mm", mesh=build_prism(circle(0.25e-3)), depth=1e-3, is_impossible=True),
+        HardScene(name="wire of 2 mm", mesh=build_prism(circle(1e-3)), depth=2e-3),
+        HardScene(name="drum of 1 m", mesh=build_prism(circle(0.5)), depth=5e-4),
+        HardScene(name="block of 1 m", mesh=build_prism(rectangle(1.0, 1.0)), depth=5e-5),
+        HardScene(name="plate of 1 mm, edge on", mesh=build_prism(rectangle(0.03, 1e-3)), depth=2e-3),
+        HardScene(
+            name="plate of 0.3 mm, edge on", mesh=build_prism(rectangle(0.03, 3e-4)), depth=2e-3, is_impossible=True
+        ),
+        HardScene(name="plate of 1 mm, face on", mesh=build_prism(rectangle(1e-3, 0.03)), depth=2e-3),
+        HardScene(
+            name="plate of 0.3 mm, face on", mesh=build_prism(rectangle(3e-4, 0.03)), depth=2e-3, is_impossible=True
+        ),
+        HardScene(name="open rod", mesh=leave_open(rod)),
+        HardScene(name="open bar", mesh=leave_open(bar), depth=2e-4),
+        HardScene(name="engulfing", mesh=build_prism(rectangle(0.2, 0.2), 0.2), depth=0.11, is_impossible=True),
+        HardScene(name="beyond the tip", mesh=rod, height=0.2, is_impossible=True),
+    )

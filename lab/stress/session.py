@@ -1,0 +1,301 @@
+"""Key points of a press in time, what an estimator says of them, and whether that is right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+from finforce_ifea.contact_mechanics.forward_press import PressState, RigidCylinder, press_jaw
+from finforce_ifea.contact_mechanics.penalty import measure_penalty_energy
+from finforce_ifea.errors import ContactError
+from finforce_ifea.estimator import JawEstimator
+from finforce_ifea.jaw.calibration import Calibration
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
+from finforce_ifea.mechanics import build_mechanics
+from finforce_ifea.observation import Contact, Observation, Solution
+from finforce_ifea.settings import EstimatorSettings
+from lab.stress.stress import Plan, Trial, attempt
+
+PERIOD = 1 / 30
+LIKELIHOOD = 0.95
+# Key point noise of a bench camera [m]: across and along its line of sight.
+ACROSS, ALONG = 0.2e-3, 0.45e-3
+SIGHT = np.array([0.25, -0.95, 0.18]) / np.linalg.norm([0.25, -0.95, 0.18])
+OFFSET = 0.2e-3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SessionStep:
+    """What an estimator is given in one image, and the truth.
+
+    Attributes:
+        stamp: [s].
+        points: (K, 3) [m].
+        likelihood: (K,).
+        contact: as for `JawEstimator.update`.
+        force: true (3,) [N].
+        torque: true (3,) [N m].
+        level: see `Trial`.
+        stddev: stated (K, 3) [m], or None.
+    """
+
+    stamp: float
+    points: NDArray
+    likelihood: NDArray
+    contact: Contact | None
+    force: NDArray
+    torque: NDArray
+    level: str = ""
+    stddev: NDArray | None = None
+
+
+def noise_of(random: np.random.Generator, shape: tuple[int, ...], scale: float = 1.0) -> NDArray:
+    """Returns the noise (..., 3) [m] of a bench camera, `scale` times as large."""
+    scatter = ACROSS * random.normal(size=(*shape, 3))
+    return scale * (scatter + ALONG * random.normal(size=(*shape, 1)) * SIGHT)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Session:
+    """An estimator that has tared and is about to see a press.
+
+    Attributes:
+        bench: whose estimator it is.
+        random: of the noise.
+        history: the press.
+        contact: what the estimator is told of the place.
+        offsets: of the key points, constant (K, 3) [m].
+        start: stamp of the last unloaded image [s].
+        level: see `Trial`.
+    """
+
+    bench: Bench
+    random: np.random.Generator
+    history: PressHistory
+    contact: Contact
+    offsets: NDArray
+    start: float
+    level: str = ""
+
+    def steps(self, depths: NDArray, *, scale: float = 1.0) -> list[SessionStep]:
+        """Returns one step for each depth (n,) [m], a period apart, with `scale` times a bench camera's noise."""
+        clean = self.history.keypoints(depths) + self.offsets
+        points = clean + noise_of(self.random, clean.shape[:2], scale)
+        forces, torques = self.history.forces(depths), self.history.torques(depths)
+        return [
+            SessionStep(
+                stamp=self.start + (i + 1) * PERIOD,
+                points=points[i],
+                likelihood=np.full(len(points[i]), LIKELIHOOD),
+                contact=self.contact,
+                force=forces[i],
+                torque=torques[i],
+                level=self.level,
+            )
+            for i in range(len(depths))
+        ]
+
+    def press(self, *, scale: float = 1.0) -> list[SessionStep]:
+        """Returns the steps of a press: three images of rest, 0.4 s of ramp, 0.7 s of hold."""
+        depth = self.history.depth
+        rising = np.linspace(0.0, depth, 13)[1:]
+        return self.steps(np.concatenate([np.zeros(3), rising, np.full(20, depth)]), scale=scale)
+
+    def play(self, seed: int, steps: Iterable[SessionStep]) -> Iterator[Trial]:
+        """Gives steps to the estimator and yields one trial each."""
+        for step in steps:
+            yield attempt(
+                seed,
+                lambda s=step: update(self.bench, s),
+                lambda got, s=step: judge(got, s, self.history.balance),
+                level=step.level,
+            )
+
+
+def open_session(
+    bench: Bench,
+    random: np.random.Generator,
+    *,
+    history: PressHistory | None = None,
+    tare: float = 1.0,
+    level: str = "",
+) -> Session:
+    """Draws a press unless one is given, and lets the estimator tare on images with `tare` times the usual noise.
+
+    The estimator is told the height of first touch, off by what its settings call that height's deviation.
+    """
+    history = history or bench.press(random)
+    offsets = OFFSET * random.normal(size=bench.jaw.keypoints.shape)
+    error = bench.estimator.settings.height_stddev * random.normal()
+    contact = Contact.fixed(bench.jaw, history.height + error)
+    rest = bench.jaw.keypoints + offsets
+    bench.estimator.reset()
+    stamp, likelihood = 10.0, np.full(len(rest), LIKELIHOOD)
+    for noise in noise_of(random, (bench.estimator.settings.tare_frames, len(rest)), tare):
+        stamp += PERIOD
+        seen = Observation(stamp=stamp, points=rest + noise, likelihood=likelihood)
+        bench.estimator.update(seen, contact)
+    return Session(
+        bench=bench, random=random, history=history, contact=contact, offsets=offsets, start=stamp, level=level
+    )
+
+
+def take_another(session: Session, random: np.random.Generator) -> Session:
+    """Returns the session with another press and what is told of it, the estimator going on as it is."""
+    history = session.bench.press(random)
+    error = session.bench.estimator.settings.height_stddev * random.normal()
+    return replace(session, history=history, contact=Contact.fixed(session.bench.jaw, history.height + error))
+
+
+def update(bench: Bench, step: SessionStep) -> Solution:
+    """Returns what the bench's estimator says of a step."""
+    seen = Observation(stamp=step.stamp, points=step.points, likelihood=step.likelihood, stddev=step.stddev)
+    return bench.estimator.update(seen, step.contact)
+
+
+def judge(solution: Solution, step: SessionStep, balance: float = math.nan) -> Trial:
+    """Returns how a solution compares with the truth: along x, along z, in magnitude and in torque."""
+    error = solution.force - step.force
+    magnitude = np.linalg.norm(solution.force) - np.linalg.norm(step.force)
+    torque = solution.torque - step.torque
+    errors = np.abs([error[0], error[2], magnitude, torque[1]])
+    stated = np.array(
+        [
+            solution.force_stddev[0],
+            solution.force_stddev[2],
+            solution.magnitude_stddev,
+            solution.torque_stddev[1],
+        ]
+    )
+    wrench = np.concatenate([solution.force, solution.torque, solution.force_stddev, solution.torque_stddev])
+    return Trial(
+        converged=solution.converged,
+        sure=solution.trusted,
+        residual=solution.residual,
+        kkt=solution.kkt,
+        force_error=float(np.linalg.norm(error)),
+        stddev=solution.magnitude_stddev,
+        deviation=compare(errors, stated),
+        condition=solution.condition,
+        energy_balance=balance,
+        nan=not np.isfinite([*wrench, solution.magnitude_stddev]).all(),
+        note=f"{solution.status}: true {np.linalg.norm(step.force):.3g} N; {describe(errors, stated)}",
+    )
+
+
+def compare(errors: NDArray, stated: NDArray) -> float:
+    """Returns the largest of the errors over their stated standard deviations; no error needs none."""
+    ratio = np.divide(errors, stated, out=np.full(len(errors), np.inf), where=stated > 0.0)
+    return float(np.where(errors > 1e-9, ratio, 0.0).max())
+
+
+def describe(errors: NDArray, stated: NDArray) -> str:
+    """Returns errors and standard deviations in words."""
+    names = ("x", "z", "magnitude", "torque")
+    return ", ".join(f"{n} {e:.3g} ± {s:.2g}" for n, e, s in zip(names, errors, stated, strict=True))
+
+
+# The truth comes from the estimator's own mechanics: no more than this share of a force is left to it.
+FORCE_ERROR = 0.01
+COURSE_STEPS = 16
+OWN_MECHANICS = ("solid", "frame", "plane")
+# Heights [m] of the bench finger's first and last candidate.
+_BENCH_REACH = (0.008, 0.073)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PressHistory:
+    """A jaw pressed ever deeper by a cylinder.
+
+    Attributes:
+        height: of first touch [m].
+        radius: of the cylinder [m].
+        depth: the largest [m].
+        keypoints: by depth, (n,) -> (n, K, 3) [m].
+        forces: by depth, (n,) -> (n, 3) [N].
+        torques: by depth, (n,) -> (n, 3) [N m].
+        balance: work of the object less energy stored, relative to the energy.
+    """
+
+    height: float
+    radius: float
+    depth: float
+    keypoints: PchipInterpolator
+    forces: PchipInterpolator
+    torques: PchipInterpolator
+    balance: float
+
+
+class Bench:
+    """One jaw with an estimator, and the same mechanics to press it with."""
+
+    def __init__(self, plan: Plan, *, modulus: float = 1.0, jaw: Jaw | None = None, **settings) -> None:
+        """Builds the bench jaw, or another one, with `modulus` times its Young's modulus."""
+        self.plan = plan
+        jaw = jaw or load_jaw(plan.jaw)
+        self._reach = jaw.candidates[[0, -1], 2]
+        calibration = Calibration(
+            young_modulus=modulus * jaw.material.young_modulus, force_error=FORCE_ERROR, clamped_z=0.0
+        )
+        chosen = EstimatorSettings(solver=plan.solver, mesh=plan.mesh, **settings)
+        self.estimator = JawEstimator(jaw, settings=chosen, calibration=calibration)
+        self.estimator.warm_up()
+        self.jaw = self.estimator.jaw
+        own, full = plan.solver in OWN_MECHANICS, replace(chosen, solver=self.jaw.model)
+        self.mechanics = self.estimator.mechanics if own else build_mechanics(self.jaw, full)
+
+    def press(self, random: np.random.Generator, *, depth: float | None = None) -> PressHistory:
+        """Returns a press by a drawn cylinder at a drawn height, `depth` [m] deep or drawn too.
+
+        A press that slips off or buckles is drawn anew.
+        """
+        while True:
+            height, radius = random.uniform(0.018, 0.062), np.exp(random.uniform(np.log(5e-3), np.log(25e-3)))
+            deepest = np.exp(random.uniform(np.log(0.3e-3), np.log(8e-3))) if depth is None else depth
+            try:
+                return self.history(height=height, radius=radius, depth=deepest)
+            except ContactError:
+                continue
+
+    def history(self, *, height: float, radius: float, depth: float) -> PressHistory:
+        """Returns the press of a cylinder at a height and depth [m] that are meant for the bench finger.
+
+        Another finger is pressed at the same share of its candidates, and a shorter one as much less.
+
+        Raises:
+            ContactError: There is no equilibrium.
+        """
+        if self.plan.jaw != "bench":
+            larger = float(np.diff(self._reach)[0] / np.diff(_BENCH_REACH)[0])
+            height, depth = float(self._reach[0] + larger * (height - _BENCH_REACH[0])), depth * min(larger, 1.0)
+        model, surface = self.mechanics.model, self.mechanics.contact.surface
+        depths = np.linspace(0.0, depth, COURSE_STEPS + 1)[1:]
+        presses = press_jaw(model, surface, self.jaw.inner_face_x, RigidCylinder(radius=radius), height, depths)
+        probe = model.attach(self.jaw.keypoints, 1.0)
+        points = np.stack([model.positions(probe, press.q) for press in presses])
+        grid, rest = np.r_[0.0, depths], model.positions(probe, np.zeros(model.size))
+        zero = np.zeros((1, 3))
+        return PressHistory(
+            height=height,
+            radius=radius,
+            depth=depth,
+            keypoints=PchipInterpolator(grid, np.concatenate([rest[None], points])),
+            forces=PchipInterpolator(grid, np.concatenate([zero, [press.force for press in presses]])),
+            torques=PchipInterpolator(grid, np.concatenate([zero, [press.torque for press in presses]])),
+            balance=self._balance(presses, RigidCylinder(radius=radius), height, grid),
+        )
+
+    def _balance(self, presses: list[PressState], rigid: RigidCylinder, height: float, grid: NDArray) -> float:
+        """Returns work less energy of a press, over the energy; that of the springs of the surface counts."""
+        model, surface = self.mechanics.model, self.mechanics.contact.surface
+        pushes = np.array([0.0, *(-press.force[0] for press in presses)])
+        work = float(PchipInterpolator(grid, pushes).integrate(grid[0], grid[-1]))
+        points = model.positions(surface.probe, presses[-1].q)
+        contact = rigid.press(points, surface.stiffness, self.jaw.inner_face_x, presses[-1].depth, height)
+        energy = presses[-1].energy + measure_penalty_energy(contact.forces, surface.stiffness)
+        return (work - energy) / max(work, energy)

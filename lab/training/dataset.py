@@ -1,0 +1,189 @@
+"""Shards of rectified pictures of many fingers with their templates, on disk and in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from lab.training.errors import DatasetError
+
+MARGIN = 28  # px of padding all round, room for shifting and turning a picture
+TRAIN, VALIDATION = "train", "val"  # how the names of shards begin
+_SHAPES = {"picture": 4, "rest": 3, "place": 3, "visible": 2, "template": 4, "finger": 1, "keypoints": 1}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FingerPictures:
+    """Pictures of the side planes of fingers, and where points of their material are.
+
+    Attributes:
+        picture: (n, h, w, 3) uint8 RGB, square to the side plane, with MARGIN pixels of padding all round.
+        rest: (n, P, 2) float32 column and row of points of the finger at rest, in the template [px]; the mark first.
+        place: (n, P, 2) float32 column and row of the same points in the padded picture [px]; NaN where not known.
+        visible: (n, P) bool, whether a point can be seen.
+        keypoints: (n,) how many of the points, from the first on, are key points; the others lie anywhere.
+        template: (f, h', w', 3) uint8, the fingers at rest on the unpadded grid.
+        finger: (n,) index of a picture's template.
+    """
+
+    picture: NDArray
+    rest: NDArray
+    place: NDArray
+    visible: NDArray
+    keypoints: NDArray
+    template: NDArray
+    finger: NDArray
+
+    def __post_init__(self) -> None:
+        for name, axes in _SHAPES.items():
+            if getattr(self, name).ndim != axes:
+                raise DatasetError(f"{name}: got shape {getattr(self, name).shape}, expected {axes} axes")
+        count, points = self.visible.shape
+        lengths = {len(self.picture), len(self.rest), len(self.place), len(self.finger), len(self.keypoints), count}
+        if lengths != {count} or self.rest.shape[1:] != (points, 2) or self.place.shape[1:] != (points, 2):
+            raise DatasetError(
+                f"picture {self.picture.shape}, rest {self.rest.shape}, place {self.place.shape}, visible "
+                f"{self.visible.shape}; expected (n, h, w, 3), (n, P, 2), (n, P, 2), (n, P)"
+            )
+        if self.picture.dtype != np.uint8 or self.template.dtype != np.uint8 or self.visible.dtype != bool:
+            raise DatasetError("picture and template are to be uint8, visible bool")
+        if not np.isfinite(self.place[self.visible]).all():
+            raise DatasetError("place: a visible point has no place; mark it as not visible")
+        if count and not 0 <= self.finger.min() <= self.finger.max() < len(self.template):
+            raise DatasetError(f"finger: {self.finger.min()} to {self.finger.max()}, of {len(self.template)} templates")
+
+    def __len__(self) -> int:
+        return len(self.picture)
+
+    @property
+    def middle(self) -> NDArray:
+        """The pictures (n, h', w', 3) without their padding."""
+        return self.picture[:, MARGIN:-MARGIN, MARGIN:-MARGIN]
+
+    def take(self, indices: NDArray) -> FingerPictures:
+        """Return the pictures of some indices (m,), or of a mask (n,)."""
+        columns = {name: getattr(self, name)[indices] for name in _SHAPES if name != "template"}
+        return FingerPictures(**columns, template=self.template)
+
+    def widened(self, points: int) -> FingerPictures:
+        """Return the same with as many points a picture: those that are missing are its own once more."""
+        have = self.rest.shape[1]
+        if have > points:
+            raise DatasetError(f"{have} points a picture; expected at most {points}")
+        own = np.arange(points) % have
+        columns = {name: getattr(self, name)[:, own] for name in ("rest", "place", "visible")}
+        others = {name: getattr(self, name) for name in _SHAPES if name not in columns}
+        return FingerPictures(**columns, **others)
+
+    def mixed_with(self, many: FingerPictures) -> FingerPictures:
+        """Return both sets, these pictures repeated until they are about half."""
+        points = max(self.rest.shape[1], many.rest.shape[1])
+        repeated = self.take(np.tile(np.arange(len(self)), max(1, round(len(many) / len(self)))))
+        return FingerPictures.join([repeated.widened(points), many.widened(points)])
+
+    @staticmethod
+    def join(parts: Sequence[FingerPictures], picture: NDArray | None = None) -> FingerPictures:
+        """Return several sets one after the other, with all their templates.
+
+        Args:
+            parts: the sets.
+            picture: their pictures one after the other, where that is so already.
+
+        Raises:
+            DatasetError: their pictures differ in size or in the number of points.
+        """
+        if len({(part.picture.shape[1:], part.rest.shape[1:]) for part in parts}) != 1:
+            raise DatasetError("shards of several kinds (size, number of points); expected one kind")
+        starts = np.cumsum([0, *(len(part.template) for part in parts[:-1])])
+        fingers = [part.finger + start for part, start in zip(parts, starts, strict=True)]
+        columns = {"finger": np.concatenate(fingers)} | ({} if picture is None else {"picture": picture})
+        for name in _SHAPES.keys() - columns.keys():
+            columns[name] = np.concatenate([getattr(part, name) for part in parts])
+        return FingerPictures(**columns)
+
+
+def save_shard(path: Path, pictures: FingerPictures) -> None:
+    """Write one shard, `train_*.npz` or `val_*.npz`; it appears whole or not at all."""
+    save_arrays(path, {name: getattr(pictures, name) for name in _SHAPES})
+
+
+def save_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
+    """Write arrays by name as a .npz file, which appears whole or not at all."""
+    unfinished = path.with_suffix(".part")
+    with unfinished.open("wb") as file:
+        np.savez(file, **arrays)
+    unfinished.replace(path)
+
+
+def load_shard(path: Path) -> FingerPictures:
+    """Read one shard.
+
+    Raises:
+        DatasetError: the file cannot be read, or lacks an array, or its arrays do not fit each other.
+    """
+    with _reading(path), np.load(path, allow_pickle=False) as content:
+        return FingerPictures(**{name: content[name] for name in _SHAPES})
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Name the file in whatever goes wrong with it in the `with` block."""
+    try:
+        yield
+    except (OSError, EOFError, ValueError, KeyError, BadZipFile) as error:
+        raise DatasetError(f"{path}: {error}; expected a shard with {', '.join(_SHAPES)}") from error
+
+
+def load_pictures(folder: Path, part: str, limit: int | None = None) -> FingerPictures:
+    """Read the shards of one part of a data set into memory, with a progress bar.
+
+    Args:
+        folder: of the shards.
+        part: TRAIN or VALIDATION; fingers, never pictures of one finger, separate the two.
+        limit: the number of pictures that is enough; all when absent.
+
+    Raises:
+        DatasetError: there is no shard of this part, or one cannot be used, or they are of several kinds.
+    """
+    paths = sorted(folder.glob(f"{part}_*.npz"))
+    if not paths:
+        raise DatasetError(f"{folder}: no shard {part}_*.npz; make some with python -m lab.training.scenes")
+    counts = [_count_pictures(path) for path in paths]
+    if limit is not None:
+        paths = paths[: int(np.searchsorted(np.cumsum(counts), limit)) + 1]
+    shards, ends = [], np.cumsum(counts[: len(paths)])
+    for path, end in tqdm(list(zip(paths, ends, strict=True)), desc=f"read {part}", unit="shard", leave=False):
+        shard = load_shard(path)
+        if not shards:  # filled as shards come: joined afterwards they would need twice the memory
+            pictures = np.empty((ends[-1], *shard.picture.shape[1:]), np.uint8)
+        if shard.picture.shape[1:] != pictures.shape[1:]:
+            raise DatasetError(
+                f"{path}: pictures {shard.picture.shape[1:]}, expected {pictures.shape[1:]} as before it"
+            )
+        own = pictures[end - len(shard) : end]
+        own[:] = shard.picture
+        shards.append(replace(shard, picture=own))
+    return FingerPictures.join(shards, pictures)
+
+
+def _count_pictures(path: Path) -> int:
+    """Return how many pictures a shard has."""
+    with _reading(path), np.load(path, allow_pickle=False) as content:
+        return len(content["finger"])
+
+
+def iterate_batches(count: int, size: int, rng: np.random.Generator) -> Iterator[NDArray]:
+    """Yield batches (size,) of indices below `count` without end, each index once per round, in random order."""
+    left = np.empty(0, dtype=int)
+    while True:
+        while len(left) < size:
+            left = np.concatenate((left, rng.permutation(count)))
+        yield left[:size]
+        left = left[size:]

@@ -1,0 +1,319 @@
+"""Claims about `finforce jaw`: from files of printed fingers to jaw files, and what is refused."""
+
+import json
+import re
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+import trimesh
+from scipy.spatial.transform import Rotation
+from section_fakes import BASE, LENGTH, MILLIMETRE, WIDTH, draw_polygon, make_section
+
+from finforce_eval.cli.main import main
+from finforce_ifea.errors import JawFileError
+from finforce_ifea.jaw.cad.cad_file import read_section
+from finforce_ifea.jaw.cad.proposal import propose
+from finforce_ifea.jaw.cad.recognition import Wishes, recognize
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.jaw.section import order_rings
+from finforce_ifea.jaw.section_mesh import extrude_section
+
+RIBS = 4
+
+
+def finger_surface(polygon=None, size=2e-3):
+    """The closed surface of a finger, in millimetres."""
+    mesh = extrude_section(make_section(polygon, size=size))
+    return trimesh.Trimesh(mesh.nodes / MILLIMETRE, mesh.surface, process=True)
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return finger_surface()
+
+
+def check_found(finger):
+    assert finger.length == pytest.approx(LENGTH * MILLIMETRE, abs=2e-5)
+    assert finger.width == pytest.approx(WIDTH * MILLIMETRE, abs=2e-5)
+    assert len(finger.ribs) == RIBS and len(finger.bolts) == 2
+    assert finger.face_deviation < 2e-5
+    free = finger.inner.line[:, 1] > BASE * MILLIMETRE + 1e-3
+    assert np.median(finger.inner.thickness[free]) == pytest.approx(1.6e-3, abs=3e-5)
+    for rib in finger.ribs:
+        assert rib.wall.usual == pytest.approx(1.2e-3, abs=3e-5)
+        assert rib.outer[0] < rib.inner[0] and rib.outer[1] > rib.inner[1]
+    # a base bolt's hole of 3 mm, 5 mm up, holds to three radii above its middle
+    assert finger.clamped_z == pytest.approx((5.0 + 3 * 1.5) * MILLIMETRE, abs=3e-4)
+
+
+@pytest.mark.parametrize("unit", ["mm", "m", "inch"])
+@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [90.0, 0.0, 0.0], [17.0, -41.0, 133.0]])
+def test_a_finger_is_found_in_any_unit_and_any_way_round(tmp_path, surface, unit, turn):
+    mesh = surface.copy()
+    mesh.apply_scale({"mm": 1.0, "m": 1e-3, "inch": 1.0 / 25.4}[unit])
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    mesh.apply_transform(frame)
+    path = tmp_path / "finger.stl"
+    mesh.export(path)
+    raw = read_section(path)
+    assert not raw.taper.any()
+    assert f"unit: {unit}" in raw.notes[0]
+    check_found(recognize(raw.polygon, raw.width, Wishes()))
+
+
+def taper_surface(surface, slope, lean):
+    """A finger whose one side is slanted along its length, and whose walls lean as it gets wider."""
+    mesh = surface.copy()
+    points = np.array(mesh.vertices)
+    share = (points[:, 1] + 0.5 * WIDTH) / WIDTH
+    points[:, 1] = share * (WIDTH - slope * points[:, 2])
+    points[:, 0] += lean * points[:, 1]
+    return trimesh.Trimesh(points, mesh.faces, process=True)
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.1])
+@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [90.0, 0.0, 0.0], [90.0, 40.0, 0.0]])
+def test_a_tapered_finger_is_taken_as_symmetric_about_its_middle(tmp_path, surface, turn, lean):
+    mesh = taper_surface(surface, 0.12, lean)
+    volume = mesh.volume
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    mesh.apply_transform(frame)
+    mesh.export(tmp_path / "finger.stl")
+    raw = read_section(tmp_path / "finger.stl")
+    assert any("tapered" in note for note in raw.notes)
+    finger = recognize(raw.polygon, raw.width, Wishes(), raw.taper)
+    stretch = np.hypot(1.0, lean)  # along the walls
+    assert finger.taper == pytest.approx([0.0, -0.12 * stretch], abs=2e-3)
+    assert finger.width == pytest.approx(WIDTH * MILLIMETRE * stretch, abs=5e-5)
+    assert len(finger.ribs) == RIBS
+    main(["jaw", str(tmp_path / "finger.stl"), "-o", str(tmp_path / "finger.yaml")])
+    jaw = load_jaw(tmp_path / "finger.yaml")
+    made = jaw.build_mesh("coarse")
+    assert trimesh.Trimesh(made.nodes, made.surface).volume == pytest.approx(volume * MILLIMETRE**3, rel=3e-3)
+    tip = jaw.keypoints[list(jaw.keypoint_names).index("tip")]
+    assert tip[1] == pytest.approx(0.5 * stretch * (WIDTH * MILLIMETRE - 0.12 * tip[2]), abs=5e-5)
+
+
+def test_a_side_that_is_no_plane_and_walls_that_run_apart_are_refused(tmp_path, surface):
+    mesh = taper_surface(surface, 0.12, 0.0)
+    mesh.vertices[:, 1] *= 1.0 + 0.02 * mesh.vertices[:, 0]
+    mesh.export(tmp_path / "round.stl")
+    with pytest.raises(JawFileError, match="a side leaves its plane"):
+        read_section(tmp_path / "round.stl")
+    mesh = surface.copy()
+    mesh.vertices[:, 0] *= 1.0 + 0.03 * mesh.vertices[:, 1]
+    mesh.export(tmp_path / "cone.stl")
+    with pytest.raises(JawFileError, match="walls all run in one direction"):
+        read_section(tmp_path / "cone.stl")
+
+
+def test_a_surface_that_is_inside_out_is_turned(tmp_path, surface):
+    mesh = surface.copy()
+    mesh.invert()
+    mesh.export(tmp_path / "finger.stl")
+    raw = read_section(tmp_path / "finger.stl")
+    assert any("inside out" in note for note in raw.notes)
+    check_found(recognize(raw.polygon, raw.width, Wishes()))
+
+
+def test_one_body_of_several_is_chosen(tmp_path, surface):
+    box = trimesh.creation.box((8.0, 8.0, 8.0))
+    box.apply_translation([60.0, 0.0, 0.0])
+    trimesh.util.concatenate([surface, box]).export(tmp_path / "two.stl")
+    with pytest.raises(JawFileError, match=r"holds 2 bodies, expected one; choose the finger with --body N"):
+        read_section(tmp_path / "two.stl")
+    with pytest.raises(JawFileError, match="no number 3"):
+        read_section(tmp_path / "two.stl", body=3)
+    raw = read_section(tmp_path / "two.stl", body=1)
+    check_found(recognize(raw.polygon, raw.width, Wishes()))
+
+
+def test_junctions_are_where_rib_and_band_were_drawn():
+    """The centre line of rib k meets that of the inner band, 0.8 mm behind the face, where it was drawn."""
+    finger = recognize(shapely.affinity.scale(draw_polygon(), 1e-3, 1e-3, origin=(0, 0)), 0.02, Wishes())
+    heights = np.linspace(BASE + 10.0, LENGTH - 16.0, RIBS) * MILLIMETRE
+    slope = 4.0 / 28.0
+    for z, rib in zip(heights, finger.ribs, strict=True):
+        assert rib.inner[1] == pytest.approx(z + slope * (19.0 - 13.2) * MILLIMETRE, abs=1e-4)
+        assert finger.face_x - rib.inner[0] == pytest.approx(0.8e-3, abs=5e-5)
+
+
+def test_wishes_go_before_guesses():
+    polygon = shapely.affinity.scale(draw_polygon(), 1e-3, 1e-3, origin=(0, 0))
+    finger = recognize(polygon, 0.02, Wishes(clamp_z=0.02, face_x=0.014))
+    assert finger.clamped_z == 0.02 and finger.face_x == pytest.approx(0.014)
+    other = recognize(polygon, 0.02, Wishes(other_face=True))
+    assert np.linalg.norm(other.inner.line[-1] - finger.inner.line[-1]) > 1e-3
+
+
+def test_a_bolt_above_a_whole_cell_is_held_by_itself():
+    drawn = draw_polygon(ribs=5)
+    inside = shapely.union_all([shapely.Polygon(ring) for ring in drawn.interiors])
+    lug, hole = shapely.Point(-6.0, 40.0).buffer(5.0), shapely.Point(-7.0, 40.0).buffer(1.5, quad_segs=12)
+    polygon = drawn.union(lug.difference(inside)).difference(hole)
+    finger = recognize(shapely.affinity.scale(polygon, 1e-3, 1e-3, origin=(0, 0)), 0.02, Wishes())
+    assert len(finger.clamped_circles) == 1
+    assert finger.clamped_circles[0, 1:] == pytest.approx([0.040, 3e-3], abs=2e-4)
+
+
+def write_dxf(path, loops):
+    ezdxf = pytest.importorskip("ezdxf")
+    document = ezdxf.new(units=4)
+    for loop in loops:
+        document.modelspace().add_lwpolyline(loop, close=True)
+    document.saveas(path)
+
+
+def write_svg(path, loops):
+    pytest.importorskip("svgelements")
+    data = " ".join("M " + " L ".join(f"{x},{-y}" for x, y in loop) + " Z" for loop in loops)
+    path.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" width="60mm" height="100mm" viewBox="0 0 60 100">'
+        f'<path d="{data}"/></svg>'
+    )
+
+
+@pytest.mark.parametrize(("suffix", "write"), [(".dxf", write_dxf), (".svg", write_svg)])
+def test_a_drawing_is_read_and_needs_a_width(tmp_path, capsys, suffix, write):
+    path = tmp_path / f"finger{suffix}"
+    write(path, [ring.tolist() for ring in order_rings(draw_polygon())])
+    raw = read_section(path)
+    assert raw.width is None
+    check_found(recognize(raw.polygon, WIDTH * MILLIMETRE, Wishes()))
+    assert main(["jaw", str(path), "-o", str(tmp_path / "out.yaml")]) == 2
+    assert "a drawing has no width; give it in metres: --width" in capsys.readouterr().err
+
+
+def test_the_command_writes_a_jaw_that_loads(tmp_path, capsys, surface):
+    surface.export(tmp_path / "my_finger.stl")
+    output = tmp_path / "made" / "my_finger.yaml"
+    assert main(["jaw", str(tmp_path / "my_finger.stl"), "-o", str(output), "--material", "tpu85a"]) == 0
+    said = capsys.readouterr().out
+    for word in ("unit: mm", "prismatic", "inner face", "clamped below", "4 ribs", "19 key points", "tpu85a: 12 MPa"):
+        assert word in said
+    jaw = load_jaw(output)
+    assert jaw.name == "my_finger"
+    assert jaw.keypoint_names[0] == "inner_1" and jaw.keypoint_names[8] == "tip"
+    np.testing.assert_allclose(jaw.keypoints[:, 1], 0.5 * WIDTH * MILLIMETRE)
+    assert 0.0 < jaw.reference_point[2] < jaw.section.clamped_z
+    assert output.with_suffix(".png").stat().st_size > 20_000
+    assert len(output.read_text().splitlines()) < 35
+
+
+def test_of_few_key_points_those_between_are_taken_too(tmp_path, surface):
+    finger = recognize(draw_polygon(), WIDTH * MILLIMETRE, Wishes())
+    points = propose(finger, "few", "tpu95a").keypoints
+    assert list(points)[9:14] == ["inner_clamp_1", "inner_1_2", "inner_2_3", "inner_3_4", "inner_4_tip"]
+    for name, (x, _, z) in list(points.items())[9:]:
+        band, below, above = name.split("_")
+        ends = [points[end if end == "tip" else f"{band}_{end}"][2] for end in (below, above) if end != "clamp"]
+        assert z == pytest.approx(np.mean([*ends, finger.clamped_z][:2]))
+        assert finger.polygon.contains(shapely.Point(x, z))
+    many = replace(finger, ribs=finger.ribs * 2)
+    assert len(propose(many, "many", "tpu95a").keypoints) == 17
+
+
+def test_a_curved_inner_face_is_taken(tmp_path, capsys):
+    """The straighter side is guessed to be the inner face; a user who knows better says so."""
+    path = tmp_path / "bulge.json"
+    loops = [ring.tolist() for ring in order_rings(draw_polygon(bulge=1.5))]
+    path.write_text(json.dumps({"unit": "mm", "width": 20, "loops": loops}))
+    faces = {}
+    for option in ([], ["--other-face"]):
+        assert main(["jaw", str(path), "-o", str(tmp_path / "finger.yaml"), *option]) == 0
+        faces[len(option)] = load_jaw(tmp_path / "finger.yaml").face
+    assert "inner face curved: it leaves its plane by" in capsys.readouterr().out
+    assert faces[0].is_flat and not faces[1].is_flat
+    free = faces[1].heights < LENGTH * MILLIMETRE - 5e-3
+    assert np.ptp(faces[1].x[free]) > 1e-3
+
+
+def test_another_origin_is_another_number_alone(tmp_path, surface):
+    """Key points keep their places on the finger wherever x = 0 is."""
+    surface.export(tmp_path / "finger.stl")
+    jaws = []
+    for options in ([], ["--face-x", "0.02"]):
+        assert main(["jaw", str(tmp_path / "finger.stl"), "-o", str(tmp_path / "finger.yaml"), *options]) == 0
+        jaws.append(load_jaw(tmp_path / "finger.yaml"))
+    shift = np.array([jaws[1].inner_face_x - jaws[0].inner_face_x, 0.0, 0.0])
+    assert jaws[1].inner_face_x == pytest.approx(0.02)
+    np.testing.assert_allclose(jaws[1].keypoints, jaws[0].keypoints + shift, atol=2e-5)
+
+
+def holed_plate():
+    plate = shapely.box(0.0, 0.0, 30.0, 90.0)
+    for z in (15.0, 35.0, 55.0, 75.0):
+        plate = plate.difference(shapely.box(6.0, z - 5.0, 24.0, z + 5.0))
+    return plate
+
+
+def crossing_loops():
+    return json.dumps({"unit": "mm", "loops": [[[0, 0], [30, 60], [30, 0], [0, 60]]]})
+
+
+def test_no_fin_ray_finger_is_refused(tmp_path, capsys):
+    polygon = draw_polygon()
+    wedge = shapely.Polygon(order_rings(polygon)[0])
+    cases = {
+        "wedge": (wedge, "its section has 0 cells between ribs and 0 round holes, expected at least two cells"),
+        "plate": (holed_plate(), "30 mm wide at one end and 30 mm at the other, expected a tip that is narrower"),
+    }
+    for name, (shape, message) in cases.items():
+        name, *options = name.split()
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps({"unit": "mm", "width": 20, "loops": [r.tolist() for r in order_rings(shape)]}))
+        assert main(["jaw", str(path), "-o", str(tmp_path / "out.yaml"), *options]) == 2
+        said = capsys.readouterr().err
+        assert len(said.splitlines()) == 1
+        assert re.search(message, said), said
+    assert not (tmp_path / "out.yaml").exists()
+
+
+def test_bad_files_are_refused_in_one_line(tmp_path, capsys, surface):
+    open_one = surface.copy()
+    open_one.update_faces(np.arange(len(open_one.faces)) > 3)
+    open_one.export(tmp_path / "open.stl")
+    surface.export(tmp_path / "whole.stl")
+    whole = (tmp_path / "whole.stl").read_bytes()
+    (tmp_path / "cut.stl").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "huge.stl").write_bytes(b"\0" * 80 + (10_000_000).to_bytes(4, "little") + b"\0" * 200)
+    (tmp_path / "noise.stl").write_bytes(np.random.default_rng(0).bytes(5000))
+    (tmp_path / "noise.obj").write_bytes(np.random.default_rng(0).bytes(5000))
+    (tmp_path / "cross.json").write_text(crossing_loops())
+    (tmp_path / "text.txt").write_text("a finger")
+    cases = {
+        "open.stl": "open and 0 doubled edges, expected a closed one: repair it",
+        "cut.stl": "is no STL file, or is cut short",
+        "huge.stl": "is no STL file, or is cut short",
+        "noise.stl": "is no STL file, or is cut short",
+        "noise.obj": "expected the surface of a finger|cannot be read as OBJ",
+        "cross.json": "touches or crosses itself",
+        "text.txt": "files of this kind are not read; expected one of .stl",
+        "none.stl": "there is no file",
+    }
+    for name, message in cases.items():
+        assert main(["jaw", str(tmp_path / name), "-o", str(tmp_path / "out.yaml")]) == 2, name
+        said = capsys.readouterr().err
+        assert len(said.splitlines()) == 1, said
+        assert re.search(message, said), said
+
+
+@pytest.mark.parametrize(
+    ("option", "message"), [("--width=25", "--width 25: expected metres"), ("--clamp=20", "metres")]
+)
+def test_millimetres_in_options_are_refused(tmp_path, capsys, surface, option, message):
+    surface.export(tmp_path / "finger.stl")
+    assert main(["jaw", str(tmp_path / "finger.stl"), "-o", str(tmp_path / "out.yaml"), option]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_step_without_its_reader_says_what_to_install(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cascadio", None)
+    (tmp_path / "finger.step").write_text("ISO-10303-21;")
+    assert main(["jaw", str(tmp_path / "finger.step")]) == 2
+    assert "needs cascadio: pip install cascadio" in capsys.readouterr().err

@@ -1,0 +1,98 @@
+"""The benchmark of the chain: what was dropped where, how late and how wrong, in counts that are known."""
+
+import numpy as np
+import pytest
+from eval_fakes import drawn_hues
+
+from finforce.stamps import NANOSECONDS
+from finforce_eval.replay.live import ReplayLog
+from finforce_eval.replay.node_run import NodeRun
+from lab.bench import chain as bench
+from lab.bench.chain import IMAGES, KEYPOINTS, TOGETHER, TrueGrasp, error_now, make_row
+
+FIRST = 10**12
+PERIOD = NANOSECONDS // 10
+COUNT = 40  # images at 10 Hz, of which the last 22 come after the tare
+
+
+def stamp_of(index):
+    return FIRST + index * PERIOD
+
+
+@pytest.fixture
+def truth():
+    """A force that grows by 1 N a second."""
+    stamps = np.array([stamp_of(index) for index in range(COUNT)])
+    return TrueGrasp(stamps=stamps, force=(stamps - FIRST) / NANOSECONDS)
+
+
+@pytest.fixture
+def run(truth):
+    """Every image is answered 30 ms late and 0.2 N too high."""
+    log = ReplayLog(("left", "right"))
+    for index, stamp in enumerate(truth.stamps.tolist()):
+        for side in ("left", "right"):
+            log.jaws[side].sent[stamp] = 0.0
+            log.jaws[side].force[stamp] = np.zeros(3)
+            log.detections[side].clouds[stamp] = None
+        log.grasp[stamp], log.grasp_latency[stamp] = 0.1 * index + 0.2, 0.03
+    return NodeRun(
+        log=log, cpu={"solver": 12.0, "other": 3.0}, memory={"solver": 3e8}, player=5.0, others=1.0, seconds=4.0
+    )
+
+
+def test_everything_answered_is_nothing_dropped(run, truth):
+    row = make_row(IMAGES, TOGETHER, 10, run, truth)
+    assert (row.images, row.answered, row.memory_MB) == (22, 22, 300.0)
+    assert row.latency.p50 == row.latency.max == pytest.approx(30.0)
+    assert row.error_N == pytest.approx(0.2)
+    assert row.largest_N == pytest.approx(3.9)
+
+
+def test_what_was_dropped_is_counted_and_not_during_the_tare(run, truth):
+    log = run.log
+    for index in (2, 20, 21, 22, 30, 31, 33):
+        del log.grasp[stamp_of(index)], log.grasp_latency[stamp_of(index)]
+    row = make_row(IMAGES, TOGETHER, 10, run, truth)
+    assert (row.images, row.answered) == (22, 16)
+    assert "| images | one process | 10 | 22 | 72.7 |" in bench.format_table(bench.ChainFigures(rows=[row]))
+
+
+def test_error_now_is_that_of_the_newest_force_that_has_arrived(run, truth):
+    sent = truth.stamps
+    # a force of 0.2 N too much that is used from 30 to 130 ms after its image, while the truth grows by 1 N/s
+    late = error_now(run.log, truth, sent)
+    assert late.max() == pytest.approx(0.17, abs=2e-3) and late.min() == pytest.approx(0.07, abs=2e-3)
+
+
+def test_an_image_that_is_dropped_makes_the_error_now_larger_and_not_that_of_the_images(run, truth):
+    full = make_row(IMAGES, TOGETHER, 10, run, truth)
+    for index in range(20, 39, 2):
+        del run.log.grasp[stamp_of(index)], run.log.grasp_latency[stamp_of(index)]
+    half = make_row(IMAGES, TOGETHER, 10, run, truth)
+    assert half.error_N == pytest.approx(full.error_N)
+    assert error_now(run.log, truth, truth.stamps).min() == pytest.approx(-0.03, abs=2e-3)
+
+
+def test_force_that_overtakes_an_older_one_is_the_newest():
+    truth = TrueGrasp(stamps=np.array([stamp_of(0), stamp_of(39)]), force=np.zeros(2))
+    log = ReplayLog(("left", "right"))
+    log.grasp = {stamp_of(0): 1.0, stamp_of(25): 2.0}
+    log.grasp_latency = {stamp_of(0): 3.5, stamp_of(25): 0.5}
+    errors = error_now(log, truth, truth.stamps)
+    # at 3.0 s the second one, at 3.5 s the first, which is older than what is known
+    assert errors[0] == 2.0 and errors[-1] == 2.0
+
+
+def test_nothing_answered_is_no_error_and_not_zero(run, truth):
+    run.log.grasp.clear()
+    run.log.grasp_latency.clear()
+    row = make_row(IMAGES, TOGETHER, 10, run, truth)
+    assert row.answered == 0 and np.isnan(row.error_N) and np.isnan(row.error_now_N) and np.isnan(row.latency.p50)
+
+
+def test_picture_is_written(run, truth, tmp_path):
+    figures = bench.ChainFigures(rows=[make_row(source, TOGETHER, 10, run, truth) for source in (IMAGES, KEYPOINTS)])
+    bench.draw(figures, tmp_path / "chain.png")
+    assert drawn_hues(tmp_path / "chain.png") >= 2  # images and key points
+    assert bench.as_json(figures)["rows"][0]["latency"]["n"] == 22

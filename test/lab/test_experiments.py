@@ -1,0 +1,529 @@
+"""Claims about the letter's experiments: resumed after a kill, honest of what failed, and right in what they count."""
+
+import json
+import subprocess
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from eval_fakes import make_recording
+
+from finforce.errors import FinforceError
+from finforce.transforms import pose_from_quaternion
+from finforce_contact.errors import ObjectMeshError
+from finforce_contact.mesh.chamfer import compute_chamfer
+from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.reconstruction.generated import read_generated
+from finforce_contact.reconstruction.result import GeneratedMesh
+from finforce_eval.cli.main import main
+from finforce_eval.engine.tasks import Manifest
+from finforce_eval.errors import RecordingError
+from finforce_eval.evaluation.contact_source import EstimatedContact
+from finforce_eval.evaluation.manipulation import NetForces
+from finforce_eval.machine import describe_sources
+from finforce_eval.recordings.image_files import read_generated_pose
+from finforce_eval.recordings.images import StampedImage
+from finforce_eval.recordings.objects import ObjectTrack
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.writer import write_recording
+from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench
+from finforce_sim.scenes.guesses import place_mesh
+from finforce_sim.scenes.objects import build_object
+from lab.experiments import grasp_sensors
+from lab.experiments.chip import ChipExperiment
+from lab.experiments.experiment import Case, Findings, ResultTable, format_tables, run_experiment
+from lab.experiments.force_network import HEIGHT, SHOWN, WIDTH, ForceNetwork, reduce_image
+from lab.experiments.grasp import GraspCourse, GraspExperiment, score_course
+from lab.experiments.letter_tables import BenchExperiment
+from lab.experiments.manipulation import (
+    ManipulationExperiment,
+    score_weight,
+    tell_gravity,
+    true_gravity,
+)
+from lab.experiments.network import NetworkExperiment
+from lab.experiments.pose import PoseExperiment, drop_poses, flip_poses
+from lab.experiments.runs import RunOptions, keep_poses, list_missing, render_scene
+from lab.experiments.shape import write_generated
+from lab.experiments.tracked_poses import score_poses, track_object, true_poses
+
+DATA = Path(__file__).parents[2] / "finforce_eval" / "data"
+
+
+@dataclass
+class Counting:
+    """An experiment that counts its runs; a case called `bad` fails."""
+
+    names: tuple = ("one", "two", "three")
+    settings: dict = field(default_factory=dict)
+    stop_after: int = 99
+    name: str = "count"
+    title: str = "Counting"
+    about: str = "It counts."
+    ran: list = field(default_factory=list)
+
+    def list_cases(self):
+        return [Case(name=name, settings=self.settings) for name in self.names]
+
+    def run(self, case, folder):
+        if len(self.ran) >= self.stop_after:
+            raise KeyboardInterrupt
+        if case.name == "bad":
+            raise FinforceError("it is bad")
+        self.ran.append(case.name)
+        return {"letters": len(case.name), "nothing": float("nan")}
+
+    def find(self, figures, folder):
+        total = sum(row["letters"] for row in figures.values())
+        table = ResultTable(title="**Letters**", head=("case", "n"), rows=[(name, "1") for name in figures])
+        return Findings(figures={"total": total}, tables=[table])
+
+
+def test_a_run_that_was_killed_goes_on_where_it_was(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(Counting(stop_after=2), tmp_path)
+    assert not (tmp_path / "count" / "count.json").exists()
+    again = Counting()
+    run_experiment(again, tmp_path)
+    assert again.ran == ["three"]
+    assert json.loads((tmp_path / "count" / "count.json").read_text())["total"] == 11
+    assert "It counts." in (tmp_path / "count" / "README.md").read_text()
+    nothing = Counting()
+    run_experiment(nothing, tmp_path)
+    assert nothing.ran == []
+
+
+def test_a_line_that_was_cut_off_is_run_again_and_others_stay(tmp_path):
+    run_experiment(Counting(), tmp_path)
+    log = tmp_path / "count" / "manifest.jsonl"
+    log.write_text(log.read_text()[:-20])
+    again = Counting()
+    run_experiment(again, tmp_path)
+    assert again.ran == ["three"]
+    assert list(Manifest(log.parent).read()) == ["one", "two", "three"]
+
+
+def test_other_settings_are_another_case(tmp_path):
+    run_experiment(Counting(), tmp_path)
+    other = Counting(settings={"size": 2})
+    run_experiment(other, tmp_path)
+    assert other.ran == ["one", "two", "three"]
+
+
+def test_other_code_is_another_case(tmp_path, monkeypatch):
+    run_experiment(Counting(), tmp_path)
+    monkeypatch.setattr("lab.experiments.experiment.commit", lambda: "another")
+    other = Counting()
+    run_experiment(other, tmp_path)
+    assert other.ran == ["one", "two", "three"]
+
+
+def test_sources_are_told_apart_by_their_changes(tmp_path):
+    file = tmp_path / "module.py"
+    file.write_text("one = 1\n")
+    assert describe_sources(file) == "unknown"
+    who = ("-c", "user.name=A", "-c", "user.email=a@b.c")
+    for words in (("init", "-q"), ("add", "module.py"), (*who, "commit", "-qm", "One")):
+        subprocess.run(("git", *words), cwd=tmp_path, check=True)
+    clean = describe_sources(file)
+    (tmp_path / "notes.txt").write_text("not of the sources")
+    assert describe_sources(file) == clean and "dirty" not in clean
+    told = []
+    for text in ("one = 2\n", "one = 3\n"):
+        file.write_text(text)
+        told.append(describe_sources(file))
+    assert all(text.startswith(f"{clean}-dirty-") for text in told) and told[0] != told[1]
+
+
+def test_a_jaw_file_with_another_content_is_another_case(tmp_path):
+    jaw = tmp_path / "jaw.yaml"
+    cases = []
+    for text in ("one", "two"):
+        jaw.write_text(text)
+        cases.append(ManipulationExperiment(options=RunOptions(jaw=str(jaw))).list_cases()[0])
+    assert cases[0].settings != cases[1].settings
+
+
+def test_a_recording_of_another_scene_of_that_name_is_rendered_anew(tmp_path, monkeypatch):
+    rendered = []
+
+    def record(scenario, seed, folder, **how):
+        rendered.append((seed, how["camera"].width))
+        folder.mkdir(parents=True)
+        (folder / "case.json").write_text("{}")
+
+    monkeypatch.setattr("lab.experiments.runs.record_scene", record)
+    small, large, other = (
+        RunOptions(size=size, seed=seed).scene_case("one", "grasp_cube", {"record": 0.2}, 0).settings
+        for size, seed in (("320x240", 1), ("640x480", 1), ("640x480", 2))
+    )
+    for settings in (small, small, large, large, other):
+        render_scene(settings, tmp_path / "one")
+    assert rendered == [(1, 320), (1, 640), (2, 640)]
+    (tmp_path / "one" / "scene.json").write_text('{"scene": "gra')  # killed while it was written
+    render_scene(other, tmp_path / "one")
+    assert len(rendered) == 4
+
+
+def test_a_case_that_fails_costs_itself_only_and_is_named(tmp_path, capsys):
+    experiment = Counting(names=("one", "bad", "two"))
+    run_experiment(experiment, tmp_path)
+    assert experiment.ran == ["one", "two"]
+    assert "failed: bad: it is bad" in capsys.readouterr().err
+    assert json.loads((tmp_path / "count" / "count.json").read_text())["failed"] == {"bad": "it is bad"}
+    assert "2 of 3 cases" in (tmp_path / "count" / "README.md").read_text()
+
+
+def test_nothing_but_failures_is_an_error(tmp_path):
+    with pytest.raises(FinforceError, match="not one of 1 cases gave figures.*it is bad"):
+        run_experiment(Counting(names=("bad",)), tmp_path)
+
+
+def test_parts_are_put_on_a_page_by_a_run_of_all(tmp_path):
+    first, second, whole = Counting(), Counting(), Counting()
+    assert run_experiment(first, tmp_path, shard="1/2") is None
+    assert not (tmp_path / "count" / "count.json").exists()
+    run_experiment(second, tmp_path, shard="2/2")
+    run_experiment(whole, tmp_path)
+    assert (first.ran, second.ran, whole.ran) == (["one", "three"], ["two"], [])
+    assert json.loads((tmp_path / "count" / "count.json").read_text())["total"] == 11
+
+
+def course(error=0.0, stddev=0.1):
+    """A grasp that rises to 4 N within a second, rests for one and is let go within another; an image each 20 ms."""
+    seconds = np.arange(0.0, 4.0, 0.02)
+    truth = np.interp(seconds, [0.5, 1.5, 2.5, 3.5], [0.0, 4.0, 4.0, 0.0])
+    nothing = np.zeros_like(seconds)
+    return GraspCourse(
+        stamps=np.round(1e9 * seconds).astype(np.int64),
+        truth=truth,
+        found=truth + error * (truth > 0.0),
+        stddev=nothing + stddev,
+        delay=nothing,
+    )
+
+
+def test_phases_follow_from_the_true_force():
+    phases = course().phases
+    seconds = course().seconds
+    assert seconds[phases["load"]].max() == pytest.approx(1.5, abs=0.05)
+    assert seconds[phases["release"]].min() == pytest.approx(2.75, abs=0.05)
+    assert (phases["all"] == (phases["load"] | phases["hold"] | phases["release"])).all()
+
+
+def test_a_grasp_is_scored_by_phase():
+    score = score_course(course(error=0.2))
+    assert score["rmse_N"] == pytest.approx(dict.fromkeys(("all", "load", "hold", "release"), 0.2))
+    assert score["nrmsd_pct"]["all"] == pytest.approx(5.0, rel=0.04)
+    assert score["answered_pct"] == 100.0
+    assert score["within_3_sigma_pct"] == 100.0
+    assert score_course(course(error=0.2, stddev=0.05))["within_3_sigma_pct"] == 0.0
+    assert score["delay_ms"][0] < 20.0
+
+
+def test_images_without_an_answer_are_counted():
+    one = course()
+    found = one.found.copy()
+    found[one.phases["hold"]] = np.nan
+    score = score_course(replace(one, found=found))
+    assert score["answered_pct"] < 75.0
+    assert score["rmse_N"]["load"] == 0.0
+    assert np.isnan(score["rmse_N"]["hold"])
+
+
+def test_a_weight_is_scored_along_gravity():
+    angles = np.linspace(0.0, 2.0 * np.pi, 50)
+    true = np.column_stack((np.sin(angles), np.zeros(50), np.cos(angles)))
+    found = 1.1 * true + (0.0, 0.3, 0.0)
+    blank = np.full((50, 3), np.nan)
+    net = NetForces(
+        stamps=np.arange(50),
+        found=Wrench(found, blank),
+        true=Wrench(true, blank),
+        stated=np.full((50, 3), 0.1),
+        answered_pct=100.0,
+    )
+    score = score_weight(net)
+    assert score["along_rmse_N"] == pytest.approx(0.1)
+    assert score["along_bias_N"] == pytest.approx(0.1)
+    assert score["across_rmse_N"] == pytest.approx(0.3)
+    assert score["within_3_sigma_pct"] == 100.0
+    assert np.ptp(score["course"]["angle"]) == pytest.approx(2.0 * np.pi, rel=0.01)
+
+
+def test_gravity_is_told_in_each_jaws_frame():
+    case = ManipulationExperiment(options=RunOptions()).list_cases()[0]
+    gravity = true_gravity(case.settings)
+    directions = np.array(list(gravity.values()))
+    assert directions[0] == pytest.approx([0.0, -1.0, 0.0])  # a level gripper that rolls
+    assert directions[:, 0].min() == pytest.approx(-1.0, abs=1e-3) and np.abs(directions[:, 2]).max() < 1e-9
+    one = make_recording("one")
+    told = tell_gravity(one, {stamp: np.array([0.6, 0.0, 0.8]) for stamp in one.jaw("left").keypoints.stamps.tolist()})
+    seen = told.jaw("left").keypoints.observation(0).gravity
+    assert R_GRIPPER_JAW["left"] @ seen == pytest.approx([0.6, 0.0, 0.8])
+    assert one.jaw("left").keypoints.observation(0).gravity is None
+
+
+def test_the_twin_has_27_grasps_with_seeds_of_their_own():
+    cases = GraspExperiment(options=RunOptions()).list_cases()
+    assert len({case.name for case in cases}) == 27
+    assert len({case.settings["seed"] for case in cases}) == 27
+    assert len(ManipulationExperiment(options=RunOptions()).list_cases()) == 12
+    assert len(ChipExperiment(options=RunOptions()).list_cases()) == 60
+    assert len(BenchExperiment(options=RunOptions()).list_cases()) == 9
+
+
+def test_quick_cases_are_some_of_the_others():
+    kinds = (
+        GraspExperiment,
+        ManipulationExperiment,
+        ChipExperiment,
+        BenchExperiment,
+        PoseExperiment,
+        NetworkExperiment,
+    )
+    for kind in kinds:
+        every, few = ([c.name for c in kind(options=RunOptions(quick=q)).list_cases()] for q in (False, True))
+        assert set(few) < set(every)
+
+
+class ScriptedJaw:
+    """A jaw that says of its images what it is told to."""
+
+    def __init__(self, pressed, side):
+        self._words, self.touching = iter(pressed.script[side]), True
+
+    def take_pose(self, stamp, pose, origin_x):
+        pass
+
+    def solve(self, observation):
+        status, message = next(self._words)
+        force = np.array([3.0, 0.0, 0.0])
+        return SimpleNamespace(
+            status=status, message=message, trusted=status == "ok", force=force, force_stddev=0.1 * force
+        )
+
+
+def test_images_without_a_force_are_told_with_what_the_jaws_said(monkeypatch):
+    monkeypatch.setattr(grasp_sensors, "JawSensor", ScriptedJaw)
+    fine, doubt, start = ("ok", ""), ("unobservable", "they do not fit"), ("waiting", "for the tare")
+    script = {"left": [start, fine, fine, fine], "right": [start, fine, doubt]}
+    seen = SimpleNamespace(origin_x=0.0, keypoints=np.zeros((8, 3)))
+    jaws = [{"left": seen, "right": seen}] * 3 + [{"left": seen}]
+    states = iter(SimpleNamespace(stamp=0.1 * n, jaws=each, T_gripper_object=np.eye(4)) for n, each in enumerate(jaws))
+    pressed = SimpleNamespace(script=script, assembly=SimpleNamespace(jaws=script), state=lambda *_: next(states))
+    sensor = grasp_sensors.EstimatorSensor(pressed, 0)
+    sensor._next_pose = np.inf
+    assert [sensor.measure(0.1 * n, 3.0, 0.02) for n in range(4)] == [None, 3.0, None, None]
+    assert [words for _, words in sensor.untold] == [
+        "right unobservable: they do not fit",
+        "right not found in the image",
+    ]
+    assert [stamp for stamp, _ in sensor.untold] == pytest.approx([0.2, 0.3])
+
+
+def test_why_a_grasp_ended_early_is_on_the_page(tmp_path):
+    row = {"way": "force", "peak_N": 3.0, "end_N": 2.9, "is_broken": False, "error": "", "violations": 0,
+           "seconds": [0.0], "force": [0.0], "untold": []}  # fmt: skip
+    early = {"error": "the newest force is 0.27 s old", "untold": [[0.1, "left waiting"], [0.2, "right unobservable"]]}
+    findings = ChipExperiment(options=RunOptions()).find({"force_00": row, "force_01": row | early}, tmp_path)
+    assert "force_01 ended early: the newest force is 0.27 s old (right unobservable)" in findings.tables[0].note
+    assert "force_00" not in findings.tables[0].note
+    assert findings.figures["ways"]["force"]["images_without_force"] == 2
+    assert findings.figures["grasps"]["force_01"]["untold"] == early["untold"]
+
+
+def test_a_recording_that_lacks_something_is_told_what(tmp_path, capsys):
+    one = make_recording("one")
+    assert list_missing(one, ("left", "right")) == ["/right/ground_truth_wrench"]
+    assert list_missing(replace(one, object_pose=None), ("left",)) == ["/object_pose"]
+    bag = write_recording(replace(one, object_pose=None), tmp_path / "one")
+    assert main(["experiment", "grasp", "--on", str(bag), "--report", str(tmp_path / "report")]) == 2
+    words = capsys.readouterr().err
+    assert "/right/ground_truth_wrench; /object_pose" in words
+    assert not (tmp_path / "report").exists()
+
+
+def test_an_object_that_is_hidden_has_no_poses_any_more():
+    one = make_recording("one")
+    stamps = one.object_pose.stamps
+    hidden = keep_poses(one, stamps < stamps[5])
+    assert len(hidden.object_pose.stamps) == 5
+    assert len(hidden.object_pose.position) == 5
+    assert len(one.object_pose.stamps) > 5
+
+
+def test_some_poses_are_turned_by_half_a_turn_and_others_stay():
+    one = make_recording("one", frames=900)
+    before, after = one.object_pose, flip_poses(one, 3).object_pose
+    dots = np.abs((before.quaternion * after.quaternion).sum(axis=1))
+    turned = dots < 1e-9
+    assert 0.03 < turned.mean() < 0.2
+    assert dots[~turned] == pytest.approx(1.0)
+    assert (before.position == after.position).all()
+
+
+def test_gaps_leave_no_pose_for_a_while():
+    one = make_recording("one", frames=900)
+    stamps = drop_poses(one).object_pose.stamps
+    gaps = np.diff(stamps)
+    assert (gaps > 0.75e9).sum() > 5
+    assert len(stamps) < 0.7 * len(one.object_pose.stamps)
+
+
+def test_the_built_in_tracker_stands_in_for_the_recorded_poses(tmp_path):
+    pytest.importorskip("open3d", reason="the tracker casts rays: pip install open3d")
+    changes = {"clearance": 0.001, "displacement": 0.001, "closing_speed": 0.01, "settle": 0.1, "record": 0.1}
+    case = RunOptions(size="320x240").scene_case("small", "grasp_asymmetric", changes, 0)
+    truth = true_poses(case.settings)
+    render_scene(case.settings, tmp_path / "small")
+    recording = read_recording(tmp_path / "small")
+    assert set(recording.object_pose.stamps.tolist()) <= set(truth)
+    tracked = track_object(recording)
+    assert tracked.lost == 0
+    recorded, found = score_poses(recording, truth), score_poses(tracked.recording, truth)
+    assert (recorded["rate_Hz"], found["rate_Hz"]) == pytest.approx((10.0, 30.0), rel=0.01)
+    assert 0.3 < recorded["position_median_mm"] < 0.7  # 0.3 mm along each axis
+    assert found["position_median_mm"] < recorded["position_median_mm"]
+    assert score_poses(recording, {}) == {"rate_Hz": recorded["rate_Hz"]}
+    turned = flip_poses(recording, 3)
+    assert score_poses(turned, truth)["rotation_p95_deg"] > 90.0
+    with pytest.raises(RecordingError, match="small: the built-in tracker needs depth images"):
+        track_object(replace(recording, images=recording.images.colors_alone()))
+
+
+@pytest.mark.parametrize("form", ["glb", "ply"])
+def test_generated_meshes_are_read_in_their_own_axes_and_scale(tmp_path, form):
+    pytest.importorskip("open3d", reason="splats become a surface by Open3D: pip install open3d")
+    rng = np.random.default_rng(3)
+    mesh = build_object("asymmetric")
+    size = float(np.ptp(mesh.vertices, axis=0).max())
+    affine = pose_from_quaternion([0.02, -0.03, 0.25], [0.1, -0.5, 0.3, 0.8] / np.linalg.norm([0.1, -0.5, 0.3, 0.8]))
+    affine[:3, :3] *= size
+    guess = GeneratedMesh(vertices=mesh.vertices / size, triangles=mesh.triangles, affine=affine, name="thing")
+    file, layout = write_generated(guess, tmp_path / f"thing.{form}", rng)
+    vertices, triangles = read_generated(file)
+    assert 0.9 < np.ptp(vertices, axis=0).max() < 1.15
+    placed = ObjectMesh(vertices=vertices, triangles=triangles, watertight=False, name="thing")
+    placed = place_mesh(placed, read_generated_pose(layout))
+    true = place_mesh(mesh, affine @ np.diag([1.0 / size] * 3 + [1.0]))
+    assert compute_chamfer(placed, true).mean < 1.2e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda data: data[:-4000], "expected as many as the header says"),
+        (lambda data: data.replace(b"binary_little_endian", b"binary_big_endian"), "binary_little_endian"),
+        (lambda data: data.replace(b"vertex 20300", b"vertex 99999999"), "for 99999999 splats"),
+        (lambda data: data.replace(b"vertex 20300", b"vertex 7"), "got 7 splats that can be seen"),
+        (lambda data: data.replace(b"property float opacity", b"property float opacit_"), "no triangles"),
+    ],
+)
+def test_damaged_splats_are_refused(tmp_path, change, words):
+    mesh = build_object("cube")
+    guess = GeneratedMesh(vertices=mesh.vertices / 0.06, triangles=mesh.triangles, affine=np.eye(4), name="cube")
+    file, _ = write_generated(guess, tmp_path / "cube.ply", np.random.default_rng(0))
+    file.write_bytes(change(file.read_bytes()))
+    with pytest.raises(ObjectMeshError, match=words):
+        read_generated(file)
+
+
+def test_poses_that_are_late_come_late():
+    track = ObjectTrack(stamps=np.array([0, 100, 200]), poses=np.tile(np.eye(4), (3, 1, 1)))
+    taken = []
+
+    class Loop:
+        last = None
+
+        def take_pose(self, stamp, T_jaw_object, covariance=None, camera=None):
+            taken.append(stamp)
+
+        def update(self, stamp):
+            self.last = SimpleNamespace(estimate=SimpleNamespace(contact=None))
+
+    source = EstimatedContact(None, track, "estimate", delay=150)
+    source._loop = Loop()
+    for stamp in (100, 150, 249, 350):
+        source.contact_at(stamp)
+        assert taken == [when for when in (0, 100, 200) if when + 150 <= stamp]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["nothing"], "invalid choice"),
+        (["chip", "--on", "some_bag"], "expected twin"),
+        (["grasp", "--on", "twin", "a_bag"], "not both"),
+        (["grasp", "--seed", "-1"], "from 0"),
+        (["grasp", "--on", "no_such_bag"], "no_such_bag"),
+    ],
+)
+def test_what_cannot_be_run_is_one_line(words, expected, tmp_path, capsys):
+    try:
+        code = main(["experiment", *words, "--report", str(tmp_path)])
+    except SystemExit as end:
+        code = end.code
+    assert code == 2
+    error = capsys.readouterr().err
+    assert expected in error and error.count("\n") == 1
+
+
+def test_the_bench_runs_on_the_recording_in_the_package(tmp_path, capsys):
+    bag = str(DATA / "bench_cyl25_middle")
+    command = ["experiment", "bench", "--on", bag, "--calibration", "bench", "--report", str(tmp_path)]
+    assert main(command) == 0
+    figures = json.loads((tmp_path / "bench" / "bench.json").read_text())
+    assert figures["summary"]["estimate"]["worst_N"] < 0.2
+    assert "(0.28)" in capsys.readouterr().out
+    assert bag not in (tmp_path / "bench" / "README.md").read_text()
+
+
+def test_tables_have_a_title_and_a_note():
+    table = ResultTable(title="**T**", head=("a", "b"), rows=[("x", "1")], note="N.")
+    lines = format_tables(Findings(figures={}, tables=[table])).splitlines()
+    assert lines[0] == "**T**" and lines[-1] == "N."
+
+
+def test_the_end_to_end_network_needs_ten_images():
+    pytest.importorskip("onnxruntime", reason="the network runs on onnxruntime: pip install onnxruntime")
+    network = ForceNetwork()
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 255, (96, 128, 3), dtype=np.uint8) for _ in range(12)]
+    images = [StampedImage(7 * number, SimpleNamespace(color=color)) for number, color in enumerate(pictures)]
+    stamps, forces = network.follow(images)
+    assert stamps.tolist() == [7 * number for number in range(12)]
+    assert np.isnan(forces[: SHOWN - 1]).all()
+    assert np.isfinite(forces[SHOWN - 1 :]).all()
+    last = np.stack([reduce_image(color) for color in pictures[-SHOWN:]])
+    assert last.shape == (SHOWN, HEIGHT, WIDTH, 3)
+    assert network.predict(last[None]) == pytest.approx(forces[-1:], abs=1e-5)
+
+
+def test_another_network_than_an_end_to_end_one_is_refused(tmp_path, capsys):
+    pytest.importorskip("onnxruntime", reason="the network runs on onnxruntime: pip install onnxruntime")
+    other = Path(__file__).parents[2] / "finforce_keypoints" / "models" / "side_plane" / "coarse.onnx"
+    report = ["--report", str(tmp_path)]
+    assert main(["experiment", "network", "--quick", "--network", str(other), *report]) == 2
+    words = capsys.readouterr().err
+    assert "coarse.onnx: got a network of" in words
+    assert "expected one of lab.training.baseline.train" in words
+    assert main(["experiment", "network", "--quick", "--network", str(tmp_path / "none.onnx"), *report]) == 2
+    assert "none.onnx" in capsys.readouterr().err
+
+
+def test_both_methods_are_compared_by_what_the_network_has_seen(tmp_path):
+    series = {"seconds": [0.0, 1.0], "truth": [0.0, 2.0], "found": [0.0, 2.1], "network": [None, 1.0]}
+    row = {"peak_N": 2.0, "span_N": 2.0, "network_bias_N": 0.0, "answered_pct": 100.0, "course": series}
+    figures = {
+        "known": {**row, "group": "as trained", "rmse_N": 0.1, "network_rmse_N": 0.2},
+        "new": {**row, "group": "another object", "rmse_N": 0.1, "network_rmse_N": 0.6},
+        "newer": {**row, "group": "another object", "rmse_N": 0.3, "network_rmse_N": 1.0},
+    }
+    groups = NetworkExperiment(options=RunOptions()).find(figures, tmp_path).figures["groups"]
+    assert groups["as trained"]["ratio"] == pytest.approx(2.0)
+    assert groups["another object"]["ratio"] == pytest.approx(4.0)
+    assert groups["another object"]["network_nrmsd_pct"] == pytest.approx(40.0)
+    assert (tmp_path / "network.png").stat().st_size > 1000

@@ -1,0 +1,230 @@
+"""Claims about the rules of a stress run: each of them can be broken, and then the run says so."""
+
+import json
+import time
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from eval_fakes import answers, divide, fail_with, family_of, refuse
+
+from finforce_eval.cli.main import main
+from finforce_eval.errors import OptionError
+from lab.cli.stress import choose_families, worst_trials, write_page
+from lab.stress.stress import (
+    Plan,
+    Trial,
+    attempt,
+    find_families,
+    format_summaries,
+    measure_longest,
+    run_family,
+    summarise,
+    summarise_family,
+    summarise_levels,
+)
+
+
+def broken(trials, **rules):
+    return summarise("made", trials, **rules).broken
+
+
+# --- the rule: right within what is stated, or not sure
+
+
+def test_answers_within_what_they_state_break_no_rule():
+    assert broken(answers(200)) == ()
+
+
+def test_a_liar_is_caught():
+    assert "97.0 % of the sure answers" in broken(answers(194) + answers(6, error=0.04))[0]
+
+
+def test_one_in_a_hundred_may_be_beyond_three_sigma():
+    assert broken(answers(99) + answers(1, error=0.04)) == ()
+    assert broken(answers(98) + answers(2, error=0.04))
+
+
+def test_a_liar_who_says_that_it_is_not_sure_is_none():
+    assert broken(answers(194) + answers(6, error=50.0, sure=False)) == ()
+
+
+def test_an_error_without_any_stated_deviation_is_a_lie():
+    assert broken(answers(10, stddev=0.0))
+    assert broken(answers(10, stddev=float("nan")))
+    assert broken(answers(10, error=0.0, stddev=0.0)) == ()
+
+
+def test_the_farthest_component_decides():
+    assert broken(answers(10, deviation=3.1))
+    assert broken(answers(10, deviation=2.9)) == ()
+
+
+def test_who_is_never_sure_is_useless():
+    silent = answers(10, sure=False)
+    assert broken(silent) == ()
+    assert "0.0 % of the answers are sure" in broken(silent, least_sure=0.5)[0]
+
+
+# --- time, NaN, crashes, hanging
+
+
+def test_a_step_of_eleven_medians_is_caught_and_one_of_nine_is_not():
+    assert "11.0 times the median" in broken(answers(50) + answers(1, step_time=11e-3))[0]
+    assert broken(answers(50) + answers(1, step_time=9e-3)) == ()
+    assert broken(answers(50) + answers(1, step_time=11e-3), timed=False) == ()
+
+
+def test_a_nan_that_leaves_is_caught():
+    assert broken(answers(50) + answers(1, nan=True)) == ("1 answers are not finite",)
+
+
+def test_our_errors_are_refusals_and_any_other_is_a_crash():
+    assert fail_with(refuse).outcome == "refused"
+    assert broken([*answers(5), fail_with(refuse)]) == ()
+    crashed = fail_with(divide)
+    assert crashed.outcome == "crashed" and "ZeroDivisionError" in crashed.note
+    assert broken([*answers(5), crashed]) == ("1 trials crashed",)
+
+
+def test_a_step_that_hangs_is_ended():
+    hung = fail_with(lambda: time.sleep(5.0), limit=0.05)
+    assert hung.outcome == "hung"
+    assert broken([*answers(5), hung]) == ("1 trials hung",)
+
+
+def test_nothing_in_a_step_keeps_it_from_being_ended():
+    def swallow():
+        with suppress(Exception):
+            time.sleep(5.0)
+
+    assert fail_with(swallow, limit=0.05).outcome == "hung"
+
+
+def test_no_trials_are_no_success():
+    assert broken([]) == ("no trial was run",)
+
+
+def test_a_family_that_fails_between_its_steps_is_a_crash():
+    def run(plan):
+        yield from answers(2)
+        divide()
+
+    family = family_of([])
+    trials = run_family(type(family)(name="made", what="", run=run), Plan())
+    assert [trial.outcome for trial in trials] == ["answer", "answer", "crashed"]
+
+
+def test_a_step_that_was_long_by_chance_is_timed_again():
+    times = iter([1e-3] * 9 + [50e-3] + [1e-3] * 10)
+
+    def run(plan):
+        yield from (Trial(step_time=next(times)) for _ in range(10))
+
+    assert measure_longest(run_family(type(family_of([]))(name="made", what="", run=run), Plan())) == 1.0
+
+
+def test_judging_is_not_timed():
+    def judge(got):
+        end = time.thread_time() + 0.05
+        while time.thread_time() < end:
+            pass
+        return Trial()
+
+    assert attempt(0, lambda: None, judge).step_time < 0.05
+
+
+# --- summaries
+
+
+def test_figures_are_of_what_they_say():
+    trials = answers(3, error=0.02, residual=1e-5, condition=4.0, energy_balance=-0.2)
+    trials += answers(1, sure=False, converged=False, error=9.0, residual=1.0)
+    summary = summarise("made", trials)
+    assert (summary.n, summary.converged, summary.sure) == (4, 0.75, 0.75)
+    assert summary.worst_error == 0.02 and summary.worst_residual == 1e-5
+    assert summary.median_sigmas == pytest.approx(2.0) and summary.worst_balance == 0.2
+    assert summary.worst_condition == 4.0
+
+
+def test_levels_keep_their_order():
+    trials = answers(2, level="b") + answers(1, level="a") + answers(1, level="b")
+    assert [(level.name, level.n) for level in summarise_levels(trials)] == [("b", 3), ("a", 1)]
+
+
+def test_table_has_one_row_per_summary_and_no_nan():
+    lines = format_summaries([summarise("first", answers(2)), summarise("second", [])]).splitlines()
+    assert len(lines) == 4 and lines[2].startswith("first") and "nan" not in "".join(lines)
+
+
+def test_worst_trials_begin_with_what_is_broken():
+    trials = answers(20) + answers(1, error=0.05) + [fail_with(divide)]
+    outcomes = [(trial.outcome, trial.force_error) for trial in worst_trials(trials)[:2]]
+    assert outcomes[0][0] == "crashed" and outcomes[1] == ("answer", 0.05)
+
+
+def test_page_shows_what_is_broken(tmp_path):
+    family = family_of(answers(5) + answers(5, error=1.0, level="far"))
+    trials = run_family(family, Plan())
+    write_page(tmp_path / "report", [summarise_family(family, trials)], {"made": trials}, {"made": "made up"})
+    page = (tmp_path / "report" / "stress.md").read_text()
+    assert "**broken:** 50.0 %" in page and "| far |" in page
+
+
+# --- plans and the command
+
+
+def test_a_seed_draws_the_same_and_other_keys_another():
+    first, again = (Plan(seed=3).random("noise", 1).normal(size=4) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert (Plan(seed=3).random("noise", 2).normal(size=4) != first).all()
+    assert (Plan(seed=4).random("noise", 1).normal(size=4) != first).all()
+
+
+def test_families_have_names_of_their_own_and_say_what_they_do():
+    families = find_families()
+    assert {"subsets", "noise", "gross", "clusters", "jumps", "stamps", "long", "contacts", "forces"} <= set(families)
+    assert all(family.what and "\n" not in family.what for family in families.values())
+
+
+def test_unknown_family_is_refused_with_their_names():
+    known = find_families()
+    with pytest.raises(OptionError, match="expected one of.*noise"):
+        choose_families("nothing", known)
+    assert [family.name for family in choose_families("noise, gross", known)] == ["noise", "gross"]
+
+
+@pytest.fixture
+def one_family(monkeypatch):
+    def use(trials):
+        monkeypatch.setattr("lab.cli.stress.find_families", lambda: {"made": family_of(trials)})
+
+    return use
+
+
+def test_command_ends_with_zero_when_every_rule_holds(one_family, capsys, tmp_path):
+    one_family(answers(5))
+    out = tmp_path / "stress.json"
+    assert main(["stress", "--json", str(out), "--seed", "4"]) == 0
+    content = json.loads(out.read_text())
+    assert content["plan"]["seed"] == 4 and content["families"]["made"]["n"] == 5 and "machine" in content
+    assert "made" in capsys.readouterr().out
+
+
+def test_command_ends_with_one_when_a_rule_is_broken(one_family, capsys):
+    one_family(answers(5, error=1.0))
+    assert main(["stress"]) == 1
+    assert "broken: made: 0.0 % of the sure answers" in capsys.readouterr().out
+
+
+WRONG = [("--count", "0"), ("--count", "1e20"), ("--seed", "-1"), ("--families", "nothing")]
+
+
+@pytest.mark.parametrize("options", WRONG)
+def test_command_refuses_what_it_cannot_do(options, capsys):
+    try:
+        status = main(["stress", *options])
+    except SystemExit as stop:
+        status = stop.code
+    assert status == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1

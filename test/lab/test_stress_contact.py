@@ -1,0 +1,102 @@
+"""Claims about hard objects at given poses, through contact estimator and solver together."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from finforce_contact.localization.section import cut_outline
+from finforce_ifea.contact_mechanics.indenter import expect_object
+from finforce_ifea.contact_mechanics.penalty import build_distance_field
+from finforce_ifea.errors import ContactError
+from finforce_ifea.observation import Contact, ObjectOutline
+from finforce_ifea.settings import EstimatorSettings
+from lab.stress.contact import CLEAR, build_scenes, plan_depths, play_scene, press_scene
+from lab.stress.session import Bench
+from lab.stress.stress import Plan, summarise
+
+SCENES = {scene.name: scene for scene in build_scenes()}
+
+
+@cache
+def bench():
+    return Bench(Plan(solver="frame"))
+
+
+@cache
+def played(name):
+    scene = SCENES[name]
+    return list(play_scene(bench(), scene, press_scene(bench(), scene), 0))
+
+
+SOLVED = (
+    "rod",
+    "rod near the base",
+    "rod grazing by 0.2 mm",
+    "edge of a leaning bar",
+    "drum of 1 m",
+    "bar over the tip",
+)
+
+
+@pytest.mark.parametrize("name", SOLVED)
+def test_hard_objects_are_pressed_with_the_right_force(name):
+    summary = summarise(name, played(name), timed=False)
+    # one of fifty images may be beyond three deviations by chance
+    assert summary.within >= 0.95 and summary.sure > 0.9
+    assert not (summary.crashed or summary.hung or summary.nans or summary.refused)
+
+
+@pytest.mark.parametrize("name", ["rod 0.3 mm away", "rod far away", "beyond the tip", "engulfing"])
+def test_nothing_presses_without_a_press(name):
+    assert all(trial.sigmas <= 3.5 for trial in played(name) if trial.sure)
+    assert all(trial.outcome == "answer" for trial in played(name))
+
+
+@pytest.mark.parametrize("name", ["wire of 0.5 mm", "plate of 0.3 mm, edge on"])
+def test_what_an_outline_cannot_describe_is_refused_in_words(name):
+    refused = [trial for trial in played(name) if trial.outcome == "refused"]
+    assert refused and all("mm, expected at least 0.6 mm" in trial.note for trial in refused)
+    assert not any(trial.sure and trial.force_error > 0.05 for trial in played(name))
+
+
+def test_a_press_begins_clear_of_the_jaw():
+    for scene in build_scenes():
+        depths = plan_depths(scene)
+        assert depths[0] <= -CLEAR and depths[-1] == pytest.approx(scene.depth)
+        assert (np.diff(depths) >= -1e-15).all()
+
+
+# --- outlines in single precision, and twice
+
+
+def outline(name, dtype=float):
+    polygons = tuple(p.astype(dtype) for p in cut_outline(SCENES[name].mesh, np.eye(3), 0.01))
+    stddev = np.array([1e-4, 1e-4, 3e-3])
+    return ObjectOutline(polygons=polygons, origin=np.array([0.03, 0.04]), tilt=0.0, stddev=stddev)
+
+
+def contact_of(shape):
+    return Contact(points=np.array([[0.014, 0.0, 0.04]]), weights=np.ones(1), outline=shape)
+
+
+def test_a_field_of_single_precision_is_that_of_double():
+    double, single = (build_distance_field(outline("rod", kind).polygons) for kind in (float, np.float32))
+    assert single.coefficients.dtype == single.segments.dtype == float
+    # 60 mm have 4e-9 m of rounding
+    np.testing.assert_allclose(single.coefficients, double.coefficients, atol=2e-8)
+
+
+def test_an_outline_that_comes_again_is_not_built_again():
+    """Contacts that switch between two outlines cost a look-up; another outline is another object."""
+    first, settings = outline("rod"), EstimatorSettings()
+    once = expect_object(contact_of(first), settings).indenter
+    other = expect_object(contact_of(outline("edge")), settings).indenter
+    again = expect_object(contact_of(outline("rod")), settings, other).indenter
+    assert again is once and other is not once
+
+
+def test_a_tiny_outline_is_refused_each_time():
+    for _ in range(2):
+        with pytest.raises(ContactError, match="at least 0.6 mm"):
+            expect_object(contact_of(outline("wire of 0.5 mm")), EstimatorSettings())

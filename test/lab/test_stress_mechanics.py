@@ -1,0 +1,221 @@
+"""Claims about mechanics under stress: right, or refused in words."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mechanics_fakes import BENCH, bench_mechanics, block
+
+from finforce.errors import FinforceError
+from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
+from finforce_ifea.errors import ContactError, MeshError
+from finforce_ifea.fem.factorisation import SparseFactor, factorise_banded
+from finforce_ifea.fem.locking import LockingWarning, measure_locking, measure_shape, warn_of_locking
+from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
+from finforce_ifea.jaw.mesh import build_volume_mesh, check_connection
+from lab.stress.mechanics import (
+    MODULUS,
+    Rig,
+    build_jaw,
+    build_own_mechanics,
+    estimate_press,
+    run_buckling,
+    run_epsilon,
+)
+from lab.stress.mechanics_meshes import CHANGES, parts_of, run_kind, try_mesh
+from lab.stress.stress import Plan, summarise
+
+COARSE, FRAME = Plan(solver="solid", mesh="coarse"), Plan(solver="frame")
+
+
+def broken(trials):
+    return summarise("", list(trials), timed=False).broken
+
+
+# --- stiffness
+
+
+@pytest.mark.parametrize("plan", [COARSE, FRAME], ids=["solid", "frame"])
+@pytest.mark.parametrize("modulus", [1e3, 1e8, 1e12])
+def test_forces_go_with_the_modulus(plan, modulus):
+    """From 1 kPa to 1 TPa; 1e-9: rounding of a condition of some 1e8 in a force that the object's depth fixes."""
+    forces = []
+    for value in (MODULUS, modulus):
+        jaw = build_jaw(value)
+        rig = Rig(mechanics=build_own_mechanics(plan, jaw), jaw=jaw, height=0.02)
+        forces.append(rig.press(3e-3)[1].force / value)
+    np.testing.assert_allclose(forces[1], forces[0], rtol=1e-9, atol=1e-9 * np.linalg.norm(forces[0]))
+
+
+def test_a_constant_penalty_would_not_go_with_the_modulus():
+    """The opposite: with the surface's own penalty a jaw of 1 TPa gives way by a twentieth of the depth only."""
+    jaw = build_jaw(1e12)
+    mechanics = build_own_mechanics(COARSE, jaw)
+    surface = mechanics.contact.surface
+    soft = replace(surface, stiffness=surface.stiffness * (MODULUS / 1e12))
+    rigid = RigidCylinder(radius=0.0125)
+    right, wrong = (
+        press_jaw(mechanics.model, s, jaw.inner_face_x, rigid, 0.04, [2e-3])[0].force for s in (surface, soft)
+    )
+    assert np.linalg.norm(wrong) < 0.1 * np.linalg.norm(right)
+
+
+def test_estimates_go_with_the_modulus():
+    first, other = (estimate_press(FRAME, 0, modulus) for modulus in (MODULUS, 1e9))
+    assert first.status == other.status == "ok"
+    # key points that differ by rounding go through the estimator's iterations
+    np.testing.assert_allclose(other.force / 1e9, first.force / MODULUS, rtol=1e-6, atol=1e-15)
+
+
+# --- the energy weight
+
+
+@pytest.mark.parametrize("plan", [COARSE, FRAME], ids=["solid", "frame"])
+def test_force_falls_with_the_energy_weight_and_its_bias_is_stated(plan):
+    """Both forms, eps from 0 to 1e6: never more than with the weight before, and within three stated deviations."""
+    trials = list(run_epsilon(replace(plan, count=1)))
+    assert not broken(trials)
+    last = [float(trial.note) for trial in trials if trial.level.endswith("eps 1e+06")]
+    assert len(last) == 2 and max(last) < 1e-4
+
+
+# --- loads into buckling
+
+
+def test_loads_through_limit_points_are_found_again():
+    trials = list(run_buckling(replace(COARSE, count=1)))
+    assert len(trials) >= 8
+    assert not broken(trials)
+
+
+@pytest.mark.parametrize(("mesh", "solver"), [("coarse", "solid"), ("default", "frame")])
+def test_a_jaw_that_snaps_is_no_equilibrium(mesh, solver):
+    """Near the tip the outer band gives way at 13 to 17 mm; what Newton's method finds beyond is another shape."""
+    mechanics = bench_mechanics(mesh, solver)
+    pressed = lambda depth: press_jaw(  # noqa: E731
+        mechanics.model, mechanics.contact.surface, BENCH.inner_face_x, RigidCylinder(radius=0.0125), 0.075, [depth]
+    )
+    with pytest.raises(ContactError, match="beyond a depth of 1[37]"):
+        pressed(18e-3)
+
+
+def test_tiny_presses_are_in_equilibrium_with_their_force():
+    """Newton's method stops by the depth, not by an absolute length: at 1 um the residual is still rounding."""
+    jaw = build_jaw()
+    rig = Rig(mechanics=build_own_mechanics(COARSE, jaw), jaw=jaw, height=0.04)
+    trial = rig.judge(rig.press(1e-6), np.zeros(3), 1.0)
+    assert trial.residual < 1e-6
+    assert abs(trial.energy_balance) < 1e-2
+
+
+def test_stability_is_seen_by_both_factors():
+    """Of diag(2, 2, -1) with couplings, banded Cholesky sees it by failing, LU by its pivots."""
+    storage = np.array([[2.0, 2.0, 2.0], [0.5, 0.5, 0.0]], order="F")
+    assert factorise_banded(storage).positive
+    matrix = lambda last: np.array([[2.0, 0.5, 0.0], [0.5, 2.0, 0.5], [0.0, 0.5, last]])  # noqa: E731
+    from scipy.sparse import csc_matrix
+
+    assert SparseFactor(csc_matrix(matrix(2.0))).positive
+    assert not SparseFactor(csc_matrix(matrix(-1.0))).positive
+
+
+# --- meshes
+
+
+def test_every_faulty_mesh_is_refused_or_right():
+    """Hexahedra with one fault each; right within a tenth, or warned of."""
+    trials = list(run_kind(Plan(seed=2), "hexahedra"))
+    assert len(trials) == len(CHANGES) and not broken(trials)
+    kept = {trial.level for trial in trials if trial.outcome == "answer"}
+    assert {"hexahedra: as it is", "hexahedra: aspect ratio 1e4", "hexahedra: nodes in another order"} <= kept
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("element twice", "occur twice"),
+        ("loose element", "falls into 2 pieces"),
+        ("element on one edge", "nodes on one line"),
+        ("clamped along a line", "lie on one line"),
+        ("clamped by a mask", "got bool"),
+        ("index not whole", "not whole"),
+        ("node twice", "duplicate"),
+        ("millimetres", "millimetres"),
+        ("nearly inverted", "inverted"),
+    ],
+)
+def test_a_fault_is_called_by_its_name(fault, words):
+    parts = parts_of(build_jaw().build_mesh("coarse"))
+    with pytest.raises(MeshError, match=words):
+        try_mesh(build_jaw(), CHANGES[fault](parts, np.random.default_rng(0)))
+
+
+def test_a_face_of_three_elements_is_refused():
+    mesh = block((1, 1, 2), (0.004, 0.006, 0.008))
+    lower = mesh.hexes[0]
+    shared = np.intersect1d(mesh.hexes[0], mesh.hexes[1])
+    # a third element on the face between the two, through the upper one
+    tall = np.where(np.isin(lower, shared), lower, -1)
+    moved = {int(node): len(mesh.nodes) + i for i, node in enumerate(np.setdiff1d(lower, shared))}
+    third = np.array([node if node >= 0 else moved[int(lower[i])] for i, node in enumerate(tall)])
+    extra = mesh.nodes[np.setdiff1d(lower, shared)] - [0.0, 0.0, 0.001]
+    with pytest.raises(MeshError, match="more than two elements"):
+        build_volume_mesh(
+            nodes=np.vstack([mesh.nodes, extra]), hexes=np.vstack([mesh.hexes, third]), clamped=mesh.clamped
+        )
+
+
+def test_good_meshes_are_one_piece():
+    for mesh in (
+        BENCH.build_mesh("default"),
+        to_tet10(BENCH.build_mesh("coarse")),
+        block((2, 2, 4), (0.01, 0.01, 0.02)),
+    ):
+        check_connection(mesh)
+
+
+# --- locking
+
+
+def warned(ratio, mesh):
+    jaw = replace(build_jaw(ratio=ratio), drawing=None)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        warn_of_locking(jaw, mesh)
+    return [str(w.message) for w in said if issubclass(w.category, LockingWarning)]
+
+
+def test_hexahedra_do_not_lock_near_incompressibility():
+    """Within 5 % of plane strain from nu = 0.3 to 0.499, where 4-node tetrahedra are 12 times too stiff."""
+    mesh = build_jaw().build_mesh("coarse")
+    assert measure_locking(build_jaw(ratio=0.499), mesh) == pytest.approx(1.0, abs=0.05)
+    assert measure_locking(build_jaw(ratio=0.499), to_tet4(mesh)) > 8.0
+    assert not warned(0.499, mesh)
+
+
+def test_tetrahedra_that_lock_are_warned_of():
+    mesh = build_jaw().build_mesh("coarse")
+    (words,) = warned(0.499, to_tet10(mesh))
+    assert "10-node tetrahedra lock, they are 1.4 times" in words and "0.499" in words
+    assert not warned(0.3, to_tet10(mesh))
+    assert warned(0.3, to_tet4(mesh))
+
+
+def test_distorted_hexahedra_are_warned_of():
+    parts = parts_of(build_jaw().build_mesh("coarse"))
+    skewed = CHANGES["skewed by 0.95"](parts, np.random.default_rng(0)).build()
+    assert measure_shape(skewed) < 0.8 < measure_shape(parts.build())
+    (words,) = warned(0.3, skewed)
+    assert "distorted hexahedra" in words
+
+
+def test_refusals_are_ours():
+    """Whatever is done to a mesh, nothing but this package's errors comes out."""
+    parts, random = parts_of(build_jaw().build_mesh("coarse")), np.random.default_rng(7)
+    for _ in range(40):
+        elements = parts.elements.copy()
+        rows = random.integers(len(elements), size=3)
+        elements[rows] = random.integers(len(parts.nodes), size=(3, 8))
+        with pytest.raises(FinforceError):
+            replace(parts, elements=elements).build()

@@ -1,0 +1,106 @@
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from finforce.camera import project
+from finforce.gripper_frames import ROBOT_CAMERA
+from finforce_sim.gripper.gripper import TwinGripper
+from finforce_sim.rendering.bodies import DrawnJaw
+from finforce_sim.rendering.depth_camera import build_d405_vga
+from finforce_sim.rendering.photographer import BANDS, Photographer, SceneSetting
+from finforce_sim.scenes.scenarios import build_scenario
+
+
+@pytest.fixture(scope="module")
+def gripper():
+    return TwinGripper(build_scenario("grasp_cylinder"), 3, density="coarse")
+
+
+@pytest.fixture(scope="module")
+def setting(gripper):
+    shapes = {
+        side: DrawnJaw(jaw=jaw, rest=gripper.rest_vertices(side), triangles=gripper.triangles(side))
+        for side, jaw in gripper.jaws.items()
+    }
+    return SceneSetting(
+        shapes=shapes, mesh=gripper.object_mesh, camera=build_d405_vga(), T_gripper_camera=ROBOT_CAMERA, light="bright"
+    )
+
+
+@pytest.fixture(scope="module")
+def pressed(gripper):
+    return next(state for state in gripper.states() if np.linalg.norm(state.jaws["left"].force) > 1.0)
+
+
+@pytest.fixture(scope="module")
+def shot(setting, pressed):
+    return Photographer(setting, 3).shoot(pressed)
+
+
+def test_true_pixels_are_the_projected_key_points(shot, setting):
+    for truth in shot.truth.values():
+        points = truth.points @ truth.T_camera_jaw[:3, :3].T + truth.T_camera_jaw[:3, 3]
+        np.testing.assert_allclose(truth.pixels, project(points, setting.camera), atol=1e-9)
+
+
+def test_depth_at_visible_key_points_is_that_of_the_finger(shot):
+    for truth in shot.truth.values():
+        points = truth.points @ truth.T_camera_jaw[:3, :3].T + truth.T_camera_jaw[:3, 3]
+        at = np.round(truth.pixels).astype(int)
+        error = shot.depth[at[:, 1], at[:, 0]] - points[:, 2]
+        assert np.nanmedian(np.abs(error[truth.visible])) < 1e-3  # noise and millimetre steps
+
+
+def test_what_the_object_covers_is_not_visible(shot, setting, pressed):
+    bare = Photographer(replace(setting, mesh=None), 3).shoot(pressed)
+    for side, truth in bare.truth.items():
+        assert truth.visible.all()
+        assert not shot.truth[side].visible.all()
+        assert shot.truth[side].visible.sum() >= 10
+
+
+def test_the_same_seed_gives_the_same_image_and_another_one_another(shot, setting, pressed):
+    again = Photographer(setting, 3).shoot(pressed)
+    np.testing.assert_array_equal(again.color, shot.color)
+    np.testing.assert_array_equal(again.depth, shot.depth)
+    assert (Photographer(setting, 4).shoot(pressed).color != shot.color).mean() > 0.5
+
+
+def test_the_dot_on_the_holder_is_where_the_reference_point_is(shot):
+    for truth in shot.truth.values():
+        column, row = np.round(truth.pixels[-1]).astype(int)
+        dot = shot.color[row - 1 : row + 2, column - 1 : column + 2].mean()
+        around = shot.color[row - 14 : row + 15, column - 14 : column + 15].astype(float)
+        assert abs(dot - np.median(around)) > 20.0  # grey levels
+
+
+def test_depth_comes_in_the_steps_that_were_asked_for(setting, pressed):
+    for step in (1e-3, 1e-4):
+        depth = Photographer(replace(setting, depth_step=step), 3).shoot(pressed).depth
+        depth = depth[np.isfinite(depth)].astype(float)
+        np.testing.assert_allclose(depth / step, np.round(depth / step), atol=1e-3)  # float32 metres
+        assert len(np.unique(np.round(depth / step))) > (50 if step == 1e-3 else 500)
+
+
+def test_rows_of_a_rolling_shutter_are_of_their_own_time(setting, gripper):
+    states = gripper.states()
+    before, state = next((a, b) for a, b in pairwise(states) if a.jaws["left"].origin_x < b.jaws["left"].origin_x)
+    readout, height = 0.02, setting.camera.height
+    photographer = Photographer(replace(setting, readout=readout), 3)
+    photographer.look(before)
+    rolled, flat = photographer.look(state), Photographer(setting, 3)
+    band = height // BANDS
+    for number in (0, BANDS - 1):
+        rows = slice(number * band, (number + 1) * band)
+        ago = readout * (1.0 - (rows.start + 0.5 * (band - 1)) / (height - 1))
+        then = flat.look(state.blend(before, ago / (state.stamp - before.stamp)))
+        inner = slice(rows.start + 1, rows.stop - 1)  # a band's edge has no neighbours that show an edge in its pixels
+        np.testing.assert_allclose(rolled.picture.color[inner], then.picture.color[inner], atol=1e-6)
+    # a point is where the jaw was when the point's own row was exposed
+    now, past = (flat.look(some).truth["left"].pixels for some in (state, before))
+    seen = rolled.truth["left"].pixels
+    ago = readout * (1.0 - seen[:, 1] / (height - 1)) / (state.stamp - before.stamp)
+    np.testing.assert_allclose(seen[:, 0], now[:, 0] + ago * (past - now)[:, 0], atol=0.02)
+    assert np.ptp((seen - now)[:, 0]) > 0.5

@@ -1,0 +1,173 @@
+"""Claims about images of a grasp that are taken beforehand and shown as a gripper moves; a lens without a renderer."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from rgbd_fakes import CAMERA_POSE, FakeLens
+
+from finforce.transforms import invert_pose
+from finforce_driver.errors import LinkError
+from finforce_sim.errors import ScenarioError
+from finforce_sim.gripper.live import (
+    BEFORE_TOUCH,
+    COUNTS,
+    OPEN_STRIDE,
+    TAKES,
+    CoupledGripper,
+    ImageTable,
+    LiveScene,
+    choose_openings,
+    render_openings,
+)
+from finforce_sim.gripper.pressing import PressedGrasp, RelaxedGrasp
+from finforce_sim.scenes.scenarios import build_scenario
+
+STROKE = 0.048
+COUNT = STROKE / COUNTS
+HELD = 0.013
+
+
+@pytest.fixture(scope="module")
+def grasp():
+    return PressedGrasp(build_scenario("grasp_cylinder"), 3, "coarse", step=5e-4)
+
+
+@pytest.fixture
+def scene(grasp):
+    scene = LiveScene(grasp, FakeLens(), 5)
+    scene.render(lambda frame: frame, lambda done, count: None)
+    return scene
+
+
+@dataclass
+class Teller:
+    """Hears how far the filming is, and may end it."""
+
+    ends_at: int = -1
+    heard: list = field(default_factory=list)
+
+    def __call__(self, done, count):
+        self.heard.append((done, count))
+        if done == self.ends_at:
+            raise KeyboardInterrupt
+
+
+def test_every_rest_position_of_the_gripper_has_its_image_where_the_jaws_touch(grasp):
+    openings = choose_openings(grasp, 0.0, STROKE)
+    in_contact = openings[openings < grasp.touch_opening + BEFORE_TOUCH]
+    np.testing.assert_allclose(in_contact, COUNT * np.arange(len(in_contact)), atol=1e-12)
+    assert in_contact[-1] > grasp.touch_opening + BEFORE_TOUCH - COUNT
+    free = openings[len(in_contact) :]
+    np.testing.assert_allclose(np.diff(free), OPEN_STRIDE * COUNT, atol=1e-12)
+    assert openings[-1] == pytest.approx(STROKE)
+
+
+def test_no_image_is_taken_of_jaws_that_jam(grasp, monkeypatch):
+    monkeypatch.setattr(grasp, "least_opening", 0.0105)
+    openings = choose_openings(grasp, 0.0, STROKE)
+    assert 0.0105 <= openings[0] < 0.0105 + COUNT
+
+
+@pytest.mark.parametrize(
+    ("opening", "place"),
+    [(-0.1, 0), (0.0, 0), (0.0014, 0), (0.0016, 1), (0.003, 1), (0.0074, 1), (0.0076, 2), (1.0, 2)],
+)
+def test_the_nearest_image_is_shown(opening, place):
+    table = ImageTable(openings=np.array([0.0, 0.003, 0.012]), takes=[[0], [1], [2]])
+    assert table.find(opening) == place
+
+
+def test_images_are_of_their_openings_and_no_two_takes_are_alike(grasp):
+    openings = np.array([0.0, 0.010, 0.030])
+    teller = Teller()
+    table = render_openings(grasp, FakeLens(), openings, lambda frame: frame, teller)
+    assert teller.heard == [(1, 3), (2, 3), (3, 3)]
+    pictures = [frame.color.tobytes() for takes in table.takes for frame in takes]
+    assert len(pictures) == len(set(pictures)) == TAKES * 3
+    for opening, takes in zip(openings, table.takes, strict=True):
+        state = grasp.state(opening)
+        for frame in takes:
+            np.testing.assert_array_equal(frame.jaws["left"].points, state.jaws["left"].keypoints)
+            np.testing.assert_array_equal(frame.jaws["right"].force, state.jaws["right"].force)
+
+
+def test_the_same_seed_gives_the_same_images_whatever_the_threads(grasp, monkeypatch):
+    openings = np.linspace(0.0, 0.03, 12)
+    reels = []
+    for workers in (1, 4):
+        monkeypatch.setattr("finforce_sim.gripper.live.MOST_WORKERS", workers)
+        reels.append(render_openings(grasp, FakeLens(), openings, lambda frame: frame.color))
+    np.testing.assert_array_equal(reels[0].takes, reels[1].takes)
+
+
+def test_filming_that_is_ended_does_not_go_on(grasp):
+    lens = FakeLens()
+    with pytest.raises(KeyboardInterrupt):
+        render_openings(grasp, lens, np.linspace(0.0, 0.048, 200), lambda frame: frame, Teller(ends_at=2))
+    # what the threads had begun, and what they took while the end was on its way
+    assert lens.looks < 100
+
+
+def test_a_gripper_that_stands_still_is_never_shown_twice_by_the_same_image(scene):
+    pictures = [scene.take(HELD, 0.033 * k).picture for k in range(6)]
+    assert all(a is not b for a, b in zip(pictures[:-1], pictures[1:], strict=True))
+    shown = scene.grasp.state(scene.table.openings[scene.table.find(HELD)])
+    for picture in pictures:
+        np.testing.assert_array_equal(picture.jaws["left"].points, shown.jaws["left"].keypoints)
+
+
+def test_true_forces_follow_the_true_opening_and_relax_in_time(scene):
+    expected = RelaxedGrasp(scene.grasp)
+    stamps = 0.1 * np.arange(60)
+    openings = np.interp(stamps, [0.0, 1.0, 2.0], [0.03, 0.03, HELD])
+    for count, (stamp, opening) in enumerate(zip(stamps, openings, strict=True)):
+        wrenches = scene.take(float(opening), float(stamp)).wrenches
+        wanted = expected.update(float(opening), 0.1 if count else 0.0)
+        for side, wrench in wrenches.items():
+            np.testing.assert_allclose(wrench.force, wanted[side].force, atol=1e-9)
+    assert np.linalg.norm(wrenches["left"].force) > 1.0
+
+
+def test_the_object_is_tracked_at_a_third_of_the_images_where_it_is_seen():
+    # on the bench the object moves
+    scene = LiveScene(PressedGrasp(build_scenario("bench_cylinder"), 3, "coarse", step=1e-3), FakeLens(), 5)
+    scene.render(lambda frame: frame, lambda done, count: None)
+    poses = [scene.take(HELD, 0.033 * k).T_camera_object for k in range(9)]
+    assert [pose is not None for pose in poses] == [True, False, False] * 3
+    seen = scene.table.openings[scene.table.find(HELD)]
+    true = invert_pose(CAMERA_POSE) @ scene.grasp.object_pose(seen)
+    tracked = [pose for pose in poses if pose is not None]
+    for pose in tracked:
+        assert 0.0 < np.abs(pose[:3, 3] - true[:3, 3]).max() < 1.5e-3  # five standard deviations
+    assert not np.array_equal(tracked[0], tracked[1])
+
+
+def test_an_object_that_fills_the_gripper_is_refused():
+    grasp = PressedGrasp(build_scenario("grasp_cylinder", object="cylinder"), 3, "coarse", step=5e-4)
+    with pytest.raises(ScenarioError, match="50 mm wide.*expected at most 46 mm"):
+        LiveScene(grasp, FakeLens(), 0)
+
+
+def test_a_coupled_gripper_waits_at_its_link_with_open_jaws(grasp, tmp_path):
+    gripper = CoupledGripper(grasp, str(tmp_path / "gripper"), "old")
+    assert gripper.opening == pytest.approx(STROKE, abs=1e-5)
+    assert gripper.gripper.variant == "old"
+    gripper.open()
+    try:
+        assert gripper.path == str(tmp_path / "gripper")
+        assert (tmp_path / "gripper").is_char_device()
+        gripper.gripper.jaws.ticks = gripper.gripper.jaws.ticks_at(HELD)
+        assert gripper.opening == pytest.approx(HELD, abs=5e-6)
+        assert gripper.gripper.jaws.force == pytest.approx(grasp.elastic_force(gripper.opening), rel=1e-9)
+    finally:
+        gripper.close()
+        gripper.close()
+    assert not (tmp_path / "gripper").is_symlink()
+
+
+def test_a_file_in_place_of_the_link_is_left_alone(grasp, tmp_path):
+    (tmp_path / "gripper").write_text("mine")
+    with pytest.raises(LinkError, match="expected nothing or a link"):
+        CoupledGripper(grasp, str(tmp_path / "gripper")).open()
+    assert (tmp_path / "gripper").read_text() == "mine"
