@@ -377,7 +377,7 @@ def _shipped(*names: str) -> Callable[[Path], list[Path]]:
     """Return what copies shipped files, and all beside them."""
 
     def make(folder: Path) -> list[Path]:
-        root, found = Path(__file__).resolve().parents[1], []
+        root, found = Path(__file__).resolve().parents[2], []
         for name in names:
             source = root / name
             for other in source.parent.iterdir():

@@ -27,7 +27,7 @@ from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 from lab.bench.cases import HEIGHTS, TRUTH
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 YOUNG_MODULUS, POISSON_RATIO = 30e6, 0.45  # of the truth
 SHOWN = (2, 5, 10)  # [mm]
 
