@@ -32,7 +32,8 @@ def setting(
         unit: of value and bounds.
         low: least value.
         high: largest value.
-        flags: `choices` (one of several words), `topic` (names one, or several), `settable` (while a node runs).
+        flags: `choices` (one of several words), `topic` (names one, or several), `settable` (while a node runs),
+            `alias` (former name of the ROS parameter, still read).
     """
     bounds = {"min": low, "max": high}
     return field(default=default, metadata={"description": description, "unit": unit, **bounds, **flags})
