@@ -51,7 +51,7 @@ def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
             if not stat.S_ISREG(state.st_mode):
                 raise FileError("is no plain file")
             allowed = raise_budget(largest)
-            content = file.read(allowed + 1)
+            content = file.read(min(allowed, state.st_size) + 1)
     except (OSError, ValueError) as error:  # a name with a null byte is a ValueError
         if isinstance(error, FileError):
             raise

@@ -8,9 +8,10 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from finforce.optional import import_open3d, import_trimesh
+from finforce.files import FileError
+from finforce.optional import import_open3d
+from finforce.surfaces import read_surface
 from finforce_contact.errors import ObjectMeshError, to_floats
-from finforce_contact.mesh.glb_check import check_glb
 from finforce_contact.mesh.repair import crosses_itself, repair
 from finforce_contact.mesh.triangles import (
     ObjectMesh,
@@ -28,7 +29,6 @@ SMALLEST, LARGEST = 0.005, 0.6  # [m], largest extent of what a gripper of 50 mm
 THINNEST = 1e-4  # [m], a mesh that is thinner is a sheet, and has no inside
 FARTHEST = 1.0  # [m], of a vertex from the origin of its frame; poses are of that origin, and turn about it
 TRIANGLE_BOUND = 2_000_000  # a closed mesh of so many takes some ten seconds, an open one a minute
-FILE_BOUND = 1 << 30  # [byte], more than any format needs for as many triangles
 _CROSSING_LIMIT = 30_000  # triangles, whose pairs are compared in a fraction of a second
 _COMMON = 0.1  # [m], the size that tells which unit is the likely one
 
@@ -71,22 +71,10 @@ def read_triangles(path: Path | str) -> tuple[NDArray, NDArray]:
         raise ObjectMeshError(f"{str(path)[:200]}: there is no such file, expected a mesh ({formats}); check the path")
     if path.suffix.lower() not in FORMATS:
         raise ObjectMeshError(f"{path.name}: got ending {path.suffix!r}, expected one of {formats}; convert the file")
-    size = path.stat().st_size
-    if size == 0 or size > FILE_BOUND:
-        raise ObjectMeshError(f"{path.name}: got {size} bytes, expected 1 to {FILE_BOUND}; export it again")
-    trimesh = import_trimesh()
-    if path.suffix.lower() == ".glb":
-        check_glb(path)
     try:
-        mesh = trimesh.load_scene(path, process=False, skip_materials=True).to_mesh()
-        vertices = np.array(mesh.vertices, dtype=float).reshape(-1, 3)
-        triangles = np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
-    except Exception as error:  # a broken file makes the readers stumble over anything
-        raise ObjectMeshError(
-            f"{path.name}: cannot be read ({type(error).__name__}: {error}), expected a whole {path.suffix} file; "
-            "export it again"
-        ) from error
-    return vertices, triangles
+        return read_surface(path)
+    except FileError as error:
+        raise ObjectMeshError(f"{path.name}: {error}") from error
 
 
 def _is_file(path: Path) -> bool:

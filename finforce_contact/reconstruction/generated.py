@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.optional import import_open3d
+from finforce.surfaces import LARGEST
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.mesh.closing import POISSON_ROOMS, solve_poisson
-from finforce_contact.mesh.object_mesh import FILE_BOUND, read_triangles
+from finforce_contact.mesh.object_mesh import read_triangles
 
 PLACE, OPACITY = ("x", "y", "z"), "opacity"
 HEADER_BOUND = 65536  # bytes
@@ -45,8 +46,8 @@ def read_splats(path: Path) -> NDArray | None:
     Raises:
         ObjectMeshError: the file is too large, or shorter than its header says.
     """
-    if path.stat().st_size > FILE_BOUND:
-        raise ObjectMeshError(f"{path.name}: got {path.stat().st_size} bytes, expected {FILE_BOUND} at most")
+    if path.stat().st_size > LARGEST:
+        raise ObjectMeshError(f"{path.name}: got {path.stat().st_size} bytes, expected {LARGEST} at most")
     with path.open("rb") as file:
         head, end, _ = file.read(HEADER_BOUND).partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]

@@ -1,6 +1,6 @@
 """Harmful and damaged files given to what reads them, each within a limit of memory and time: what became of them.
 
-    python -m benchmarks.fuzz --count 100000 --json fuzz.json
+    python -m lab.benchmarks.fuzz --count 100000 --json fuzz.json
 
 A reader may read a file or refuse it with an error of the package. It fails with any other error, where it takes 1 GB
 more than a good file does, or 20 s; and where a damaged recording gives other key points without a word.
@@ -85,7 +85,7 @@ class Reader:
         return answer["outcome"], answer["said"]
 
     def _start(self) -> None:
-        command = [sys.executable, "-m", "benchmarks.fuzz", "--worker", self._kind.name]
+        command = [sys.executable, "-m", "lab.benchmarks.fuzz", "--worker", self._kind.name]
         self._process = subprocess.Popen(
             [*command, *map(str, self._good)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
         )
@@ -270,7 +270,7 @@ def fuzz(kinds: Iterable[Kind], count: int, seed: int, *, shown: bool = True) ->
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, print a table, write JSON; 1 where a file failed."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.fuzz", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m lab.benchmarks.fuzz", description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=2000, help="damaged files of all kinds together (2,000)")
     parser.add_argument("--seed", type=int, default=0, help="of the damage (0)")
     parser.add_argument("--kinds", nargs="+", choices=tuple(KINDS), default=tuple(KINDS), help="of files (all)")

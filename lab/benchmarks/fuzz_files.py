@@ -794,7 +794,7 @@ KINDS = {
             read=_read_case,
             craft=_craft_json,
         ),
-        Kind(name="glb", make=_make_glb, read=_read_mesh, craft=_craft_glb),
+        Kind(name="glb", make=_make_glb, read=_read_mesh, craft=_craft_glb, cost=8),
         Kind(name="mesh", make=_make_meshes, read=_read_mesh),
         Kind(name="onnx", make=_make_onnx, read=_read_onnx, craft=_craft_onnx, cost=20),
         Kind(name="cloud", make=_make_cloud, read=_read_cloud, craft=_craft_cloud),

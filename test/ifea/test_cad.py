@@ -206,7 +206,8 @@ def test_the_command_writes_a_jaw_that_loads(tmp_path, capsys, surface):
 
 
 def test_of_few_key_points_those_between_are_taken_too(tmp_path, surface):
-    finger = recognize(draw_polygon(), WIDTH * MILLIMETRE, Wishes())
+    polygon = shapely.affinity.scale(draw_polygon(), MILLIMETRE, MILLIMETRE, origin=(0, 0))
+    finger = recognize(polygon, WIDTH * MILLIMETRE, Wishes())
     points = propose(finger, "few", "tpu95a").keypoints
     assert list(points)[9:14] == ["inner_clamp_1", "inner_1_2", "inner_2_3", "inner_3_4", "inner_4_tip"]
     for name, (x, _, z) in list(points.items())[9:]:
@@ -274,6 +275,10 @@ def test_no_fin_ray_finger_is_refused(tmp_path, capsys):
     assert not (tmp_path / "out.yaml").exists()
 
 
+# a surface that is part of itself crashes the reader
+LOOP = "ISO-10303-21;\nHEADER;\nENDSEC;\nDATA;\n#1=SHELL_BASED_SURFACE_MODEL('',(#1));\nENDSEC;\nEND-ISO-10303-21;\n"
+
+
 def test_bad_files_are_refused_in_one_line(tmp_path, capsys, surface):
     open_one = surface.copy()
     open_one.update_faces(np.arange(len(open_one.faces)) > 3)
@@ -284,14 +289,20 @@ def test_bad_files_are_refused_in_one_line(tmp_path, capsys, surface):
     (tmp_path / "huge.stl").write_bytes(b"\0" * 80 + (10_000_000).to_bytes(4, "little") + b"\0" * 200)
     (tmp_path / "noise.stl").write_bytes(np.random.default_rng(0).bytes(5000))
     (tmp_path / "noise.obj").write_bytes(np.random.default_rng(0).bytes(5000))
+    (tmp_path / "noise.dxf").write_bytes(np.random.default_rng(0).bytes(5000))
+    (tmp_path / "noise.svg").write_bytes(np.random.default_rng(0).bytes(5000))
+    (tmp_path / "loop.step").write_text(LOOP)
     (tmp_path / "cross.json").write_text(crossing_loops())
     (tmp_path / "text.txt").write_text("a finger")
     cases = {
         "open.stl": "open and 0 doubled edges, expected a closed one: repair it",
-        "cut.stl": "is no STL file, or is cut short",
-        "huge.stl": "is no STL file, or is cut short",
-        "noise.stl": "is no STL file, or is cut short",
-        "noise.obj": "expected the surface of a finger|cannot be read as OBJ",
+        "cut.stl": "expected 1 to 2000000 of a whole .stl file|cannot be read",
+        "huge.stl": "expected 1 to 2000000 of a whole .stl file|cannot be read",
+        "noise.stl": "expected 1 to 2000000 of a whole .stl file|cannot be read",
+        "noise.obj": "expected 1 to 2000000 of a whole .obj file|cannot be read",
+        "loop.step": "loop.step: .* expected a whole .step file",
+        "noise.dxf": "noise.dxf: made its reader fail",
+        "noise.svg": "noise.svg: made its reader fail",
         "cross.json": "touches or crosses itself",
         "text.txt": "files of this kind are not read; expected one of .stl",
         "none.stl": "there is no file",

@@ -1,6 +1,5 @@
 """The section of a prismatic finger out of the files that people print: surfaces, STEP, DXF, SVG, JSON."""
 
-import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,8 +9,10 @@ import trimesh
 from numpy.typing import NDArray
 from shapely.ops import polygonize, unary_union
 
-from finforce.errors import one_line
+from finforce.files import FileError
 from finforce.optional import import_library
+from finforce.sandbox import SandboxError, run_limited
+from finforce.surfaces import read_surface
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.section import UNITS, check_loops, join_loops, read_loops
 
@@ -77,14 +78,15 @@ def read_section(path: Path, *, unit: str | None = None, body: int | None = None
             loops, width = read_loops(path)
             return RawSection(polygon=join_loops(loops), width=width, notes=["a section file"])
         if suffix in (".dxf", ".svg"):
-            loops, named = _read_dxf(path) if suffix == ".dxf" else _read_svg(path)
+            loops, named = run_limited(_read_dxf if suffix == ".dxf" else _read_svg, path)
             check_loops(loops, path.name)
             extent = np.ptp(np.concatenate(loops), axis=0).max()
             scale, note = _choose_unit(float(extent), unit or named)
             return RawSection(polygon=_join_lines([scale * loop for loop in loops]), width=None, notes=[note])
-        return _cut_surface(_load_surface(path, suffix), unit, body)
-    except JawFileError as error:
-        raise JawFileError(f"{path.name}: {error}" if path.name not in str(error) else str(error)) from error
+        return _cut_surface(_load_surface(path), unit, body)
+    except (JawFileError, FileError, SandboxError) as error:
+        prefix = "" if str(error).startswith(path.name) else f"{path.name}: "
+        raise JawFileError(f"{prefix}{error}") from error
 
 
 def _choose_unit(extent: float, unit: str | None) -> tuple[float, str]:
@@ -96,45 +98,19 @@ def _choose_unit(extent: float, unit: str | None) -> tuple[float, str]:
     return UNITS[guess], f"unit: {guess}, since the largest size is {extent:.4g}, thus {size:.4g} mm (--unit)"
 
 
-def _load_surface(path: Path, suffix: str) -> trimesh.Trimesh:
+def _load_surface(path: Path) -> trimesh.Trimesh:
     """Load the triangles of a file."""
-    if suffix == ".stl":
-        _check_stl(path)
-    if suffix in (".step", ".stp"):
-        import_library("cascadio", f"reading {path.name}, which may be exported as STL instead,")
-    try:
-        mesh = trimesh.load(path, file_type=suffix[1:], force="mesh", process=True)
-    except Exception as error:  # trimesh has no base error
-        reason = one_line(error, 120)
-        raise JawFileError(f"cannot be read as {suffix[1:].upper()} ({type(error).__name__}: {reason})") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise JawFileError(f"holds no triangles, expected the surface of a finger as {suffix[1:].upper()}")
-    if len(mesh.faces) > _MOST_TRIANGLES:
-        raise JawFileError(_say_too_many(len(mesh.faces)))
-    if not np.isfinite(mesh.vertices).all():
+    vertices, triangles = read_surface(path)
+    if not 0 < len(triangles) <= _MOST_TRIANGLES:
+        raise JawFileError(
+            f"{len(triangles)} triangles, expected 1 to {_MOST_TRIANGLES} of a whole {path.suffix} file: export it "
+            "again, or coarser"
+        )
+    if not np.isfinite(vertices).all():
         raise JawFileError("has coordinates that are not finite")
+    mesh = trimesh.Trimesh(vertices, triangles, process=True)
     mesh.merge_vertices()
     return mesh
-
-
-def _check_stl(path: Path) -> None:
-    """Refuse an STL file of too many triangles before any is loaded, and one that is cut short."""
-    with path.open("rb") as file:
-        head = file.read(84)
-    if head[:5] == b"solid" and b"facet" in path.open("rb").read(400):
-        return
-    count = struct.unpack("<I", head[80:84])[0] if len(head) == 84 else -1
-    expected, size = 84 + 50 * count, path.stat().st_size
-    if count > _MOST_TRIANGLES and size >= expected:
-        raise JawFileError(_say_too_many(count))
-    if count < 1 or size < expected:
-        raise JawFileError(
-            f"is no STL file, or is cut short: {size} bytes, of {max(count, 0)} triangles that its head names"
-        )
-
-
-def _say_too_many(count: int) -> str:
-    return f"{count} triangles, expected at most {_MOST_TRIANGLES}: export it coarser"
 
 
 def _cut_surface(mesh: trimesh.Trimesh, unit: str | None, body: int | None) -> RawSection:
@@ -320,10 +296,7 @@ def _read_dxf(path: Path) -> tuple[list[NDArray], str | None]:
     """Read the curves of a DXF drawing, and its unit."""
     ezdxf = import_library("ezdxf", f"reading {path.name}")
     make_path = import_library("ezdxf.path", f"reading {path.name}").make_path
-    try:
-        document = ezdxf.readfile(path)
-    except (OSError, ezdxf.DXFError, UnicodeError, ValueError) as error:
-        raise JawFileError(f"cannot be read as DXF ({one_line(error, 120)})") from error
+    document = ezdxf.readfile(path)
     lines = []
     for entity in document.modelspace():
         try:
@@ -340,17 +313,11 @@ def _read_dxf(path: Path) -> tuple[list[NDArray], str | None]:
 def _read_svg(path: Path) -> tuple[list[NDArray], str | None]:
     """Read the curves of an SVG drawing; lengths without a unit are CSS pixels, as in browsers, unless one is named."""
     svgelements = import_library("svgelements", f"reading {path.name}")
-    try:
-        # a pixel is 1/96 inch: at 25.4 per inch everything comes out in millimetres where sizes have units
-        document = svgelements.SVG.parse(str(path), ppi=25.4, reify=True)
-        lines = []
-        for element in document.elements():
-            if not isinstance(element, svgelements.Shape):
-                continue
-            for part in svgelements.Path(element).as_subpaths():
-                lines.append(_sample_curve(svgelements.Path(part)))
-    except (OSError, ValueError, SyntaxError, AttributeError, TypeError, ZeroDivisionError) as error:
-        raise JawFileError(f"cannot be read as SVG ({type(error).__name__}: {str(error)[:120]})") from error
+    # a pixel is 1/96 inch: at 25.4 per inch everything comes out in millimetres where sizes have units
+    document = svgelements.SVG.parse(str(path), ppi=25.4, reify=True)
+    shapes = [element for element in document.elements() if isinstance(element, svgelements.Shape)]
+    parts = [part for shape in shapes for part in svgelements.Path(shape).as_subpaths()]
+    lines = [_sample_curve(svgelements.Path(part)) for part in parts]
     return _keep_lines(lines), None
 
 

@@ -1,0 +1,57 @@
+"""Triangles out of surface and CAD files; formats that can announce more than they hold are read in a sandbox."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.errors import FinforceError, one_line
+from finforce.files import FileError, read_bytes
+from finforce.optional import import_library, import_trimesh
+from finforce.sandbox import SandboxError, run_limited
+
+LARGEST = 1 << 30  # bytes, more than any format needs for millions of triangles
+# What these formats take goes with the size of the file.
+_PLAIN = (".stl", ".obj", ".ply", ".off")
+_STEP = (".step", ".stp")
+_MEMORY, _SECONDS = 2 << 30, 60
+
+
+def read_surface(path: Path) -> tuple[NDArray, NDArray]:
+    """Return the vertices (n, 3) and triangles (m, 3) of a file, in its own unit and frame, its parts put together.
+
+    Raises:
+        FileError: It cannot be read, or took too much memory or time; the message is a predicate.
+        MissingDependencyError: The library that reads it is not installed.
+    """
+    suffix = path.suffix.lower()
+    import_trimesh()
+    if suffix in _STEP:
+        import_library("cascadio", f"reading {path.name}, which may be exported as STL instead,")
+    try:
+        if suffix in _PLAIN:
+            return _load_triangles(path)
+        return run_limited(_load_triangles, path, memory=_MEMORY, seconds=_SECONDS)
+    except SandboxError as error:
+        raise FileError(f"{error}; expected a whole {suffix} file: export it again") from error
+    except FinforceError:
+        raise
+    except Exception as error:  # trimesh has no base error
+        reason = f"{type(error).__name__}: {one_line(error, 120)}"
+        raise FileError(f"cannot be read ({reason}); expected a whole {suffix} file: export it again") from error
+
+
+def _load_triangles(path: Path) -> tuple[NDArray, NDArray]:
+    """Return vertices and triangles; without the file's name, its content leads to no other file."""
+    content, kind = read_bytes(path, LARGEST), path.suffix[1:].lower()
+    if not content:
+        raise FileError(f"got 0 bytes, expected a whole .{kind} file: export it again")
+    scene = import_trimesh().load_scene(io.BytesIO(content), file_type=kind, process=False, skip_materials=True)
+    mesh = scene.to_mesh()
+    vertices, triangles = np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
+    if len(triangles) and not np.ptp(vertices, axis=0).any():
+        raise FileError("has all its points in one place, as where they are compressed in a way that is not read")
+    return vertices.reshape(-1, 3), triangles.reshape(-1, 3)
