@@ -8,8 +8,7 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 # Packages whose functions are compiled, and days after which what nobody has used is removed.
@@ -45,20 +44,21 @@ def keep_compiled() -> None:
         sys.modules["numba"].config.CACHE_DIR = str(folder)
 
 
-@contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Keep other processes that lock the same file from doing the same; where locks cannot be had, all do it."""
-    with ExitStack() as stack:
-        with suppress(ImportError, OSError):
-            import fcntl
-
-            path.parent.mkdir(parents=True, exist_ok=True)
-            fcntl.flock(stack.enter_context(path.open("w")), fcntl.LOCK_EX)
-        yield
+def is_prepared() -> bool:
+    """Say whether `finforce prepare` has compiled these sources for this processor, Python and Numba."""
+    return _prepared_mark().exists()
 
 
-def find_prepared() -> Path:
-    """Return the file that says that all is compiled: for these sources, processor, Python and Numba."""
+def note_prepared() -> None:
+    """Note that all is compiled; a folder that cannot be written costs nothing."""
+    with suppress(OSError):
+        path = _prepared_mark()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def _prepared_mark() -> Path:
+    """Return the file that stands for everything being compiled."""
     from numba import __version__ as numba_version
     from numba.core import codegen
 
@@ -67,15 +67,6 @@ def find_prepared() -> Path:
     parts = (_name_sources(ROOT), platform.python_version(), numba_version, *processor)
     name = hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]
     return Path(os.environ["NUMBA_CACHE_DIR"]) / f"prepared-{name}"
-
-
-def note_prepared() -> None:
-    """Note that all is compiled; a folder that cannot be written costs nothing."""
-    with suppress(OSError):
-        path = find_prepared()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-        path.with_suffix(".failed").unlink(missing_ok=True)
 
 
 def _name_sources(root: Path) -> str:

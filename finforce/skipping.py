@@ -10,10 +10,9 @@ from finforce.errors import FinforceError
 ALL = "all"
 
 # of every node
-UNCHANGED = "wait set unchanged"
 LATE = "frame late"
 UNHEARD = "nobody subscribes"
-EVERYWHERE = (UNCHANGED, LATE, UNHEARD)
+EVERYWHERE = (LATE, UNHEARD)
 # of a solver
 AWAY = "no object near"
 IDLE = "idle image"

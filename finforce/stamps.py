@@ -81,7 +81,6 @@ class Idling:
     def __init__(self, period: float = 0.1) -> None:
         self._period = round(period * NANOSECONDS)
         self._answered: int | None = None
-        self._ages: deque[int] = deque(maxlen=2)
 
     @property
     def is_idle(self) -> bool:
@@ -92,21 +91,9 @@ class Idling:
         """Say whether an image [ns] may be passed over: one of its period was answered, and nothing happened then."""
         return self._answered == stamp // self._period
 
-    def spare_time(self, now: int) -> float:
-        """Return for how long [s] from `now` [ns] no image will come that has to be answered.
-
-        That which begins the next period takes as long to come as the quicker one of the last two answered.
-        """
-        if self._answered is None or not self._ages:
-            return 0.0
-        left = (self._answered + 1) * self._period + min(self._ages) - now
-        return min(max(left, 0), self._period) / NANOSECONDS
-
-    def note(self, stamp: int, idle: bool, now: int | None = None) -> None:
-        """Note that an image [ns] was answered, whether nothing happened in it, and when [ns] for `spare_time`."""
+    def note(self, stamp: int, idle: bool) -> None:
+        """Note that an image [ns] was answered, and whether nothing happened in it."""
         self._answered = stamp // self._period if idle else None
-        if now is not None:
-            self._ages.append(now - stamp)
 
     def end(self) -> None:
         """Note that something happens."""

@@ -47,7 +47,7 @@ class ContactEstimatorNode(Node):
         ros.name_unknown_parameters(self)
         sides, age = parameters.sides, parameters.max_age
         self.skips = Skips(CONTACT, parameters.skip_off)
-        ros.prepare_first_start(self.get_logger())
+        ros.warn_unprepared(self)
         self.session = ContactSession(parameters, contact, tracker, self.skips)
         self.gates = {side: StampGate(max_age=age, restart_gap=parameters.restart_gap) for side in sides}
         self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in sides}
@@ -108,14 +108,10 @@ class ContactEstimatorNode(Node):
         for read in list(self.unread[side].values()):
             read()
 
-    def spare_time(self) -> float:
-        """Return for how long messages may wait [s]: while nothing happens, until the next image that is answered."""
-        return min(idling.spare_time(self._now()) for idling in self.idling.values())
-
     def _rest(self, side: str, stamp: int) -> None:
         """Do less for a jaw out of whose reach the object stood in an image [ns], or that holds it still."""
         jaw = self.session.jaws[side]
-        self.idling[side].note(stamp, jaw.is_idle and self.skips.allows(IDLE), self._now())
+        self.idling[side].note(stamp, jaw.is_idle and self.skips.allows(IDLE))
         if jaw.needs_surface or not self.skips.allows(UNNEEDED):
             self.inputs[side].open()
             return

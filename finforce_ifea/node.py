@@ -67,7 +67,7 @@ class IfeaSolverNode(Node):
         jaw = load_parameter_jaw(parameters)
         self.contacts = build_contact_feed(jaw, parameters)
         self.gravity = GravityFeed(parameters) if settings.held == "yes" else None
-        ros.prepare_first_start(self.get_logger())
+        ros.warn_unprepared(self)
         with self._patience(jaw.name):
             self.estimator = build(jaw, parameters, settings, self.skips.allows(AWAY))
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
@@ -184,11 +184,7 @@ class IfeaSolverNode(Node):
         spared = bool(getattr(self.estimator, "spared", False))
         if spared:
             self.skips.count(AWAY)
-        self.idling.note(stamp, spared and self.skips.allows(IDLE), self._now())
-
-    def spare_time(self) -> float:
-        """Return for how long messages may wait [s]: while nothing happens, until the next image that is answered."""
-        return self.idling.spare_time(self._now())
+        self.idling.note(stamp, spared and self.skips.allows(IDLE))
 
     def _on_contact(self, cloud: PointCloud2) -> None:
         """Keep the newest contact."""

@@ -10,12 +10,11 @@ from importlib import import_module
 from threading import Thread
 from typing import NamedTuple
 
-from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
-from finforce.ros.executor import KeepingExecutor
 from finforce.ros.pipeline import Pipeline, Stage
 from finforce.ros.start import NODES
 
@@ -79,10 +78,8 @@ def spin(parts: Sequence[Part], nodes: Sequence[Node], executor: Executor) -> No
 
 def _spin_apart(node: Node) -> None:
     """Let one node work in this thread; what nobody catches ends it alone."""
-    executor = KeepingExecutor(context=node.context)
-    executor.obey([node])
     try:
-        ros.spin([node], executor)
+        ros.spin([node], SingleThreadedExecutor(context=node.context))
     except ExternalShutdownException:
         pass
     except Exception:

@@ -23,7 +23,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -37,12 +37,11 @@ from std_msgs.msg import Header, String  # noqa: F401 - for those who publish
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who publish
 
+from finforce.caches import is_prepared
 from finforce.errors import FinforceError
 from finforce.health import Level, Outcome, Report
 from finforce.messages import CloudColumns
 from finforce.processors import free_caller
-from finforce.ros.executor import KeepingExecutor, is_wanted  # noqa: F401 - for those who publish
-from finforce.ros.first_start import end_preparation, prepare_first_start  # noqa: F401 - for those who compile
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     KeptMessage,
     cloud_message,
@@ -64,6 +63,7 @@ from finforce.ros.pipeline import Outlet, Port, Stage, Unread
 from finforce.ros.tracing import note, write_trace
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
 from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe
+from finforce.skipping import UNHEARD, Skips
 from finforce.stamps import NANOSECONDS  # noqa: F401 - for those with stamps
 
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -308,6 +308,20 @@ class LargeSubscription:
             self.current = self._qos.subscription(*self._asked, SENSOR, **self._options)
 
 
+def is_wanted(publisher: Any, skips: Skips) -> bool:
+    """Say whether anybody subscribes to a topic, whose message need not be made otherwise; that is counted."""
+    wanted = publisher.get_subscription_count() > 0 or not skips.allows(UNHEARD)
+    if not wanted:
+        skips.count(UNHEARD)
+    return wanted
+
+
+def warn_unprepared(node: Node) -> None:
+    """Log that a first start compiles, where `finforce prepare` has not done so."""
+    if not is_prepared():
+        node.get_logger().info("compiling, which takes about a minute once; `finforce prepare` does it ahead of time")
+
+
 def publish_diagnostics(
     node: Node, qos: QosWatch, name: str, period: float, report: Callable[[list[Outcome]], Report]
 ) -> None:
@@ -455,7 +469,6 @@ def _ending_with_context() -> Iterator[None]:
     def watch() -> None:
         while not built.wait(_GLANCE):
             if not rclpy.ok():
-                end_preparation()
                 sys.stdout.flush()
                 sys.stderr.flush()
                 os._exit(0)
@@ -477,13 +490,12 @@ def run_nodes(
         print(f"{name}: {str(error).partition(', at ')[0]}", file=sys.stderr)
         return 2
     # an executor that is made after a signal cannot be taken down quietly; a node takes long to build
-    executor, nodes = KeepingExecutor(), ()
+    executor, nodes = SingleThreadedExecutor(), ()
     try:
         with _ending_with_context():
             nodes = build()
         gc.collect()
         gc.freeze()  # what was built stays, and would be looked through for garbage again and again
-        executor.obey(nodes)
         work(nodes, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a launch sends it again after the terminal

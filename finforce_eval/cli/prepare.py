@@ -6,7 +6,7 @@ import argparse
 
 from tqdm import tqdm
 
-from finforce.caches import find_prepared, locked, note_prepared
+from finforce.caches import note_prepared
 from finforce_eval.preparation import COMPILED, prepare
 
 
@@ -16,19 +16,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("jaws", nargs="*", default=["bench"], metavar="JAW", help=text)
     text = "calibration of the fingers, a file or a shipped name; without it the jaw files' own materials"
     parser.add_argument("--calibration", default="", metavar="FILE", help=text)
-    text = "do nothing where everything was compiled before"
-    parser.add_argument("--once", action="store_true", help=text)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Compile and build under a progress bar; of two such commands one does, and the other waits."""
-    prepared = find_prepared()
-    with locked(prepared.with_suffix(".lock")):
-        if options.once and prepared.exists():
-            return
-        count = len(COMPILED) + len(options.jaws)
-        with tqdm(total=count, desc="preparing", unit="part", disable=None, leave=False) as bar:
-            for done in prepare(options.jaws, options.calibration):
-                bar.update()
-                bar.write(done)
-        note_prepared()
+    """Compile and build under a progress bar."""
+    count = len(COMPILED) + len(options.jaws)
+    with tqdm(total=count, desc="preparing", unit="part", disable=None, leave=False) as bar:
+        for done in prepare(options.jaws, options.calibration):
+            bar.update()
+            bar.write(done)
+    note_prepared()

@@ -17,7 +17,7 @@ import numpy as np
 
 from finforce.errors import MissingDependencyError
 from finforce.ros.transport import free_domain
-from finforce.skipping import ALL, AWAY, CONTACT, EVERYWHERE, IDLE, SOLVER, STILL, UNCHANGED, UNHEARD, UNNEEDED
+from finforce.skipping import ALL, AWAY, CONTACT, EVERYWHERE, IDLE, SOLVER, STILL, UNHEARD, UNNEEDED
 from finforce.systems.processes import compose
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.live import ReplayLog
@@ -49,7 +49,7 @@ SETTINGS: Mapping[str, Sequence[str]] = {ON: ("",), OFF: (ALL,)}
 # each rule that these scenes give work to, switched off alone
 EACH: Mapping[str, Sequence[str]] = {
     ON: ("",),
-    **{f"without {rule!r}": (rule,) for rule in (UNCHANGED, UNHEARD, AWAY, IDLE, STILL, UNNEEDED, ANNOTATED)},
+    **{f"without {rule!r}": (rule,) for rule in (UNHEARD, AWAY, IDLE, STILL, UNNEEDED, ANNOTATED)},
 }
 OF_NODE = {"ifea_solver": SOLVER, "contact_estimator": CONTACT, "keypoint_detector": RULES}
 USUAL_SECONDS, QUICK_SECONDS = 10.0, 3.0  # of idling and of holding that are measured

@@ -75,23 +75,13 @@ class TestIdling:
 
     def test_nothing_is_passed_over_once_something_happens(self):
         idling = Idling()
-        idling.note(0, True, 0)
+        idling.note(0, True)
         assert idling.passes(TENTH // 3)
-        idling.note(TENTH // 2, False, 0)
-        assert not idling.passes(TENTH // 2 + 1) and idling.spare_time(0) == 0.0
-        idling.note(TENTH, True, TENTH)
+        idling.note(TENTH // 2, False)
+        assert not idling.passes(TENTH // 2 + 1)
+        idling.note(TENTH, True)
         idling.end()
         assert not idling.passes(TENTH + 1)
-
-    @pytest.mark.parametrize(
-        ("now", "spare"), [(0.01, 0.09 + 0.02), (0.10, 0.02), (0.12, 0.0), (5.0, 0.0), (-9.0, 0.1)]
-    )
-    def test_a_node_may_sleep_until_the_next_image_that_counts_can_be_here(self, now, spare):
-        idling = Idling()
-        idling.note(-TENTH, True, -TENTH + 30_000_000)
-        idling.note(0, True, 20_000_000)
-        # never longer than the period, whatever the clocks say
-        assert idling.spare_time(round(now * 1e9)) == pytest.approx(min(spare, 0.1))
 
 
 def circle(gap):
