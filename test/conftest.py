@@ -3,6 +3,10 @@
 import sys
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("finforce", deadline=None)  # a machine under load is no counterexample
+settings.load_profile("finforce")
 
 
 @pytest.fixture(autouse=True)

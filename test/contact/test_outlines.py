@@ -115,7 +115,7 @@ def test_vertices_on_the_side_of_the_slab_make_no_difference():
         assert fakes.signed_area(outline) == pytest.approx(0.04 * 0.06, rel=1e-6)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(angles=st.tuples(ANGLES, ANGLES, ANGLES), centre_y=st.floats(-0.03, 0.03))
 def test_outline_is_the_projection_of_the_cut_solid(angles, centre_y):
     """The solid cut and projected by manifold3d, which knows nothing of loops."""
@@ -128,7 +128,7 @@ def test_outline_is_the_projection_of_the_cut_solid(angles, centre_y):
     assert sum(fakes.signed_area(polygon) for polygon in outline) == pytest.approx(expected, abs=6e-6)
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(angle=ANGLES)
 def test_turning_the_object_about_y_turns_its_outline(angle):
     mug, tilted = fakes.build_mug(), fakes.turn_about("x", 25.0)

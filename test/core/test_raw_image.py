@@ -16,7 +16,7 @@ STAMP = 1_700_000_000_123_456_789
 PICTURE = np.arange(5 * 7 * 3, dtype=np.uint8).reshape(5, 7, 3)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(frame=st.text(st.characters(codec="utf-8", exclude_characters="\0", exclude_categories=("Cs",)), max_size=9))
 @pytest.mark.parametrize("encoding", ["rgb8", "mono8", "16UC1", ""])
 def test_a_message_is_read_as_ros_has_written_it(frame, encoding):
@@ -42,7 +42,7 @@ def test_the_other_byte_order_is_read_too():
     assert (read.height, read.width, read.encoding, read.step, bytes(read.data)) == (5, 7, "rgb8", 21, b"xy")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(cut=st.integers(0, 160))
 def test_a_message_that_is_cut_off_is_no_image(cut):
     data = serialize_message(image_of(STAMP, PICTURE, "rgb8"))
@@ -51,7 +51,7 @@ def test_a_message_that_is_cut_off_is_no_image(cut):
         read_image(data[: len(data) - 4 - cut])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.binary(max_size=80))
 def test_garbage_is_refused_or_read_but_never_breaks(data):
     with suppress(ImageError):

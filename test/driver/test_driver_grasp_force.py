@@ -80,7 +80,7 @@ def test_surprise_is_what_neither_noise_nor_motion_explains():
     assert model.surprise(opening - 0.001, force + 1.3) == 0.0
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.lists(
         st.tuples(st.floats(-0.05, 0.05), st.floats(0.0, 30.0), st.floats(0.0, 1.0), st.floats(0.0, 0.01)),
@@ -217,7 +217,7 @@ def test_jaws_rest_after_their_way_and_not_before():
     assert not course.is_late(3.2, 11 * STEP)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.lists(st.tuples(st.floats(0.0, 12.0), st.floats(0.0, 0.3), st.booleans(), st.floats(-0.002, 0.002)), max_size=60)
 )

@@ -49,13 +49,11 @@ def test_known_lines_are_written_and_read(line):
     assert decode_line(line) == VECTORS[line]
 
 
-@settings(deadline=None)
 @given(messages)
 def test_decode_inverts_encode(message):
     assert SlcanParser().feed(encode_message(message)) == [message]
 
 
-@settings(deadline=None)
 @given(st.lists(messages, max_size=6), st.data())
 def test_messages_arrive_however_the_bytes_are_cut(sent, data):
     stream = b"".join(map(encode_message, sent))
@@ -68,7 +66,7 @@ def test_messages_arrive_however_the_bytes_are_cut(sent, data):
     assert parser.counts["messages"] == len(sent)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(pieces, max_size=12).map(b"".join))
 def test_no_bytes_raise_and_every_message_is_a_line_of_its_own(stream):
     found = SlcanParser().feed(stream)

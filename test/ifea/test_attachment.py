@@ -82,7 +82,7 @@ def test_weights_stay_non_negative_where_loads_are_applied(name):
     assert (abs(attachment.weights[~on_face]) < 1e-9).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10_000))
 def test_distorted_hexahedra_are_inverted_exactly(seed):
     rng = np.random.default_rng(seed)
@@ -104,7 +104,7 @@ def test_shape_gradients_are_the_derivatives_of_the_shape_values(count):
         np.testing.assert_allclose(shape_gradients(count, places)[:, :, axis], slope, atol=1e-9)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(x=st.floats(-0.03, 0.03), y=st.floats(-0.02, 0.02), z=st.floats(-0.01, 0.09), seed=st.integers(0, 1000))
 def test_no_surface_point_is_closer_than_the_closest(x, y, z, seed):
     point = np.array([[x, y, z]])

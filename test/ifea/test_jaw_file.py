@@ -204,7 +204,7 @@ VALUES = st.recursive(
 PLACES_IN_FILE = sorted({place for place, value, _ in BAD_VALUES if value is ...} | {"keypoints", "candidates"})
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(place=st.sampled_from(PLACES_IN_FILE), value=VALUES)
 def test_no_content_causes_anything_but_our_errors(tmp_path_factory, place, value):
     path = write_jaw(tmp_path_factory.mktemp("jaw"), changed(content_of(SHIPPED_BENCH), place, value))

@@ -38,7 +38,7 @@ def test_thousands_of_hard_programs_meet_their_conditions_and_agree_with_a_secon
     assert all(trial.sigmas <= 3.0 for trial in answers)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 7))
 def test_small_programs_agree_with_every_choice_of_bounds(seed, size):
     random = np.random.default_rng(seed)

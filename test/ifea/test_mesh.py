@@ -77,7 +77,7 @@ def test_bench_mesh_fills_its_drawing(name):
     assert mesh.nodes.max(axis=0) == pytest.approx([0.014, 0.010, 0.080])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(drawing=drawings(), density=densities())
 def test_any_drawing_meshes_without_inverted_elements_and_fills_its_outline(drawing, density):
     mesh = mesh_drawing(drawing, density)
@@ -86,7 +86,7 @@ def test_any_drawing_meshes_without_inverted_elements_and_fills_its_outline(draw
     assert mesh.nodes[mesh.clamped, 2].max() == pytest.approx(drawing.clamped_z)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(drawing=drawings(), density=densities())
 def test_mesh_is_symmetric_about_the_middle_plane(drawing, density):
     nodes = mesh_drawing(drawing, density).nodes
@@ -94,7 +94,7 @@ def test_mesh_is_symmetric_about_the_middle_plane(drawing, density):
     assert {tuple(node) for node in nodes.tolist()} == {tuple(node) for node in mirrored.tolist()}
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(drawing=drawings(), density=densities())
 def test_surface_is_closed_and_faces_outwards(drawing, density):
     for mesh in (mesh_drawing(drawing, density), mesh_drawing(drawing, density).mirrored()):
@@ -104,7 +104,7 @@ def test_surface_is_closed_and_faces_outwards(drawing, density):
         assert compute_volume(mesh) > 0
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(drawing=drawings(), density=densities())
 def test_tetrahedra_conform_and_fill_the_hexahedra(drawing, density):
     mesh = mesh_drawing(drawing, density)

@@ -18,7 +18,7 @@ def random_program(seed, size, rows):
     return A, random.normal(size=rows) * 10.0 ** random.uniform(-3, 3)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 14), st.booleans())
 def test_program_meets_its_optimality_conditions_and_agrees_with_a_second_solver(seed, size, some_free):
     """min |A x - b|^2 over x >= 0, against SciPy's bounded-variable least squares, in wildly different units."""
@@ -36,7 +36,7 @@ def test_program_meets_its_optimality_conditions_and_agrees_with_a_second_solver
     )
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 8))
 def test_solution_does_not_depend_on_the_units(seed, size):
     A, b = random_program(seed, size, size + 15)

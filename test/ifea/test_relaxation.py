@@ -104,7 +104,7 @@ def test_inversion_undoes_the_relaxation(terms):
     np.testing.assert_allclose(invert_relaxation(measured, stamps, terms), elastic, atol=1e-10)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     st.lists(st.floats(0.0, 2.0), min_size=1, max_size=3),
     st.lists(st.floats(0.01, 1e4), min_size=3, max_size=3),
