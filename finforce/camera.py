@@ -19,8 +19,6 @@ PLUMB_BOB, RATIONAL, EQUIDISTANT = "plumb_bob", "rational_polynomial", "equidist
 # how many coefficients each has, filled up with zeros to the last number; the names are those of ROS (REP 104)
 COEFFICIENTS = {PLUMB_BOB: (0, 4, 5), RATIONAL: (0, 5, 8), EQUIDISTANT: (0, 4)}
 WIDEST = np.radians(88.0)  # from the optical axis; farther out a ray has no place on the plane z = 1
-UNDISTORTION_STEPS = 50
-UNDISTORTION_TOLERANCE = 1e-10  # of a ray with z = 1
 
 
 class ImageError(FinforceError, ValueError):
@@ -141,64 +139,17 @@ def compute_rays(camera: CameraIntrinsics) -> NDArray:
 def rays_from_pixels(pixels: NDArray, camera: CameraIntrinsics) -> NDArray:
     """Return the viewing rays (n, 3), z = 1, of pixels (n, 2) given as column and row [px].
 
-    The distortion is inverted by a fixed-point iteration, x = (x_d - tangential(x)) / radial(x), that of a fisheye by
-    Newton's; where a fisheye sees farther than `WIDEST` from its axis there is no such ray, NaN.
+    The rays of pixels that are NaN are NaN, and so are those farther than `WIDEST` from the axis of a fisheye.
 
     Raises:
         IntrinsicsError: the distortion cannot be inverted at one of the pixels.
     """
-    pixels = np.asarray(pixels, dtype=float)
-    distorted = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    if camera.model == EQUIDISTANT:
-        return np.column_stack((_unbend_fisheye(distorted, camera.distortion), np.ones(len(distorted))))
-    plane = distorted.copy()
-    if camera.is_distorted:
-        for _ in range(UNDISTORTION_STEPS):
-            radial, tangential = _distortion_at(plane, camera.distortion)
-            previous, plane = plane, (distorted - tangential) / radial[:, None]
-            if np.abs(plane - previous).max(initial=0.0) < UNDISTORTION_TOLERANCE:
-                break
-        else:
-            raise IntrinsicsError(f"distortion {camera.distortion.tolist()}: cannot be inverted within the image")
-    return np.column_stack((plane, np.ones(len(plane))))
+    from finforce.lens import find_rays
 
-
-def _distortion_at(plane: NDArray, coefficients: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the radial factors (n,) and tangential shifts (n, 2) at points (n, 2) of the plane z = 1."""
-    k1, k2, p1, p2, k3 = coefficients[:5]
-    x, y = plane.T
-    square = x * x + y * y
-    radial = 1.0 + square * (k1 + square * (k2 + square * k3))
-    if len(coefficients) > 5:
-        k4, k5, k6 = coefficients[5:]
-        radial /= 1.0 + square * (k4 + square * (k5 + square * k6))
-    shift_x = 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
-    shift_y = p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
-    return radial, np.column_stack((shift_x, shift_y))
-
-
-def _bend_fisheye(angle: NDArray, coefficients: NDArray) -> tuple[NDArray, NDArray]:
-    """Return what angles (n,) [rad] from the axis become (n,), and the slopes of that (n,)."""
-    square = angle * angle
-    k1, k2, k3, k4 = coefficients
-    bent = angle * (1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
-    slope = 1.0 + square * (3.0 * k1 + square * (5.0 * k2 + square * (7.0 * k3 + square * 9.0 * k4)))
-    return bent, slope
-
-
-def _unbend_fisheye(distorted: NDArray, coefficients: NDArray) -> NDArray:
-    """Return the points (n, 2) of the plane z = 1 that a fisheye shows at (n, 2); NaN beyond `WIDEST`."""
-    bent = np.hypot(*distorted.T)
-    angle = np.minimum(bent, 0.5 * np.pi)
-    for _ in range(UNDISTORTION_STEPS):
-        value, slope = _bend_fisheye(angle, coefficients)
-        previous, angle = angle, np.clip(angle - (value - bent) / np.where(slope > 0.05, slope, 0.05), 0.0, 0.5 * np.pi)
-        if np.nanmax(np.abs(angle - previous), initial=0.0) < UNDISTORTION_TOLERANCE:
-            break
-    missed = np.abs(_bend_fisheye(angle, coefficients)[0] - bent) > 1e-6
-    angle = np.where(missed | (angle > WIDEST), np.nan, angle)
-    share = np.where(bent > 1e-12, np.tan(angle) / np.maximum(bent, 1e-12), 1.0)
-    return distorted * share[:, None]
+    rays, found = find_rays(camera.lens, np.ascontiguousarray(pixels, dtype=float))
+    if not found:
+        raise IntrinsicsError(f"distortion {camera.distortion.tolist()}: cannot be inverted within the image")
+    return rays
 
 
 def project(points: NDArray, camera: CameraIntrinsics) -> NDArray:
@@ -206,20 +157,9 @@ def project(points: NDArray, camera: CameraIntrinsics) -> NDArray:
 
     Points at or behind the camera's plane have no pixel and come back as NaN; so do those beyond `WIDEST` of a fisheye.
     """
-    points = np.asarray(points, dtype=float)
-    depth = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
-    plane = points[:, :2] / depth[:, None]
-    if camera.model == EQUIDISTANT:
-        distance = np.hypot(*plane.T)
-        angle = np.arctan(distance)
-        bent, slope = _bend_fisheye(angle, camera.distortion)
-        # beyond the angle where its circles begin to shrink again, a lens shows nothing
-        share = np.where(distance > 1e-12, bent / np.maximum(distance, 1e-12), 1.0)
-        plane = plane * np.where((angle <= WIDEST) & (slope > 0.0), share, np.nan)[:, None]
-    elif camera.is_distorted:
-        radial, tangential = _distortion_at(plane, camera.distortion)
-        plane = plane * radial[:, None] + tangential
-    return plane * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    from finforce.lens import project_points
+
+    return project_points(camera.lens, np.ascontiguousarray(points, dtype=float))
 
 
 def deproject(depth: NDArray, camera: CameraIntrinsics, mask: NDArray | None = None) -> NDArray:

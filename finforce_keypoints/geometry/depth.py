@@ -10,19 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from finforce.camera import (
-    EQUIDISTANT,
-    UNDISTORTION_STEPS,
-    UNDISTORTION_TOLERANCE,
-    CameraIntrinsics,
-    rays_from_pixels,
-)
+from finforce.camera import CameraIntrinsics
+from finforce.elimination import eliminate
+from finforce.lens import project_point
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.geometry.kernels import fit_shape, sample_side, undistort, weigh_samples
 
+_OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
 _SPACING = 0.15e-3  # of the raster on which the finger's side is drawn [m]
 _STRIDES = (3, 2, 1)  # every so many points of it are sampled: a pixel is 0.25 to 0.5 mm
 _ENOUGH = 24  # samples; a thin band is sampled more densely for as many, then nearer to its edges
@@ -33,6 +30,9 @@ _SMALLEST_RADIUS = 0.45e-3  # around a key point that is not on a flat side of t
 _INLIER_SIGMA = 3.0
 _MAD_TO_STDDEV = 1.4826
 _CORRELATED = 6.0  # neighbouring samples whose errors are alike
+_OUTLIER_SIGMA = 2.5
+_ROBUST_STEPS = 3
+_LEAST_STDDEV = 1e-7  # [m], or relative: keeps the fit regular where settings are zero
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -143,7 +143,40 @@ def sample_depths(
         T_camera_jaw: (4, 4).
     """
     T, depth = np.ascontiguousarray(T_camera_jaw, dtype=float), np.asarray(depth)
-    return sample_side(depth, camera.lens, T, np.ascontiguousarray(points), samples.offsets, samples.used)
+    return _sample_side(depth, camera.lens, T, np.ascontiguousarray(points), samples.offsets, samples.used)
+
+
+@njit(**_OPTIONS)
+def _sample_side(depth, lens, T, points, offsets, used):
+    """Return measured less expected depths (n, S) [m] at places around points of a side; NaN without one.
+
+    Args:
+        depth: (h, w) [m].
+        lens: see `finforce.lens.project_point`.
+        T: T_camera_jaw (4, 4).
+        points: (n, 3) [m], jaw frame.
+        offsets: (n, S, 3) of the places [m], jaw frame.
+        used: (n, S) which of them there are.
+    """
+    height, width = depth.shape
+    excess = np.full(used.shape, np.nan)
+    for i in range(used.shape[0]):
+        if not np.isfinite(points[i]).all():
+            continue
+        for s in range(used.shape[1]):
+            if not used[i, s]:
+                continue
+            x, y, z = points[i, 0] + offsets[i, s, 0], points[i, 1] + offsets[i, s, 1], points[i, 2] + offsets[i, s, 2]
+            away = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            u, v = project_point(
+                lens,
+                T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+                T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+                away,
+            )
+            if -0.5 < u < width - 0.5 and -0.5 < v < height - 0.5:
+                excess[i, s] = depth[int(np.rint(v)), int(np.rint(u))] - away
+    return excess
 
 
 def weigh_depths(excess: NDArray, centre: NDArray, gate: float, quantum: float) -> DepthEvidence:
@@ -159,13 +192,71 @@ def weigh_depths(excess: NDArray, centre: NDArray, gate: float, quantum: float) 
         gate: [m].
         quantum: step of the depths [m].
     """
-    limits = np.array([_INLIER_SIGMA, _MAD_TO_STDDEV, _CORRELATED])
-    return DepthEvidence(*weigh_samples(excess, np.asarray(centre, dtype=float), gate, quantum, limits))
+    return DepthEvidence(*_weigh_samples(excess, np.asarray(centre, dtype=float), gate, quantum))
 
 
-_OUTLIER_SIGMA = 2.5
-_ROBUST_STEPS = 3
-_LEAST_STDDEV = 1e-7  # [m], or relative: keeps the fit regular where settings are zero
+@njit(**_OPTIONS)
+def _weigh_samples(excess, centre, gate, quantum):
+    """Return excess, stddev, known, count, share and nearer (6, n) of `DepthEvidence`.
+
+    Args:
+        excess: (n, S) measured less expected depths [m], NaN where nothing was measured.
+        centre: (n,) [m].
+        gate: [m].
+        quantum: [m].
+    """
+    n, size = excess.shape
+    found, chosen, apart = np.zeros((6, n)), np.empty(size), np.empty(size)
+    for i in range(n):
+        known, near, count = 0, 0, 0
+        for s in range(size):
+            away = excess[i, s] - centre[i]
+            if not np.isfinite(away):
+                continue
+            known += 1
+            if away < -gate:
+                near += 1
+            elif not away > gate:
+                chosen[count] = away
+                count += 1
+        middle = _median_of(chosen, count)
+        for s in range(count):
+            apart[s] = abs(chosen[s] - middle)
+        spread = _MAD_TO_STDDEV * _median_of(apart, count)
+        widest, total, kept = _INLIER_SIGMA * max(spread, 0.5 * quantum), 0.0, 0
+        for s in range(count):
+            if abs(chosen[s] - middle) <= widest:
+                total += chosen[s]
+                kept += 1
+        found[0, i] = total / kept + centre[i] if kept else np.nan
+        rounded = max(spread, quantum / np.sqrt(12.0)) if count else np.nan
+        found[1, i] = rounded / np.sqrt(max(kept / _CORRELATED, 1.0))
+        found[2, i], found[3, i] = known, kept
+        found[4, i], found[5, i] = kept / max(known, 1), near / max(known, 1)
+    return found
+
+
+@njit(**_OPTIONS)
+def _median_of(values, count):
+    """Return the median of the first values (count,), NaN of none."""
+    if count == 0:
+        return np.nan
+    part, middle = values[:count].copy(), count // 2
+    low, high = 0, count - 1
+    while low < high:  # values are only sorted as far as it takes to have the middle one in its place
+        pivot, i, j = part[(low + high) // 2], low, high
+        while i <= j:
+            while part[i] < pivot:
+                i += 1
+            while part[j] > pivot:
+                j -= 1
+            if i <= j:
+                part[i], part[j] = part[j], part[i]
+                i, j = i + 1, j - 1
+        if j < middle < i:
+            break
+        low, high = (low, j) if middle <= j else (i, high)
+    return part[middle] if count % 2 else 0.5 * (part[:middle].max() + part[middle])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -191,17 +282,6 @@ class SideView:
     def points_at(self, y: NDArray) -> NDArray:
         """Return the points (n, 3) [m] where the rays reach y (n,) [m]."""
         return self.camera + self.depths_at(y)[:, None] * self.rays
-
-
-def rays_through(pixels: NDArray, camera: CameraIntrinsics) -> NDArray:
-    """Return the undistorted rays (n, 3), z = 1, camera frame, through pixels (n, 2); NaN where these are."""
-    if camera.model != EQUIDISTANT:
-        rays, found = undistort(camera.lens, pixels, UNDISTORTION_STEPS, UNDISTORTION_TOLERANCE)
-        if found:
-            return rays
-    rays, seen = np.full((len(pixels), 3), np.nan), np.isfinite(pixels).all(axis=1)
-    rays[seen] = rays_from_pixels(pixels[seen], camera)
-    return rays
 
 
 def look_along(rays: NDArray, T_camera_jaw: NDArray) -> SideView:
@@ -269,12 +349,68 @@ def fit_side(model: SideModel, measured: NDArray, stddev: NDArray, lever: NDArra
         scale: what is known of the relative error s beforehand.
     """
     beforehand = np.array([model.offset, model.tilt, model.tilt, model.bow, scale.stddev])
-    limits = np.array([_LEAST_STDDEV, _OUTLIER_SIGMA, _ROBUST_STEPS])
     places = np.ascontiguousarray(model.places)
-    (y, spread, misfit), error, left = fit_shape(
-        places, model.relief, beforehand, measured, stddev, lever, scale.error, limits
+    (y, spread, misfit), error, left = _fit_shape(
+        places, model.relief, beforehand, measured, stddev, lever, scale.error
     )
     return SideFit(y=y, stddev=spread, misfit=misfit, scale=DepthScale(error=float(error), stddev=float(left)))
+
+
+@njit(**_OPTIONS)
+def _fit_shape(places, relief, beforehand, measured, stddev, lever, error):
+    """Return y, stddev and misfit (3, K + 1), and the scale's error and its stddev; see `fit_side`.
+
+    Args:
+        places: (K + 1, 2) x and z at rest [m], the reference point last.
+        relief: of single key points [m].
+        beforehand: (5,) standard deviations of offset, tilts, bow and scale.
+        measured: (K + 1,) [m], NaN without depth.
+        stddev: (K + 1,) [m].
+        lever: (K + 1,) [m].
+        error: of the scale, so far.
+    """
+    count = len(measured)
+    seen, noise, own = np.isfinite(measured), np.ones(count), np.zeros(count)
+    rows, known, left = np.zeros((count, 5)), measured - lever * error, np.full(count, np.nan)
+    own[:-1] = relief**2
+    rows[:-1, 0], rows[:-1, 1], rows[:-1, 2], rows[:-1, 3] = 1.0, places[:-1, 0], places[:-1, 1], places[:-1, 1] ** 2
+    rows[:, 4] = lever
+    noise[seen] = np.maximum(stddev[seen], _LEAST_STDDEV) ** 2
+    variance = noise.copy()
+    prior = np.diag(1.0 / np.maximum(beforehand, _LEAST_STDDEV) ** 2)
+    covariance, theta = prior, beforehand
+    for _ in range(_ROBUST_STEPS):
+        covariance, theta = _solve_weighted(prior, rows, known, seen, own + noise)
+        left = known - rows @ theta
+        noise = variance * (1.0 + left**2 / (own + variance) / _OUTLIER_SIGMA**2)
+    found, spread = np.full((3, count), np.nan), np.empty(5)
+    for i in range(count):
+        share = own[i] / (own[i] + noise[i]) if seen[i] else 0.0
+        spread[:] = (1.0 - share) * rows[i]
+        spread[4] = -share * rows[i, 4]
+        found[0, i] = rows[i, :4] @ theta[:4] + (share * left[i] if seen[i] else 0.0)
+        found[1, i] = np.sqrt(spread @ (covariance @ spread) + (1.0 - share) * own[i])
+        if seen[i]:
+            found[2, i] = left[i] / np.sqrt(own[i] + variance[i])
+    return found, error + theta[4], np.sqrt(covariance[4, 4])
+
+
+@njit(**_OPTIONS)
+def _solve_weighted(prior, rows, known, seen, variance):
+    """Return covariance (m, m) and mean (m,) by least squares with a prior information (m, m), of rows (n, m) seen."""
+    size = len(prior)
+    A, g = prior.copy(), np.zeros(size)
+    for i in range(len(rows)):
+        if not seen[i]:
+            continue
+        w = 1.0 / variance[i]
+        for a in range(size):
+            g[a] += w * rows[i, a] * known[i]
+            for b in range(size):
+                A[a, b] += w * rows[i, a] * rows[i, b]
+    covariance = np.eye(size)
+    eliminate(A, covariance)
+    return covariance, covariance @ g
 
 
 def compute_stddev(sight: SideView, depths: NDArray, y_stddev: NDArray, ray_stddev: NDArray) -> NDArray:

@@ -18,7 +18,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics, project
+from finforce.camera import CameraIntrinsics, project, rays_from_pixels
 from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.geometry.depth import (
@@ -31,7 +31,6 @@ from finforce_keypoints.geometry.depth import (
     compute_stddev,
     fit_side,
     look_along,
-    rays_through,
     sample_depths,
     weigh_depths,
 )
@@ -348,7 +347,7 @@ class JawLocalizer:
             image=image,
             finding=finding,
             likely=self._find_likely(image, finding),
-            rays=rays_through(np.where(inside[:, None], finding.pixels, np.nan), image.camera),
+            rays=rays_from_pixels(np.where(inside[:, None], finding.pixels, np.nan), image.camera),
             ray_stddev=finding.stddev / np.sqrt(image.camera.fx * image.camera.fy),
         )
 

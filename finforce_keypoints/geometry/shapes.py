@@ -9,9 +9,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from finforce_keypoints.geometry import kernels
+from finforce.elimination import eliminate
 
 if TYPE_CHECKING:
     from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
@@ -30,7 +31,8 @@ RIDGE = 1e-4  # of the products' fit, in the mean of its normal matrix
 ROUNDS, SETTLED = 10, 0.02  # of reweighting, and the largest change after which there is no other [px]
 FARTHEST = 3.0  # standard deviations that a motion can be large
 TOLERANCE, SHARE = 1.0, 0.05  # [px] and share of a point's motion by which a finger may differ from its shapes
-_PAIRS, _LIMITS = np.array(PAIRS), np.array([FARTHEST, ROUNDS, SETTLED])
+_PAIRS = np.array(PAIRS)
+_OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
 _known: dict[tuple[str, bytes], NDArray] = {}
 
 
@@ -158,7 +160,63 @@ def fit_motion(shapes: NDArray, moves: NDArray, stddev: NDArray, weight: NDArray
         weight: how much each is believed (K,), 0 to 1.
     """
     numbers = (np.ascontiguousarray(values, dtype=float) for values in (moves, stddev, weight))
-    return kernels.fit_motion(shapes, _PAIRS, *numbers, _LIMITS)
+    return _fit_motion(shapes, *numbers)
+
+
+@njit(**_OPTIONS)
+def _fit_motion(shapes, moves, stddev, weight):
+    """Return the motion (K, 2) [px] within a finger's shapes that is nearest to another; see `fit_motion`."""
+    sizes, believed = np.zeros(shapes.shape[1] - len(_PAIRS)), np.zeros(len(moves))
+    found, doubt = np.zeros(moves.shape), np.ones(len(moves))
+    for k in range(len(moves)):
+        if np.isfinite(moves[k, 0]) and np.isfinite(moves[k, 1]) and np.isfinite(stddev[k]):
+            believed[k] = weight[k] / stddev[k] ** 2
+    for _ in range(ROUNDS):
+        sizes = _improve_sizes(shapes, sizes, moves - found, believed * doubt)
+        sizes = np.minimum(np.maximum(sizes, -FARTHEST), FARTHEST)
+        before, found = found, _move_by(shapes, sizes)
+        if np.abs(found - before).max() < SETTLED:
+            break
+        for k in range(len(moves)):
+            if believed[k] > 0.0:
+                apart = (moves[k, 0] - found[k, 0]) ** 2 + (moves[k, 1] - found[k, 1]) ** 2
+                doubt[k] = 1.0 / (1.0 + 0.5 * apart / stddev[k] ** 2)
+    return found
+
+
+@njit(**_OPTIONS)
+def _improve_sizes(shapes, sizes, left, weight):
+    """Return the sizes (n,) of shapes by least squares of what is left (K, 2) [px], to first order around some."""
+    count = len(sizes)
+    A, g, slope = np.eye(count), np.zeros((count, 1)), np.empty(count)
+    for row in range(len(shapes)):
+        w = weight[row // 2]
+        if not w > 0.0:
+            continue
+        slope[:] = shapes[row, :count]
+        for p in range(len(_PAIRS)):
+            i, j = _PAIRS[p]
+            slope[i] += sizes[j] * shapes[row, count + p]
+            slope[j] += sizes[i] * shapes[row, count + p]
+        aim = left[row // 2, row % 2] + (slope * sizes).sum()
+        for a in range(count):
+            g[a, 0] += w * slope[a] * aim
+            for b in range(count):
+                A[a, b] += w * slope[a] * slope[b]
+    eliminate(A, g)
+    return g.reshape(count)
+
+
+@njit(**_OPTIONS)
+def _move_by(shapes, sizes):
+    """Return the motion (K, 2) [px] of shapes by their sizes (n,)."""
+    moved = np.zeros((len(shapes) // 2, 2))
+    for row in range(len(shapes)):
+        for a in range(len(sizes)):
+            moved[row // 2, row % 2] += shapes[row, a] * sizes[a]
+        for p in range(len(_PAIRS)):
+            moved[row // 2, row % 2] += shapes[row, len(sizes) + p] * sizes[_PAIRS[p, 0]] * sizes[_PAIRS[p, 1]]
+    return moved
 
 
 def trust(moves: NDArray, shape: NDArray) -> NDArray:

@@ -10,15 +10,19 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, rays_from_pixels
-from finforce_keypoints.geometry.kernels import map_side, project_side
+from finforce.lens import project_point
+from finforce.optional import import_cv2
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
 
 COARSE = 4  # [px] between the places that are projected exactly; between them a line is right within 0.04 px
+OUTSIDE = -1e4  # [px] where what the camera does not see is taken
+_OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +103,23 @@ def find_side(jaw: Jaw) -> SidePlane:
 def project_plane(places: NDArray, side: SidePlane, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
     """Return the image pixels (n, 2) of places x, z (n, 2) [m] on a jaw's side."""
     places = np.ascontiguousarray(places, dtype=float)
-    return project_side(camera.lens, np.ascontiguousarray(T_camera_jaw, dtype=float), side.numbers, places)
+    return _project_side(camera.lens, np.ascontiguousarray(T_camera_jaw, dtype=float), side.numbers, places)
+
+
+@njit(**_OPTIONS)
+def _project_side(lens, T, side, places):
+    """Return the pixels (n, 2) of places x, z (n, 2) [m] on a side (level, slopes) (3,) of a jaw at T (4, 4)."""
+    pixels = np.empty(places.shape)
+    for i in range(len(places)):
+        x, z = places[i, 0], places[i, 1]
+        y = side[0] + side[1] * x + side[2] * z
+        pixels[i, 0], pixels[i, 1] = project_point(
+            lens,
+            T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+            T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+            T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+        )
+    return pixels
 
 
 def intersect_plane(pixels: NDArray, side: SidePlane, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> NDArray:
@@ -124,12 +144,55 @@ def map_picture(
     """
     place = np.array([grid.scale, grid.x, grid.z])
     T = np.ascontiguousarray(T_camera_jaw, dtype=float)
-    return map_side(camera.lens, T, side.numbers, place, grid.width, grid.height, COARSE)
+    return _map_side(camera.lens, T, side.numbers, place, grid.width, grid.height)
+
+
+@njit(**_OPTIONS)
+def _map_side(lens, T, side, grid, width, height):
+    """Return the image column and row (height, width, 2) float32 at which the pixels of a picture of a side are taken.
+
+    Every `COARSE`-th pixel is projected, those between are on a line.
+
+    Args:
+        lens: see `finforce.lens.project_point`.
+        T: T_camera_jaw (4, 4).
+        side: level [m] and slopes (3,).
+        grid: pixel size, x and z of the first pixel (3,) [m].
+        width: of the picture [px].
+        height: of the picture [px].
+    """
+    rows, columns = (height - 1) // COARSE + 2, (width - 1) // COARSE + 2
+    places = np.empty((rows * columns, 2))
+    for knot in range(rows * columns):
+        places[knot, 0] = grid[1] + grid[0] * COARSE * (knot % columns)
+        places[knot, 1] = grid[2] + grid[0] * COARSE * (knot // columns)
+    exact = _project_side(lens, T, side, places)
+    knots = np.empty((rows, columns, 2), np.float32)
+    for knot in range(rows * columns):
+        for k in range(2):
+            seen = np.isfinite(exact[knot, k])
+            knots[knot // columns, knot % columns, k] = exact[knot, k] if seen else OUTSIDE
+    return _fill_between(knots, width, height)
+
+
+@njit(**_OPTIONS)
+def _fill_between(knots, width, height):
+    """Return values (height, width, 2) float32 on lines between knots (rows, columns, 2) that are `COARSE` apart."""
+    filled = np.empty((height, width, 2), np.float32)
+    line = np.empty(knots.shape[1:], np.float32)
+    for r in range(height):
+        i, down = r // COARSE, np.float32((r % COARSE) / COARSE)
+        for j in range(len(line)):
+            for k in range(2):
+                line[j, k] = knots[i, j, k] + down * (knots[i + 1, j, k] - knots[i, j, k])
+        for c in range(width):
+            j, across = c // COARSE, np.float32((c % COARSE) / COARSE)
+            for k in range(2):
+                filled[r, c, k] = line[j, k] + across * (line[j + 1, k] - line[j, k])
+    return filled
 
 
 def take_picture(image: NDArray, mapping: NDArray) -> NDArray:
     """Return the picture (height, width, 3) of an image (h, w, 3) uint8 by the map of `map_picture`; black outside."""
-    from finforce.optional import import_cv2
-
     cv2 = import_cv2()
     return cv2.remap(image, mapping, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0, 0, 0))

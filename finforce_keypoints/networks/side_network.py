@@ -15,12 +15,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from finforce.errors import one_line
 from finforce.optional import import_cv2
 from finforce_keypoints.errors import DetectionError, ModelError
-from finforce_keypoints.geometry.kernels import cut_pieces
 from finforce_keypoints.geometry.shapes import fit_motion, trust
 from finforce_keypoints.networks.helpers import Helpers
 from finforce_keypoints.networks.network import CPU, open_session
@@ -32,6 +32,7 @@ COARSE_LAYOUT = (("pictures", "templates", "points"), ("guesses", "context", "me
 GUESS, BLUR = 4.0, 1.0  # [px] by which the coarse part is off, and by which a finger differs from its shapes
 ASTRAY = 12.0  # [px] off the coarse part: a shape of the picture before is not where one begins to look any more
 NEAR = 1.0  # [px] within which a better guess is none: the fine part finds the same from both
+FARTHEST = 4e3  # [px] that a piece can be from a picture's first pixel
 FINE_LAYOUT = (("pieces", "templates", "context", "mean", "gain"), ("offsets", "likelihood", "spread"))
 
 
@@ -238,3 +239,33 @@ def _fit(template: Template, places: Places) -> NDArray:
     """Return how a finger's points (K, 2) [px] have moved by what was found of them in one picture, as one shape."""
     moves, stddev = places.pixels - template.points, np.hypot(BLUR, places.stddev)
     return fit_motion(template.shapes, moves, stddev, places.likelihood**2)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def cut_pieces(picture, centres, size):
+    """Return pieces (K, size, size, 3) uint8 of a picture (h, w, 3) around places (K, 2) [px], its edge continued."""
+    height, width = picture.shape[:2]
+    pieces = np.empty((len(centres), size, size, 3), np.uint8)
+    line = np.empty(3 * (size + 1), np.float32)
+    upper, lower = np.empty(3 * size, np.float32), np.empty(3 * size, np.float32)
+    for k in range(len(centres)):
+        x, y = centres[k]
+        if not (abs(x) < FARTHEST and abs(y) < FARTHEST):
+            x = y = -FARTHEST
+        left, top = x - 0.5 * (size - 1), y - 0.5 * (size - 1)
+        column, row = int(np.floor(left)), int(np.floor(top))
+        across, down = np.float32(left - column), np.float32(top - row)
+        piece = pieces[k].reshape(size, 3 * size)
+        for r in range(size + 1):
+            here = min(max(row + r, 0), height - 1)
+            for c in range(size + 1):
+                there = min(max(column + c, 0), width - 1)
+                for n in range(3):
+                    line[3 * c + n] = picture[here, there, n]
+            for n in range(3 * size):
+                upper[n] = lower[n]
+                lower[n] = line[n] + across * (line[n + 3] - line[n])
+            if r > 0:
+                for n in range(3 * size):
+                    piece[r - 1, n] = np.uint8(upper[n] + down * (lower[n] - upper[n]) + np.float32(0.5))
+    return pieces

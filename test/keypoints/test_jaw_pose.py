@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from keypoint_scene_fakes import CAMERA, FakeScene
 
-from finforce.camera import project
+from finforce.camera import project, rays_from_pixels
 from finforce.gripper_frames import jaw_in_camera
-from finforce_keypoints.geometry.depth import rays_through
 from finforce_keypoints.geometry.jaw_pose import Origin, OriginFinder, OriginTrack
 from finforce_keypoints.settings import DetectorSettings
 
@@ -27,7 +26,7 @@ def seen(request):
 
 
 def measure(finder, pixels):
-    return finder.measure(rays_through(pixels, CAMERA), STDDEV)
+    return finder.measure(rays_from_pixels(pixels, CAMERA), STDDEV)
 
 
 def only(rows, pixels):

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from keypoint_scene_fakes import CAMERA, FakeScene
 
+from finforce.camera import rays_from_pixels
 from finforce_keypoints.geometry.depth import (
     DepthScale,
     SideModel,
     compute_stddev,
     fit_side,
     look_along,
-    rays_through,
 )
 
 SCENE = FakeScene("robot")
@@ -22,7 +22,7 @@ MODEL = SideModel(places=PLACES, offset=0.2e-3, tilt=0.02, bow=0.2, relief=0.06e
 
 def sights():
     pixels, poses = SCENE.pixels(), SCENE.poses()
-    return {side: look_along(rays_through(pixels[side], CAMERA), poses[side]) for side in SIDES}
+    return {side: look_along(rays_from_pixels(pixels[side], CAMERA), poses[side]) for side in SIDES}
 
 
 @pytest.mark.parametrize("side", SIDES)
@@ -42,7 +42,7 @@ def test_standard_deviations_are_those_of_the_errors(side):
     pixels, y = SCENE.pixels()[side], SCENE.keypoints(side)[:, 1]
     drawn = []
     for _ in range(600):
-        errs = look_along(rays_through(pixels + 0.5 * rng.standard_normal(pixels.shape), CAMERA), T)
+        errs = look_along(rays_from_pixels(pixels + 0.5 * rng.standard_normal(pixels.shape), CAMERA), T)
         drawn.append(errs.points_at(y + 0.2e-3 * rng.standard_normal(16)))
     stated = compute_stddev(sight, sight.depths_at(y), np.full(16, 0.2e-3), np.full(16, 0.5 / 430.6))
     np.testing.assert_allclose(np.std(drawn, axis=0), stated, rtol=0.12)  # 600 samples: 3 % each, 48 of them

@@ -9,9 +9,8 @@ import pytest
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.errors import DetectionError, ModelError
-from finforce_keypoints.geometry.kernels import cut_pieces
 from finforce_keypoints.geometry.template import draw_template, find_shape, fit_grid
-from finforce_keypoints.networks.side_network import COARSE, FINE, METADATA, SideNetwork
+from finforce_keypoints.networks.side_network import COARSE, FINE, METADATA, SideNetwork, cut_pieces
 
 RNG = np.random.default_rng(3)
 
