@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import platform
 import shutil
 import sys
 import time
@@ -57,29 +56,10 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-def is_prepared() -> bool:
-    """Say whether `finforce prepare` has compiled these sources for this processor, Python and Numba."""
-    return _prepared_mark().exists()
-
-
-def note_prepared() -> None:
-    """Note that all is compiled; a folder that cannot be written costs nothing."""
-    with suppress(OSError):
-        path = _prepared_mark()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-
-
-def _prepared_mark() -> Path:
-    """Return the file that stands for everything being compiled."""
-    from numba import __version__ as numba_version
-    from numba.core import codegen
-
+def is_compiled() -> bool:
+    """Say whether anything of these sources was compiled before."""
     keep_compiled()
-    processor = (codegen.ll.get_host_cpu_name(), codegen.get_host_cpu_features())
-    parts = (_name_sources(ROOT), platform.python_version(), numba_version, *processor)
-    name = hashlib.sha256("|".join(parts).encode()).hexdigest()[:16]
-    return Path(os.environ["NUMBA_CACHE_DIR"]) / f"prepared-{name}"
+    return any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbc"))
 
 
 def _name_sources(root: Path) -> str:

@@ -47,7 +47,7 @@ class ContactEstimatorNode(Node):
         ros.name_unknown_parameters(self)
         sides, age = parameters.sides, parameters.max_age
         self.skips = Skips(CONTACT, parameters.skip_off)
-        ros.warn_unprepared(self)
+        ros.warn_first_start(self)
         self.session = ContactSession(parameters, contact, tracker, self.skips)
         self.gates = {side: StampGate(max_age=age, restart_gap=parameters.restart_gap) for side in sides}
         self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in sides}

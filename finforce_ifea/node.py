@@ -67,7 +67,7 @@ class IfeaSolverNode(Node):
         jaw = load_parameter_jaw(parameters)
         self.contacts = build_contact_feed(jaw, parameters)
         self.gravity = GravityFeed(parameters) if settings.held == "yes" else None
-        ros.warn_unprepared(self)
+        ros.warn_first_start(self)
         with self._patience(jaw.name):
             self.estimator = build(jaw, parameters, settings, self.skips.allows(AWAY))
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)

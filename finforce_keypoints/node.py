@@ -85,7 +85,7 @@ class KeypointDetectorNode(Node):
         self.declare_parameter("keypoint_names", list(names), said, ignore_override=True)
         ros.name_unknown_parameters(self)
         self.skips = Skips(RULES, parameters.skip_off)
-        ros.warn_unprepared(self)
+        ros.warn_first_start(self)
         self.detector, self.card = build(jaws, parameters, settings, dots, self.skips)
         self.feed = RgbdFeed(parameters)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)

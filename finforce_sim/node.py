@@ -61,7 +61,7 @@ class TwinCameraNode(Node):
         super().__init__("twin_camera", **options)
         self.parameters = parameters = ros.declare_record(self, TwinParameters)
         ros.name_unknown_parameters(self)
-        ros.warn_unprepared(self)
+        ros.warn_first_start(self)
         self.gripper: CoupledGripper | None = None
         self.scene = (build_live if parameters.gripper_link else build)(
             parameters.scenario,

@@ -37,7 +37,7 @@ from std_msgs.msg import Header, String  # noqa: F401 - for those who publish
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray  # noqa: F401 - for those who publish
 
-from finforce.caches import is_prepared
+from finforce.caches import is_compiled
 from finforce.errors import FinforceError
 from finforce.health import Level, Outcome, Report
 from finforce.messages import CloudColumns
@@ -316,9 +316,9 @@ def is_wanted(publisher: Any, skips: Skips) -> bool:
     return wanted
 
 
-def warn_unprepared(node: Node) -> None:
-    """Log that a first start compiles, where `finforce prepare` has not done so."""
-    if not is_prepared():
+def warn_first_start(node: Node) -> None:
+    """Log that a first start compiles, where nothing was compiled before."""
+    if not is_compiled():
         node.get_logger().info("compiling, which takes about a minute once; `finforce prepare` does it ahead of time")
 
 

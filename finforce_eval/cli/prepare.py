@@ -6,7 +6,6 @@ import argparse
 
 from tqdm import tqdm
 
-from finforce.caches import note_prepared
 from finforce_eval.preparation import COMPILED, prepare
 
 
@@ -25,4 +24,3 @@ def run(options: argparse.Namespace) -> None:
         for done in prepare(options.jaws, options.calibration):
             bar.update()
             bar.write(done)
-    note_prepared()

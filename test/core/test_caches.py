@@ -63,3 +63,10 @@ def test_a_folder_that_cannot_be_written_stops_nobody(cache, monkeypatch):
     monkeypatch.setenv("FINFORCE_CACHE", str(cache.parent / "file" / "below"))
     caches.keep_compiled()
     assert not cache.exists()
+
+
+def test_a_first_start_is_known_by_its_empty_cache(cache):
+    assert not caches.is_compiled()
+    (folder,) = cache.iterdir()
+    (folder / "kernels.1.nbc").touch()
+    assert caches.is_compiled()
