@@ -6,7 +6,6 @@ import argparse
 import os
 import pty
 import select
-import signal
 import sys
 import termios
 import tty
@@ -18,6 +17,7 @@ from time import monotonic
 from types import TracebackType
 
 from finforce.errors import FinforceError
+from finforce.signals import StopSignals
 from finforce_driver.errors import LinkError, TargetError
 from finforce_sim.emulator.adapter import ACK_MODES, EmulatedAdapter
 from finforce_sim.emulator.faults import FaultyAdapter, draw_plan
@@ -224,13 +224,10 @@ def build_adapter(options: argparse.Namespace) -> SteppedAdapter:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve an emulated gripper until Ctrl-C or a request to end; return the exit status."""
     options = build_parser().parse_args(arguments)
-    stop = Event()
-    for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, lambda *_: stop.set())
     try:
-        with PtyPort(build_adapter(options), options.link, options.baud) as port:
+        with StopSignals() as stop, PtyPort(build_adapter(options), options.link, options.baud) as port:
             print(port.path, flush=True)
-            while not stop.wait(0.5):
+            while not stop.wait():  # another handled signal wakes it, too
                 pass
     except FinforceError as error:
         print(error, file=sys.stderr)

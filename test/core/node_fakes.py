@@ -12,6 +12,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
+from process_fakes import running
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -189,13 +190,13 @@ def run_node(command):
 
 def stop_when_ready(command, number):
     """The exit status of a node that is sent a signal once it is ready, and all that it said."""
-    node = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment())
-    guard = threading.Timer(START_PATIENCE, node.kill)
-    guard.start()
-    said = []
-    for line in node.stderr:
-        said.append(line)
-        if " ready" in line:
-            node.send_signal(number)
-    guard.cancel()
-    return node.wait(10), "".join(said)
+    with running(command, stderr=subprocess.PIPE, text=True, env=environment()) as node:
+        guard = threading.Timer(START_PATIENCE, node.kill)
+        guard.start()
+        said = []
+        for line in node.stderr:
+            said.append(line)
+            if " ready" in line:
+                node.send_signal(number)
+        guard.cancel()
+        return node.wait(10), "".join(said)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import serial
+from process_fakes import running
 
 from finforce_driver.errors import LinkError, TargetError
 from finforce_sim.emulator.adapter import EmulatedAdapter
@@ -172,7 +173,7 @@ def test_impossible_node_ends_with_one_line(capsys):
 def test_program_says_its_path_and_ends_cleanly(link, end):
     command = [sys.executable, "-m", "finforce_sim.emulator", "--link", str(link)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+    with running(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout.readline().strip() == str(link)
         with open_serial(link) as device:
             device.write(b"S8\rO\r")

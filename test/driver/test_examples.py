@@ -14,6 +14,7 @@ import rclpy
 from emulator_fakes import Bench, Fingers
 from geometry_msgs.msg import TwistStamped
 from node_fakes import ros_domain
+from process_fakes import running
 
 from finforce import GripperClient
 from finforce.errors import ServiceError
@@ -58,20 +59,21 @@ def simulation(tmp_path):
     environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     options = RobotOptions(composed=False, sim=True, camera_name="", gripper_port=str(tmp_path / "gripper"))
     parts = [smaller(part) for part in robot_processes(options, ROOT) if part.package == "finforce"]
-    log = (tmp_path / "log").open("w+")
-    nodes = [subprocess.Popen(part.command(), env=environment, stdout=log, stderr=log) for part in parts]
-    until = monotonic() + START
-    while "playing as the gripper" not in (tmp_path / "log").read_text():
-        assert monotonic() < until and all(node.poll() is None for node in nodes), (tmp_path / "log").read_text()
-        sleep(0.5)
-    with watching(domain) as client:  # until the solvers have taken their tare
-        while client.force is None:
-            assert monotonic() < until, (tmp_path / "log").read_text()
+    with (tmp_path / "log").open("w+") as log, ExitStack() as stack:
+        started = [running(part.command(), env=environment, stdout=log, stderr=log) for part in parts]
+        nodes = [stack.enter_context(node) for node in started]
+        until = monotonic() + START
+        while "playing as the gripper" not in (tmp_path / "log").read_text():
+            assert monotonic() < until and all(node.poll() is None for node in nodes), (tmp_path / "log").read_text()
             sleep(0.5)
-    yield domain
-    for node in nodes:
-        node.terminate()
-    assert [node.wait(20.0) for node in nodes] == [0] * len(nodes), (tmp_path / "log").read_text()
+        with watching(domain) as client:  # until the solvers have taken their tare
+            while client.force is None:
+                assert monotonic() < until, (tmp_path / "log").read_text()
+                sleep(0.5)
+        yield domain
+        for node in nodes:
+            node.terminate()
+        assert [node.wait(20.0) for node in nodes] == [0] * len(nodes), (tmp_path / "log").read_text()
 
 
 def test_the_examples_hold_two_newtons_and_lift_on_the_simulated_robot(simulation):

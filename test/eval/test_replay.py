@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from eval_fakes import with_both_jaws
+from process_fakes import running
 
 from finforce.ros.transport import free_domain
 from finforce.transforms import pose_from_quaternion, quaternion_from_pose
@@ -90,14 +91,14 @@ def test_a_context_that_a_signal_has_taken_away_is_no_fault(ended, monkeypatch):
 def test_a_signal_ends_the_replay_and_its_nodes(number):
     domain = free_domain()
     words = [sys.executable, "-m", "finforce_eval.cli.main", "replay", str(SHIPPED), "--domain", str(domain)]
-    replay = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    until = monotonic() + 120.0
-    while not solvers_of(domain) and monotonic() < until:
-        sleep(0.05)
-    assert solvers_of(domain)
-    sleep(1.0)
-    replay.send_signal(number)
-    output, _ = replay.communicate(timeout=30)
+    with running(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as replay:
+        until = monotonic() + 120.0
+        while not solvers_of(domain) and monotonic() < until:
+            sleep(0.05)
+        assert solvers_of(domain)
+        sleep(1.0)
+        replay.send_signal(number)
+        output, _ = replay.communicate(timeout=30)
     assert replay.returncode == 130, output
     assert "Traceback" not in output
     assert not solvers_of(domain)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from process_fakes import running
 
 from finforce.errors import MissingDependencyError
 from finforce_eval.cli.main import main
@@ -81,7 +82,7 @@ def test_every_call_is_timed_once():
 
 def test_process_takes_memory_and_knows_its_children():
     assert 1e6 < resident_bytes() < 1e11
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+    with running([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         assert child.pid in child_processes(os.getpid())
         child.communicate(b"\n")
     assert child.pid not in child_processes(os.getpid())
