@@ -6,20 +6,21 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from threading import Condition, Lock
-from typing import TYPE_CHECKING, Protocol
+from threading import Condition
+from typing import TYPE_CHECKING
 
 from finforce_driver.errors import BackOffError, DriverError, GraspError, GripperTimeoutError
 from finforce_driver.grasp.controller import ForceGrasp
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus, GraspStep
+from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
 from finforce_driver.grasp.slip_guard import SlipGuard
 from finforce_driver.state import GripperState
 
 if TYPE_CHECKING:
     from finforce_driver.gripper import Gripper
 
-MARGIN = 2.0  # s beyond the time limit of a goal, after which nobody waits for its grasp any longer
+CYCLE = 0.05  # [s] in which the silence of a gripper is noticed
+MARGIN = 2.0  # [s] beyond the time limit of a goal, after which nobody waits for its grasp any longer
 SETTLED = (GraspPhase.HOLDING, GraspPhase.STOPPED)
 
 
@@ -76,6 +77,38 @@ class GraspSession:
                 self._grasp.change_force(goal.force)
                 self._slips.begin(goal.force)
 
+    def begin(self) -> None:
+        """Begin a grasp, which looks at the gripper at once and may end by that."""
+        gripper = self._gripper
+        with self._changed:
+            self._grasp = ForceGrasp(
+                self.goal,
+                self._settings,
+                resolution=gripper.resolution,
+                closed_opening=gripper.settings.closed_opening,
+                stroke=gripper.settings.stroke,
+            )
+            self._slips.begin(self.goal.force)
+            self.status = None
+            self.update(gripper.state)
+
+    def advance(self, samples: Sequence[ForceSample | TouchSample]) -> GraspStatus:
+        """Hand on what has come, act once on all of it, and return how the grasp is.
+
+        Raises:
+            GraspError: it has ended; of the class that its status names.
+        """
+        with self._changed:
+            for sample in samples:
+                if isinstance(sample, TouchSample):
+                    self.take_touch("", sample.touching, sample.stamp)
+                elif self._grasp is not None:
+                    self._grasp.take_force(sample)
+            self.update(self._gripper.state)
+            if self.status.phase is GraspPhase.STOPPED:
+                raise (self.status.failure or GraspError)(self.status.reason)
+            return self.status
+
     def run(self, begun: Callable[[], None] = lambda: None) -> GraspStatus:
         """Begin a grasp, if none runs, and wait; return how it is once the force is held, and go on holding it.
 
@@ -87,7 +120,7 @@ class GraspSession:
         """
         with self._changed:
             if self._grasp is None:
-                self._begin()
+                self.begin()
                 if self.runs:
                     begun()
             if not self._changed.wait_for(self._is_settled, self.goal.time_limit + MARGIN):
@@ -150,16 +183,21 @@ class GraspSession:
             if self._grasp is None:
                 return
             step = self._grasp.update(state, self._gripper.clock.now(), self._gripper.opening_at)
-            self._tell(step.status)
-            if step.status.phase is GraspPhase.STOPPED:
-                self._grasp = None
-                self._ended()
+            status = step.status
             try:
-                self._act(step)
+                if step.stop:
+                    self._gripper.hold()
+                elif step.move is not None:
+                    self._gripper.move(step.move.opening, step.move.speed, step.move.force)
             except DriverError as error:
-                self._end(str(error), GraspError)
                 with suppress(DriverError):
                     self._gripper.hold()
+                if step.move is not None:
+                    status = replace(status, phase=GraspPhase.STOPPED, reason=str(error), failure=GraspError)
+            self._tell(status)
+            if status.phase is GraspPhase.STOPPED:
+                self._grasp = None
+                self._ended()
 
     def replace(self, command: Callable[[], None], reason: str) -> None:
         """Give the gripper another command; the grasp ends, unless the command is refused.
@@ -188,26 +226,12 @@ class GraspSession:
         if self.status is not None and self.status.failed:
             self.status = replace(self.status, failure=None)
 
-    def _begin(self) -> None:
-        """Make a grasp and let it look at the gripper."""
-        self._grasp = _grasp_of(self._gripper, self.goal, self._settings)
-        self._slips.begin(self.goal.force)
-        self.status = None
-        self.update(self._gripper.state)
-
-    def _act(self, step: GraspStep) -> None:
-        """Do what a step asks for."""
-        if step.stop:
-            self._gripper.hold()
-        elif step.move is not None:
-            self._gripper.move(step.move.opening, step.move.speed, step.move.force)
-
-    def _end(self, reason: str, failure: type[GraspError] | None = None) -> None:
-        """Forget the grasp that runs and say why, and how it failed if it did."""
+    def _end(self, reason: str) -> None:
+        """Forget the grasp that runs and say why."""
         if self._grasp is not None:
             self._grasp = None
             last = self.status or GraspStatus(phase=GraspPhase.STOPPED, reason=reason, goal=self.goal.force)
-            self._tell(replace(last, phase=GraspPhase.STOPPED, reason=reason, failure=failure))
+            self._tell(replace(last, phase=GraspPhase.STOPPED, reason=reason, failure=None))
             self._ended()
 
     def _tell(self, status: GraspStatus) -> None:
@@ -218,59 +242,15 @@ class GraspSession:
         return self.status is not None and self.status.phase in SETTLED
 
 
-def _grasp_of(gripper: Gripper, goal: GraspGoal, settings: GraspSettings | None) -> ForceGrasp:
-    """Return a grasp for a gripper."""
-    mechanism = gripper.settings
-    return ForceGrasp(
-        goal,
-        settings,
-        resolution=gripper.resolution,
-        closed_opening=mechanism.closed_opening,
-        stroke=mechanism.stroke,
-    )
-
-
 def _check_opening(goal: GraspGoal, gripper: Gripper) -> None:
     """Refuse a least opening [m] that the jaws are never above; below the closed one it limits nothing."""
     settings = gripper.settings
     settings.check_opening("least opening", max(goal.least_opening, settings.closed_opening))
 
 
-if TYPE_CHECKING:
-    from finforce_driver.gripper import Gripper
-
-_CYCLE = 0.05  # [s] in which silence is noticed
-
-
-class ForceSource(Protocol):
-    """Where forces come from."""
-
-    def take(self) -> Sequence[ForceSample | TouchSample]:
-        """Return what has come since the last call, oldest first, without waiting."""
-
-
-class ForceInbox:
-    """A force source that another thread fills."""
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._samples: list[ForceSample | TouchSample] = []
-
-    def put(self, sample: ForceSample | TouchSample) -> None:
-        """Add what has come."""
-        with self._lock:
-            self._samples.append(sample)
-
-    def take(self) -> Sequence[ForceSample | TouchSample]:
-        """Return what was put since the last call."""
-        with self._lock:
-            samples, self._samples = self._samples, []
-        return samples
-
-
 def hold_force(
     gripper: Gripper,
-    forces: ForceSource,
+    forces: Callable[[], Sequence[ForceSample | TouchSample]],
     goal: GraspGoal,
     settings: GraspSettings | None = None,
     *,
@@ -280,22 +260,26 @@ def hold_force(
 
     Args:
         gripper: calibrated and ready.
-        forces: what the camera says, on the gripper's clock.
+        forces: returns what the camera has said since the last call, oldest first, without waiting; times are on the
+            gripper's clock.
         goal: force, speed, limits.
         settings: of the grasp.
         until: asked with every status; the force is held, with feedback, until it returns true. None: returns as soon
             as the force is held.
 
     Raises:
-        TargetError: the set force is above the limit of the settings.
+        TargetError: the set force is above the limit of the settings, or the least opening beyond the stroke.
         GraspError: the grasp was ended for safety. Here, and whatever else is raised, the gripper holds in place, if
             it can.
     """
-    grasp = _grasp_of(gripper, goal, settings)
+    session = GraspSession(gripper, goal, settings or GraspSettings())
     is_done = until or (lambda status: status.phase is GraspPhase.HOLDING)
     try:
-        while not is_done(status := _turn(gripper, forces, grasp)):
-            _await_reply(gripper)
+        session.begin()
+        while not is_done(status := session.advance(forces())):
+            last = gripper.state.stamp
+            with suppress(GripperTimeoutError):  # the next reply, or a silence that has to be noticed
+                gripper.wait(lambda state, last=last: state.stamp != last, CYCLE)
     except BackOffError:
         raise  # the jaws back off
     except BaseException:
@@ -303,30 +287,3 @@ def hold_force(
             gripper.hold()
         raise
     return status
-
-
-def _turn(gripper: Gripper, forces: ForceSource, grasp: ForceGrasp) -> GraspStatus:
-    """Hand what has come to the grasp and do what it asks for.
-
-    Raises:
-        GraspError: it has ended.
-        DriverError: the gripper refuses.
-    """
-    for sample in forces.take():
-        if isinstance(sample, TouchSample):
-            grasp.take_touch(sample.touching, sample.stamp)
-        else:
-            grasp.take_force(sample)
-    step = grasp.update(gripper.state, gripper.clock.now(), gripper.opening_at)
-    if step.move is not None:
-        gripper.move(step.move.opening, step.move.speed, step.move.force)
-    if step.status.phase is GraspPhase.STOPPED:
-        raise (step.status.failure or GraspError)(step.status.reason)
-    return step.status
-
-
-def _await_reply(gripper: Gripper) -> None:
-    """Return with the next reply of the gripper, or when silence has to be looked at."""
-    last = gripper.state.stamp
-    with suppress(GripperTimeoutError):
-        gripper.wait(lambda state: state.stamp != last, _CYCLE)

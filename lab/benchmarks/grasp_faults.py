@@ -167,7 +167,7 @@ class FaultyGrasp(World):
         goal = GraspGoal(force=self._case.force, speed=self._case.speed, time_limit=8.0)
         backing, end = False, "was content"
         try:
-            hold_force(self.gripper, self, goal, until=self._is_over)
+            hold_force(self.gripper, self.take, goal, until=self._is_over)
         except DriverError as error:
             backing, end = isinstance(error, BackOffError), str(error)
             if not end:

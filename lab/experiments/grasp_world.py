@@ -112,7 +112,7 @@ class GraspTrace:
 
 
 class World:
-    """One emulated gripper with fingers and camera; it is the force source of `hold_force`, too.
+    """One emulated gripper with fingers and camera; `hold_force` takes its forces.
 
     A grasp by force is watched until it has held for `holding` seconds.
     """
@@ -167,7 +167,7 @@ class World:
         self.gripper.wait(lambda state: bool(self._arrivals), 5.0)
         goal = GraspGoal(force=self._case.force, speed=self._case.speed)
         try:
-            hold_force(self.gripper, self, goal, self._settings, until=self._is_over)
+            hold_force(self.gripper, self.take, goal, self._settings, until=self._is_over)
         except Exception as error:  # whatever ends a grasp is a result of the benchmark
             self.course.error = str(error)
         self.course.violations = dict(self.emulated.violations)

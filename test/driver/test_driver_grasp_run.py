@@ -1,15 +1,14 @@
 """Claims about the blocking grasp by force on the emulated gripper, in stepped time, with both firmware variants."""
 
 import heapq
-import math
 from itertools import count
 
 import numpy as np
 import pytest
 
 from finforce_driver.errors import GraspError
-from finforce_driver.grasp.load_watch import ForceSample, TouchSample
-from finforce_driver.grasp.session import ForceInbox, hold_force
+from finforce_driver.grasp.load_watch import ForceSample
+from finforce_driver.grasp.session import hold_force
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase
 from finforce_driver.gripper import Gripper
 from finforce_driver.state import Phase
@@ -68,7 +67,7 @@ class Lab:
     def grasp(self, force=2.0, seconds=8.0, **goal):
         end = self.begin + seconds
         return hold_force(
-            self.gripper, self, GraspGoal(force=force, **goal), until=lambda status: self.clock.now() > end
+            self.gripper, self.take, GraspGoal(force=force, **goal), until=lambda status: self.clock.now() > end
         )
 
     def assert_stands(self):
@@ -97,7 +96,7 @@ def test_force_is_reached_and_held_without_overshoot(lab, force):
 
 
 def test_call_returns_when_the_force_is_held(lab):
-    status = hold_force(lab.gripper, lab, GraspGoal(force=2.0))
+    status = hold_force(lab.gripper, lab.take, GraspGoal(force=2.0))
     assert status.phase is GraspPhase.HOLDING
     assert lab.clock.now() - lab.begin < 4.0
     lab.assert_stands()
@@ -140,15 +139,5 @@ def test_gripper_that_is_not_calibrated_is_not_moved():
     gripper.wait(lambda state: state.phase is Phase.UNCALIBRATED, 5.0)
     before = emulated.true_opening
     with pytest.raises(GraspError, match="uncalibrated"):
-        hold_force(gripper, ForceInbox(), GraspGoal(force=1.0))
+        hold_force(gripper, list, GraspGoal(force=1.0))
     assert emulated.true_opening == before
-
-
-def test_inbox_gives_what_was_put_once_and_in_order():
-    inbox = ForceInbox()
-    samples = [ForceSample(stamp=1.0, arrived=1.1, force=0.0), TouchSample(stamp=1.0, touching=True)]
-    for sample in samples:
-        inbox.put(sample)
-    assert list(inbox.take()) == samples
-    assert list(inbox.take()) == []
-    assert math.isnan(ForceSample(stamp=1.0, arrived=1.1, force=math.nan).force)

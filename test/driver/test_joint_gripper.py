@@ -158,7 +158,7 @@ def test_the_same_controller_holds_a_force_with_another_gripper(maker, takes_spe
         until.append(joint.clock.now()) if status.phase is GraspPhase.HOLDING else None
         return bool(until) and joint.clock.now() > until[0] + 4.0
 
-    status = hold_force(joint.gripper, camera, GraspGoal(force=force), settings, until=held)
+    status = hold_force(joint.gripper, camera.take, GraspGoal(force=force), settings, until=held)
     step = stiffness * joint.gripper.resolution
     assert max(camera.forces) < force + 0.15 + 0.5 * step
     assert camera.forces[-1] == pytest.approx(force, abs=0.12 + step)
@@ -178,7 +178,7 @@ def test_a_camera_that_falls_silent_stops_another_gripper(maker):
         return False
 
     with pytest.raises(GraspError, match="old"):
-        hold_force(joint.gripper, camera, GraspGoal(force=3.0), settings, until=until)
+        hold_force(joint.gripper, camera.take, GraspGoal(force=3.0), settings, until=until)
     joint.clock.wait(0.3)
     before = joint.opening
     joint.clock.wait(1.0)
