@@ -53,6 +53,7 @@ setup(
         "pyserial",  # the serial port of the CAN adapter
         "matplotlib",  # pictures of the reports
         "tqdm",  # progress bars
+        "pandas",  # tables of forces over time and of figures, with named columns
     ],
     extras_require={
         # ROS 2 Jazzy for machines without it; Python 3.10 to 3.13 on x86_64

@@ -5,15 +5,15 @@ All ways look at a second of images each, one way after the other, so that a bus
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
-from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.camera import ImageError, project
@@ -21,7 +21,6 @@ from finforce.skipping import ALL, Skips
 from finforce.transforms import pose_from_quaternion
 from finforce_eval.evaluation.keypoint_source import Detector, KeypointSource, SideLog, build_records, with_detections
 from finforce_eval.evaluation.results import DetectionErrors, DetectionStats, compare_detection, detection_stats
-from finforce_eval.figures.time_error import ErrorPoint, ErrorSeries, TimeStats, draw_time_error, time_stats
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
@@ -31,6 +30,7 @@ from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import load_jaws
 from finforce_keypoints.settings import RULES
 from lab.bench.scenes import DIM, GRASP, BenchScene, find_scene
+from lab.harness import Figures, Tradeoff, percentiles
 
 QUICK_IMAGES = 45
 BLOCK = 30  # images that one way sees in a row
@@ -64,33 +64,6 @@ WAYS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class DetectionRow:
-    """One way, from image to key points of both jaws.
-
-    Attributes:
-        name: of the way.
-        time: wall times.
-        cpu: CPU times of all threads, which a busy machine hardly changes.
-        cpu_mean_ms: the mean of them, which shows what rests save.
-        sight: how well the key points were seen.
-    """
-
-    name: str
-    time: TimeStats
-    cpu: TimeStats
-    cpu_mean_ms: float
-    sight: DetectionStats
-
-
-@dataclass(frozen=True, kw_only=True)
-class DetectionFigures:
-    """What was measured, and a yardstick of the machine [ms]."""
-
-    rows: Sequence[DetectionRow]
-    yardstick: TimeStats
-
-
 @dataclass(kw_only=True)
 class _DetectionRun:
     """A way at work on one recording: its detector, and what it said of each jaw."""
@@ -117,7 +90,7 @@ class _DetectionRun:
                 log.found[stamp] = found[side]
 
 
-def measure(quick: bool) -> DetectionFigures:
+def measure(quick: bool) -> Figures:
     """Return times and pixel errors of every way.
 
     Args:
@@ -129,7 +102,7 @@ def measure(quick: bool) -> DetectionFigures:
     return measure_ways(WAYS, [GRASP] if quick else [GRASP, DIM], QUICK_IMAGES if quick else None)
 
 
-def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int | None = None) -> DetectionFigures:
+def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int | None = None) -> Figures:
     """Return times and pixel errors of some ways on scenes.
 
     Args:
@@ -153,16 +126,42 @@ def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int |
                 compare_detection(track.detection, track.sight) for track in detected.jaws.values()
             ]
     rows = [
-        DetectionRow(
-            name=name,
-            time=time_stats(spent),
-            cpu=time_stats(cpu[name]),
-            cpu_mean_ms=1e3 * float(np.mean(cpu[name])),
-            sight=detection_stats(series[name]),
-        )
+        {
+            "key points of both jaws": name,
+            **percentiles(spent),
+            "CPU p50/ms": 1e3 * float(np.median(cpu[name])),
+            "CPU mean/ms": 1e3 * float(np.mean(cpu[name])),
+            **sight_columns(detection_stats(series[name])),
+        }
         for name, spent in seconds.items()
     ]
-    return DetectionFigures(rows=rows, yardstick=time_stats(yardstick))
+    return Figures(
+        tables={"detection": pd.DataFrame(rows)},
+        notes=[f"Product of two matrices of 512 x 512 in the same run: p50 {1e3 * np.median(yardstick):.2f} ms."],
+        picture=Tradeoff(
+            table="detection",
+            method=("key points of both jaws",),
+            time="p50/ms",
+            slow="p99/ms",
+            error="pixel error p95/px",
+            answered="visible accepted/%",
+            log_error=True,
+            title="Key points of both jaws in one image: time against error",
+        ),
+    )
+
+
+def sight_columns(stats: DetectionStats) -> dict[str, float]:
+    """Return how well key points were seen as columns of a table."""
+    found = {name: np.nan if value is None else value for name, value in asdict(stats).items()}
+    return {
+        "pixel error median/px": found["pixel_median_px"],
+        "pixel error p95/px": found["pixel_p95_px"],
+        "point error median/mm": found["point_median_mm"],
+        "point error p95/mm": found["point_p95_mm"],
+        "hidden accepted/%": found["hidden_accepted_pct"],
+        "visible accepted/%": 100.0 - found["visible_lost_pct"],
+    }
 
 
 def _look_at(recording: Recording, ways: Sequence[Way], yardstick: list[float]) -> list[_DetectionRun]:
@@ -196,50 +195,6 @@ def time_product(size: int = 512) -> float:
     begin = perf_counter()
     matrix @ matrix
     return perf_counter() - begin
-
-
-def format_table(figures: DetectionFigures) -> str:
-    """Return the rows as a table in Markdown, with the yardstick below."""
-    return "\n".join(_lines(figures))
-
-
-def _lines(figures: DetectionFigures) -> Iterator[str]:
-    yield (
-        "| key points of both jaws | images | p50/ms | p95 | p99 | of CPU: p50/ms | mean | pixels: median | p95 "
-        "| points: median/mm | p95 | hidden accepted/% | visible lost/% |"
-    )
-    yield "|---|---|---|---|---|---|---|---|---|---|---|---|---|"
-    for row in figures.rows:
-        wall, cpu = row.time, row.cpu
-        time = f"{wall.n} | {wall.p50:.2f} | {wall.p95:.2f} | {wall.p99:.2f} | {cpu.p50:.2f} | {row.cpu_mean_ms:.2f}"
-        numbers = [value for name, value in asdict(row.sight).items() if not name.startswith("n_")]
-        yield f"| {row.name} | {time} | {' | '.join('-' if value is None else f'{value:.2f}' for value in numbers)} |"
-    yield f"Product of two matrices of 512 x 512 in the same run: p50 {figures.yardstick.p50:.2f} ms."
-
-
-def as_json(figures: DetectionFigures) -> dict[str, Any]:
-    """Return the figures as plain values; times in ms."""
-    return asdict(figures)
-
-
-def draw(figures: DetectionFigures, path: Path | str) -> None:
-    """Draw time against the 95th percentile of the pixel error; hollow: a tenth or more of what is visible is lost."""
-    series = []
-    for row in figures.rows:
-        if row.sight.pixel_p95_px is None:
-            continue
-        lost = row.sight.visible_lost_pct or 0.0
-        point = ErrorPoint(text="", time=row.time.p50, slow=row.time.p99, error=row.sight.pixel_p95_px)
-        label = f"{row.name}\n(lost {lost:.1f} %)"
-        series.append(ErrorSeries(name=label, points=[point], complete=lost < 10.0))
-    draw_time_error(
-        series,
-        path,
-        title="Key points: time against error; in brackets: visible points that were lost",
-        error="pixel error, 95th percentile [px]",
-        time="time for one image, both jaws [ms]",
-        log_error=True,
-    )
 
 
 DIAMETER = 0.003  # [m]

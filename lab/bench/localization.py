@@ -7,12 +7,13 @@ cuts the deformed surface. Times and errors are of the same calls.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from finforce_contact.estimator import ContactEstimator
@@ -30,7 +31,6 @@ from finforce_contact.paper_contact import NearSolid, intersect
 from finforce_contact.settings import ContactSettings
 from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import match_truth
-from finforce_eval.figures.time_error import ErrorPoint, ErrorSeries, TimeStats, draw_time_error, time_stats
 from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
@@ -39,6 +39,7 @@ from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.observation import Observation
+from lab.harness import Figures, Tradeoff, percentiles
 
 LEAST_FORCE = 0.1  # [N], below which the line of a measured force says nothing of its place
 EVERY, EVERY_QUICK = 5, 25  # images between two that are looked at
@@ -66,39 +67,7 @@ class LocatedImage:
     true: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class MethodRow:
-    """One way with one mesh: place errors [mm] where it found a place, and times [ms].
-
-    Attributes:
-        method: its name.
-        triangles: of the mesh.
-        found: share of the images on which it found a place.
-        median: of the errors; NaN when it found none, as the next two.
-        p95: of the same.
-        largest: of the same.
-        contact: times on the images in contact.
-        apart: times with the object 50 mm away.
-    """
-
-    method: str
-    triangles: int
-    found: float
-    median: float
-    p95: float
-    largest: float
-    contact: TimeStats
-    apart: TimeStats
-
-
-@dataclass(frozen=True, kw_only=True)
-class LocalizationFigures:
-    """What was measured, and what could not be."""
-
-    rows: Sequence[MethodRow]
-
-
-def measure(quick: bool) -> LocalizationFigures:
+def measure(quick: bool) -> Figures:
     """Return times and place errors of every way with 1, 5 and 20 thousand triangles, on the shipped recording.
 
     Args:
@@ -108,9 +77,7 @@ def measure(quick: bool) -> LocalizationFigures:
     return measure_methods([RECORDING], meshes, EVERY_QUICK if quick else EVERY)
 
 
-def measure_methods(
-    paths: Sequence[str | Path], meshes: Sequence[ObjectMesh] = (), every: int = EVERY
-) -> LocalizationFigures:
+def measure_methods(paths: Sequence[str | Path], meshes: Sequence[ObjectMesh] = (), every: int = EVERY) -> Figures:
     """Return times and place errors over bench recordings.
 
     Args:
@@ -132,7 +99,20 @@ def measure_methods(
                 calls.setdefault(key, []).extend(_run(method, frames, _stay))
                 away.setdefault(key, []).extend(spent for spent, _ in _run(method, frames, _jittered_apart()))
     rows = [summarise(*key, np.array(found), away[key]) for key, found in calls.items()]
-    return LocalizationFigures(rows=rows)
+    return Figures(
+        tables={"localization": pd.DataFrame(rows)},
+        picture=Tradeoff(
+            table="localization",
+            method=("method",),
+            text="triangles",
+            time="in contact p50/ms",
+            slow="in contact p99/ms",
+            error="error p95/mm",
+            answered="found/%",
+            complete=100.0,
+            title="Location of the contact: time against error; numbers: triangles of the mesh",
+        ),
+    )
 
 
 def build_methods(mesh: ObjectMesh) -> dict[str, Method]:
@@ -199,20 +179,21 @@ def _run(
         yield perf_counter() - begin, np.nan if found is None else abs(found - frame.true)
 
 
-def summarise(method: str, triangles: int, calls: NDArray, away: Sequence[float]) -> MethodRow:
-    """Return the statistics of calls (n, 2), time [s] and error [m], and of times without contact [s]."""
+def summarise(method: str, triangles: int, calls: NDArray, away: Sequence[float]) -> dict[str, Any]:
+    """Return the row of calls (n, 2), time [s] and error [m], and of times without contact [s]."""
     errors = 1e3 * calls[np.isfinite(calls[:, 1]), 1]
     median, p95, largest = np.percentile(errors, [50, 95, 100]).tolist() if len(errors) else [float("nan")] * 3
-    return MethodRow(
-        method=method,
-        triangles=triangles,
-        found=len(errors) / len(calls),
-        median=median,
-        p95=p95,
-        largest=largest,
-        contact=time_stats(calls[:, 0]),
-        apart=time_stats(away),
-    )
+    contact, apart = percentiles(calls[:, 0], "in contact"), percentiles(away, "50 mm apart")
+    return {
+        "method": method,
+        "triangles": triangles,
+        "n": len(calls),
+        "found/%": 100.0 * len(errors) / len(calls),
+        "error median/mm": median,
+        "error p95/mm": p95,
+        "largest/mm": largest,
+        **{name: value for name, value in (contact | apart).items() if "p50" in name or "p99" in name},
+    }
 
 
 def build_cylinder(radius: float, length: float, around: int, along: int) -> ObjectMesh:
@@ -233,52 +214,6 @@ def build_cylinder(radius: float, length: float, around: int, along: int) -> Obj
         watertight=True,
         name="cylinder",
     )
-
-
-def format_table(figures: LocalizationFigures) -> str:
-    """Return the rows as a table in Markdown."""
-    lines = [
-        "| contact place | triangles | n | found | error: median/mm | p95 | max | in contact: p50/ms | p99 "
-        "| 50 mm apart: p50/ms | p99 |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {row.method} | {row.triangles} | {row.contact.n} | {row.found:.0%} | {row.median:.2f} | {row.p95:.2f} "
-        f"| {row.largest:.2f} | {row.contact.p50:.3f} | {row.contact.p99:.3f} | {row.apart.p50:.3f} "
-        f"| {row.apart.p99:.3f} |"
-        for row in figures.rows
-    ]
-    return "\n".join(lines)
-
-
-def as_json(figures: LocalizationFigures) -> dict[str, Any]:
-    """Return the figures as plain values; errors in mm, times in ms."""
-    return asdict(figures)
-
-
-def draw(figures: LocalizationFigures, path: Path | str) -> None:
-    """Draw time against the 95th percentile of the place error; ways that do not answer always are hollow."""
-    by_method: dict[str, list[MethodRow]] = {}
-    for row in figures.rows:
-        by_method.setdefault(row.method, []).append(row)
-    draw_time_error(
-        [_series(name, rows) for name, rows in by_method.items()],
-        path,
-        title="Contact place: time against error; numbers: thousand triangles",
-        error="place error, 95th percentile [mm]",
-        time="time for one image [ms]",
-    )
-
-
-def _series(name: str, rows: Sequence[MethodRow]) -> ErrorSeries:
-    """Return the rows of one way as a series."""
-    share = min(row.found for row in rows)
-    label = name if share == 1.0 else f"{name}\n(finds {share:.0%})"
-    points = [
-        ErrorPoint(text=f"{row.triangles / 1e3:.0f}", time=row.contact.p50, slow=row.contact.p99, error=row.p95)
-        for row in rows
-    ]
-    return ErrorSeries(name=label, points=points, complete=share == 1.0)
 
 
 Wrench = tuple[NDArray, NDArray] | None

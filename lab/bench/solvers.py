@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from gc import collect, disable, enable
 from pathlib import Path
-from time import thread_time
+from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from finforce_eval.evaluation.tables import align_rows
-from finforce_eval.figures.figures import BLACK, BLUE, GREEN, GREY, ORANGE, new_figure, style_axes
-from finforce_eval.figures.time_error import ErrorPoint, find_front
+from finforce_eval.errors import OptionError, RecordingError
+from finforce_eval.evaluation.contact_source import parse_contacts
+from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
+from finforce_eval.evaluation.scoring import rms
+from finforce_eval.evaluation.setup import EvaluationSetup
+from finforce_eval.recordings.recording import read_recording
+from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.fem.solid import SolidModel
+from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
-from lab.bench.bench import Row, row_from_times, time_calls
+from finforce_ifea.settings import SOLVERS, EstimatorSettings
 from lab.bench.cases import (
     DIAMETERS,
     BenchCase,
@@ -28,97 +35,133 @@ from lab.bench.cases import (
     press_cases,
     record_press,
 )
-from lab.bench.process import Start, measure_start
-from lab.bench.recordings import RecordedFigures, find_recordings, measure_recordings
-from lab.bench.tiers import Accuracy, ShapeErrors, Tier, list_tiers, run_tier, score_runs, score_shapes
+from lab.harness import Figures, Tradeoff, percentiles, time_calls
 
 SEED = 1
 FACTORISATIONS = 20
-# A tier that leaves more than this share of the scored frames unanswered is on no front.
-MOST_LOST = 0.01
-# Quoted, NOTES on the peer: SOFA v25.06 with SoftRobots.Inverse on the same 522 vertices and 45 shapes.
+WARM_UP_FRAMES = 150
+# A tier that leaves more of the scored frames unanswered is on no front.
+LEAST_ANSWERED = 99.0
+# Quoted: SOFA v25.06 with SoftRobots.Inverse on the same 522 vertices and 45 shapes, and its yardstick.
 SOFA = {"step_ms": 3.9, "yardstick_ms": 3.0, "rmse_N": 20.9, "one_factor_N": 1.01, "factor_per_height_N": 0.74}
 # Quoted, Zuo, Yang, Chua, RA-L 2026: the rate of the whole loop, and the RMSE range of Tables I and II.
 PAPER = {"rate_Hz": 40.0, "least_N": 0.20, "largest_N": 1.21}
+CONTACTS = {"height": "fixed:case", "outline": "estimate"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class TierFigures:
-    """What was measured of one tier.
+class Tier:
+    """One way to solve.
 
     Attributes:
-        tier: the way to solve.
-        exact: errors with noise-free key points.
-        noisy: errors with those of the bench's camera.
-        shapes: errors at the 45 noise-free shapes.
-        step_exact: time per step with noise-free key points [ms].
-        step: time per step with noisy ones [ms].
-        cpu: processor time of the same steps [ms].
-        yardstick: processor time of SuperLU on the whole jaw's stiffness matrix, 522 vertices, around these steps [ms].
-        start: memory and set-up of a fresh process; None where another tier has the same.
+        name: for tables.
+        solver: `EstimatorSettings.solver`.
+        mesh: `EstimatorSettings.mesh`.
+        contact: what is known of the object: its "height" of first touch, or its "outline".
+        slow: whether it is left out where time is short.
     """
 
-    tier: Tier
-    exact: Accuracy
-    noisy: Accuracy
-    shapes: ShapeErrors
-    step_exact: Row
-    step: Row
-    cpu: Row
-    yardstick: Row
-    start: Start | None
+    name: str
+    solver: str
+    mesh: str = "default"
+    contact: str = "height"
+    slow: bool = False
+
+    def settings(self) -> EstimatorSettings:
+        """Return the estimator's settings; raises ObservationError where there is no such solver."""
+        return EstimatorSettings(solver=self.solver, mesh=self.mesh)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SolverFigures:
-    """Everything of one run.
+TIERS = (
+    Tier(name="linear", solver="linear"),
+    Tier(name="reduced", solver="reduced"),
+    Tier(name="frame", solver="frame"),
+    Tier(name="solid, 522 vertices", solver="solid", mesh="coarse"),
+    Tier(name="solid, default mesh", solver="solid"),
+    Tier(name="solid, fine mesh", solver="solid", mesh="fine", slow=True),
+    Tier(name="paper's setting", solver="paper"),
+    Tier(name="reduced, outline known", solver="reduced", contact="outline"),
+    Tier(name="frame, outline known", solver="frame", contact="outline"),
+    Tier(name="solid, default mesh, outline known", solver="solid", contact="outline"),
+)
 
-    Attributes:
-        tiers: as far as they exist.
-        recorded: the tiers over recordings; empty without a folder.
-        notes: what was not measured, and why.
+
+def list_tiers(*, slow: bool = True, section: bool = False) -> tuple[Tier, ...]:
+    """Return the tiers, with one for each solver that the list does not name.
+
+    Args:
+        slow: include those that take long.
+        section: of a finger that is given by its section, not by a drawing.
     """
+    listed, foreign = {tier.solver for tier in TIERS} | {"default"}, ("frame", "paper") if section else ("plane",)
+    others = tuple(Tier(name=name, solver=name) for name in SOLVERS if name not in listed)
+    every = [tier for tier in TIERS + others if tier.solver not in foreign]
+    if section:  # ten thousand unknowns and more, a second for a step: the smallest of the solids alone
+        every = [tier for tier in every if tier.solver != "solid" or tier.mesh == "coarse"]
+        every = [replace(tier, slow=tier.solver in ("solid", "plane")) for tier in every]
+    return tuple(tier for tier in every if slow or not tier.slow)
 
-    tiers: Sequence[TierFigures]
-    recorded: Sequence[RecordedFigures] = ()
-    notes: Sequence[str] = field(default_factory=tuple)
 
-
-def measure(quick: bool, folder: Path | str | None = None, jaw: str = "bench") -> SolverFigures:
-    """Measures every tier, under a progress bar.
+def measure(quick: bool, folder: Path | str | None = None, jaw: str = "bench") -> Figures:
+    """Return times and errors of every tier.
 
     Args:
         quick: three cases instead of nine, and no slow tier.
-        folder: recordings to be taken, too; None for none.
-        jaw: the finger; another one than that of the bench is pressed by its own solid model.
+        folder: recordings of the bench finger that the tiers run on, too.
+        jaw: finger; another one than that of the bench is pressed by its own solid model.
 
     Raises:
-        FinforceError: The jaw cannot be used, the folder holds no recordings, or one that cannot be used.
+        FinforceError: the jaw cannot be used, the folder holds no recordings, or one that cannot be used.
     """
     from tqdm import tqdm
 
-    name, jaw = jaw, bench_finger() if jaw == "bench" else load_jaw(jaw)
-    tiers, cases = list_tiers(slow=not quick, section=jaw.section is not None), _find_cases(name, jaw, quick)
-    exact = [record_press(case, jaw) for case in cases]
-    noisy = [record_press(case, jaw, NoisyCamera(), SEED) for case in cases]
-    recordings = len(find_recordings(folder)) if folder else 0
-    total, figures, notes = len(tiers) * (2 * len(cases) + recordings), [], []
-    with tqdm(total=total, unit="press", disable=None, leave=False) as bar:
+    finger = bench_finger() if jaw == "bench" else load_jaw(jaw)
+    tiers, cases = list_tiers(slow=not quick, section=finger.section is not None), find_cases(jaw, finger, quick)
+    presses = {
+        "noise-free": [record_press(case, finger) for case in cases],
+        "noisy": [record_press(case, finger, NoisyCamera(), SEED) for case in cases],
+    }
+    recordings = find_recordings(folder) if folder else []
+    rows, by_case, shapes, recorded, notes = [], [], [], [], []
+    with tqdm(total=len(tiers) * (2 * len(cases) + len(recordings)), unit="press", disable=None, leave=False) as bar:
         for tier in tiers:
             bar.set_description(tier.name)
             try:
-                figures.append(_measure_tier(tier, (name, jaw), exact, noisy, bar.update))
+                yardstick = time_factorisation()
+                runs = {kind: run_tier(tier, finger, seen, bar.update) for kind, seen in presses.items()}
+                yardstick = float(np.median(yardstick + time_factorisation()))
             except FinforceError as error:
                 notes.append(f"{tier.name}: not measured: {error}")
-        recorded = measure_recordings(folder, tiers, lambda _: bar.update()) if folder else ()
-    return SolverFigures(tiers=figures, recorded=recorded, notes=notes)
+                continue
+            rows += [tier_row(tier, kind, found, yardstick) for kind, found in runs.items()]
+            by_case += [case_row(tier, kind, found) for kind, found in runs.items()]
+            shapes.append({"tier": tier.name, **score_shapes(runs["noise-free"]), **compare_with_sofa(rows[-1])})
+            recorded += measure_recordings(recordings, tier, bar.update)
+    shapes.append({"tier": "SOFA, quoted", **quoted_shapes()})
+    tables = {"tiers": rows, "cases": by_case, "shapes": shapes, "recorded": recorded}
+    return Figures(
+        tables={name: pd.DataFrame(found) for name, found in tables.items() if found},
+        notes=notes,
+        picture=Tradeoff(
+            table="tiers",
+            method=("tier", "key points"),
+            time="step p50/ms",
+            slow="step p99/ms",
+            error="RMSE/N",
+            answered="answered/%",
+            complete=LEAST_ANSWERED,
+            log_error=True,
+            title="Time of a step against force error: nine presses of an independent program",
+        ),
+        more={"quoted": {"sofa": SOFA, "paper": PAPER}},
+    )
 
 
-def _find_cases(name: str, jaw: Jaw, quick: bool) -> Sequence[BenchCase]:
-    """Returns the presses of a jaw: of the bench's those of an independent program, else of its own solid model.
+def find_cases(name: str, jaw: Jaw, quick: bool) -> Sequence[BenchCase]:
+    """Return the presses of a jaw: those of an independent program for the bench's, else of its own solid model.
 
     Raises:
-        FinforceError: No solid describes the jaw, or it bears no press.
+        FinforceError: no solid describes the jaw, or it bears no press.
     """
     if name == "bench":
         return [case for case in load_cases() if case.name.startswith("Ø25") or not quick]
@@ -130,222 +173,207 @@ def _find_cases(name: str, jaw: Jaw, quick: bool) -> Sequence[BenchCase]:
     return cases
 
 
-def _measure_tier(
-    tier: Tier,
-    named: tuple[str, Jaw],
-    exact: Sequence[ReplayedPress],
-    noisy: Sequence[ReplayedPress],
-    progress: Callable[[], object],
-) -> TierFigures:
-    name, jaw = named
-    yardstick = measure_factorisation()
-    without = run_tier(tier, jaw, exact, progress)
-    with_noise = run_tier(tier, jaw, noisy, progress)
-    yardstick += measure_factorisation()
-    return TierFigures(
-        tier=tier,
-        exact=score_runs(without),
-        noisy=score_runs(with_noise),
-        shapes=score_shapes(without),
-        step_exact=_row(tier, [run.seconds for run in without]),
-        step=_row(tier, [run.seconds for run in with_noise]),
-        cpu=_row(tier, [run.cpu for run in with_noise]),
-        yardstick=row_from_times(tier.name, yardstick),
-        start=measure_start(tier.solver, tier.mesh, name) if tier.contact == "height" else None,
-    )
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """What a tier makes of one press.
+
+    Attributes:
+        press: that it was given.
+        force: (n, 3) [N], NaN where none is trusted.
+        seconds: wall time of the steps that gave a force (m,).
+        cpu: processor time of the same steps (m,) [s].
+    """
+
+    press: ReplayedPress
+    force: NDArray
+    seconds: NDArray
+    cpu: NDArray
+
+    @property
+    def errors(self) -> NDArray:
+        """Errors of the magnitude (n,) [N]; NaN where there is no estimate."""
+        return np.linalg.norm(self.force, axis=1) - np.linalg.norm(self.press.force, axis=1)
 
 
-def _row(tier: Tier, times: Sequence[NDArray]) -> Row:
-    return row_from_times(tier.name, np.concatenate(times))
+def run_tier(
+    tier: Tier, jaw: Jaw, presses: Sequence[ReplayedPress], progress: Callable[[], object] = lambda: None
+) -> list[Run]:
+    """Run one estimator over presses, each from the start; what compiles is compiled before.
+
+    Raises:
+        FinforceError: the tier does not exist, or cannot describe the jaw.
+    """
+    estimator = JawEstimator(jaw, settings=tier.settings())
+    estimator.warm_up()
+    _run_press(tier, estimator, presses[0], WARM_UP_FRAMES)
+    runs = []
+    for press in presses:
+        runs.append(_run_press(tier, estimator, press))
+        progress()
+    return runs
 
 
-def measure_factorisation(mesh: str = "coarse") -> list[float]:
-    """Returns the processor times [s] of a SuperLU factorisation of the whole jaw's stiffness matrix."""
+def _run_press(tier: Tier, estimator: JawEstimator, press: ReplayedPress, frames: int | None = None) -> Run:
+    """Return what an estimator that starts anew makes of the first frames of a press."""
+    estimator.reset()
+    force = np.full(press.force.shape, np.nan)
+    seconds, cpu = [], []
+    contacts = press.contacts(tier.contact)
+    # a collection in the middle of a step is not the step's own time
+    collect()
+    disable()
+    try:
+        for index, observation in enumerate(press.observations[:frames]):
+            begin, begin_cpu = perf_counter(), thread_time()
+            solution = estimator.update(observation, contacts[index])
+            passed, used = perf_counter() - begin, thread_time() - begin_cpu
+            if solution.trusted:
+                force[index] = solution.force
+            # an unloaded or unsolved frame may be cheaper: it is not what a user waits for
+            if solution.status == "ok":
+                seconds.append(passed)
+                cpu.append(used)
+    finally:
+        enable()
+    return Run(press=press, force=force, seconds=np.array(seconds), cpu=np.array(cpu))
+
+
+def tier_row(tier: Tier, kind: str, runs: Sequence[Run], yardstick: float) -> dict[str, Any]:
+    """Return times and errors of a tier over its presses.
+
+    Args:
+        tier: the way to solve.
+        kind: of key points.
+        runs: over presses.
+        yardstick: processor time of a factorisation of the whole jaw's stiffness matrix, 522 vertices [s].
+    """
+    held = np.concatenate([run.errors[run.press.held] for run in runs])
+    step = percentiles(np.concatenate([run.seconds for run in runs]), "step")
+    cpu = percentiles(np.concatenate([run.cpu for run in runs]), "CPU")
+    known = held[np.isfinite(held)]
+    return {
+        "tier": tier.name,
+        "key points": kind,
+        **{name: value for name, value in step.items() if "p95" not in name},
+        **{name: cpu[name] for name in ("CPU p50/ms", "CPU p99/ms")},
+        "SuperLU/ms": 1e3 * yardstick,
+        "RMSE/N": rms(held),
+        "bias/N": float(known.mean()) if known.size else np.nan,
+        "largest/N": float(np.abs(known).max()) if known.size else np.nan,
+        "answered/%": 100.0 * known.size / held.size,
+    }
+
+
+def case_row(tier: Tier, kind: str, runs: Sequence[Run]) -> dict[str, Any]:
+    """Return the RMSE of a tier on each press [N]."""
+    errors = {f"{run.press.case.name}/N": rms(run.errors[run.press.held]) for run in runs}
+    return {"tier": tier.name, "key points": kind, **errors}
+
+
+def score_shapes(runs: Sequence[Run]) -> dict[str, Any]:
+    """Return the errors at the end of each level of noise-free runs, one number per shape.
+
+    Three of them are after fitting: nothing, the one best factor on all estimates, and the best one for each height.
+    """
+    estimated = np.concatenate([np.linalg.norm(run.force[run.press.ends], axis=1) for run in runs])
+    true = np.concatenate([np.linalg.norm(run.press.force[run.press.ends], axis=1) for run in runs])
+    heights = np.concatenate([[run.press.case.height_name] * len(run.press.ends) for run in runs])
+    factors = {name: _best_factor(estimated[heights == name], true[heights == name]) for name in set(heights)}
+    scaled = estimated * np.array([factors[height] for height in heights])
+    by_height = {
+        f"{name}/N": rms((estimated - true)[heights == name])
+        for name in ("lower", "middle", "upper")
+        if name in factors
+    }
+    return {
+        "shapes": len(true),
+        "solved": int(np.isfinite(estimated).sum()),
+        "nothing fitted/N": rms(estimated - true),
+        **by_height,
+        "one factor/N": rms(_best_factor(estimated, true) * estimated - true),
+        "a factor per height/N": rms(scaled - true),
+    }
+
+
+def _best_factor(estimated: NDArray, true: NDArray) -> float:
+    """Return the factor on the estimates with the least squared error."""
+    known = np.isfinite(estimated)
+    return float(true[known] @ estimated[known] / max(estimated[known] @ estimated[known], 1e-300))
+
+
+def time_factorisation() -> list[float]:
+    """Return the processor times [s] of a SuperLU factorisation of the whole jaw's stiffness matrix."""
     from scipy.sparse.linalg import splu
 
     jaw = load_jaw("bench")
-    model = SolidModel(jaw.build_mesh(mesh), jaw.material, symmetric=False)
+    model = SolidModel(jaw.build_mesh("coarse"), jaw.material, symmetric=False)
     stiffness = model.sparse_tangent(model.linearize(np.zeros(model.size)).tangent).tocsc()
     options = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     return time_calls(lambda: splu(stiffness, **options), FACTORISATIONS, clock=thread_time)
 
 
-def compare_with_sofa(tier: TierFigures) -> dict[str, float]:
-    """Returns how much faster and more exact than SOFA, as quoted, a tier is.
+def compare_with_sofa(row: dict[str, Any]) -> dict[str, float]:
+    """Return the rate of a tier in SOFA's, as measured and with SOFA's step scaled to this machine by the yardstick."""
+    scaled = SOFA["step_ms"] * row["SuperLU/ms"] / SOFA["yardstick_ms"]
+    return {"rate in SOFA's": SOFA["step_ms"] / row["step p50/ms"], "by the yardstick": scaled / row["CPU p50/ms"]}
 
-    The rate is taken as measured, and with SOFA's step scaled to this machine by the two yardsticks, in processor time.
+
+def quoted_shapes() -> dict[str, float]:
+    """Return SOFA's row of the shapes, as quoted."""
+    errors = ("rmse_N", "one_factor_N", "factor_per_height_N")
+    names = ("nothing fitted/N", "one factor/N", "a factor per height/N")
+    quoted = dict(zip(names, (SOFA[name] for name in errors), strict=True))
+    return {"shapes": 45, "solved": 45, **quoted, "rate in SOFA's": 1.0, "by the yardstick": 1.0}
+
+
+def find_recordings(folder: Path | str) -> list[Path]:
+    """Return the recordings in a folder: its folders with a bag in them.
+
+    Raises:
+        OptionError: there are none.
     """
-    scale = tier.yardstick.p50 / SOFA["yardstick_ms"]
-    return {
-        "rate": SOFA["step_ms"] / tier.step.p50,
-        "rate_by_yardstick": scale * SOFA["step_ms"] / tier.cpu.p50,
-        "error_share": tier.shapes.rmse / SOFA["factor_per_height_N"],
+    folder = Path(folder)
+    found = sorted(path.parent for path in folder.glob("*/metadata.yaml"))
+    if not found:
+        raise OptionError(f"{folder}: no recordings, expected folders with a rosbag2 each")
+    return found
+
+
+def measure_recordings(
+    paths: Sequence[Path], tier: Tier, progress: Callable[[], object] = lambda: None
+) -> Iterator[dict[str, Any]]:
+    """Yield one row: a tier over recordings of the bench finger, as `finforce evaluate` scores them.
+
+    Raises:
+        FinforceError: a recording cannot be used.
+    """
+    if not paths:
+        return
+    setup = EvaluationSetup(
+        jaw=load_jaw("bench"),
+        settings=tier.settings(),
+        calibration=load_calibration("bench"),
+        contacts=parse_contacts([CONTACTS[tier.contact]]),
+        about={},
+    )
+    recordings, results = [read_recording(path) for path in paths], []
+    for recording in recordings:
+        try:
+            source = setup.source(recording)
+            results.append(evaluate_recording(recording, setup.jaw, source, factory=setup.estimator))
+        except RecordingError:  # not one frame was solved
+            pass
+        progress()
+    if not results:
+        return
+    total = score_results(results, recordings).total
+    step = percentiles(1e-3 * np.concatenate([result.step_ms[result.status == "ok"] for result in results]), "step")
+    yield {
+        "tier": tier.name,
+        "step p50/ms": step["step p50/ms"],
+        "step p99/ms": step["step p99/ms"],
+        "RMSE/N": total.all.rmse_N,
+        "bias/N": total.all.bias_N,
+        "answered/%": 100.0 * (1.0 - total.record_skipped / total.record_frames),
+        "not solved at all": len(recordings) - len(results),
     }
-
-
-def mean_yardstick(figures: SolverFigures) -> float:
-    """Returns the median of the tiers' median yardsticks [ms]; NaN without tiers."""
-    return float(np.median([tier.yardstick.p50 for tier in figures.tiers])) if figures.tiers else float("nan")
-
-
-def as_json(figures: SolverFigures) -> dict[str, Any]:
-    """Returns the figures as plain values, with what is quoted."""
-    fronts = {kind: [point.text for point in front] for kind, front in find_fronts(figures).items()}
-    return {
-        "yardstick_ms": mean_yardstick(figures),
-        "tiers": [{**asdict(tier), "sofa": compare_with_sofa(tier)} for tier in figures.tiers],
-        "fronts": fronts,
-        "recorded": [asdict(row) for row in figures.recorded],
-        "tables": dict(format_tables(figures)),
-        "notes": list(figures.notes),
-        "quoted": {"sofa": SOFA, "paper": PAPER},
-    }
-
-
-def front_points(figures: SolverFigures) -> dict[str, list[ErrorPoint]]:
-    """Returns a point for every tier, noise-free ("exact") and noisy."""
-    return {
-        "exact": [_point(tier, tier.step_exact, tier.exact) for tier in figures.tiers],
-        "noisy": [_point(tier, tier.step, tier.noisy) for tier in figures.tiers],
-    }
-
-
-def _point(tier: TierFigures, step: Row, accuracy: Accuracy) -> ErrorPoint:
-    return ErrorPoint(text=tier.tier.name, time=step.p50, slow=step.p99, error=accuracy.rmse)
-
-
-def is_complete(accuracy: Accuracy) -> bool:
-    """Whether a tier answers so often that its error can be compared; one that gives up where it is hard cannot."""
-    return accuracy.lost <= MOST_LOST
-
-
-def find_fronts(figures: SolverFigures) -> dict[str, list[ErrorPoint]]:
-    """Returns the Pareto fronts of noise-free and noisy key points, of tiers that answer."""
-    fronts = {}
-    for kind, points in front_points(figures).items():
-        whole = [is_complete(getattr(tier, kind)) for tier in figures.tiers]
-        fronts[kind] = find_front([point for point, complete in zip(points, whole, strict=True) if complete])
-    return fronts
-
-
-def format_table(figures: SolverFigures) -> str:
-    """Returns times, errors, memory and set-up of every tier as tables in Markdown."""
-    return "\n\n".join([*format_tables(figures).values(), *figures.notes])
-
-
-def draw(figures: SolverFigures, path: Path | str) -> None:
-    """Draws run time against force error, with the front, and writes it."""
-    draw_pareto(figures).savefig(path)
-
-
-def format_tables(figures: SolverFigures) -> Mapping[str, str]:
-    """Returns the tables by name: "tiers", "cases", "peer" and, where there are recordings, "recorded"."""
-    tables = {"tiers": _tiers(figures.tiers), "cases": _cases(figures.tiers), "peer": _peer(figures.tiers)}
-    return {**tables, "recorded": _recorded(figures.recorded)} if figures.recorded else tables
-
-
-def _tiers(tiers: Sequence[TierFigures]) -> str:
-    head = ("tier", "p50/ms", "p99", "CPU p50", "CPU p99", "SuperLU/ms", "noise-free/N", "unanswered", "noisy/N",
-            "unanswered", "memory/MB", "set-up/s", "anew/s")  # fmt: skip
-    rows = []
-    for tier in tiers:
-        times = (tier.step.p50, tier.step.p99, tier.cpu.p50, tier.cpu.p99)
-        row = [tier.tier.name, *(f"{time:.3f}" for time in times), f"{tier.yardstick.p50:.1f}"]
-        for accuracy in (tier.exact, tier.noisy):
-            row += [f"{accuracy.rmse:.3f}", f"{accuracy.lost:.1%}"]
-        rows.append(row + _start_cells(tier))
-    return align_rows(head, rows)
-
-
-def _start_cells(tier: TierFigures) -> list[str]:
-    """Returns memory and set-up of a process; empty cells where another tier has the same."""
-    start = tier.start
-    if start is None:
-        return [""] * 3
-    anew = "" if start.build_uncached is None else f"{start.build_uncached:.1f}"
-    return [f"{start.memory:.0f}", f"{start.imports + start.build:.2f}", anew]
-
-
-def _cases(tiers: Sequence[TierFigures]) -> str:
-    """Returns the RMSE of every case, noise-free and noisy."""
-    names = list(tiers[0].exact.by_case) if tiers else []
-    rows = [
-        [tier.tier.name, *(f"{tier.exact.by_case[name]:.2f} / {tier.noisy.by_case[name]:.2f}" for name in names)]
-        for tier in tiers
-    ]
-    return align_rows(("noise-free / noisy, N", *names), rows)
-
-
-def _peer(tiers: Sequence[TierFigures]) -> str:
-    """Returns the errors at the held shapes beside those that are quoted of the peer."""
-    heights = ("lower", "middle", "upper")
-    head = ("noise-free shapes", "shapes", "solved", "nothing fitted/N", *heights, "one factor/N",
-            "a factor per height/N", "rate, times SOFA's", "by the yardstick", "share of SOFA's error")  # fmt: skip
-    rows = []
-    for tier in tiers:
-        shapes, compared = tier.shapes, compare_with_sofa(tier)
-        row = [tier.tier.name, str(shapes.n), str(shapes.solved), f"{shapes.rmse:.3f}"]
-        row += [f"{shapes.by_height[name]:.3f}" if name in shapes.by_height else "" for name in heights]
-        row += [f"{shapes.one_factor:.3f}", f"{shapes.factor_per_height:.3f}"]
-        rates = (compared["rate"], compared["rate_by_yardstick"])
-        rows.append(row + [*(f"{rate:.1f}" for rate in rates), f"{compared['error_share']:.0%}"])
-    quoted = [f"{SOFA['rmse_N']:g}", "", "", "", f"{SOFA['one_factor_N']:g}", f"{SOFA['factor_per_height_N']:g}"]
-    return align_rows(head, [*rows, ["SOFA, quoted", "45", "45", *quoted, "1", "1", "100%"]])
-
-
-def _recorded(recorded: Sequence[RecordedFigures]) -> str:
-    head = ("recordings", "p50/ms", "p99", "RMSE/N", "bias/N", "unanswered", "not solved at all")
-    rows = [
-        [row.tier, f"{row.p50:.3f}", f"{row.p99:.3f}", f"{row.rmse:.3f}", f"{row.bias:+.3f}", f"{row.lost:.1%}",
-         str(len(row.unsolved))]
-        for row in recorded
-    ]  # fmt: skip
-    return align_rows(head, rows)
-
-
-_STYLES = {"exact": (BLUE, "o", "noise-free key points"), "noisy": (ORANGE, "s", "noisy key points")}
-
-
-def draw_pareto(figures: SolverFigures) -> Any:
-    """Returns the figure: milliseconds per step against RMSE, both logarithmic, p99 as a whisker."""
-    figure = new_figure(10.5, 6.2)
-    axes = figure.subplots()
-    style_axes(axes)
-    axes.set(xscale="log", yscale="log", xlabel="time per step, one thread [ms]", ylabel="RMSE of the force [N]")
-    points, fronts = front_points(figures), find_fronts(figures)
-    for kind, (colour, marker, label) in _STYLES.items():
-        for tier, point in zip(figures.tiers, points[kind], strict=True):
-            face = colour if is_complete(getattr(tier, kind)) else "white"
-            axes.plot([point.time, point.slow], [point.error] * 2, color=colour, linewidth=0.8, alpha=0.6)
-            axes.plot(point.time, point.error, marker, color=colour, markerfacecolor=face, markersize=6)
-        axes.plot([], [], marker, color=colour, linestyle="none", label=label)
-        steps = [(point.time, point.error) for point in fronts[kind]]
-        if steps:
-            axes.step(*zip(*steps, strict=True), where="post", color=colour, linewidth=4, alpha=0.25, zorder=0)
-    for tier, exact, noisy in zip(figures.tiers, points["exact"], points["noisy"], strict=True):
-        axes.plot([exact.time, noisy.time], [exact.error, noisy.error], color=GREY, linewidth=0.6, zorder=1)
-        # the tiers with an outline lie beside those without: one kind is named above its points, the other below
-        is_above = tier.tier.contact == "height"
-        place = (max if is_above else min)((exact, noisy), key=lambda point: point.error)
-        style = {"textcoords": "offset points", "fontsize": 8, "color": BLACK if is_above else GREY}
-        axes.annotate(tier.tier.name, (place.time, place.error), (4, 6) if is_above else (4, -12), **style)
-    _draw_quoted(axes, figures)
-    axes.set_title("Run time against force error: nine presses of an independent program", loc="left", fontsize=11)
-    axes.plot([], [], "D", color=GREY, markerfacecolor="white", linestyle="none",
-              label="hollow: leaves more than 1 % of the frames unanswered, on no front")  # fmt: skip
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
-    return figure
-
-
-def _draw_quoted(axes: Any, figures: SolverFigures) -> None:
-    """Marks what others state: SOFA as quoted and scaled to this machine, the paper's rate and range of errors."""
-    error, step = SOFA["factor_per_height_N"], SOFA["step_ms"]
-    here = step * mean_yardstick(figures) / SOFA["yardstick_ms"]
-    axes.plot(step, error, "*", color=GREEN, markersize=13, linestyle="none",
-              label=f"SOFA, quoted: {step:g} ms, {error:g} N after one factor per height")  # fmt: skip
-    axes.plot(here, error, "*", markeredgecolor=GREEN, color="white", markersize=13, linestyle="none",
-              label=f"SOFA, its time scaled by the yardstick: {here:.1f} ms")  # fmt: skip
-    period = 1e3 / PAPER["rate_Hz"]
-    low, high = PAPER["least_N"], PAPER["largest_N"]
-    axes.plot([period, period], [low, high], color=BLACK, linewidth=2.5, solid_capstyle="butt",
-              label=f"the paper, quoted: {PAPER['rate_Hz']:g} Hz, {low:g} to {high:g} N on its own finger")  # fmt: skip

@@ -1,5 +1,6 @@
 """Claims about the benchmark command and the recording that it and the demo run on."""
 
+import inspect
 import json
 import os
 import subprocess
@@ -8,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from process_fakes import running
 
@@ -19,8 +21,8 @@ from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.replay.processes import child_processes, resident_bytes
 from finforce_ifea.jaw.jaw import load_jaw
-from lab.bench import bench
-from lab.bench.bench import PARTS, BenchPart, format_rows, row_from_times, select_parts, time_calls
+from lab import harness
+from lab.harness import PARTS, Figures, Part, Tradeoff, percentiles, select_parts, time_calls
 
 ROOT = Path(__file__).parents[2]
 
@@ -30,27 +32,36 @@ def recording():
     return read_recording(RECORDING)
 
 
+def figures_of(name):
+    rows = [{"way": name, "p50/ms": 1.0, "p99/ms": 2.0, "error/N": 0.5, "answered/%": 100.0}]
+    return Figures(tables={"rows": pd.DataFrame(rows)}, notes=[f"note of {name}"], picture=PICTURE)
+
+
+PICTURE = Tradeoff(
+    table="rows", method=("way",), time="p50/ms", slow="p99/ms", error="error/N", answered="answered/%", title="t"
+)
+
+
 @pytest.fixture
 def two_parts(monkeypatch):
-    """Replaces the parts by two that measure nothing; returns what they were asked for."""
+    """Replace the parts by some that measure nothing; return what they were asked for."""
     asked = []
 
-    def make(name, **options):
-        def measure(quick, folder=None):
+    def make(name, takes_folder=False, **options):
+        def measure(quick):
+            asked.append((name, quick, None))
+            return figures_of(name)
+
+        def measure_folder(quick, folder=None):
             asked.append((name, quick, folder))
-            return name
+            return figures_of(name)
 
-        module = SimpleNamespace(
-            measure=measure,
-            format_table=lambda figures: f"table of {figures}",
-            as_json=lambda figures: {"measured": figures},
-            draw=lambda figures, path: path.write_text(figures),
-        )
-        monkeypatch.setitem(sys.modules, f"part_{name}", module)
-        return BenchPart(name=name, module=f"part_{name}", title=f"Title of {name}", **options)
+        module = SimpleNamespace(measure=measure_folder if takes_folder else measure)
+        monkeypatch.setitem(sys.modules, f"lab.bench.{name}", module)
+        return Part(name=name, title=f"Title of {name}", **options)
 
-    parts = (make("first", takes_folder=True), make("second"), make("third", usual=False))
-    monkeypatch.setattr(bench, "PARTS", parts)
+    parts = (make("first", takes_folder=True, usual=True), make("second", usual=True), make("third"))
+    monkeypatch.setattr(harness, "PARTS", parts)
     return asked
 
 
@@ -68,9 +79,22 @@ def test_shipped_recording_is_small_and_one_cycle_that_begins_unloaded(recording
 
 
 def test_times_become_percentiles_in_milliseconds():
-    row = row_from_times("step", 1e-3 * np.arange(101))
-    assert (row.n, row.p50, row.p95, row.p99, row.max) == pytest.approx((101, 50, 95, 99, 100))
-    assert format_rows([row]).splitlines()[-1].split() == ["step", "50.00", "95.00", "99.00", "100.00", "101"]
+    row = percentiles(1e-3 * np.arange(101), "step")
+    assert list(row.values()) == pytest.approx([101, 50, 95, 99, 100])
+    assert list(row) == ["step n", "step p50/ms", "step p95/ms", "step p99/ms", "step max/ms"]
+    nothing = percentiles([])
+    assert nothing["n"] == 0 and np.isnan(nothing["p50/ms"])
+
+
+def test_front_holds_what_no_other_beats_in_both():
+    points = pd.DataFrame({"t": [6.0, 2.0, 5.0, 1.0, np.nan], "e": [1.0, 4.0, 1.0, 3.0, 0.1]})
+    assert harness.find_front(points, "t", "e")["t"].tolist() == [1.0, 5.0]
+
+
+def test_a_table_has_words_first_and_nothing_where_nothing_was_measured():
+    text = harness.format_table(pd.DataFrame({"x/N": [0.12345, np.nan], "name": ["a", "b"], "n": [1, 20]}))
+    assert [cell.strip() for cell in text.splitlines()[2].split("|")[1:-1]] == ["a", "0.1235", "1"]
+    assert [cell.strip() for cell in text.splitlines()[3].split("|")[1:-1]] == ["b", "", "20"]
 
 
 def test_every_call_is_timed_once():
@@ -96,33 +120,37 @@ def test_usual_parts_are_measured_unless_others_are_named(two_parts):
         select_parts("fourth")
 
 
-def test_every_listed_part_keeps_the_contract():
+def test_every_listed_part_can_be_measured():
     for part in PARTS:
-        module = __import__(part.module, fromlist=["measure"])
-        assert all(callable(getattr(module, name)) for name in ("measure", "format_table", "as_json")), part
+        assert "quick" in inspect.signature(part._measure).parameters, part
 
 
 def test_command_prints_tables_and_writes_json_and_a_picture_for_each_part(two_parts, tmp_path, capsys):
     out, picture = tmp_path / "new" / "bench.json", tmp_path / "new" / "p.png"
-    assert main(["bench", str(tmp_path), "--quick", "--json", str(out), "--figure", str(picture)]) == 0
-    assert two_parts == [("first", True, str(tmp_path)), ("second", True, None)]
+    assert main(["bench", "--quick", "--json", str(out), "--figure", str(picture)]) == 0
+    assert two_parts == [("first", True, None), ("second", True, None)]
     content = json.loads(out.read_text())
     assert {"processor", "python", "commit"} <= content["machine"].keys()
-    assert [content[name]["measured"] for name in ("first", "second")] == ["first", "second"]
-    assert (picture.read_text(), picture.with_name("p_second.png").read_text()) == ("first", "second")
+    assert [content[name]["rows"]["rows"][0]["way"] for name in ("first", "second")] == ["first", "second"]
+    assert picture.is_file() and picture.with_name("p_second.png").is_file()
     printed = capsys.readouterr().out
-    assert "Title of first" in printed and "table of second" in printed
+    assert "Title of first" in printed and "note of second" in printed
+
+
+def test_an_option_reaches_the_part_that_takes_it(two_parts, tmp_path):
+    assert main(["bench", str(tmp_path), "--parts", "first"]) == 0
+    assert two_parts == [("first", False, str(tmp_path))]
 
 
 def test_part_that_cannot_be_measured_is_said_and_the_others_are_measured(two_parts, tmp_path, monkeypatch, capsys):
     def refuse(quick, folder=None):
         raise MissingDependencyError("needs ROS 2")
 
-    monkeypatch.setattr(sys.modules["part_first"], "measure", refuse)
+    monkeypatch.setattr(sys.modules["lab.bench.first"], "measure", refuse)
     assert main(["bench", "--json", str(tmp_path / "bench.json")]) == 0
     content = json.loads((tmp_path / "bench.json").read_text())
     assert content["first"]["not_measured"] == "needs ROS 2"
-    assert content["second"]["measured"] == "second"
+    assert content["second"]["notes"] == ["note of second"]
     assert "not measured: needs ROS 2" in capsys.readouterr().out
 
 

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from eval_fakes import drawn_hues
 
 from finforce.stamps import NANOSECONDS
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import NodeRun
-from lab.bench import chain as bench
-from lab.bench.chain import IMAGES, KEYPOINTS, TOGETHER, TrueGrasp, error_now, make_row
+from lab.bench.chain import IMAGES, TOGETHER, TrueGrasp, describe_run, error_now
 
 FIRST = 10**12
 PERIOD = NANOSECONDS // 10
@@ -42,20 +40,18 @@ def run(truth):
 
 
 def test_everything_answered_is_nothing_dropped(run, truth):
-    row = make_row(IMAGES, TOGETHER, 10, run, truth)
-    assert (row.images, row.answered, row.memory_MB) == (22, 22, 300.0)
-    assert row.latency.p50 == row.latency.max == pytest.approx(30.0)
-    assert row.error_N == pytest.approx(0.2)
-    assert row.largest_N == pytest.approx(3.9)
+    row = describe_run(IMAGES, TOGETHER, 10, run, truth)
+    assert (row["images"], row["answered/%"], row["memory/MB"]) == (22, 100.0, 300.0)
+    assert row["latency p50/ms"] == row["latency max/ms"] == pytest.approx(30.0)
+    assert row["error/N"] == pytest.approx(0.2)
 
 
 def test_what_was_dropped_is_counted_and_not_during_the_tare(run, truth):
     log = run.log
     for index in (2, 20, 21, 22, 30, 31, 33):
         del log.grasp[stamp_of(index)], log.grasp_latency[stamp_of(index)]
-    row = make_row(IMAGES, TOGETHER, 10, run, truth)
-    assert (row.images, row.answered) == (22, 16)
-    assert "| images | one process | 10 | 22 | 72.7 |" in bench.format_table(bench.ChainFigures(rows=[row]))
+    row = describe_run(IMAGES, TOGETHER, 10, run, truth)
+    assert (row["images"], row["answered/%"]) == (22, pytest.approx(100.0 * 16 / 22))
 
 
 def test_error_now_is_that_of_the_newest_force_that_has_arrived(run, truth):
@@ -66,11 +62,11 @@ def test_error_now_is_that_of_the_newest_force_that_has_arrived(run, truth):
 
 
 def test_an_image_that_is_dropped_makes_the_error_now_larger_and_not_that_of_the_images(run, truth):
-    full = make_row(IMAGES, TOGETHER, 10, run, truth)
+    full = describe_run(IMAGES, TOGETHER, 10, run, truth)
     for index in range(20, 39, 2):
         del run.log.grasp[stamp_of(index)], run.log.grasp_latency[stamp_of(index)]
-    half = make_row(IMAGES, TOGETHER, 10, run, truth)
-    assert half.error_N == pytest.approx(full.error_N)
+    half = describe_run(IMAGES, TOGETHER, 10, run, truth)
+    assert half["error/N"] == pytest.approx(full["error/N"])
     assert error_now(run.log, truth, truth.stamps).min() == pytest.approx(-0.03, abs=2e-3)
 
 
@@ -87,12 +83,6 @@ def test_force_that_overtakes_an_older_one_is_the_newest():
 def test_nothing_answered_is_no_error_and_not_zero(run, truth):
     run.log.grasp.clear()
     run.log.grasp_latency.clear()
-    row = make_row(IMAGES, TOGETHER, 10, run, truth)
-    assert row.answered == 0 and np.isnan(row.error_N) and np.isnan(row.error_now_N) and np.isnan(row.latency.p50)
-
-
-def test_picture_is_written(run, truth, tmp_path):
-    figures = bench.ChainFigures(rows=[make_row(source, TOGETHER, 10, run, truth) for source in (IMAGES, KEYPOINTS)])
-    bench.draw(figures, tmp_path / "chain.png")
-    assert drawn_hues(tmp_path / "chain.png") >= 2  # images and key points
-    assert bench.as_json(figures)["rows"][0]["latency"]["n"] == 22
+    row = describe_run(IMAGES, TOGETHER, 10, run, truth)
+    assert row["answered/%"] == 0.0
+    assert all(np.isnan(row[name]) for name in ("error/N", "error now/N", "latency p50/ms"))

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from eval_fakes import drawn_hues
 from rgbd_fakes import FakeDetector, FakePhotographer, make_footage
 
 from finforce_eval.recordings.recording import read_recording
@@ -50,21 +49,19 @@ def detectors(monkeypatch, bag):
 
 def test_every_way_sees_every_image_once_and_its_errors_are_those_of_its_detector(detectors):
     figures = measure_ways([Way(name="plain"), Way(name="blind")], [bench.GRASP])
-    plain, blind = figures.rows
+    plain, blind = figures.tables["detection"].to_dict("records")
     assert len(detectors["plain"].seen) == len(detectors["blind"].seen) == 12
     # the fake detector is off by (0.6, 0.8) px and 0.3 mm, and accepts two of the three visible points
-    assert plain.sight.pixel_median_px == pytest.approx(1.0)
-    assert plain.sight.point_median_mm == pytest.approx(0.3)
-    assert plain.sight.visible_lost_pct == pytest.approx(100.0 / 3.0)
-    assert blind.sight.visible_lost_pct == pytest.approx(100.0 * 2.0 / 3.0)
-    assert plain.time.n == 11  # the first image also compiles
-    assert figures.yardstick.n == 2
+    assert plain["pixel error median/px"] == pytest.approx(1.0)
+    assert plain["point error median/mm"] == pytest.approx(0.3)
+    assert plain["visible accepted/%"] == pytest.approx(200.0 / 3.0)
+    assert blind["visible accepted/%"] == pytest.approx(100.0 / 3.0)
+    assert plain["n"] == 11  # the first image also compiles
 
 
 def test_only_so_many_images_as_asked_for_are_seen_and_scored(detectors):
-    row = measure_ways([Way(name="plain")], [bench.GRASP], count=5).rows[0]
-    assert len(detectors["plain"].seen) == 5
-    assert row.sight.n_visible == 5 * 3
+    table = measure_ways([Way(name="plain")], [bench.GRASP], count=5).tables["detection"]
+    assert len(detectors["plain"].seen) == 5 and table["n"].tolist() == [4]
 
 
 def test_a_searching_way_forgets_the_jaws_before_every_image(detectors):
@@ -91,10 +88,3 @@ def test_rules_are_applied_by_the_resting_way_only(monkeypatch):
     bench._begin(Way(name="a", parameters={"threads": 1}), recording)
     bench._begin(Way(name="b", parameters={"threads": 3}, rests=True), recording)
     assert asked == {1: False, 3: True}
-
-
-def test_picture_and_table_name_every_way(detectors, tmp_path):
-    figures = measure_ways([Way(name="plain"), Way(name="blind")], [bench.GRASP])
-    bench.draw(figures, tmp_path / "a.png")
-    assert drawn_hues(tmp_path / "a.png") >= 2  # a colour for each way
-    assert all(f"| {name} |" in bench.format_table(figures) for name in ("plain", "blind"))

@@ -7,7 +7,6 @@ import pytest
 
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import OptionError
-from finforce_eval.figures.time_error import time_stats
 from finforce_eval.recordings.tracks import WrenchTrack
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.synthetic_stream import START
@@ -57,30 +56,16 @@ def test_losses_and_errors_belong_to_their_grasps():
         if stamp not in lost:
             log.grasp[stamp] = float(truth.force[index]) + 0.1 * (index // IMAGES)
     rows = endurance.divide_grasps(log, truth, Stream(), [500.0, 510.0, 511.0, 511.5])
-    assert [row.images for row in rows] == [IMAGES - round(TARE * RATE), IMAGES, IMAGES, IMAGES]
-    assert [row.images - row.answered for row in rows] == [0, 2, 1, 0]
-    assert [row.bias_N for row in rows] == pytest.approx([0.0, 0.1, 0.2, 0.3])
-    assert [row.error_N for row in rows] == pytest.approx([0.0, 0.1, 0.2, 0.3])
-    figures = endurance.EnduranceFigures(
-        rate=RATE, seconds=20.0, grasps=rows, latency=time_stats([0.01]), cpu=40.0, others=1.0, refused={}
-    )
-    assert figures.lost == 3 and figures.growth == 0.5
-    assert figures.drift == pytest.approx(0.2)
-    table = endurance.format_table(figures)
-    assert "| 0.3 | 4 | 546 | 3 | +0.5 | +0.2000 |" in table
-    assert "| 2 | 148 of 150 | +0.100 | 0.100 | 510.0 |" in table
-
-
-def test_memory_is_read_where_a_grasp_begins(monkeypatch):
-    sizes = iter([1e6, 2e6, 3e6])
-    monkeypatch.setattr(endurance, "resident_bytes", lambda pid: next(sizes))
-    watch = endurance._MemoryWatch(Stream())
-    for time in (0, 1, PERIOD // 2, PERIOD, PERIOD + 1, 2 * PERIOD + 5):
-        watch.look({"pipeline": 7}, SimpleNamespace(time=START + time))
-    assert watch.memory_MB == [1.0, 2.0, 3.0]
+    assert rows["images"].tolist() == [IMAGES - round(TARE * RATE), IMAGES, IMAGES, IMAGES]
+    assert (rows["images"] - rows["answered"]).tolist() == [0, 2, 1, 0]
+    assert rows["bias/N"].tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3])
+    assert rows["RMSE/N"].tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3])
+    summary = endurance.summarise(rows)
+    assert (summary["lost"], summary["images"], summary["growth/MB"]) == (3, 546, 0.5)
+    assert summary["drift/N"] == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("minutes", [0.0, -1.0, np.inf, np.nan])
 def test_a_time_that_is_none_is_refused(minutes):
-    with pytest.raises(OptionError, match="minutes of grasps; expected a time above zero"):
+    with pytest.raises(OptionError, match="--minutes .*expected a duration above zero"):
         endurance.measure(False, minutes=minutes)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from eval_fakes import drawn_hues
 
 from finforce.stamps import NANOSECONDS
 from finforce_eval.recordings.recording import DEMO as RECORDING
@@ -34,15 +33,15 @@ def frames(monkeypatch):
 
 
 def test_error_is_the_distance_to_the_true_place_over_the_images_where_one_was_found(frames):
-    row = measure_methods([RECORDING], [MESH]).rows[0]
-    assert (row.method, row.triangles, row.contact.n, row.apart.n) == ("near", len(MESH.triangles), 4, 4)
-    assert row.found == 0.5
-    assert row.median == row.largest == pytest.approx(2.0)  # mm
+    row = measure_methods([RECORDING], [MESH]).tables["localization"].iloc[0]
+    assert (row["method"], row["triangles"], row["n"]) == ("near", len(MESH.triangles), 4)
+    assert row["found/%"] == 50.0
+    assert row["error median/mm"] == row["largest/mm"] == pytest.approx(2.0)
 
 
 def test_a_way_that_found_nothing_has_no_error():
     row = summarise("blind", 10, np.array([[1e-3, np.nan]] * 3), [1e-3])
-    assert row.found == 0.0 and np.isnan(row.median)
+    assert row["found/%"] == 0.0 and np.isnan(row["error median/mm"])
 
 
 def test_cylinder_is_closed_of_the_size_asked_for_and_turned_outwards():
@@ -61,14 +60,7 @@ def test_true_place_is_found_on_the_shipped_recording_by_the_default_way(monkeyp
     start = int(recording.jaw("left").keypoints.stamps[0])
     monkeypatch.setattr(bench, "read_recording", lambda path: recording.between(start, start + 15 * NANOSECONDS))
     monkeypatch.setattr(bench, "METHODS", dict(list(METHODS.items())[:1]))
-    figures = measure_methods([RECORDING], every=20)
-    row = figures.rows[0]
-    assert row.method == "outline and line of action" and row.contact.n > 3
-    assert row.found == 1.0
-    assert row.median < 1.5  # mm; over all images it is 0.8, the others' mean is 3
-
-
-def test_picture_is_written(frames, tmp_path):
-    path = tmp_path / "places.png"
-    bench.draw(measure_methods([RECORDING], [MESH]), path)
-    assert drawn_hues(path) >= 1
+    row = measure_methods([RECORDING], every=20).tables["localization"].iloc[0]
+    assert row["method"] == "outline and line of action" and row["n"] > 3
+    assert row["found/%"] == 100.0
+    assert row["error median/mm"] < 1.5  # over all images it is 0.8, the others' mean is 3

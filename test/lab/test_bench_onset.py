@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from finforce.stamps import NANOSECONDS
-from finforce_eval.evaluation.results import delay_stats
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.synthetic_stream import START
 from lab.bench import onset as bench
@@ -31,9 +30,3 @@ def test_a_force_shows_with_the_first_image_beyond_a_tenth_of_a_newton_and_its_l
     # the onset is told between two images, along a line that begins with the one before the force
     assert delay.shown == pytest.approx(shown + LATENCY - BEGIN, abs=1.0 / RATE)
     assert delay.shown >= LATENCY + late / RATE
-
-
-def test_the_table_says_what_was_missed():
-    delays = [bench.Delay(shown=0.040, risen=0.01), bench.Delay(shown=np.nan, risen=0.02)]
-    rows = [bench.OnsetRow(rate=30, speed=0.02, delays=delay_stats(delays), others=3.0)]
-    assert "| 20 | 30 | 1 | 1 | 40 | 40 | 15 |" in bench.format_table(bench.OnsetFigures(rows=rows))

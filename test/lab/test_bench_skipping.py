@@ -1,29 +1,13 @@
 """Claims about the benchmark of skipped work: what is played when, and what its figures say."""
 
-from dataclasses import replace
-
+import pandas as pd
 import pytest
-from eval_fakes import drawn_hues
 
-from finforce.skipping import EVERYWHERE
 from finforce_eval.errors import RecordingError
 from finforce_eval.replay.playback import RawMessage
 from finforce_keypoints.parameters import COLOR_TOPIC
 from lab.bench.scenes import SceneStream, StreamPart, cut_sections, read_word
-from lab.bench.skipping import (
-    EACH,
-    OF_NODE,
-    OFF,
-    ON,
-    SceneCost,
-    SkippingFigures,
-    as_json,
-    draw,
-    draw_costs,
-    find_cost,
-    format_each,
-    format_table,
-)
+from lab.bench.skipping import arrange
 
 SECOND = 1_000_000_000
 
@@ -71,46 +55,18 @@ def test_a_section_without_images_is_refused():
         SceneStream({}, [StreamPart(section="press", seconds=1.0)])
 
 
-def figures():
-    costs = [
-        SceneCost(setting=setting, scene=scene, node="solver", cpu=cpu, others=12.0, images=30.0)
-        for setting, scene, cpu in ((ON, "idle", 1.5), (OFF, "idle", 6.0), (ON, "grasp", 4.0), (OFF, "grasp", 10.0))
-    ]
-    return SkippingFigures(costs=costs, memory={ON: {"solver": 250.0}}, skipped={"solver": {"no object near": "7"}})
-
-
 def test_the_table_sets_a_node_with_the_rules_beside_the_same_without():
-    found = figures()
-    assert find_cost(found, OFF, "grasp", "solver") == 10.0
-    line = next(line for line in format_table(found).splitlines() if line.startswith("solver"))
-    assert line.split()[1:] == ["1.5", "6.0", "0.25", "nan", "nan", "nan", "4.0", "10.0", "0.40", "250"]
-    assert "Everything else on the machine: rules on, idle: 12 %" in format_table(found)
-
-
-def test_the_json_holds_figures_and_aims():
-    written = as_json(figures())
-    assert written["costs"][0]["cpu"] == 1.5 and written["skipped"]["solver"] == {"no object near": "7"}
-    assert written["aims"] == {"idle_pct": 2.0, "steady_share": 0.5}
-
-
-def test_the_picture_has_a_panel_for_each_scene(tmp_path):
-    draw(figures(), tmp_path / "picture.png")
-    assert drawn_hues(tmp_path / "picture.png") >= 1
-    picture = draw_costs(figures())
-    assert [axes.get_title(loc="left") for axes in picture.axes] == ["idle", "approach", "grasp"]
-
-
-def test_a_rule_that_is_off_alone_is_set_beside_all_of_them():
-    found = figures()
-    alone = [cost for cost in found.costs if cost.setting == OFF]
-    both = replace(found, memory={ON: {}, OFF: {}}, costs=[*found.costs, *(replace(cost, node="x") for cost in alone)])
-    line = next(line for line in format_each(both).splitlines() if line.startswith(OFF))
-    assert line.split()[-6:-4] == ["12.0", "nan"]  # 6 % each; the second node was not measured with all rules
-    only = replace(found, memory={ON: {}, OFF: {}})
-    line = next(line for line in format_each(only).splitlines() if line.startswith(OFF))
-    assert line.split()[-6:] == ["6.0", "4.5", "nan", "nan", "10.0", "6.0"]
-
-
-def test_every_rule_that_is_measured_alone_is_one_of_some_node():
-    known = {rule for rules in (EVERYWHERE, *OF_NODE.values()) for rule in rules}
-    assert {rule for off in EACH.values() for rule in off} - {""} <= known
+    common = {"node": "solver", "grasp forces/Hz": 30.0, "other load/%": 12.0, "memory/MB": 250.0}
+    rows = [
+        {**common, "rules": rules, "scene": scene, "CPU/% of a core": cpu}
+        for rules, scene, cpu in (
+            ("on", "idle", 1.5),
+            ("on", "grasp", 4.0),
+            ("off", "idle", 6.0),
+            ("off", "grasp", 10.0),
+        )
+    ]
+    table = arrange(pd.DataFrame(rows))
+    assert table["scene"].tolist() == ["idle", "grasp"]
+    assert table["on: CPU/% of a core"].tolist() == [1.5, 4.0]
+    assert table["off: CPU/% of a core"].tolist() == [6.0, 10.0]

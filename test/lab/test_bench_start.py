@@ -8,7 +8,7 @@ import pytest
 
 from finforce.systems.processes import executables_of, merge
 from finforce_eval.replay.processes import ProcessError
-from lab.bench import first_start as bench
+from lab.bench import start as bench
 
 
 def python(text):
@@ -34,13 +34,3 @@ def test_the_pipeline_has_all_nodes():
     nodes = bench.list_nodes()
     assert len(executables_of([merge(nodes)])) == len(nodes) == 4
     assert len(executables_of(nodes[:1])) == 1
-
-
-def test_the_table_says_what_was_compiled_before():
-    rows = [
-        bench.StartRow(name="solver", compiled=compiled, n=3, seconds=1.25, most=2.0, memory_MB=300.4)
-        for compiled in (False, True)
-    ]
-    table = bench.format_table(bench.FirstStartFigures(rows=rows, import_ms=3.14))
-    assert "| solver | meanwhile | 3 | 1.25 | 2.00 | 300 |" in table
-    assert "| solver | before |" in table and "3.1 ms" in table

@@ -10,12 +10,12 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from tqdm import tqdm
 
 from finforce.ros.transport import free_domain
@@ -31,44 +31,16 @@ from finforce.systems.processes import (
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.replay.processes import PATIENCE, ProcessError, last_words, resident_bytes
+from lab.harness import Figures
 
 READY = b" ready"  # every node says so once, when it takes messages
 LONGEST = 600.0  # [s]
 TIMES = 5
-_GLANCE = 0.005  # [s]
+POLL = 0.005  # [s]
 IMPORT = "import time; begin = time.perf_counter(); import finforce; print(time.perf_counter() - begin)"
 
 
-@dataclass(frozen=True, kw_only=True)
-class StartRow:
-    """One kind of start.
-
-    Attributes:
-        name: of the executable.
-        compiled: whether what it needs was compiled before.
-        n: starts.
-        seconds: until all its nodes were ready, median [s].
-        most: the longest [s].
-        memory_MB: resident then, median.
-    """
-
-    name: str
-    compiled: bool
-    n: int
-    seconds: float
-    most: float
-    memory_MB: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class FirstStartFigures:
-    """What was measured; importing finforce by itself takes `import_ms`."""
-
-    rows: Sequence[StartRow]
-    import_ms: float
-
-
-def measure(quick: bool) -> FirstStartFigures:
+def measure(quick: bool) -> Figures:
     """Return the times of all starts, each once when `quick`.
 
     Raises:
@@ -85,7 +57,9 @@ def measure(quick: bool) -> FirstStartFigures:
         rows.append(_start(pipeline, 1, folder, bar.update, compiled=False))
         rows += [_start(node, times, folder, bar.update) for node in (pipeline, *seen.values())]
     took = [float(subprocess.check_output([sys.executable, "-c", IMPORT])) for _ in range(times)]
-    return FirstStartFigures(rows=rows, import_ms=1e3 * float(np.median(took)))
+    return Figures(
+        tables={"start": pd.DataFrame(rows)}, notes=[f"`import finforce` takes {1e3 * float(np.median(took)):.1f} ms."]
+    )
 
 
 def list_nodes() -> list[Process]:
@@ -104,7 +78,7 @@ def list_nodes() -> list[Process]:
 
 def _start(
     process: Process, times: int, folder: str, progress: Callable[[], Any], *, compiled: bool = True
-) -> StartRow:
+) -> dict[str, Any]:
     """Start a process several times, one after the other, with a folder for what it keeps."""
     surroundings = {**os.environ, **SINGLE_THREAD, "FINFORCE_CACHE": folder, "NUMBA_CACHE_DIR": ""}
     name = "all in one process" if process.executable == PIPELINE else process.executable
@@ -114,14 +88,14 @@ def _start(
         seconds.append(took)
         memory.append(1e-6 * taken)
         progress()
-    return StartRow(
-        name=name,
-        compiled=compiled,
-        n=times,
-        seconds=float(np.median(seconds)),
-        most=max(seconds),
-        memory_MB=float(np.median(memory)),
-    )
+    return {
+        "start of": name,
+        "compiled": "before" if compiled else "meanwhile",
+        "n": times,
+        "ready after: median/s": float(np.median(seconds)),
+        "largest/s": max(seconds),
+        "memory/MB": float(np.median(memory)),
+    }
 
 
 def time_start(command: Sequence[str], nodes: int, surroundings: Mapping[str, str]) -> tuple[float, int]:
@@ -147,7 +121,7 @@ def time_start(command: Sequence[str], nodes: int, surroundings: Mapping[str, st
             while _count_ready(Path(log.name)) < nodes:
                 if child.poll() is not None or monotonic() - begin > LONGEST:
                     raise ProcessError(f"{' '.join(command[1:4])} is not ready: {last_words(log)}")
-                sleep(_GLANCE)
+                sleep(POLL)
             return monotonic() - begin, resident_bytes(child.pid)
         finally:
             for number, patience in PATIENCE:
@@ -160,21 +134,5 @@ def time_start(command: Sequence[str], nodes: int, surroundings: Mapping[str, st
 
 
 def _count_ready(log: Path) -> int:
-    """Return how many nodes have said in a log that they are ready."""
+    """Return how many nodes have logged that they are ready."""
     return sum(READY in line for line in log.read_bytes().splitlines())
-
-
-def format_table(figures: FirstStartFigures) -> str:
-    """Return the rows as a table in Markdown."""
-    lines = ["| start of | compiled | n | ready after: median/s | at most/s | memory/MB |", "|---|---|---|---|---|---|"]
-    lines += [
-        f"| {row.name} | {'before' if row.compiled else 'meanwhile'} | {row.n} | {row.seconds:.2f} | {row.most:.2f} "
-        f"| {row.memory_MB:.0f} |"
-        for row in figures.rows
-    ]
-    return "\n".join([*lines, f"`import finforce` takes {figures.import_ms:.1f} ms."])
-
-
-def as_json(figures: FirstStartFigures) -> dict[str, Any]:
-    """Return the figures as plain values."""
-    return asdict(figures)
