@@ -13,6 +13,7 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 KEYS = {
+    "pandas": "python3-pandas",
     "numpy": "python3-numpy",
     "scipy": "python3-scipy",
     "pyyaml": "python3-yaml",
