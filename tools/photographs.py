@@ -212,9 +212,9 @@ def find_hinges(
 
 def refine_network(options: argparse.Namespace, jaw: Jaw, labelled: list[Photograph], place: FingerPlace) -> Path:
     """Train the network further on labelled photographs and return its folder."""
-    from lab.training.dataset import TRAIN, FingerPictures, load_pictures
-    from lab.training.rectification import LabelledImage, cut_picture
-    from lab.training.refinement import refine
+    from lab.training.labels import LabelledImage, cut_picture
+    from lab.training.pictures import TRAIN, FingerPictures, load_pictures
+    from lab.training.train import refine
 
     pictures = []
     for one in labelled:

@@ -13,12 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from finforce_keypoints.networks.side_network import COARSE, FINE, SideNetwork
-from lab.training.arguments import one_line_errors, read_share
-from lab.training.dataset import VALIDATION, load_pictures
-from lab.training.errors import CheckpointError
-from lab.training.evaluate import detect, format_scores
-from lab.training.optional import import_onnx
-from lab.training.scoring import fit_shift, score_detections
+from lab.training.commands import CheckpointError, import_onnx, one_line_errors, read_share
+from lab.training.evaluate import detect, fit_shift, format_scores, score_detections
+from lab.training.pictures import VALIDATION, load_pictures
 
 BIAS = "part.judge.2.bias"  # of logit and log deviation, in the fine part's file
 

@@ -13,15 +13,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from finforce_keypoints.networks.side_network import COARSE, COARSE_LAYOUT, FINE, FINE_LAYOUT, KIND, METADATA
-from lab.training.arguments import one_line_errors
+from finforce_keypoints.networks.side_network import (
+    COARSE,
+    COARSE_LAYOUT,
+    FINE,
+    FINE_LAYOUT,
+    KIND,
+    METADATA,
+    SideNetwork,
+)
 from lab.training.checkpoint import build_averaged, load_checkpoint
-from lab.training.dataset import VALIDATION, load_pictures
+from lab.training.commands import import_onnx, import_torch, one_line_errors
+from lab.training.evaluate import detect, fit_factor
 from lab.training.network import PIECE, ExportedCoarse, ExportedFine, FingerNetwork, NetworkShape, fold_batch_norm
-from lab.training.optional import import_onnx, import_torch
-from lab.training.quantization import quantize_network
-from lab.training.scoring import fit_factor
-from lab.training.trainer import detect
+from lab.training.pictures import VALIDATION, load_pictures
+from lab.training.quantize import quantize_network
 
 torch = import_torch()
 OPSET = 17
@@ -38,7 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with one_line_errors():
         network = build_averaged(load_checkpoint(options.checkpoint))
         pictures = load_pictures(options.dataset, VALIDATION)
-        write_network(network, options.output, fit_factor(detect(network, pictures)))
+        write_network(network, options.output, 1.0)
+        factor = fit_factor(detect(SideNetwork(options.output, threads=1), pictures))
+        write_network(network, options.output, factor)
         if not options.floats:
             quantize_network(options.output, pictures)
     print(f"{options.output}: {COARSE}, {FINE}")

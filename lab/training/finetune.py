@@ -19,13 +19,10 @@ from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.networks.metadata import build_name_map, parse_mapping
 from finforce_keypoints.networks.side_network import SideNetwork
-from lab.training.arguments import one_line_errors
-from lab.training.dataset import TRAIN, FingerPictures, load_pictures
-from lab.training.errors import LabelFileError
-from lab.training.evaluate import detect, format_scores
-from lab.training.labels import Labels, read_labels
-from lab.training.rectification import CameraView, LabelledImage, read_camera, rectify
-from lab.training.scoring import score_detections
+from lab.training.commands import LabelFileError, one_line_errors
+from lab.training.evaluate import detect, format_scores, score_detections
+from lab.training.labels import CameraView, LabelledImage, Labels, read_camera, read_labels, rectify
+from lab.training.pictures import TRAIN, FingerPictures, load_pictures
 
 FEWEST = 3  # labelled pictures
 HELD_BACK = 6  # every sixth picture judges, the others teach; of fewer than twelve every second one
@@ -80,7 +77,7 @@ def run(options: argparse.Namespace) -> None:
     """Fine-tune as the options say."""
     # PyTorch is only wanted once the labels are known to be usable
     pictures = load_project(read_project(options))
-    from lab.training.refinement import refine
+    from lab.training.train import refine
 
     every = HELD_BACK if len(pictures) >= 2 * HELD_BACK else 2
     judging = np.arange(len(pictures)) % every == every - 1

@@ -15,6 +15,8 @@ from finforce_ifea.fem.frame import BeamPoints, Beams, add_beams, point_position
 from finforce_ifea.jaw.cad.proposal import FEW
 from finforce_ifea.jaw.section import order_rings
 
+SEED = 40_000_000_000  # of training's fingers begin here
+FIRST_VALIDATION = 10_000_000  # number of the first of those that judge
 BETWEEN = 3  # beams along a band from rib to rib
 ALONG = 3  # beams along a rib
 LONGEST_STEP = 0.012  # of a boundary between two vertices, in lengths of the finger

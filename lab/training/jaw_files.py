@@ -21,9 +21,8 @@ from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.cad.make_jaw import make_jaw
 from finforce_ifea.jaw.cad.recognition import Wishes
 from finforce_ifea.jaw.section import order_rings
-from lab.training.arguments import one_line_errors
-from lab.training.fingers import Finger, draw_finger
-from lab.training.scenes import FIRST_VALIDATION, SEED
+from lab.training.commands import one_line_errors
+from lab.training.fingers import FIRST_VALIDATION, SEED, Finger, draw_finger
 
 LEAST_CLAMP = 4e-3  # m of a finger that a holder keeps; those that stand on it are none of a gripper's
 LONGEST = 0.1  # m of a finger that the camera on the twin's wrist sees as a whole

@@ -1,20 +1,31 @@
-"""Label files of DeepLabCut, `CollectedData_*.csv`, old and new style."""
+"""A user's labelled images: label files of DeepLabCut, and the pictures of the jaws' side planes made of them."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
-from lab.training.errors import LabelFileError
+from finforce.camera import PLUMB_BOB, CameraIntrinsics
+from finforce.gripper_frames import jaw_in_camera, jaw_in_gripper
+from finforce.transforms import pose_from_quaternion
+from finforce_ifea.jaw.jaw import Jaw
+from finforce_keypoints.geometry.side_picture import find_side, intersect_plane, map_picture, take_picture
+from finforce_keypoints.geometry.template import draw_template, find_shape, fit_grid
+from lab.training.commands import LabelFileError
+from lab.training.pictures import MARGIN, FingerPictures
 
 SCORER, INDIVIDUALS, BODYPARTS, COORDS = HEADERS = ("scorer", "individuals", "bodyparts", "coords")
 FOLDER = "labeled-data"  # how the index of a frame begins
 _SINGLE = "single"  # DeepLabCut's individual for body parts that are there once
+BASE_PART = 0.3  # of the jaw's length: key points nearer to the base hardly move when the jaw bends
+NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,3 +134,117 @@ def _fill_points(points: NDArray, cells: Sequence[str], columns: _Columns, names
 def _join_index(cells: Sequence[str]) -> str:
     """Return the path of a frame, with slashes."""
     return str(PurePosixPath("/".join(cell.strip() for cell in cells).replace("\\", "/")))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraView:
+    """A camera and its place: intrinsics and T_gripper_camera (4, 4)."""
+
+    camera: CameraIntrinsics
+    T_gripper_camera: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LabelledImage:
+    """An image (h, w, 3) uint8 RGB with the points (K, 2) [px] of one jaw, the reference point last; NaN if hidden."""
+
+    image: NDArray
+    points: NDArray
+
+
+def read_camera(path: str | Path) -> CameraView:
+    """Read a camera from YAML: width, height, fx, fy, cx, cy [px], distortion, T_gripper_camera [x y z qx qy qz qw].
+
+    The lens is that of `distortion_model`, plumb_bob without it.
+
+    Raises:
+        LabelFileError: the file cannot be read or lacks one of these.
+        IntrinsicsError: no camera has such numbers.
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        return parse_camera(content)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise LabelFileError(
+            f"{path}: {error!r}; expected {', '.join(NUMBERS)}, distortion and T_gripper_camera [x y z qx qy qz qw]"
+        ) from error
+
+
+def parse_camera(content: Mapping[str, Any]) -> CameraView:
+    """Return the camera of a file's content; see `read_camera`."""
+    numbers = {name: content[name] for name in NUMBERS}
+    pose = np.array(content["T_gripper_camera"], dtype=float)
+    if pose.shape != (7,):
+        raise LabelFileError(f"T_gripper_camera: got {pose.tolist()}, expected x y z [m] qx qy qz qw")
+    lens = np.array(content.get("distortion", ()), dtype=float)
+    model = str(content.get("distortion_model", PLUMB_BOB))
+    return CameraView(
+        camera=CameraIntrinsics(**numbers, distortion=lens, model=model),
+        T_gripper_camera=pose_from_quaternion(pose[:3], pose[3:]),
+    )
+
+
+def find_origin(points: NDArray, jaw: Jaw, side: str, view: CameraView) -> float | None:
+    """Return where a jaw's origin is on the closing axis [m], from its labels.
+
+    The reference point tells it; where it is hidden, the mean of the key points near the base does.
+
+    Args:
+        points: (K + 1, 2) labels [px], the reference point last.
+        jaw: in its own frame, right jaws mirrored.
+        side: "left" or "right".
+        view: camera and its place.
+
+    Returns:
+        The place, None when neither the reference point nor one near the base is labelled.
+    """
+    rest = np.vstack((jaw.keypoints, jaw.reference_point))
+    chosen = np.isfinite(points).all(axis=1)
+    if chosen[-1]:
+        chosen = np.arange(len(points)) == len(points) - 1
+    else:
+        chosen &= rest[:, 2] < BASE_PART * jaw.keypoints[:, 2].max()
+    if not chosen.any():
+        return None
+    at_zero = jaw_in_camera(view.T_gripper_camera, side, 0.0)
+    places = intersect_plane(points[chosen], find_side(jaw), at_zero, view.camera)
+    along = float((places[:, 0] - rest[chosen, 0]).mean())
+    return along * float(jaw_in_gripper(side, 0.0)[0, 0])
+
+
+def rectify(labelled: LabelledImage, jaw: Jaw, side: str, view: CameraView) -> FingerPictures | None:
+    """Return the picture of one jaw's side plane with its points, as training takes it; None if the jaw is not found.
+
+    Raises:
+        LabelFileError: the image has another size than the camera.
+    """
+    height, width = labelled.image.shape[:2]
+    if (width, height) != (view.camera.width, view.camera.height):
+        raise LabelFileError(
+            f"an image of {width}x{height}; expected {view.camera.width}x{view.camera.height}, the camera's"
+        )
+    origin = find_origin(labelled.points, jaw, side, view)
+    if origin is None:
+        return None
+    return cut_picture(labelled, jaw, jaw_in_camera(view.T_gripper_camera, side, origin), view.camera)
+
+
+def cut_picture(labelled: LabelledImage, jaw: Jaw, T_camera_jaw: NDArray, camera: CameraIntrinsics) -> FingerPictures:
+    """Return the picture of the side plane of a jaw at T_camera_jaw (4, 4) with its labelled points, the mark first."""
+    shape, side = find_shape(jaw), find_side(jaw)
+    grid = fit_grid(shape)
+    padded = grid.padded(MARGIN)
+    rest = np.vstack((jaw.reference_point, jaw.keypoints))[:, [0, 2]]
+    points = np.roll(labelled.points, 1, axis=0)
+    visible = np.isfinite(points).all(axis=1)
+    place = np.full((len(visible), 2), np.nan, dtype=np.float32)
+    place[visible] = padded.pixels(intersect_plane(points[visible], side, T_camera_jaw, camera))
+    return FingerPictures(
+        picture=take_picture(labelled.image, map_picture(padded, side, T_camera_jaw, camera))[None],
+        rest=grid.pixels(rest).astype(np.float32)[None],
+        place=place[None],
+        visible=visible[None],
+        keypoints=np.array([len(rest)]),
+        template=draw_template(shape, grid)[None],
+        finger=np.zeros(1, dtype=int),
+    )

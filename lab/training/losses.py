@@ -4,46 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lab.training.batches import Batch
+from lab.training.commands import import_torch
 from lab.training.network import LARGEST_SPREAD, FingerNetwork, standardise
-from lab.training.optional import import_torch
 
 torch = import_torch()
 POINTS = 12  # of a picture that the fine part looks at in one step
 COVERED = 4  # of them that are key points which cannot be seen, where there are any
 ANYWHERE = 2  # of them that need not be key points
-FAR, FAR_SHARE, NEAR = (
-    9.0,
-    0.25,
-    1.5,
-)  # px by which guesses are off: some anywhere up to FAR, others with deviation NEAR
+# px by which guesses are off: some anywhere up to FAR, others with deviation NEAR
+FAR, FAR_SHARE, NEAR = 9.0, 0.25, 1.5
 FARTHEST = 600.0  # px; a place that a slanted view has thrown farther is not learnt
 HIDDEN_WEIGHT = 6.0  # of a hidden point beside a visible one: to accept what is not there costs more than to lose one
 SHARPNESS = 0.05  # px; smaller errors count by their square
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Batch:
-    """Pictures with what is told of their fingers, and the truth.
-
-    Attributes:
-        pictures: (B, h, w, 3) uint8.
-        templates: (B, h, w, 3) uint8.
-        rest: (B, P, 2) points at rest, in the templates [px]; the mark first.
-        places: (B, P, 2) where they are in the pictures [px]; NaN where nobody knows.
-        visible: (B, P) bool.
-        keypoints: (B,) how many, from the first on, are key points.
-    """
-
-    pictures: torch.Tensor
-    templates: torch.Tensor
-    rest: torch.Tensor
-    places: torch.Tensor
-    visible: torch.Tensor
-    keypoints: torch.Tensor
-
-    def to(self, device: torch.device) -> Batch:
-        """Return the batch on a device."""
-        return Batch(**{name: getattr(self, name).to(device) for name in self.__dataclass_fields__})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

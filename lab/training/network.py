@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from lab.training.optional import import_torch
+from lab.training.commands import import_torch
 
 torch = import_torch()
 nn = torch.nn

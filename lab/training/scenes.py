@@ -30,13 +30,10 @@ from finforce_sim.rendering.lighting import Lighting, Paint, draw_color, draw_ja
 from finforce_sim.rendering.render import Body, Decal, RenderedScene
 from finforce_sim.rendering.sensor import expose
 from finforce_sim.scenes.objects import OBJECT_NAMES, build_object
-from lab.training.arguments import one_line_errors, read_share
-from lab.training.dataset import MARGIN, TRAIN, VALIDATION, FingerPictures, save_shard
-from lab.training.fingers import BentFinger, Finger, draw_finger, outline
-from lab.training.making import make_all
+from lab.training.commands import one_line_errors, read_share
+from lab.training.fingers import FIRST_VALIDATION, SEED, BentFinger, Finger, draw_finger, outline
+from lab.training.pictures import MARGIN, TRAIN, VALIDATION, FingerPictures, make_all, save_shard
 
-SEED = 40_000_000_000  # of training's fingers begin here
-FIRST_VALIDATION = 10_000_000  # number of the first of those that judge
 STATES = 8  # pictures of a finger
 KEYPOINTS, ANYWHERE = 24, 72  # points of a picture: key points with the mark, and points anywhere on the material
 BARS = 0.35  # share of the pictures with something between camera and finger

@@ -3,78 +3,303 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from math import cos, pi
 from pathlib import Path
+from typing import Any
 
-from lab.training.arguments import add_settings, one_line_errors, settings_from
-from lab.training.augment import AugmentSettings
-from lab.training.checkpoint import load_checkpoint
-from lab.training.dataset import TRAIN, VALIDATION, load_pictures
-from lab.training.errors import RecipeError
+import numpy as np
+from tqdm import tqdm
+
+from finforce.settings import check_bounds, setting
+from lab.training.batches import AugmentSettings, Batch, load_batches
+from lab.training.checkpoint import load_checkpoint, read_network, save_checkpoint, shape_from
+from lab.training.commands import (
+    CheckpointError,
+    RecipeError,
+    add_settings,
+    import_torch,
+    one_line_errors,
+    settings_from,
+)
+from lab.training.evaluate import Detections, Score, gather_detections, score_detections
+from lab.training.export import write_network
+from lab.training.losses import compute_losses, to_layers
 from lab.training.network import FingerNetwork
-from lab.training.recipe import Recipe
-from lab.training.trainer import CHECKPOINT, Trainer, TrainingImages, train
-from lab.training.weights import read_network
-from lab.training.widen import widen
+from lab.training.pictures import TRAIN, VALIDATION, FingerPictures, load_pictures
+
+torch = import_torch()
+
+CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
+SMOOTHING = 0.98  # part of the shown losses that stays in each step
+FINETUNING_DIM = 0.15  # probability of little light: less than in the first training, as the user's light is known
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How long and how fast a network is trained; a run ends after its minutes, whatever it has seen by then."""
+
+    minutes: float = setting(80.0, "time that training may take, evaluation included", "min", 0.01, 10_000.0)
+    steps: int = setting(0, "batches until the end; 0: until the minutes are over, not repeatable", "", 0, 10**9)
+    seed: int = setting(0, "of weights, order and augmentation", "", 0, 2**31)
+    batch: int = setting(32, "pictures per step", "", 1, 4096)
+    rate: float = setting(2e-3, "largest learning rate of AdamW", "", 1e-6, 1.0)
+    warm_up: float = setting(0.04, "part of the time in which the rate rises", "-", 0.0, 0.5)
+    decay: float = setting(1e-2, "weight decay of AdamW", "", 0.0, 1.0)
+    clip: float = setting(5.0, "largest norm of the gradient", "", 1e-3, 1e6)
+    threads: int = setting(1, "threads of the network's arithmetic", "", 1, 256)
+    evaluate_every: float = setting(5.0, "time between evaluations and checkpoints", "min", 0.01, 10_000.0)
+
+    def __post_init__(self) -> None:
+        check_bounds(self, RecipeError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe(Schedule):
+    """How the network of key points is trained."""
+
+    average: float = setting(0.998, "part of the averaged weights that stays in each step", "", 0.0, 0.99999)
+    workers: int = setting(1, "processes that make batches", "", 0, 256)
+    validation: int = setting(1000, "pictures that an evaluation uses", "", 1, 1_000_000)
+
+
+class Training:
+    """A network, its optimiser, and how far they are.
+
+    Args:
+        recipe: how to train.
+        network: that is trained.
+        about: what network it is, as a checkpoint says it.
+    """
+
+    def __init__(self, recipe: Schedule, network: Any, about: Mapping[str, Any]) -> None:
+        torch.set_num_threads(recipe.threads)
+        self.recipe, self.about = recipe, about
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.network = network.to(self.device, memory_format=torch.channels_last)
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
+        self.parts = {"network": self.network, "optimizer": self.optimizer}
+        self.step, self.elapsed = 0, 0.0
+
+    @property
+    def progress(self) -> float:
+        """How much is done, 0 to 1: by steps where the recipe counts them."""
+        recipe = self.recipe
+        return min(self.step / recipe.steps if recipe.steps else self.elapsed / (60.0 * recipe.minutes), 1.0)
+
+    def descend(self, loss: Callable[[], torch.Tensor]) -> None:
+        """Take one step down a loss of the network in training mode, at the rate of the recipe."""
+        self.network.train()
+        for group in self.optimizer.param_groups:
+            group["lr"] = compute_rate(self.progress, self.recipe)
+        total = loss()
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.clip)
+        self.optimizer.step()
+        self.step += 1
+
+    def save(self, folder: Path) -> None:
+        """Write the checkpoint of a run."""
+        states = {name: part.state_dict() for name, part in self.parts.items()}
+        save_checkpoint(folder / CHECKPOINT, {**self.about, "step": self.step, "elapsed": self.elapsed, **states})
+
+    def resume(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on from a checkpoint.
+
+        Raises:
+            CheckpointError: it is of another network.
+        """
+        told = {name: checkpoint.get(name) for name in self.about}
+        if told != self.about:
+            raise CheckpointError(f"got a checkpoint of {told}, expected one of {dict(self.about)}")
+        for name, part in self.parts.items():
+            part.load_state_dict(checkpoint[name])
+        self.step, self.elapsed = int(checkpoint["step"]), float(checkpoint["elapsed"])
+
+
+def compute_rate(progress: float, recipe: Schedule) -> float:
+    """Return the learning rate at a progress from 0 to 1: a linear rise, then half a cosine down to a hundredth."""
+    if progress < recipe.warm_up:
+        return recipe.rate * (0.02 + 0.98 * progress / recipe.warm_up)
+    down = (progress - recipe.warm_up) / (1.0 - recipe.warm_up)
+    return recipe.rate * (0.01 + 0.99 * 0.5 * (1.0 + cos(pi * down)))
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Tell whether a device multiplies bfloat16 faster than float32: GPUs of late, processors only with tiles (AMX)."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported()
+    return bool(getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)())
+
+
+def train(
+    training: Training,
+    learning: Iterator[Mapping[str, float]],
+    score: Callable[[], Mapping[str, float]],
+    folder: Path,
+) -> Mapping[str, float]:
+    """Train until the recipe's end, with a log of losses and scores and a checkpoint beside it.
+
+    Args:
+        training: of which `learning` takes one step after the other.
+        learning: losses of the steps by name.
+        score: measures how good the network is.
+        folder: of log and checkpoint.
+
+    Returns:
+        The score at the end.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    every = 60.0 * training.recipe.evaluate_every
+    began, due = time.monotonic() - training.elapsed, training.elapsed + every
+    shown: dict[str, float] = {}
+    with tqdm(total=100.0, desc="train", unit="%", bar_format="{l_bar}{bar}|{postfix}", disable=None) as bar:
+        while training.progress < 1.0:
+            for name, value in next(learning).items():
+                shown[name] = SMOOTHING * shown.get(name, value) + (1.0 - SMOOTHING) * value
+            training.elapsed = time.monotonic() - began
+            bar.update(100.0 * training.progress - bar.n)
+            bar.set_postfix({"step": training.step, **{name: f"{value:.3f}" for name, value in shown.items()}})
+            if training.elapsed >= due and training.progress < 1.0:
+                due += every
+                _report(training, shown, score(), folder)
+    final = score()
+    _report(training, shown, final, folder)
+    return final
+
+
+def _report(training: Training, shown: Mapping[str, float], score: Mapping[str, float], folder: Path) -> None:
+    """Add a line to the log, write the checkpoint."""
+    line: dict[str, float] = {"step": training.step, "minutes": round(training.elapsed / 60.0, 2)}
+    line |= {name: round(value, 5) for name, value in shown.items()} | dict(score)
+    with (folder / LOG).open("a", encoding="utf-8") as log:
+        log.write(json.dumps(line) + "\n")
+    tqdm.write(json.dumps(line))
+    training.save(folder)
+
+
+class FingerTraining(Training):
+    """The training of the network of key points, of which the averaged weights are kept.
+
+    Args:
+        recipe: how to train.
+        network: to begin with; random weights when absent.
+    """
+
+    def __init__(self, recipe: Recipe, network: FingerNetwork | None = None) -> None:
+        torch.manual_seed(recipe.seed)
+        network = network or FingerNetwork()
+        super().__init__(recipe, network, {"shape": asdict(network.shape)})
+        averaging = torch.optim.swa_utils
+        self._averaging = averaging.AveragedModel(self.network, avg_fn=self._average, use_buffers=True)
+        self.averaged = self.parts["averaged"] = self._averaging.module
+
+    def learn(self, batch: Batch) -> dict[str, float]:
+        """Take one step on a batch and return its losses by name."""
+        losses = []
+
+        def measure() -> torch.Tensor:
+            losses.append(compute_losses(self.network, batch.to(self.device), low=has_bfloat16(self.device)))
+            return losses[0].total
+
+        self.descend(measure)
+        self._averaging.update_parameters(self.network)
+        return {name: float(getattr(losses[0], name).detach()) for name in losses[0].__dataclass_fields__}
+
+    def resume(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on from a checkpoint; see `Training`."""
+        super().resume(checkpoint | {"shape": asdict(shape_from(checkpoint["shape"]))})
+        self._averaging.n_averaged.fill_(self.step)
+
+    def score(self, pictures: FingerPictures) -> Score:
+        """Return how well the averaged network finds the key points of pictures."""
+        return score_detections(detect(self.averaged.eval(), pictures))
+
+    def train(
+        self, pictures: FingerPictures, judging: FingerPictures, augmentation: AugmentSettings, folder: Path
+    ) -> None:
+        """Train on some pictures and be judged by others, which share no finger with them; see `train`."""
+        recipe = self.recipe
+        batches = load_batches(
+            pictures, augmentation, recipe.batch, workers=recipe.workers, seed=recipe.seed, first=self.step
+        )
+        train(self, map(self.learn, batches), lambda: self.score(judging).as_row(), folder)
+
+    def _average(self, kept: torch.Tensor, new: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+        """Return the running average of a tensor; the first steps, of hardly trained weights, are forgotten fast."""
+        stay = min(self.recipe.average, (1.0 + int(count)) / (10.0 + int(count)))
+        return torch.lerp(new, kept, stay) if new.is_floating_point() else new
+
+
+@torch.no_grad()
+def detect(network: FingerNetwork, pictures: FingerPictures, batch: int = 32) -> Detections:
+    """Return what a network finds of the key points in the middle of padded pictures."""
+    device, count = next(network.parameters()).device, int(pictures.keypoints.max())
+    found: list[list[np.ndarray]] = []
+    for start in range(0, len(pictures), batch):
+        rows = slice(start, start + batch)
+        templates = torch.from_numpy(pictures.template[pictures.finger[rows]])
+        images = torch.from_numpy(np.ascontiguousarray(pictures.middle[rows]))
+        rest = torch.from_numpy(pictures.rest[rows, :count])
+        parts = network(*(part.to(device) for part in (to_layers(images), to_layers(templates), rest)))
+        found.append([part.float().cpu().numpy() for part in parts])
+    pixels, logits, spread = (np.concatenate(column) for column in zip(*found, strict=True))
+    return gather_detections(pictures, pixels, 1.0 / (1.0 + np.exp(-logits)), np.exp(spread))
+
+
+def refine(
+    options: argparse.Namespace, teaching: FingerPictures, judging: FingerPictures, mixed: FingerPictures | None = None
+) -> None:
+    """Train an exported network further, and export it.
+
+    Args:
+        options: `network`, `output`, `minutes`, `rate`, `threads` and `seed`.
+        teaching: a user's pictures.
+        judging: pictures of theirs that it does not learn from.
+        mixed: others against forgetting; half of what it sees is then theirs.
+    """
+    recipe = Recipe(
+        minutes=options.minutes,
+        rate=options.rate,
+        threads=options.threads,
+        seed=options.seed,
+        batch=16,
+        workers=0,  # a process that is split off after OpenCV or onnxruntime have made threads may wait for ever
+        evaluate_every=max(options.minutes / 4.0, 0.02),
+        average=0.99,
+    )
+    network, factor = read_network(options.network)
+    training = FingerTraining(recipe, network)
+    pictures = teaching if mixed is None else teaching.mixed_with(mixed)
+    training.train(pictures, judging, AugmentSettings(dim=FINETUNING_DIM), options.output)
+    write_network(training.averaged.eval(), options.output, factor)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train on the shards of a folder and leave log and checkpoint in another one."""
-    options = build_parser().parse_args(arguments)
-    with one_line_errors():
-        run(options)
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """Return the options of the command."""
     parser = argparse.ArgumentParser(prog="python -m lab.training.train", description=__doc__)
     parser.add_argument("dataset", type=Path, help="folder of shards train_*.npz and val_*.npz")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the run")
     parser.add_argument("--limit", type=int, help="train on the first so many pictures only")
     parser.add_argument("--network", type=Path, help="begin with the weights of an exported network")
-    parser.add_argument(
-        "--widen", type=_read_channels, help="give that network so many channels: coarse A,B,C,D, fine E,F"
-    )
-    parser.add_argument("--fine", action="store_true", help="train the fine part alone, leave the coarse one as it is")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder of the run")
     add_settings(parser, Recipe)
-    add_settings(parser.add_argument_group("augmentation"), AugmentSettings)
-    return parser
-
-
-def run(options: argparse.Namespace) -> None:
-    """Train as the options say."""
-    recipe = settings_from(options, Recipe)
-    pictures = TrainingImages(
-        train=load_pictures(options.dataset, TRAIN, options.limit),
-        validation=load_pictures(options.dataset, VALIDATION, recipe.validation),
-    )
-    if options.resume:
-        checkpoint = load_checkpoint(options.output / CHECKPOINT)
-        trainer = Trainer(recipe, FingerNetwork(checkpoint.shape))
-        trainer.resume(checkpoint)
-    else:
-        trainer = Trainer(recipe, _begin(options))
-    trainer.network.coarse.requires_grad_(not options.fine)
-    print(train(trainer, pictures, settings_from(options, AugmentSettings), options.output))
-
-
-def _begin(options: argparse.Namespace) -> FingerNetwork | None:
-    """Return the network to begin with, none for one by chance."""
-    if options.network is None:
-        if options.widen:
-            raise RecipeError("--widen: there is no network to widen; expected --network FOLDER")
-        return None
-    network = read_network(options.network)[0]
-    return widen(network, options.widen[:4], options.widen[4:], options.seed) if options.widen else network
-
-
-def _read_channels(text: str) -> tuple[int, ...]:
-    """Return six whole numbers."""
-    parts = text.split(",")
-    if len(parts) != 6 or not all(part.strip().isdigit() for part in parts):
-        raise argparse.ArgumentTypeError(f"{text[:40]!r}: expected six numbers, as 32,64,96,128,24,64")
-    return tuple(int(part) for part in parts)
+    options = parser.parse_args(arguments)
+    with one_line_errors():
+        recipe = settings_from(options, Recipe)
+        pictures = load_pictures(options.dataset, TRAIN, options.limit)
+        judging = load_pictures(options.dataset, VALIDATION, recipe.validation)
+        if options.resume:
+            checkpoint = load_checkpoint(options.output / CHECKPOINT)
+            training = FingerTraining(recipe, FingerNetwork(shape_from(checkpoint["shape"])))
+            training.resume(checkpoint)
+        else:
+            training = FingerTraining(recipe, read_network(options.network)[0] if options.network else None)
+        training.train(pictures, judging, AugmentSettings(), options.output)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ from finforce_eval.engine.tasks import Task
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording
 from lab.experiments.experiment import run_experiment
-from lab.training.errors import DatasetError
-from lab.training.making import make_all
+from lab.training.commands import DatasetError
+from lab.training.pictures import make_all
 
 
 def without_times(content):

@@ -10,8 +10,7 @@ from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 from finforce_eval.recordings.recording import DEMO  # noqa: E402
 from finforce_keypoints.build import BENCH  # noqa: E402
 from finforce_keypoints.networks.model import KeypointModel  # noqa: E402
-from lab.training.quantization import find_ends, quantize_file  # noqa: E402
-from lab.training.quantize import main, watch_batches  # noqa: E402
+from lab.training.quantize import find_ends, main, quantize_file, watch_batches  # noqa: E402
 
 
 def write_chain(path):
@@ -47,12 +46,7 @@ def test_first_and_last_convolutions_stay_as_they_are(tmp_path):
     write_chain(tmp_path / "chain.onnx")
     assert find_ends(tmp_path / "chain.onnx") == ["first", "left", "right"]
     pictures = np.random.default_rng(1).normal(size=(8, 1, 3, 16, 16)).astype(np.float32)
-    quantize_file(
-        tmp_path / "chain.onnx",
-        tmp_path / "bytes.onnx",
-        [{"picture": one} for one in pictures],
-        ["first", "left", "right"],
-    )
+    quantize_file(tmp_path / "chain.onnx", tmp_path / "bytes.onnx", [{"picture": one} for one in pictures])
     kinds = {item.name: item.data_type for item in onnx.load(str(tmp_path / "bytes.onnx")).graph.initializer}
     assert kinds["middle_weights_quantized"] == TensorProto.INT8
     assert all(kinds[f"{name}_weights"] == TensorProto.FLOAT for name in ("first", "left", "right"))

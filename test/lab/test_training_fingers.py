@@ -10,13 +10,13 @@ pytest.importorskip("open3d", reason="scenes are rendered with Open3D: pip insta
 pytest.importorskip("cv2", reason="pictures need OpenCV: pip install opencv-contrib-python-headless")
 
 from finforce_ifea.jaw.jaw import load_jaw
-from lab.training.arguments import read_share
-from lab.training.dataset import MARGIN, FingerPictures
-from lab.training.fingers import BentFinger, draw_finger, outline
+from lab.training.commands import read_share
+from lab.training.fingers import FIRST_VALIDATION, SEED, BentFinger, draw_finger, outline
 from lab.training.jaw_files import write_jaws
-from lab.training.scenes import ANYWHERE, FIRST_VALIDATION, KEYPOINTS, SEED, STATES, FingerScenes, load_textures
+from lab.training.pictures import MARGIN, FingerPictures
+from lab.training.scenes import ANYWHERE, KEYPOINTS, STATES, FingerScenes, load_textures
 
-SEEDS = range(12)
+SEEDS = range(8)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

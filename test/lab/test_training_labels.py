@@ -15,11 +15,19 @@ from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.errors import NamingError
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape, fit_grid
-from lab.training.dataset import MARGIN
-from lab.training.errors import LabelFileError
+from lab.training.commands import LabelFileError
 from lab.training.finetune import Project, load_project
-from lab.training.labels import parse_labels, read_labels
-from lab.training.rectification import CameraView, LabelledImage, find_origin, parse_camera, read_camera, rectify
+from lab.training.labels import (
+    CameraView,
+    LabelledImage,
+    find_origin,
+    parse_camera,
+    parse_labels,
+    read_camera,
+    read_labels,
+    rectify,
+)
+from lab.training.pictures import MARGIN
 
 CAMERA = {
     "width": 640,
@@ -177,7 +185,7 @@ def test_a_camera_without_a_place_is_refused(tmp_path):
 
 
 def test_labels_need_no_torch():
-    code = "import lab.training.labels, training.finetune, training.evaluate, sys; sys.exit('torch' in sys.modules)"
+    code = "import lab.training.finetune, lab.training.evaluate, sys; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

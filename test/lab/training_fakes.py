@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from lab.training.dataset import MARGIN, FingerPictures, save_shard
+from lab.training.pictures import MARGIN, FingerPictures, save_shard
 
 HEIGHT, WIDTH, KEYPOINTS, POINTS = 224, 176, 8, 12
 

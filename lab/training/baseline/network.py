@@ -10,8 +10,7 @@ from typing import Any
 
 from finforce.optional import import_library
 from lab.experiments.force_network import SHOWN
-from lab.training.errors import RecipeError
-from lab.training.optional import PURPOSE, import_torch
+from lab.training.commands import PURPOSE, RecipeError, import_torch
 
 torch = import_torch()
 nn = torch.nn

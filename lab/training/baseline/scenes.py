@@ -22,18 +22,15 @@ from finforce_sim.gripper.gripper import TwinGripper
 from finforce_sim.rendering.photographer import Photographer
 from finforce_sim.scenes.scenarios import Scenario, build_scenario
 from lab.experiments.force_network import reduce_image
-from lab.training.arguments import one_line_errors
-from lab.training.dataset import save_arrays
-from lab.training.errors import DatasetError
-from lab.training.making import make_all
+from lab.training.commands import DatasetError, one_line_errors
+from lab.training.pictures import TRAIN, VALIDATION, make_all, save_arrays
 
 OBJECTS = ("grasp_cylinder", "grasp_cube")
-PLACES = np.linspace(0.028, 0.054, 14)  # [m] of the object's middle, as many as the letter's
-SPEEDS = (0.002, 0.004, 0.008, 0.015, 0.03)  # [m/s] of each jaw, as many as the letter's
+PLACES = np.linspace(0.028, 0.054, 14)  # [m] of the object's middle, as many as the paper's
+SPEEDS = (0.002, 0.004, 0.008, 0.015, 0.03)  # [m/s] of each jaw, as many as the paper's
 DISPLACEMENT = (0.0015, 0.0075)  # [m] of each jaw beyond first touch
 RENDERED = "320x240"
 OPEN = 12  # images before the jaws move
-TRAIN, VALIDATION = "train", "val"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

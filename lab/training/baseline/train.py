@@ -3,34 +3,30 @@
 from __future__ import annotations
 
 import argparse
-import json
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from finforce.settings import setting
 from finforce_eval.evaluation.results import ONSET
 from finforce_eval.evaluation.scoring import rms
 from lab.experiments.force_network import HEIGHT, KIND, LAYOUT, SHOWN, WIDTH
-from lab.training.arguments import add_settings, one_line_errors, settings_from
 from lab.training.baseline.network import BACKBONES, SMALL, EndToEnd
-from lab.training.baseline.scenes import TRAIN, VALIDATION, GraspFilm, load_films
-from lab.training.checkpoint import save_whole
-from lab.training.errors import CheckpointError
+from lab.training.baseline.scenes import GraspFilm, load_films
+from lab.training.checkpoint import load_checkpoint
+from lab.training.commands import add_settings, import_torch, one_line_errors, settings_from
 from lab.training.export import write_onnx
-from lab.training.optional import import_torch
-from lab.training.recipe import Schedule
-from lab.training.trainer import compute_rate, has_bfloat16, measure_progress
+from lab.training.pictures import TRAIN, VALIDATION
+from lab.training.train import CHECKPOINT, Schedule, Training, has_bfloat16, train
 
 torch = import_torch()
 
-CHECKPOINT, LOG, NETWORK = "checkpoint.pt", "log.jsonl", "force_network.onnx"
+NETWORK = "force_network.onnx"
 SEGMENT = 24  # images in a row that share their features: 15 windows of ten
 
 
@@ -71,50 +67,30 @@ def alter_images(images: NDArray[np.uint8], recipe: BaselineRecipe, rng: np.rand
     return np.clip(np.float32(gain) * seen + np.float32(offset) + noise, 0.0, 255.0).astype(np.uint8)
 
 
-class BaselineTrainer:
-    """One training.
-
-    Attributes:
-        network: that is trained.
-        step: batches seen.
-        elapsed: time spent on them [s].
-    """
+class BaselineTraining(Training):
+    """The training of the end-to-end network."""
 
     def __init__(self, recipe: BaselineRecipe, backbone: str = SMALL) -> None:
-        self.recipe = recipe
         torch.manual_seed(recipe.seed)
-        torch.set_num_threads(recipe.threads)
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.network = EndToEnd(backbone)
-        self.network(torch.zeros(2, SHOWN, HEIGHT, WIDTH, 3))  # gives lazy parts their size
-        self.network.to(self.device, memory_format=torch.channels_last)
-        parameters = self.network.parameters()
-        self.optimizer = torch.optim.AdamW(parameters, lr=recipe.rate, weight_decay=recipe.decay)
-        self.step, self.elapsed = 0, 0.0
+        network = EndToEnd(backbone)
+        network(torch.zeros(2, SHOWN, HEIGHT, WIDTH, 3))  # gives lazy parts their size
+        super().__init__(recipe, network, {"backbone": backbone})
 
-    @property
-    def progress(self) -> float:
-        """How much of the training is done, 0 to 1."""
-        return measure_progress(self.step, self.elapsed, self.recipe)
-
-    def learn(self, images: NDArray[np.uint8], forces: NDArray) -> float:
+    def learn(self, images: NDArray[np.uint8], forces: NDArray) -> dict[str, float]:
         """Take one step on images (b, 24, h, w, 3) and forces (b, 24) [N]; return the loss."""
-        self.network.train()
-        for group in self.optimizer.param_groups:
-            group["lr"] = compute_rate(self.progress, self.recipe)
-        count = len(images)
-        pictures = torch.from_numpy(images).to(self.device).flatten(0, 1)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=has_bfloat16(self.device)):
-            features = self.network.encode(pictures).view(count, SEGMENT, -1)
-        windows = features.float().unfold(1, SHOWN, 1).permute(0, 1, 3, 2).flatten(0, 1)
-        true = torch.from_numpy(forces[:, SHOWN - 1 :]).to(self.device).flatten()
-        loss = torch.nn.functional.smooth_l1_loss(self.network.judge(windows), true, beta=0.2)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.clip)
-        self.optimizer.step()
-        self.step += 1
-        return float(loss.detach())
+        losses = []
+
+        def measure() -> torch.Tensor:
+            pictures = torch.from_numpy(images).to(self.device).flatten(0, 1)
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=has_bfloat16(self.device)):
+                features = self.network.encode(pictures).view(len(images), SEGMENT, -1)
+            windows = features.float().unfold(1, SHOWN, 1).permute(0, 1, 3, 2).flatten(0, 1)
+            true = torch.from_numpy(forces[:, SHOWN - 1 :]).to(self.device).flatten()
+            losses.append(torch.nn.functional.smooth_l1_loss(self.network.judge(windows), true, beta=0.2))
+            return losses[0]
+
+        self.descend(measure)
+        return {"loss": float(losses[0].detach())}
 
     @torch.no_grad()
     def score(self, films: Sequence[GraspFilm]) -> dict[str, float]:
@@ -130,27 +106,15 @@ class BaselineTrainer:
         error, force = np.concatenate(errors), np.concatenate(true)
         return {"rmse_N": rms(error), "held_N": rms(error[force > ONSET])}
 
-    def save(self, folder: Path) -> None:
-        """Write a checkpoint; the one before it stays whole until the new one is complete."""
-        states = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict()}
-        about = {"backbone": self.network.backbone, "step": self.step, "elapsed": self.elapsed}
-        save_whole({**about, **states}, folder / CHECKPOINT)
-
-    def resume(self, path: Path) -> None:
-        """Go on from a checkpoint.
-
-        Raises:
-            CheckpointError: the file is missing, or of another network.
-        """
-        try:
-            content = torch.load(path, map_location=self.device, weights_only=True)
-            self.network.load_state_dict(content["network"])
-            self.optimizer.load_state_dict(content["optimizer"])
-            self.step, self.elapsed = int(content["step"]), float(content["elapsed"])
-        except Exception as error:  # torch raises whatever its unpickler does
-            reason = str(error).partition("\n")[0]
-            expected = f"expected a checkpoint of lab.training.baseline.train with {self.network.backbone}"
-            raise CheckpointError(f"{path}: {reason}; {expected}") from error
+    def train(self, films: Sequence[GraspFilm], held_out: Sequence[GraspFilm], folder: Path) -> None:
+        """Train on some grasps and be judged by others; write the network's file at last; see `train`."""
+        rng = np.random.default_rng((self.recipe.seed, self.step))
+        films = [film for film in films if len(film.force) >= SEGMENT]
+        learning = (self.learn(*draw_batch(films, self.recipe, rng)) for _ in count())
+        train(self, learning, lambda: self.score(held_out), folder)
+        images, minutes = sum(len(film.force) for film in films), round(self.elapsed / 60.0, 1)
+        said = {"grasps": len(films), "images": images, "steps": self.step, "minutes": minutes}
+        write_network(self.network.eval(), folder / NETWORK, said)
 
 
 def write_network(network: EndToEnd, path: Path, said: dict[str, Any]) -> None:
@@ -158,31 +122,6 @@ def write_network(network: EndToEnd, path: Path, said: dict[str, Any]) -> None:
     example = torch.zeros(1, SHOWN, HEIGHT, WIDTH, 3, dtype=torch.uint8)
     about = {"kind": KIND, "backbone": network.backbone, **said}
     write_onnx(network.cpu(), (example,), LAYOUT, path, about, {})
-
-
-def train(trainer: BaselineTrainer, films: Sequence[GraspFilm], held_out: Sequence[GraspFilm], folder: Path) -> None:
-    """Train until the recipe's end, with a log, a checkpoint and at last the network's file."""
-    recipe, loss = trainer.recipe, 0.0
-    rng = np.random.default_rng((recipe.seed, trainer.step))
-    films = [film for film in films if len(film.force) >= SEGMENT]
-    began, due = time.monotonic() - trainer.elapsed, trainer.elapsed + 60.0 * recipe.evaluate_every
-    with tqdm(total=100.0, desc="train", unit="%", bar_format="{l_bar}{bar}|{postfix}", disable=None) as bar:
-        while trainer.progress < 1.0:
-            loss += 0.02 * (trainer.learn(*draw_batch(films, recipe, rng)) - loss)
-            trainer.elapsed = time.monotonic() - began
-            bar.update(100.0 * trainer.progress - bar.n)
-            bar.set_postfix(step=trainer.step, loss=f"{loss:.4f}")
-            if trainer.elapsed >= due or trainer.progress >= 1.0:
-                due += 60.0 * recipe.evaluate_every
-                line = {"step": trainer.step, "minutes": round(trainer.elapsed / 60.0, 2), "loss": round(loss, 5)}
-                line |= {name: round(value, 4) for name, value in trainer.score(held_out).items()}
-                with (folder / LOG).open("a", encoding="utf-8") as log:
-                    log.write(json.dumps(line) + "\n")
-                tqdm.write(json.dumps(line))
-                trainer.save(folder)
-    images = sum(len(film.force) for film in films)
-    said = {"grasps": len(films), "images": images, "steps": trainer.step, "minutes": round(trainer.elapsed / 60.0, 1)}
-    write_network(trainer.network.eval(), folder / NETWORK, said)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -195,11 +134,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add_settings(parser, BaselineRecipe)
     options = parser.parse_args(arguments)
     with one_line_errors():
-        trainer = BaselineTrainer(settings_from(options, BaselineRecipe), options.backbone)
+        training = BaselineTraining(settings_from(options, BaselineRecipe), options.backbone)
         if options.resume:
-            trainer.resume(options.output / CHECKPOINT)
-        options.output.mkdir(parents=True, exist_ok=True)
-        train(trainer, load_films(options.dataset, TRAIN), load_films(options.dataset, VALIDATION), options.output)
+            training.resume(load_checkpoint(options.output / CHECKPOINT))
+        films, held_out = (load_films(options.dataset, part) for part in (TRAIN, VALIDATION))
+        training.train(films, held_out, options.output)
     print(f"{options.output / NETWORK}")
 
 

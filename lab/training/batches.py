@@ -1,7 +1,8 @@
-"""Random views, light, dirt and noise for padded pictures."""
+"""Batches of pictures, each of them seen anew: another view, light, dirt and noise, and sometimes a wrong template."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -9,33 +10,154 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.optional import import_cv2
-from finforce.settings import check_bounds, setting
-from lab.training.dataset import MARGIN
-from lab.training.errors import RecipeError
+from lab.training.commands import import_torch
+from lab.training.pictures import MARGIN, FingerPictures
+
+torch = import_torch()
+WRONG = 0.1  # share of the pictures whose template is not theirs, so that nothing of it can be seen ...
+WRONG_FINGER = 0.6  # ... of which so many show another finger; the others are mirrored or upside down
+MOST_BATCHES = 10**9
 
 
 @dataclass(frozen=True, kw_only=True)
 class AugmentSettings:
-    """How far pictures are changed; every probability is per picture."""
+    """How far pictures are changed; every probability is per picture.
 
-    shift: float = setting(12.0, "largest shift along a row and a column", "px", 0.0, 100.0)
-    scale: float = setting(0.06, "largest change of size", "-", 0.0, 0.5)
-    rotation: float = setting(4.0, "largest turn", "deg", 0.0, 90.0)
-    perspective: float = setting(4.0, "largest shift of each corner on its own", "px", 0.0, 50.0)
-    dim: float = setting(0.2, "probability of little light", "-", 0.0, 1.0)
-    darkest: float = setting(0.08, "least light, as a part of the picture's own", "-", 0.001, 1.0)
-    color: float = setting(0.8, "probability of another contrast, gamma and white balance", "-", 0.0, 1.0)
-    gradient: float = setting(0.3, "probability of light that falls off across the picture", "-", 0.0, 1.0)
-    resample: float = setting(0.6, "probability of a camera with larger pixels", "-", 0.0, 1.0)
-    coarsest: float = setting(0.4, "its pixels' number beside the picture's along an axis, at least", "-", 0.05, 1.0)
-    blur: float = setting(0.35, "probability of defocus or motion", "-", 0.0, 1.0)
-    sharpen: float = setting(0.15, "probability of a camera's sharpening", "-", 0.0, 1.0)
-    noise: float = setting(0.7, "probability of sensor noise; little light always has it", "-", 0.0, 1.0)
-    jpeg: float = setting(0.3, "probability of compression", "-", 0.0, 1.0)
-    occlusion: float = setting(0.65, "probability of things in front", "-", 0.0, 1.0)
+    Attributes:
+        shift: largest shift along a row and a column [px].
+        scale: largest change of size.
+        rotation: largest turn [deg].
+        perspective: largest shift of each corner on its own [px].
+        dim: probability of little light.
+        darkest: least light, as a part of the picture's own.
+        color: probability of another contrast, gamma and white balance.
+        gradient: probability of light that falls off across the picture.
+        resample: probability of a camera with larger pixels.
+        coarsest: least number of its pixels along an axis, as a part of the picture's.
+        blur: probability of defocus or motion.
+        sharpen: probability of a camera's sharpening.
+        noise: probability of sensor noise; little light always has it.
+        jpeg: probability of compression.
+        occlusion: probability of things in front.
+    """
 
-    def __post_init__(self) -> None:
-        check_bounds(self, RecipeError)
+    shift: float = 12.0
+    scale: float = 0.06
+    rotation: float = 4.0
+    perspective: float = 4.0
+    dim: float = 0.2
+    darkest: float = 0.08
+    color: float = 0.8
+    gradient: float = 0.3
+    resample: float = 0.6
+    coarsest: float = 0.4
+    blur: float = 0.35
+    sharpen: float = 0.15
+    noise: float = 0.7
+    jpeg: float = 0.3
+    occlusion: float = 0.65
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Batch:
+    """Pictures with what is told of their fingers, and the truth.
+
+    Attributes:
+        pictures: (B, h, w, 3) uint8.
+        templates: (B, h, w, 3) uint8.
+        rest: (B, P, 2) points at rest, in the templates [px]; the mark first.
+        places: (B, P, 2) where they are in the pictures [px]; NaN where nobody knows.
+        visible: (B, P) bool.
+        keypoints: (B,) how many, from the first on, are key points.
+    """
+
+    pictures: torch.Tensor
+    templates: torch.Tensor
+    rest: torch.Tensor
+    places: torch.Tensor
+    visible: torch.Tensor
+    keypoints: torch.Tensor
+
+    def to(self, device: torch.device) -> Batch:
+        """Return the batch on a device."""
+        return Batch(**{name: getattr(self, name).to(device) for name in self.__dataclass_fields__})
+
+
+def load_batches(
+    pictures: FingerPictures,
+    augmentation: AugmentSettings,
+    size: int,
+    *,
+    workers: int = 0,
+    seed: int = 0,
+    first: int = 0,
+) -> Iterator[Batch]:
+    """Yield augmented batches without end, each picture once per round, the same for the same seed.
+
+    Args:
+        pictures: to draw from.
+        augmentation: how far they are changed.
+        size: pictures in a batch.
+        workers: processes that make them; 0 for none but this one.
+        seed: of order and augmentation.
+        first: number of the first batch, to go on where another run ended.
+    """
+    loader = torch.utils.data.DataLoader(
+        _BatchMaker(pictures, augmentation, size, seed),
+        sampler=range(first, MOST_BATCHES),
+        batch_size=None,
+        num_workers=workers,
+        prefetch_factor=4 if workers else None,
+        worker_init_fn=_use_one_thread,
+    )
+    for columns in loader:
+        yield Batch(**columns)
+
+
+def choose_pictures(number: int, size: int, count: int, seed: int) -> NDArray:
+    """Return the indices (size,) below `count` of a batch; each index comes once per round, in random order."""
+    places = np.arange(number * size, (number + 1) * size)
+    rounds = {key: np.random.default_rng((seed, 1, key)).permutation(count) for key in set((places // count).tolist())}
+    return np.array([rounds[place // count][place % count] for place in places.tolist()])
+
+
+def _use_one_thread(_: int) -> None:
+    """Keep OpenCV in a process of its own from taking the cores that the network needs."""
+    import_cv2().setNumThreads(1)
+
+
+class _BatchMaker(torch.utils.data.Dataset):
+    """Batches by number: the same ones with the same seed are alike in whatever process."""
+
+    def __init__(self, pictures: FingerPictures, augmentation: AugmentSettings, size: int, seed: int) -> None:
+        self.pictures, self.augmentation, self.size, self.seed = pictures, augmentation, size, seed
+
+    def __getitem__(self, number: int) -> dict[str, torch.Tensor]:
+        rng, data = np.random.default_rng((self.seed, number)), self.pictures
+        rows = choose_pictures(number, self.size, len(data), self.seed)
+        samples = [augment(data.picture[i], data.place[i], data.visible[i], self.augmentation, rng) for i in rows]
+        pictures = [sample.picture for sample in samples]
+        places, visible = (np.stack([getattr(sample, name) for sample in samples]) for name in ("points", "visible"))
+        told = rows.copy()
+        for k in np.flatnonzero(rng.random(len(rows)) < WRONG):
+            others = np.flatnonzero(data.finger != data.finger[rows[k]])
+            places[k], visible[k] = np.nan, False
+            chance = rng.random()
+            if chance < WRONG_FINGER and len(others):
+                told[k] = rng.choice(others)
+            elif chance < 0.5 * (1.0 + WRONG_FINGER):
+                pictures[k] = pictures[k][:, ::-1]
+            else:
+                pictures[k] = pictures[k][::-1, ::-1]
+        columns = {
+            "pictures": np.stack(pictures),
+            "templates": data.template[data.finger[told]],
+            "rest": data.rest[told],
+            "places": places,
+            "visible": visible,
+            "keypoints": data.keypoints[told],
+        }
+        return {name: torch.from_numpy(np.ascontiguousarray(column)) for name, column in columns.items()}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

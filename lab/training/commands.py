@@ -1,4 +1,4 @@
-"""What the commands of training share: settings as options, and errors in one line."""
+"""What the commands of training share: their errors, the libraries that only they need, settings as options."""
 
 from __future__ import annotations
 
@@ -6,9 +6,39 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
+from types import ModuleType
 from typing import Any
 
 from finforce.errors import FinforceError
+from finforce.optional import import_library
+
+PURPOSE = "training of key point networks"
+
+
+def import_torch() -> ModuleType:
+    """Return torch, networks and their gradients; raises MissingDependencyError where it is not installed."""
+    return import_library("torch", PURPOSE, "torch --index-url https://download.pytorch.org/whl/cpu")
+
+
+def import_onnx() -> ModuleType:
+    """Return onnx, which the export needs; raises MissingDependencyError where it is not installed."""
+    return import_library("onnx", PURPOSE)
+
+
+class LabelFileError(FinforceError, ValueError):
+    """A label file is none of DeepLabCut's, or does not fit the jaw."""
+
+
+class DatasetError(FinforceError, ValueError):
+    """Shards are missing, or hold something else than pictures with their points."""
+
+
+class CheckpointError(FinforceError, ValueError):
+    """A checkpoint is missing, or of another network."""
+
+
+class RecipeError(FinforceError, ValueError):
+    """A setting of the training has a value that it cannot have."""
 
 
 def add_settings(parser: ArgumentParser, record: type) -> None:

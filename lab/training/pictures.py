@@ -1,4 +1,4 @@
-"""Shards of rectified pictures of many fingers with their templates, on disk and in memory."""
+"""Data sets of rectified pictures of many fingers with their templates, in memory and as shards on disk."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lab.training.errors import DatasetError
+from finforce_eval.engine.engines import EngineOptions, run_tasks
+from finforce_eval.engine.tasks import OK, Manifest, Task
+from lab.training.commands import DatasetError
 
 MARGIN = 28  # px of padding all round, room for shifting and turning a picture
 TRAIN, VALIDATION = "train", "val"  # how the names of shards begin
@@ -179,11 +182,21 @@ def _count_pictures(path: Path) -> int:
         return len(content["finger"])
 
 
-def iterate_batches(count: int, size: int, rng: np.random.Generator) -> Iterator[NDArray]:
-    """Yield batches (size,) of indices below `count` without end, each index once per round, in random order."""
-    left = np.empty(0, dtype=int)
-    while True:
-        while len(left) < size:
-            left = np.concatenate((left, rng.permutation(count)))
-        yield left[:size]
-        left = left[size:]
+def make_all(tasks: Sequence[Task], engine: EngineOptions, folder: Path, shard: str, unit: str) -> list[dict[str, Any]]:
+    """Make what is not made yet, and return the lines of all tasks.
+
+    Args:
+        tasks: each makes a file.
+        engine: where they are carried out.
+        folder: of the files, and of a manifest that lets several runs share the work, or go on where one was killed.
+        shard: "i/n" of a run that does a part only.
+        unit: what a task is, for the bar.
+
+    Raises:
+        DatasetError: one of them failed; which, and how many.
+    """
+    lines = run_tasks(tasks, engine, Manifest(folder, shard), unit=unit)
+    failed = [line for line in lines if line["status"] != OK]
+    if failed:
+        raise DatasetError(f"{len(failed)} of {len(lines)} failed, {failed[0]['name']} with: {failed[0]['error']}")
+    return lines
