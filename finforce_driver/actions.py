@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from finforce_driver.errors import DriverError
 from finforce_driver.messages import MoveRequest, fill_joint_state, move_from_gripper_command, move_from_joint_state
 from finforce_driver.services import GripperTasks
+from finforce_driver.settings import FORCE_PER_CURRENT
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class MoveAction(ABC):
         if self.read(goal).force is not None:
             return ""
         settings = self._gripper.settings
-        force = settings.default_current * settings.force_per_current
+        force = settings.default_current * FORCE_PER_CURRENT
         return f"no effort, or 0: {force:.0f} N of grip force by the motor's current, gripper.default_current"
 
     def execute(self, handle: Any) -> Any:

@@ -84,7 +84,7 @@ class GripperDriverNode(Node):
         self.qos = ros.QosWatch(self)
         self.out = DriverOutputs(self.qos, parameters, own_joints=not self.is_other)
         self.seen: ForceSample | None = None
-        self.stale_after, self.noise = grasp.stale_after, grasp.noise
+        self.stale_after = grasp.stale_after
         self.arrived: deque[GripperState] = deque(maxlen=100)
         self.published = -math.inf
         self._serve()
@@ -175,7 +175,7 @@ class GripperDriverNode(Node):
         if wrong or self.gripper.clock.now() - seen.stamp > self.stale_after:
             return None
         try:
-            return check_force_value(seen.force, self.noise)
+            return check_force_value(seen.force)
         except GraspError:
             return None
 

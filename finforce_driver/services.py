@@ -127,7 +127,7 @@ class GripperTasks:
         """Open, and wait for it."""
         given, widest = self._parameters, self._gripper.settings.closed_opening + self._gripper.settings.stroke
         opening = widest if math.isnan(given.release_opening) else given.release_opening
-        state = self.go(MoveRequest(opening=opening, speed=given.release_speed), "release was commanded")
+        state = self.go(MoveRequest(opening=opening), "release was commanded")
         if state.outcome is not MoveOutcome.REACHED:
             raise GripperStateError(f"the gripper did not open: {state.outcome.value} at {1e3 * state.opening:.1f} mm")
         return f"open: {1e3 * state.opening:.1f} mm"

@@ -8,36 +8,32 @@ from finforce.settings import check_bounds, setting
 from finforce_driver.errors import TargetError
 
 LEAST_WATCHDOG = 0.2  # [s]
+LEAST_CURRENT = 0.15  # [A] below which the gripper is unstable
+FORCE_PER_CURRENT = 47.7  # [N/A], slope of the maker's curve of grip force
+PINION_RADIUS = 0.006  # [m] of the pinion between the two racks
 
 
 @dataclass(frozen=True, kw_only=True)
 class GripperSettings:
-    """Settings of `Gripper`; each field's metadata says unit, bounds and meaning."""
+    """Settings of `Gripper`; each field's metadata says unit, bounds and meaning.
+
+    Attributes:
+        telemetry_period: between two questions for temperature, supply or errors [s]; no ROS parameter.
+    """
 
     node_id: int = setting(0, "CAN node of the gripper", "", 0, 15)
-    poll_rate: float = setting(50.0, "how often the gripper is asked for its state", "Hz", 5.0, 200.0)
-    reply_timeout: float = setting(0.05, "longest wait for a reply", "s", 0.005, 1.0)
-    missed_replies: int = setting(25, "requests in a row without a reply after which the port is reopened", "", 2, 1000)
-    stroke: float = setting(0.048, "opening of the mechanism between its end stops", "m", 0.001, 0.5)
-    closed_opening: float = setting(0.0, "between the jaws' inner faces when the mechanism is closed", "m", 0.0, 0.2)
-    stroke_tolerance: float = setting(
-        0.04, "share of the stroke by which a calibration may find another one; beyond, it is refused", "", 0.001, 1.0
-    )
-    pinion_radius: float = setting(0.006, "of the pinion between the two racks", "m", 0.001, 0.1)
-    force_per_current: float = setting(47.7, "slope of the maker's curve of grip force", "N/A", 1.0, 500.0)
-    least_current: float = setting(0.15, "below it the gripper is unstable", "A", 0.05, 1.0)
-    largest_current: float = setting(1.3, "greatest current limit that may be asked for", "A", 0.15, 1.5)
-    default_speed: float = setting(0.02, "of the opening, where a command names none", "m/s", 1e-4, 0.37)
-    default_current: float = setting(0.5, "current limit where a command names no force", "A", 0.15, 1.5)
-    telemetry_period: float = setting(1.0, "between two questions for temperature, supply or errors", "s", 0.05, 3600.0)
+    poll_rate: float = setting(50.0, "Rate of state requests", "Hz", 5.0, 200.0)
+    reply_timeout: float = setting(0.05, "Maximum wait for a reply", "s", 0.005, 1.0)
+    stroke: float = setting(0.048, "Stroke of the opening between the end stops", "m", 0.001, 0.5)
+    closed_opening: float = setting(0.0, "Opening between the jaws' inner faces at the closed stop", "m", 0.0, 0.2)
+    largest_current: float = setting(1.3, "Maximum current limit of a command", "A", 0.15, 1.5)
+    default_speed: float = setting(0.02, "Speed of the opening where a command names none", "m/s", 1e-4, 0.37)
+    default_current: float = setting(0.5, "Current limit where a command names no force", "A", 0.15, 1.5)
     watchdog: float = setting(
-        0.0,
-        "silence of the driver after which the gripper goes limp by itself; 0: it goes on with its order",
-        "s",
-        0,
-        60,
+        0.0, "Silence of the driver after which the gripper goes limp; 0: it keeps its last order", "s", 0, 60
     )
-    release_on_stop: bool = setting(False, "let go when the driver ends; else it goes on holding", "")
+    release_on_stop: bool = setting(False, "Whether the jaws go limp when the driver ends; else they hold", "")
+    telemetry_period: float = 1.0
 
     @property
     def largest_opening(self) -> float:
@@ -69,8 +65,8 @@ class GripperSettings:
                 f"watchdog: got {self.watchdog:g} s, expected 0 for none, or {LEAST_WATCHDOG:g} s at least: a computer "
                 "stands still for a moment now and then"
             )
-        if not self.least_current <= self.default_current <= self.largest_current:
+        if not LEAST_CURRENT <= self.default_current <= self.largest_current:
             raise TargetError(
-                f"default_current: got {self.default_current:g} A, expected {self.least_current:g} to "
-                f"{self.largest_current:g} A, the range of least_current and largest_current"
+                f"default_current: got {self.default_current:g} A, expected {LEAST_CURRENT:g} to "
+                f"{self.largest_current:g} A, up to largest_current"
             )

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from finforce_driver.can.protocol import LARGEST_BYTE
 from finforce_driver.errors import TargetError
-from finforce_driver.settings import GripperSettings
+from finforce_driver.settings import FORCE_PER_CURRENT, LEAST_CURRENT, PINION_RADIUS, GripperSettings
 
 TICKS_PER_TURN = 16384  # of the encoder
+OPENING_PER_TICK = 4.0 * math.pi * PINION_RADIUS / TICKS_PER_TURN  # [m]: both racks move by the pinion's circumference
 SLOWEST_TICKS = 40  # per second, at speed byte 0
 TICKS_SPAN = 79960  # per second, from speed byte 0 to 255
 SLOWEST_BYTE = 3  # below it the gripper mistakes slow motion for contact
@@ -51,25 +52,18 @@ def check_numbers(**values: object) -> None:
             raise TargetError(f"{name}: got {value!r}, expected a number; the gripper stays as it was")
 
 
-def opening_per_tick(pinion_radius: float) -> float:
-    """Return the opening [m] of a tick of the encoder: both racks move by the pinion's circumference a turn."""
-    return 4.0 * math.pi * pinion_radius / TICKS_PER_TURN
-
-
 class GripperScale:
     """Converts openings, speeds and forces into bytes and back.
 
     Args:
-        settings: stroke, offset and pinion of the gripper, slope of its force, limits of its current.
+        settings: stroke and offset of the gripper, limit of its current.
     """
 
     def __init__(self, settings: GripperSettings) -> None:
         self._settings = settings
         self._closed = settings.closed_opening
         self._stroke = settings.stroke
-        self._force_per_current = settings.force_per_current
-        self._least_current, self._largest_current = settings.least_current, settings.largest_current
-        self._opening_per_tick = opening_per_tick(settings.pinion_radius)
+        self._largest_current = settings.largest_current
 
     @property
     def resolution(self) -> float:
@@ -112,7 +106,7 @@ class GripperScale:
 
     def speed_of(self, byte: int) -> float:
         """Return the speed of the opening [m/s] of a speed byte."""
-        return (SLOWEST_TICKS + byte * TICKS_SPAN // LARGEST_BYTE) * self._opening_per_tick
+        return (SLOWEST_TICKS + byte * TICKS_SPAN // LARGEST_BYTE) * OPENING_PER_TICK
 
     def pace_of(self, speed: float) -> Pace:
         """Return how a speed of the opening [m/s] is carried out; the byte never gives a faster one.
@@ -127,14 +121,14 @@ class GripperScale:
         if speed > self.fastest:
             note = f"speed {speed:g} m/s is more than the gripper can do: {self.fastest:.3g} m/s"
             return Pace(byte=LARGEST_BYTE, speed=self.fastest, note=note)
-        byte = int((speed / self._opening_per_tick * (1.0 + 1e-9) - SLOWEST_TICKS) * LARGEST_BYTE / TICKS_SPAN) + 1
+        byte = int((speed / OPENING_PER_TICK * (1.0 + 1e-9) - SLOWEST_TICKS) * LARGEST_BYTE / TICKS_SPAN) + 1
         while self.speed_of(byte) > speed * (1.0 + 1e-9) or byte > LARGEST_BYTE:
             byte -= 1
         return Pace(byte=byte, speed=self.speed_of(byte))
 
     def force_of(self, current: float) -> float:
         """Return the grip force [N] of a current [A] by the maker's curve; both positive when driving closed."""
-        return self._force_per_current * current
+        return FORCE_PER_CURRENT * current
 
     def force_for(self, current: float, force: float | None) -> float:
         """Return the grip force [N] that stands for a current limit [A].
@@ -144,7 +138,7 @@ class GripperScale:
         """
         if force is not None:
             raise TargetError(f"force {force!r} N and current {current!r} A: expected one of them")
-        low, high = self._least_current, self._largest_current
+        low, high = LEAST_CURRENT, self._largest_current
         if not (is_number(current) and low - ROUNDING <= current <= high + ROUNDING):
             raise TargetError(f"current: got {current!r} A, expected {low:g} to {high:g} A")
         return self.force_of(current)
@@ -155,10 +149,10 @@ class GripperScale:
         Raises:
             TargetError: it is no number, or outside the range of the current limit.
         """
-        low, high = self.force_of(self._least_current), self.force_of(self._largest_current)
+        low, high = self.force_of(LEAST_CURRENT), self.force_of(self._largest_current)
         if not low - ROUNDING <= force <= high + ROUNDING:
             raise TargetError(
                 f"force: got {force:g} N, expected {low:.3g} to {high:.3g} N, the range of the current limit; "
                 "a smaller force needs vision"
             )
-        return round(1e3 * force / self._force_per_current)
+        return round(1e3 * force / FORCE_PER_CURRENT)

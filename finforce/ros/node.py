@@ -78,7 +78,7 @@ provide_transport()  # read when the first context is made, whoever makes it
 
 
 def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> RecordT:
-    """Declare a ROS parameter for every field of a frozen dataclass and return the record.
+    """Declare a ROS parameter for every field of a frozen dataclass that is a `setting`, and return the record.
 
     Field metadata: `description`, `unit`, `min`, `max`, `choices`, `topic` (names one, or several), `settable` (not
     read-only); NaN may be a default.
@@ -92,7 +92,7 @@ def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> Recor
         ParameterError: a value has the wrong type or is out of bounds, or a topic's name cannot be one.
     """
     values = {}
-    for entry in fields(record):
+    for entry in filter(lambda entry: entry.metadata, fields(record)):
         name = f"{prefix}.{entry.name}" if prefix else entry.name
         value = _read_value(node, name, entry, prefix)
         check_value(entry, value, name=name)

@@ -7,13 +7,24 @@ from collections import deque
 from collections.abc import Callable
 
 from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
-from finforce_driver.grasp.load_watch import ForceFeed, ForceSample, LoadWatch, LocatedForce, TouchSample
+from finforce_driver.grasp.load_watch import NOISE, ForceFeed, ForceSample, LoadWatch, LocatedForce, TouchSample
 from finforce_driver.grasp.plan import GraspPlan, JawHistory, JawPlace
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus, GraspStep, GripperMove
+from finforce_driver.grasp.settings import (
+    MOTOR_MARGIN,
+    GraspGoal,
+    GraspPhase,
+    GraspSettings,
+    GraspStatus,
+    GraspStep,
+    GripperMove,
+)
 from finforce_driver.state import GripperState, Phase
 
 OpeningAt = Callable[[float], float]
 
+_ONSET_FORCE = 0.25  # [N] above what was seen without load, that says that something presses
+_MOTOR_ONSET = 0.8  # [N] of the motor's force above that of free motion, at which jaws wait for the next image
+_RELAXATION = 0.4  # share of the set force that holding may make up for by closing
 _CONTENT = 3  # images at rest without a wish to move after which the force is held
 _SATURATED_AFTER = 1.0  # [s] at the least opening
 _SPARE_STEPS = 3  # that holding may close in any case
@@ -46,7 +57,7 @@ class ForceGrasp:
         self.goal, self.settings = goal, settings or GraspSettings()
         self._set_force = self.settings.check_force(goal.force)
         self._feed = ForceFeed(self.settings.stale_after)
-        self._load = LoadWatch(self.settings, min(self.settings.onset_force, 0.5 * goal.force))
+        self._load = LoadWatch(self.settings, min(_ONSET_FORCE, 0.5 * goal.force))
         self._jaws = JawHistory(
             resolution=resolution, closed_opening=closed_opening, stroke=stroke, reaction=self.settings.reaction
         )
@@ -151,7 +162,7 @@ class ForceGrasp:
                 counts = self._feed.admit_touch(sample, now) and not self._feed.heard and not sample.touching
                 force = 0.0
             else:
-                force = check_force_value(sample.force, max(self.settings.noise, sample.stddev))
+                force = check_force_value(sample.force, sample.stddev)
                 counts = self._feed.admit(sample)
             if counts:
                 stddev = 0.0 if isinstance(sample, TouchSample) else sample.stddev
@@ -197,7 +208,7 @@ class ForceGrasp:
             self._free = max(self._free, self._motor.popleft()[1])
         if self._feed.stamp > self._waits_since:
             self._waits_since = math.nan
-        meets = self._free > 0.0 and state.force > self._free + self.settings.motor_onset
+        meets = self._free > 0.0 and state.force > self._free + _MOTOR_ONSET
         if not meets or not math.isnan(self._waits_since):
             return None
         self._waits_since = now
@@ -211,7 +222,7 @@ class ForceGrasp:
         """
         seen = 0.0 if math.isnan(self._load.force) else max(0.0, self._load.pressing)
         moved = not math.isnan(self._jaws.target)  # else it was not this grasp that presses
-        if not (moved and state.force - seen > self.settings.motor_margin):
+        if not (moved and state.force - seen > MOTOR_MARGIN):
             self._excess_since = math.nan
             return
         if math.isnan(self._excess_since):
@@ -275,7 +286,7 @@ class ForceGrasp:
         if self._content >= _CONTENT and self._phase is not GraspPhase.HOLDING:
             self._phase, self._reason, self._held_at = GraspPhase.HOLDING, "holds the set force", target
             # as it is now: a force that drifts while the jaws close looks like something that gets softer
-            yielded = self.settings.relaxation * self._set_force / self._load.model.stiffness
+            yielded = _RELAXATION * self._set_force / self._load.model.stiffness
             self._spare = yielded + _SPARE_STEPS * self._jaws.resolution
 
     def _pause(self, state: GripperState, now: float) -> GripperMove | None:
@@ -325,17 +336,17 @@ _WORKING = (Phase.READY, Phase.MOVING)
 _SILENT = 0.3  # [s] after which a gripper without a reply is not the one that is known
 
 
-def check_force_value(force: float, noise: float) -> float:
+def check_force_value(force: float, stddev: float = 0.0) -> float:
     """Return a grasp force [N]; one that is negative by no more than noise is none.
 
     Args:
         force: that came [N].
-        noise: its standard deviation [N].
+        stddev: as its source states it [N].
 
     Raises:
         GraspError: the force is no finite number, or negative.
     """
-    if not math.isfinite(force) or force < -3.0 * noise:
+    if not math.isfinite(force) or force < -3.0 * max(NOISE, stddev):
         raise GraspError(f"a grasp force of {force} N came, expected a number from 0: holds in place")
     return max(0.0, force)
 
@@ -381,11 +392,11 @@ def check_silence(feed: ForceFeed, now: float, started: float, settings: GraspSe
             )
         return
     touched = feed.touched_since
-    if now - touched > settings.touch_timeout:
+    if now - touched > settings.force_timeout:
         words = f"the jaws are said to touch, but no force came for {now - touched:.2f} s"
         raise GraspError(f"{words}: {_refused(feed)}" if feed.last_refusal else words)
     heard = max(started, feed.touch.stamp if feed.touch else started)
-    if now - heard > settings.silence_timeout:
+    if now - heard > 2.0 * settings.force_timeout:
         raise GraspError(
             f"no force came for {now - heard:.2f} s: "
             + (_refused(feed) or "is the camera there, are the solvers tared (30 unloaded images)?")

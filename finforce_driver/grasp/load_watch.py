@@ -18,6 +18,8 @@ from statistics import median
 from finforce_driver.errors import BackOffError, GraspError
 from finforce_driver.grasp.settings import GraspSettings
 
+NOISE = 0.05  # [N], standard deviation of a force that is expected at first
+_JUMP = 1.0  # [N] between two images, beyond what motion and noise explain
 _LARGEST_OFFSET = 0.2  # [N] that an unloaded estimate may show
 _CONFIRMED = 2  # images in a row that make an onset, or a jump
 _FROZEN, _FROZEN_WAY = 4, 0.4e-3  # images in a row with the same force to the last digit, and [m] closed meanwhile
@@ -67,7 +69,7 @@ class LoadWatch:
 
     def __init__(self, settings: GraspSettings, onset_force: float) -> None:
         self._settings, self._onset_force = settings, onset_force
-        self.model = ForceModel(stiffness=settings.largest_stiffness, noise=settings.noise)
+        self.model = ForceModel(stiffness=settings.largest_stiffness, noise=NOISE)
         self.loaded = self.doubtful = self.resting = False
         self.force = self.opening = math.nan
         self.peak = self.stddev = 0.0
@@ -136,7 +138,7 @@ class LoadWatch:
         if math.isnan(self.force):
             return False
         beyond = self._surprise(sample)
-        if abs(beyond) <= self._settings.jump:
+        if abs(beyond) <= _JUMP:
             self._doubts = 0
             return False
         self._doubts += 1

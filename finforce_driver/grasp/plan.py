@@ -17,9 +17,11 @@ from dataclasses import dataclass
 
 from finforce_driver.errors import GraspError
 from finforce_driver.grasp.load_watch import ForceFeed, LoadWatch
-from finforce_driver.grasp.settings import GraspGoal, GraspSettings
+from finforce_driver.grasp.settings import MOTOR_MARGIN, GraspGoal, GraspSettings
 from finforce_driver.state import GripperState
 
+_APPROACH_SHARE = 0.7  # of the set force, that may build up before an image can show the contact
+_TOLERANCE = 0.08  # [N] by which the set force may be passed to come nearer to it
 _LEAST_SPEED = 0.001  # [m/s] slower would only cost time: the target is bounded anyway
 _FEW_STEPS = 3.5  # by which a target may lie ahead of the one that was sent
 _BACK_STEPS = 1.5  # by which it must lie behind while the jaws move, where a step is noise
@@ -68,7 +70,7 @@ class GraspPlan:
         load, jaws = self._load, self._jaws
         if not self._load.resting:
             return jaws.snap(load.opening - self._allowed(set_force) / self.stiffness)
-        allowed = self._allowed(set_force, min(0.5 * self.resolution, self._settings.tolerance))
+        allowed = self._allowed(set_force, min(0.5 * self.resolution, _TOLERANCE))
         if allowed < 0.0:
             return jaws.target + self._steps_back(-allowed) * jaws.resolution
         reach = allowed / self.stiffness
@@ -105,9 +107,8 @@ class GraspPlan:
     @property
     def _blind_speed(self) -> float:
         """Speed [m/s] at which the motor's current tells early enough that something presses where nothing is seen."""
-        given = self._settings
-        spare = max(0.0, given.force_limit - given.motor_margin - _FRICTION)
-        return max(_LEAST_SPEED, spare / (given.largest_stiffness * _WITNESS_TIME))
+        spare = max(0.0, self._settings.force_limit - MOTOR_MARGIN - _FRICTION)
+        return max(_LEAST_SPEED, spare / (self._settings.largest_stiffness * _WITNESS_TIME))
 
     @property
     def _sureness(self) -> float:
@@ -119,7 +120,7 @@ class GraspPlan:
     @property
     def _caution(self) -> float:
         """What the force's stated deviation has beyond the tolerance [N]: so much nearer to the set force it may be."""
-        return max(0.0, self._load.stddev - self._settings.tolerance)
+        return max(0.0, self._load.stddev - _TOLERANCE)
 
     def is_worth(self, target: float, speed: float, opening: float) -> bool:
         """Whether a target [m] with a speed [m/s] is worth a command to jaws that are at `opening` [m] now."""
@@ -158,7 +159,7 @@ class GraspPlan:
         """Return by how much the force may rise [N], with `slack` above the set one; negative: by how much to fall."""
         load = self._load
         if not load.loaded:
-            return max(0.0, self._settings.approach_share * set_force - load.force)
+            return max(0.0, _APPROACH_SHARE * set_force - load.force)
         allowed = set_force + slack - load.model.force
         # a doubt about the force keeps the jaws where they are, and opens them no more than it closes them
         return max(0.0, allowed - load.model.force_stddev - self._caution) if allowed > 0.0 else allowed

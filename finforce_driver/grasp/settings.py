@@ -10,6 +10,8 @@ from enum import Enum
 from finforce.settings import check_bounds, setting
 from finforce_driver.errors import BackOffError, GraspError, TargetError, UnseenForceError
 
+MOTOR_MARGIN = 4.0  # [N] of the motor's force above the camera's, friction included, at which a grasp backs off
+
 
 @dataclass(frozen=True, kw_only=True)
 class GraspGoal:
@@ -22,10 +24,10 @@ class GraspGoal:
         time_limit: to reach the force in [s]; holding has none.
     """
 
-    force: float = setting(description="to be reached and held", unit="N", low=0.1, high=30.0)
-    speed: float = setting(0.004, "greatest speed of the opening while closing", "m/s", 1e-4, 0.1)
-    least_opening: float = setting(0.0, "opening below which the jaws never go", "m", 0.0, 0.5)
-    time_limit: float = setting(20.0, "to reach the force in; holding has none", "s", 0.1, 3600.0)
+    force: float = setting(description="Set force", unit="N", low=0.1, high=30.0)
+    speed: float = setting(0.004, "Maximum speed of the opening while closing", "m/s", 1e-4, 0.1)
+    least_opening: float = setting(0.0, "Minimum opening of the jaws", "m", 0.0, 0.5)
+    time_limit: float = setting(20.0, "Maximum time to reach the set force", "s", 0.1, 3600.0)
 
     def __post_init__(self) -> None:
         """Refuses what no grasp can be.
@@ -40,46 +42,26 @@ class GraspGoal:
 class GraspSettings:
     """Settings of `ForceGrasp`; each field's metadata says unit, bounds and meaning."""
 
-    force_limit: float = setting(8.0, "force that ends a grasp; no goal may be above it", "N", 0.2, 30.0)
-    tolerance: float = setting(0.08, "by which the set force may be passed to come nearer to it", "N", 0.0, 1.0)
+    force_limit: float = setting(8.0, "Grasp force that ends a grasp, and maximum set force", "N", 0.2, 30.0)
     largest_stiffness: float = setting(
-        1400.0,
-        "of fingers and object per metre of opening, the greatest expected before it is learnt",
-        "N/m",
-        50.0,
-        1e5,
+        1400.0, "Maximum stiffness of jaws and object per opening, assumed until it is learnt", "N/m", 50.0, 1e5
     )
-    approach_share: float = setting(
-        0.7, "of the set force that may build up before an image can show the contact", "", 0.05, 1.0
+    approach_speed: float = setting(0.004, "Maximum speed of the opening before contact", "m/s", 1e-4, 0.1)
+    reaction: float = setting(0.05, "Delay from a command to the motion of the gripper", "s", 0.0, 1.0)
+    stale_after: float = setting(0.25, "Maximum age of the newest force; a grasp ends beyond it", "s", 0.05, 2.0)
+    force_timeout: float = setting(
+        1.0,
+        "Maximum wait for a force once the jaws touch; twice as long before",
+        "s",
+        0.1,
+        10.0,
+        alias="touch_timeout",
     )
-    approach_speed: float = setting(
-        0.004, "greatest speed of the opening before something presses, whatever the goal says", "m/s", 1e-4, 0.1
-    )
-    motor_onset: float = setting(
-        0.8,
-        "rise of the motor's force above that of free motion, at which jaws wait for the next image",
-        "N",
-        0.2,
-        62.0,
-    )
-    onset_force: float = setting(0.25, "above what was seen without load, it says that jaws are loaded", "N", 0.05, 2.0)
-    noise: float = setting(0.05, "standard deviation of the force that is expected at first", "N", 0.005, 1.0)
-    jump: float = setting(1.0, "change of the force between two images that motion does not explain", "N", 0.1, 10.0)
-    reaction: float = setting(0.05, "from a command to the motion that it asks for, of the gripper", "s", 0.0, 1.0)
-    stale_after: float = setting(0.25, "age of the newest image with a force at which a grasp ends", "s", 0.05, 2.0)
-    touch_timeout: float = setting(1.0, "wait for a force once the jaws are said to touch", "s", 0.1, 10.0)
-    silence_timeout: float = setting(2.0, "wait for the first word of the camera", "s", 0.1, 60.0)
-    relaxation: float = setting(0.4, "share of the force that holding may make up for by closing", "", 0.05, 1.0)
     slip_raise: float = setting(
-        0.0, "share of the set force by which it rises while the object slides; 0 leaves it", "", 0.0, 1.0
+        0.0, "Share of the set force that is added while the object slides; 0: none", "", 0.0, 1.0
     )
-    slip_limit: float = setting(1.5, "times the set force to which it rises at most", "", 1.0, 5.0)
-    slip_speed: float = setting(0.003, "of the object over a jaw, above which it slides", "m/s", 1e-4, 0.1)
     motor_force: float = setting(
-        7.5, "grip force by the maker's curve that the motor is limited to; 2.5 set forces if more", "N", 7.0, 62.0
-    )
-    motor_margin: float = setting(
-        4.0, "of the motor's force above the camera's, friction included, at which a grasp backs off", "N", 1.0, 62.0
+        7.5, "Motor limit as grip force by the maker's curve; 2.5 times the set force if that is more", "N", 7.0, 62.0
     )
 
     def __post_init__(self) -> None:

@@ -22,6 +22,7 @@ from finforce_driver.units import check_numbers, is_number
 Listener = Callable[[GripperState], None]
 NEAR = 1.5  # steps within which the target is reached
 STILL, STALL = 1e-3, 0.4  # [m/s], and [s] without motion after which the jaws are stalled
+SILENCE = 0.5  # [s] without a state after which the joint counts as away
 PATIENCE = 2.0  # [s] beyond the way's time
 TURN = 0.005  # [s] between two looks of one who waits
 
@@ -129,7 +130,7 @@ class JointGripper:
                 if now > self._way.arrives and self._outcome is not MoveOutcome.NONE:
                     self._way = None  # it stays at its last command
             silent = self.state.phase not in (Phase.PROBING, Phase.DISCONNECTED)
-            silent &= now - self._stamp > self._joint.silence
+            silent &= now - self._stamp > SILENCE
             if silent:
                 self._end(MoveOutcome.ABORTED)
                 self._refresh()
@@ -318,7 +319,7 @@ class JointGripper:
         if not self._is_known:
             self.state = replace(self.state, estopped=self._stopped)
             return
-        away = self.clock.now() - self._stamp > self._joint.silence
+        away = self.clock.now() - self._stamp > SILENCE
         moving = self._way is not None and self._outcome is MoveOutcome.NONE
         phase = Phase.MOVING if moving else Phase.READY
         phase = Phase.FAULT if self._stopped else phase
@@ -329,7 +330,7 @@ class JointGripper:
         if self._stopped:
             message = "emergency stop: the jaws hold; make the place safe, then clear the errors"
         if away:
-            phase, message = Phase.DISCONNECTED, f"no state of {self._joint.names[0]} for {self._joint.silence:g} s"
+            phase, message = Phase.DISCONNECTED, f"no state of {self._joint.names[0]} for {SILENCE:g} s"
         self.state = GripperState(
             phase=phase,
             stamp=self._stamp,

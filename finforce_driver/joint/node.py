@@ -43,7 +43,7 @@ class JointLink:
         self._node, self._joint = node, joint
         self._send = self._topic(target) if kind == "joint_command" else self._action(kind, target)
         self.gripper = JointGripper(self._send, settings, joint)
-        node.create_subscription(JointState, joint.states, self._take, ros.SENSOR)
+        node.create_subscription(JointState, "joint_states", self._take, ros.SENSOR)
         node.create_timer(1.0 / (joint.rate or 10.0), self.gripper.tick)
 
     def _take(self, message: JointState) -> None:

@@ -16,26 +16,18 @@ class JointSettings:
     `open`.
     """
 
-    names: tuple[str, ...] = setting(("gripper_joint",), "of the joints that are commanded, alike; the first is read")
-    states: str = setting("joint_states", "topic with the joint's state")
-    closed: float = setting(0.0, "value of the joint when the jaws are closed, in its own unit", "", -1e4, 1e4)
-    open: float = setting(1.0, "value of the joint when the jaws are open", "", -1e4, 1e4)
-    resolution: float = setting(0.0002, "smallest step of the opening that the joint follows", "m", 1e-6, 0.01)
+    names: tuple[str, ...] = setting(("gripper_joint",), "Names of the commanded joints; the first is read")
+    closed: float = setting(0.0, "Joint value of the closed gripper, in the joint's unit", "", -1e4, 1e4)
+    open: float = setting(1.0, "Joint value of the open gripper, in the joint's unit", "", -1e4, 1e4)
+    resolution: float = setting(0.0002, "Smallest step of the opening that the joint follows", "m", 1e-6, 0.01)
     rate: float = setting(
-        25.0,
-        "how often a setpoint is sent on the way; 0: once, the joint keeps to the speed by itself",
-        "Hz",
-        0.0,
-        500.0,
+        25.0, "Rate of setpoints on the way; 0: one command, the joint keeps the speed itself", "Hz", 0.0, 500.0
     )
-    largest_speed: float = setting(0.1, "of the opening", "m/s", 1e-4, 2.0)
-    largest_force: float = setting(
-        0.0, "greatest effort that may be asked for; 0: the joint takes none", "N", 0.0, 1000.0
-    )
+    largest_speed: float = setting(0.1, "Maximum speed of the opening", "m/s", 1e-4, 2.0)
+    largest_force: float = setting(0.0, "Maximum effort of a command; 0: the joint takes none", "N", 0.0, 1000.0)
     effort_is_force: bool = setting(
-        False, "the joint's effort is its grip force [N]: the second witness of a grasp by force", ""
+        False, "Whether the joint's effort is its grip force [N], as a check of the camera's", ""
     )
-    silence: float = setting(0.5, "without a state after which the joint counts as away", "s", 0.05, 10.0)
 
     def __post_init__(self) -> None:
         """Refuses what no joint is.

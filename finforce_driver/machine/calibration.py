@@ -7,8 +7,9 @@ from enum import Enum, auto
 
 from finforce_driver.can.protocol import CanMessage, Reply, decode_encoder
 from finforce_driver.settings import GripperSettings
-from finforce_driver.units import opening_per_tick
+from finforce_driver.units import OPENING_PER_TICK
 
+STROKE_TOLERANCE = 0.04  # share by which the travelled stroke may differ from that of the settings
 TIME_LIMIT = 35.0  # [s]: the firmware gives up after 30 s
 BOOT_TIME = 3.0  # [s] after a reset
 START_TIME = 1.0  # [s] in which the motor has to show that it runs
@@ -39,13 +40,12 @@ class Travel:
         answers: counts that came.
 
     Args:
-        settings: stroke, its tolerance, pinion, and how often is asked.
+        settings: stroke, and how often is asked.
     """
 
     def __init__(self, settings: GripperSettings) -> None:
         self._settings = settings
         self._period = 1.0 / settings.poll_rate
-        self._per_tick = opening_per_tick(settings.pinion_radius)
         self.answers = self._silences = 0
         self._next_time = 0.0
         self._last: tuple[float, int] | None = None
@@ -92,13 +92,13 @@ class Travel:
         """Return what is wrong with the way that was gone; empty where nothing is."""
         if not self.answers:
             return ""
-        settings, way = self._settings, self._per_tick * (self._high - self._low)
+        settings, way = self._settings, OPENING_PER_TICK * (self._high - self._low)
         # between two counts the jaws may have gone on to a stop and come back
-        unseen = 0.5 * self._per_tick * FASTEST * max(0.0, self._gap - 1.5 * self._period)
-        least, most = (settings.stroke * (1.0 + sign * settings.stroke_tolerance) for sign in (-1.0, 1.0))
+        unseen = 0.5 * OPENING_PER_TICK * FASTEST * max(0.0, self._gap - 1.5 * self._period)
+        least, most = (settings.stroke * (1.0 + sign * STROKE_TOLERANCE) for sign in (-1.0, 1.0))
         words = f"the jaws travelled {1e3 * way:.1f} mm of the stroke of {1e3 * settings.stroke:.1f} mm"
         if way > most:
-            return f"{words}: is gripper.stroke or gripper.pinion_radius wrong, or does the pinion slip?"
+            return f"{words}: is gripper.stroke wrong, or does the pinion slip?"
         if way + unseen < least:
             return f"{words}: is something between them? Take it out, then calibrate again"
         if way < least:

@@ -34,6 +34,7 @@ from finforce_driver.state import (
 from finforce_driver.units import SLOWEST_BYTE, GripperScale, check_numbers
 
 SHORT_SILENCE = 5  # requests in a row without a reply after which the gripper is taken to be absent
+MISSED_REPLIES = 25  # requests in a row without a reply after which the link is opened anew
 PROBES = 20  # the same before the first reply: a second
 ECHOES = 8  # last messages, in which one of ours is recognised that an adapter gives back
 OLD = 0.1  # [s] after which a reply does not tell where moving jaws are
@@ -160,7 +161,7 @@ class GripperMachine:
     @property
     def must_reopen(self) -> bool:
         """Whether nothing has answered for so long that the link is to be opened anew."""
-        return self.exchange.misses >= self.settings.missed_replies
+        return self.exchange.misses >= MISSED_REPLIES
 
     def opening_at(self, time: float) -> float:
         """Return the opening [m] at a past time; NaN unknown."""

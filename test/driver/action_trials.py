@@ -120,7 +120,6 @@ def test_a_second_driver_holds_a_force_by_the_actions_of_the_first(trial, interf
         "port": f"/gripper_driver/{action}",
         "joint.names": JOINTS if half else ["left_jaw_joint"],
         "joint.open": 0.024 if half else 0.048,
-        "joint.states": "/joint_states" if half else "/opening",
         "joint.rate": 8.0,
         "joint.resolution": 0.0002,
         "joint.largest_force": 62.0,
@@ -136,7 +135,8 @@ def test_a_second_driver_holds_a_force_by_the_actions_of_the_first(trial, interf
         )
         trial.probe.create_timer(0.02, double)
     parameters = [Parameter(name, value=value) for name, value in given.items()]
-    remapped = ["--ros-args", "-r", "__node:=second_driver"]
+    states = "joint_states" if half else "opening"
+    remapped = ["--ros-args", "-r", "__node:=second_driver", "-r", f"joint_states:={states}"]
     second = GripperDriverNode(context=trial.probe.context, parameter_overrides=parameters, cli_args=remapped)
     trial.probe.spinner.add_node(second)
     trial.probe.wait_for(lambda: second.gripper.state.phase.value == "ready")

@@ -165,12 +165,13 @@ class FakeGoal:
             setattr(self, name, lambda name=name: self.ends.append(name))
 
 
-def start_driver(probe, gripper=None, **parameters):
+def start_driver(probe, gripper=None, remap=(), **parameters):
     """Add a driver node around a fake gripper to the probe's executor."""
     given = {"diagnostics_period": 0.1, **parameters}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     build = {} if gripper is None else {"build": lambda *_: gripper}
-    node = GripperDriverNode(context=probe.context, parameter_overrides=overrides, **build)
+    words = ["--ros-args", *(word for rule in remap for word in ("-r", rule))] if remap else None
+    node = GripperDriverNode(context=probe.context, parameter_overrides=overrides, cli_args=words, **build)
     probe.spinner.add_node(node)
     probe.hear("joint_states", JointState)
     probe.hear("/gripper_driver/grasp_state", DiagnosticStatus, ros.LATCHED)

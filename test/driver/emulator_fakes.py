@@ -254,7 +254,7 @@ def message_of(line: str) -> CanMessage:
 
 
 # a machine that is busy with other things stops the emulation for a while, too
-PATIENT = {"gripper.reply_timeout": 0.5, "grasp.stale_after": 1.0, "max_age": 1.0, "grasp.silence_timeout": 10.0}
+PATIENT = {"gripper.reply_timeout": 0.5, "grasp.stale_after": 1.0, "max_age": 1.0, "grasp.force_timeout": 5.0}
 
 
 class Bench:

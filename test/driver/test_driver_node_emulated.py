@@ -236,7 +236,7 @@ def test_a_grasp_without_vision_holds_with_the_motors_force(bench):
 
 
 def test_release_opens_again(bench):
-    bench = bench(release_opening=0.045, release_speed=0.1)
+    bench = bench(release_opening=0.045, **{"gripper.default_speed": 0.1})
     bench.wait_for_joints()
     bench.move(0.04, velocity=[0.1])
     bench.probe.wait_for(lambda: bench.gripper.true_opening < 0.041)
@@ -246,7 +246,7 @@ def test_release_opens_again(bench):
 
 
 def test_what_was_asked_for_before_a_stop_does_not_move_the_jaws_after_it(bench):
-    bench = bench(release_speed=0.01)
+    bench = bench(**{"gripper.default_speed": 0.01})
     bench.wait_for_joints()
     bench.move(0.04, velocity=[0.1])
     bench.probe.wait_for(lambda: bench.gripper.true_opening < 0.041)

@@ -40,7 +40,7 @@ def test_a_signal_ends_a_node_that_has_no_port():
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        ("bit_rate:=123456", "123456"),
+        ("baud_rate:=100", "baud_rate"),
         ("gripper.node_id:=16", "gripper.node_id"),
         ("grasp_force:=9.0", "set force: got 9 N"),
         ("joint_names:=[a]", "joint_names: got"),

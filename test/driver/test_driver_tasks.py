@@ -64,12 +64,12 @@ def test_what_the_gripper_refuses_is_raised(name):
 
 
 def test_release_opens_as_far_as_the_gripper_goes():
-    gripper, _, tasks = build(FakeGripper(closed_opening=0.01), release_speed=0.03)
+    gripper, _, tasks = build(FakeGripper(closed_opening=0.01))
     with Caller(tasks.release) as caller:
         caller.wait_for(lambda: gripper.calls)
         gripper.reply(phase=Phase.READY, outcome=MoveOutcome.REACHED, opening=0.058)
         assert "58.0 mm" in caller.result()
-    assert gripper.calls == [("move", pytest.approx(0.058), 0.03, None)]
+    assert gripper.calls == [("move", pytest.approx(0.058), None, None)]
 
 
 def test_release_opens_as_far_as_it_is_told():

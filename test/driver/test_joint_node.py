@@ -20,7 +20,6 @@ class OtherGripper:
             "interface": "joint_command",
             "port": "/other/command",
             "joint.names": ["finger_joint"],
-            "joint.states": "/other/joint_states",
             "joint.closed": OPEN,
             "joint.open": 0.0,
             "joint.resolution": 0.0003,
@@ -29,7 +28,7 @@ class OtherGripper:
             "grasp.stale_after": 0.75,
             "max_age": 0.5,
         }
-        self.node = start_driver(probe, **{**given, **parameters})
+        self.node = start_driver(probe, remap=["joint_states:=/other/joint_states"], **{**given, **parameters})
         self.commands = []
         probe.create_subscription(JointState, "/other/command", self.follow, 10)
         self.states = probe.speak("/other/joint_states", JointState)
