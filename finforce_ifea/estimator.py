@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from math import hypot, nan
+from math import hypot
 
 import numpy as np
 from numba import njit
@@ -29,20 +29,11 @@ from finforce_ifea.observation import (
 from finforce_ifea.relaxation import Relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import TareKeeper, TareReport
-from finforce_ifea.tracking.friction_estimate import SMOOTH, Coefficient
+from finforce_ifea.tracking.contact_state import UNSEEN_ALONG, ContactState, compute_force, find_rejection_reason
+from finforce_ifea.tracking.contact_tracker import ContactTracker
+from finforce_ifea.tracking.friction import SMOOTH, Coefficient
+from finforce_ifea.tracking.given_contact import GivenContactTracker
 from finforce_ifea.tracking.influence import ReachWatch
-from finforce_ifea.tracking.place_tracker import PlaceTracker
-from finforce_ifea.tracking.point_tracker import PointTracker
-from finforce_ifea.tracking.track import (
-    UNSEEN_ALONG,
-    UNSEEN_LEAN,
-    AcrossFinger,
-    ForceEvidence,
-    Track,
-    find_doubt,
-    find_numbers,
-)
-from finforce_ifea.tracking.width_tracker import MIDDLE_STDDEV
 
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 
@@ -61,7 +52,7 @@ class JawEstimator:
     """Estimates the force on one jaw; deterministic, one thread.
 
     Attributes:
-        spared: whether the jaw was left alone in the last image.
+        is_idle: whether the jaw was at rest in the last image, its object out of reach.
     """
 
     def __init__(
@@ -70,7 +61,6 @@ class JawEstimator:
         *,
         settings: EstimatorSettings | None = None,
         calibration: Calibration | None = None,
-        spares: bool = True,
     ) -> None:
         """Builds the mechanics of the jaw as the calibration describes it.
 
@@ -78,7 +68,6 @@ class JawEstimator:
             jaw: as its file has it.
             settings: of this estimator.
             calibration: of the finger, None for the jaw as it is.
-            spares: whether a jaw at rest is left alone while its object is out of reach.
 
         Raises:
             FinforceError: Jaw, settings and calibration do not fit each other.
@@ -89,9 +78,9 @@ class JawEstimator:
         self.mechanics: Mechanics = build_chosen(self.jaw, self.settings)
         torsion = measure_torsion(self.jaw, self.mechanics.mesh)
         smooth = Coefficient(calibration.friction, calibration.friction_stddev) if calibration else SMOOTH
-        self._rolling = PlaceTracker(self.mechanics, self.jaw.keypoints, self.settings, torsion, smooth)
-        self._pointed = PointTracker(self.jaw, self.mechanics, self.settings, self._rolling.response)
-        self._tracker: PlaceTracker | PointTracker = self._rolling
+        self._tracked = ContactTracker(self.mechanics, self.jaw.keypoints, self.settings, torsion, smooth)
+        self._given = GivenContactTracker(self.jaw, self.mechanics, self.settings, self._tracked.response)
+        self._tracker: ContactTracker | GivenContactTracker = self._tracked
         self._gate = KeypointGate(self.jaw, self.settings)
         self._relaxation = Relaxation(calibration.relaxation if calibration else ())
         solver = self.settings.solver
@@ -101,42 +90,41 @@ class JawEstimator:
         self._taring = TareKeeper(
             self.jaw.keypoints, self.settings, lambda *chance: self._tracker.significance(*chance)
         )
-        self._away = ReachWatch(self.jaw.keypoints, self.jaw.inner_face_x, self._rolling.rest_modes)
-        self._spares, self.spared = spares, False
+        self._reach = ReachWatch(self.jaw.keypoints, self.jaw.inner_face_x, self._tracked.rest_modes)
         self.reset()
 
     def reset(self) -> None:
         """Forgets everything but the jaw: offsets, place, relaxation, stamps."""
         self._stamp: float | None = None
         self._contact: Contact | None = None
-        self._at_rest = False
+        self._at_rest = self.is_idle = False
         self._relaxed: float | None = None
         self._taring.reset()
         self._gate.reset()
-        self._away.reset()
+        self._reach.reset()
         self._relaxation.reset()
-        self._rolling.reset()
-        self._pointed.reset()
+        self._tracked.reset()
+        self._given.reset()
 
     def forget(self) -> None:
         """Forgets the object, too: what was learnt of its friction."""
         self.reset()
-        self._rolling.forget()
+        self._tracked.forget()
 
     @property
     def seen_friction(self) -> Coefficient:
         """What the key points alone say of the object's coefficient of friction; infinite deviation: nothing."""
-        return self._rolling.roughness.seen
+        return self._tracked.roughness.seen
 
     @property
     def friction(self) -> Coefficient:
         """The object's coefficient of friction as far as it is known."""
-        return self._rolling.roughness.coefficient
+        return self._tracked.roughness.coefficient
 
     @property
     def mobilised(self) -> float:
         """How far the object makes use of its friction, by the way that it has gone, from -1 to 1."""
-        return self._rolling.slips.mobilised
+        return self._tracked.slips.mobilised
 
     def warm_up(self) -> None:
         """Compiles what is compiled on first use, and leaves no trace."""
@@ -180,10 +168,9 @@ class JawEstimator:
             self._follow(contact)
         self._contact = contact
         self._stamp = observation.stamp
-        self._rolling.gravity = observation.gravity
         points = self._gate.accept(observation)
         self._taring.add(points, observation.stddev, apart=contact is not None and contact.touching is False)
-        used, self.spared = np.isfinite(points[:, 0]), False
+        used, self.is_idle = np.isfinite(points[:, 0]), False
         count = np.count_nonzero(used)
         if count < self.settings.minimum_keypoints:
             seen = f"{count} of {len(used)} key points can be used"
@@ -193,18 +180,20 @@ class JawEstimator:
             return self._fail("waiting", waiting, used)
         if contact is None or not len(contact.points):
             return self._without_contact(points, used)
-        if self._spares and self.tared and self._away.is_idle(contact, points, self._taring.tare):
-            self.spared = True
+        self.is_idle = self.tared and self._reach.is_idle(contact, points, self._taring.tare)
+        if self.is_idle:
             return self._rest("the object is out of reach, the jaw is at rest", points)
         try:
-            track = self._tracker.update(points, self._taring.tare, min(dt, _LONGEST_GAP), observation.stddev)
+            state = self._tracker.update(
+                points, self._taring.tare, min(dt, _LONGEST_GAP), observation.stddev, observation.gravity
+            )
         except UnobservableError as error:
             return self._fail("unobservable", str(error), used)
-        return self._conclude(track, used)
+        return self._conclude(state, used)
 
     def learn(self) -> None:
         """Learns what the last image says beside its force; the next image does it where nobody had time before."""
-        self._rolling.learn()
+        self._tracked.learn()
 
     def tare(self) -> TareReport:
         """Takes the last frames as unloaded and learns each key point's offset.
@@ -234,7 +223,7 @@ class JawEstimator:
             return
         self._check_on_surface(contact)
         free = (contact.free or contact.outline is not None) and self.settings.solver != "paper"
-        chosen = self._rolling if free else self._pointed
+        chosen = self._tracked if free else self._given
         if chosen is not self._tracker:
             chosen.resume(self._tracker.give_shape())
             self._tracker = chosen
@@ -264,7 +253,7 @@ class JawEstimator:
         if not self._at_rest:  # the shape of a load that has gone
             self._tracker.reset()
             self._contact, self._at_rest = None, True
-        response, used = self._rolling.response, np.isfinite(points[:, 0])
+        response, used = self._tracked.response, np.isfinite(points[:, 0])
         deviations = points - self.jaw.keypoints - self._taring.tare.offsets
         stddev = response.bound_force(deviations, self.settings.offset_stddev)
         return blank_solution(self._stamp, "unloaded", message, used)._replace(
@@ -278,21 +267,21 @@ class JawEstimator:
         """Returns a solution without force."""
         return blank_solution(self._stamp, status, message, used, iterations)
 
-    def _conclude(self, track: Track | None, used: NDArray) -> Solution:
-        """Turns a track into a solution."""
+    def _conclude(self, state: ContactState | None, used: NDArray) -> Solution:
+        """Turn what a tracker has found into a solution."""
         self._at_rest = False
-        if track is None:
+        if state is None:
             return self._fail("not_enough_points", "too few key points agree with the jaw's shape", used)
-        used = track.weights > 0
-        if not track.sound:
+        used, iterations = self._tracker.used, int(state["iterations"])
+        if not state["sound"]:
             self._tracker.reset()
             self._contact = None
-            return self._fail("diverged", "the shape cannot be reached by the jaw", used, track.iterations)
-        doubt = find_doubt(track, settles=self.settings.solver != "paper")
-        if doubt:
-            return self._fail("unobservable", doubt, used, track.iterations)
-        self._taring.note(quiet=track.quiet, loaded=track.loaded)
-        return self._solution(track, used)
+            return self._fail("diverged", "the shape cannot be reached by the jaw", used, iterations)
+        reason = find_rejection_reason(state, settles=self.settings.solver != "paper")
+        if reason:
+            return self._fail("unobservable", reason, used, iterations)
+        self._taring.note(quiet=bool(state["quiet"]), loaded=bool(state["loaded"]))
+        return self._solution(state, used)
 
     def _relax(self) -> None:
         """Lets the material relax without a load."""
@@ -304,42 +293,31 @@ class JawEstimator:
         self._relaxed = self._stamp
         return dt
 
-    def _solution(self, track: Track, used: NDArray) -> Solution:
-        friction = self.settings.friction
-        unseen = UNSEEN_LEAN * friction
-        across = track.across or AcrossFinger(0.0, MIDDLE_STDDEV, nan, unseen)
-        evidence = ForceEvidence(
-            elastic=track.force,
-            modes=track.force_modes,
-            covariance=track.covariance,
-            pressure=track.pressure_point,
-            place=track.pressure_place,
-            place_stddev=track.place_stddev,
-            across=tuple(across),
-            along=unseen if track.lean_stddev is None else track.lean_stddev,
-            leak=track.lean_leak,
-            error=hypot(self._force_error, track.place_error, _EXTRAPOLATED * track.extrapolation),
-            sliding=0.0 if self.settings.held == "yes" else friction,
-        )
-        numbers = find_numbers(evidence, self._relaxation.packed, self._pass_time())
+    def _solution(self, state: ContactState, used: NDArray) -> Solution:
+        """Return the force that belongs to a contact, and how good it is."""
+        error = hypot(self._force_error, state["location_error"], _EXTRAPOLATED * state["extrapolation"])
+        sliding = 0.0 if self.settings.held == "yes" else self.settings.friction
+        vectors, dt = np.empty((7, 3)), self._pass_time()
+        magnitude, stddev = compute_force(state, self._relaxation.packed, dt, error, sliding, vectors)
+        force, torque, force_stddev, torque_stddev, point, location, normal = vectors
         return Solution(
             stamp=self._stamp,
-            status="ok" if numbers.magnitude > 0.0 else "unloaded",
+            status="ok" if magnitude > 0.0 else "unloaded",
             message="" if self.tared else _UNTARED,
-            force=numbers.force,
-            torque=numbers.torque,
-            force_stddev=numbers.force_stddev,
-            torque_stddev=numbers.torque_stddev,
-            magnitude_stddev=numbers.magnitude_stddev,
-            contact_point=numbers.contact_point,
-            contact_place=numbers.contact_place,
-            normal=numbers.normal,
-            residual=track.residual,
-            kkt=track.kkt,
+            force=force,
+            torque=torque,
+            force_stddev=force_stddev,
+            torque_stddev=torque_stddev,
+            magnitude_stddev=stddev,
+            contact_point=point,
+            contact_place=location,
+            normal=normal,
+            residual=float(state["residual"]),
+            kkt=float(state["kkt"]),
             keypoints_used=used,
-            iterations=track.iterations,
-            converged=track.converged,
-            condition=track.condition,
+            iterations=int(state["iterations"]),
+            converged=bool(state["converged"]),
+            condition=float(state["condition"]),
         )
 
 

@@ -19,7 +19,7 @@ from finforce.gripper_frames import SIDES
 from finforce.health import Health, Outcome, Report
 from finforce.messages import pose_from_message, stamp_of, wrench_from_message
 from finforce.ros import node as ros
-from finforce.skipping import AWAY, IDLE, LATE, SOLVER, Skips
+from finforce.skipping import IDLE, LATE, SOLVER, Skips
 from finforce.stamps import Idling, StampGate
 from finforce_ifea.grasp_force import ForcePairing, Wrench, single_jaw_grasp
 from finforce_ifea.messages import observation_from_cloud
@@ -69,7 +69,7 @@ class IfeaSolverNode(Node):
         self.gravity = GravityFeed(parameters) if settings.held == "yes" else None
         ros.warn_first_start(self)
         with self._patience(jaw.name):
-            self.estimator = build(jaw, parameters, settings, self.skips.allows(AWAY))
+            self.estimator = build(jaw, parameters, settings)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
         self.health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
         self.pairing = ForcePairing(parameters.jaw_name)
@@ -181,10 +181,7 @@ class IfeaSolverNode(Node):
 
     def _note_idle(self, stamp: int) -> None:
         """Note whether the jaw was left alone in this image, and the next ones may be passed over."""
-        spared = bool(getattr(self.estimator, "spared", False))
-        if spared:
-            self.skips.count(AWAY)
-        self.idling.note(stamp, spared and self.skips.allows(IDLE))
+        self.idling.note(stamp, self.estimator.is_idle and self.skips.allows(IDLE))
 
     def _on_contact(self, cloud: PointCloud2) -> None:
         """Keep the newest contact."""

@@ -93,9 +93,7 @@ def build_contact_feed(jaw: Jaw, parameters: NodeParameters) -> ContactFeed:
     )
 
 
-def build_estimator(
-    jaw: Jaw, parameters: NodeParameters, settings: EstimatorSettings, spares: bool = True
-) -> JawEstimator:
+def build_estimator(jaw: Jaw, parameters: NodeParameters, settings: EstimatorSettings) -> JawEstimator:
     """Build the estimator of a node, compiled and ready for the first image; see `JawEstimator`.
 
     Raises:
@@ -106,7 +104,7 @@ def build_estimator(
 
     file = parameters.calibration_file
     calibration = load_calibration(file) if file else None
-    estimator = JawEstimator(jaw, settings=settings, calibration=calibration, spares=spares)
+    estimator = JawEstimator(jaw, settings=settings, calibration=calibration)
     estimator.warm_up()
     return estimator
 

@@ -34,14 +34,14 @@ class PointNoise(NamedTuple):
         gain: regression of x and z on y in this image (K, 2).
         width_variance: along y in this image (K,) [m^2].
         trust: variance in the tare over that in this image (K,), at most 1.
-        standing: variance of an error of this image less one of the tare, as far as these do not scatter (K,) [m^2].
+        bias: variance of an error of this image less one of the tare, as far as these do not scatter (K,) [m^2].
     """
 
     plane: NDArray
     gain: NDArray
     width_variance: NDArray
     trust: NDArray
-    standing: NDArray
+    bias: NDArray
 
 
 def match_stated(scatter: NDArray, stddev: NDArray, floor: float) -> StatedNoise:
@@ -86,7 +86,7 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
     A detector errs in the same way while it sees the same: what is stated and does not scatter in the tare stands still
     there, is taken off with the offsets, and comes back in another shape with the next sight. No averaging removes it,
 
-        standing_k = max(0, (s_kx^2 + s_kz^2) / 2 - tr N_k), zero when nothing is stated;
+        bias_k = max(0, (s_kx^2 + s_kz^2) / 2 - tr N_k), zero when nothing is stated;
 
     up to twice the variance of the scatter is taken for chance.
 
@@ -99,7 +99,7 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
         before = now = np.sqrt(np.diagonal(usual.covariance, axis1=1, axis2=2))
     before, now = (np.ascontiguousarray(each, float) for each in (before, now))
     noise = PointNoise(*_enlarge_noise(np.ascontiguousarray(usual.covariance), before, now))
-    return noise if stddev is not None else noise._replace(standing=np.zeros(len(before)))
+    return noise if stddev is not None else noise._replace(bias=np.zeros(len(before)))
 
 
 @njit(cache=True)
@@ -107,7 +107,7 @@ def _enlarge_noise(covariance, usual, stddev):
     """Returns what `PointNoise` holds, where an image states `stddev` (K, 3) [m] and usual ones are (K, 3)."""
     count = len(covariance)
     plane, gain = np.empty((count, 2, 2)), np.empty((count, 2))
-    along, trust, standing = np.empty(count), np.empty(count), np.empty(count)
+    along, trust, bias = np.empty(count), np.empty(count), np.empty(count)
     growth = np.empty(3)
     for k in range(count):
         noise, own, now, stated = covariance[k], 0.0, 0.0, 0.0
@@ -122,8 +122,8 @@ def _enlarge_noise(covariance, usual, stddev):
             now += plane[k, a, a] * growth[i] ** 2
             stated += (usual[k, i] * growth[i]) ** 2
         along[k], trust[k] = noise[1, 1] * growth[1] ** 2, own / now
-        standing[k] = max(0.0, stated - noise[0, 0] - noise[2, 2])
-    return plane, gain, along, trust, standing
+        bias[k] = max(0.0, stated - noise[0, 0] - noise[2, 2])
+    return plane, gain, along, trust, bias
 
 
 _FARTHEST_OFFSET = 3e-3

@@ -19,13 +19,13 @@ from finforce_ifea.contact_mechanics.penalty import PenaltyContact, Touch
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 
 
-class RubbedContact(NamedTuple):
+class TangentialContact(NamedTuple):
     """Contact at surface points, tangential forces included.
 
     Attributes:
         forces: on the points (p, 3) [N].
         springs: negative derivatives of the forces by the points' positions (p, 3, 3) [N/m].
-        changes: derivatives of the forces by the object's depth, shape and height and by a lean of all forces
+        changes: derivatives of the forces by the object's depth, shape and height and by a traction ratio of all forces
             (p, 3, 4).
         shear: along the tangents (p,) [N].
         mobilised: what the shear adds up to over what the cone allows, from -1 to 1.
@@ -38,24 +38,30 @@ class RubbedContact(NamedTuple):
     mobilised: float
 
 
-class LeaningContact:
-    """Tangential forces that are one share of all normal forces, as where everything slides the same way.
+class Traction(NamedTuple):
+    """What acts along the surface while an object presses.
 
     Attributes:
-        lean: that share, along t.
+        ratio: of tangential to normal force at all points [-], where friction is not followed.
+        coefficient: of friction; below zero where it is not followed.
+        shear: of each point before (p,) [N].
+        before: where each point was then (p, 3) [m]; none of them where nothing has moved yet.
+        moved: of the object since then (x, z) [m].
     """
 
-    def __init__(self) -> None:
-        """Starts upright."""
-        self.lean = 0.0
+    ratio: float
+    coefficient: float
+    shear: NDArray
+    before: NDArray
+    moved: NDArray
 
-    def rub(self, contact: PenaltyContact, points: NDArray, stiffness: NDArray, origin: NDArray) -> RubbedContact:
-        """Returns the contact with its tangential forces; see `Friction.rub`."""
-        return _rub_all(contact, points, stiffness, self.describe(origin))
 
-    def describe(self, origin: NDArray) -> "Rubbing":
-        """Returns what acts along the surface with the object's origin (x, z) [m]."""
-        return Rubbing(self.lean, -1.0, *_NO_HISTORY)
+_NO_HISTORY = np.zeros(0), np.zeros((0, 3)), np.zeros(2)
+
+
+def constant_traction(ratio: float) -> Traction:
+    """Return tangential forces that are one share of all normal forces, as where everything slides the same way."""
+    return Traction(ratio, -1.0, *_NO_HISTORY)
 
 
 class Friction:
@@ -65,24 +71,33 @@ class Friction:
         coefficient: of the object, 0 for none.
     """
 
-    def __init__(self, count: int) -> None:
-        """Starts with points (count) that nothing has touched."""
-        self.coefficient = 0.0
+    def __init__(self, count: int, coefficient: float = 0.0) -> None:
+        """Start with points (count) that nothing has touched."""
+        self.coefficient = coefficient
         self._count = count
         self.reset()
 
     def reset(self) -> None:
-        """Forgets what the points have done; the coefficient stays."""
+        """Forget what the points have done; the coefficient stays."""
         self._shear = np.zeros(self._count)
         self._before: tuple[NDArray, NDArray] | None = None
 
+    def set_coefficient(self, coefficient: float) -> None:
+        """Take another coefficient from now on."""
+        self.coefficient = coefficient
+
     def shift(self, change: float) -> None:
-        """Counts the object's x from another place, `change` [m] more."""
+        """Count the object's x from another origin, `change` [m] more."""
         if self._before is not None:
             self._before = self._before[0], self._before[1] + np.array([change, 0.0])
 
-    def rub(self, contact: PenaltyContact, points: NDArray, stiffness: NDArray, origin: NDArray) -> RubbedContact:
-        """Returns the contact with friction.
+    def describe(self, origin: NDArray) -> Traction:
+        """Return what acts along the surface with the object's origin (x, z) [m]."""
+        before, start = self._before or (_NO_HISTORY[1], origin)
+        return Traction(0.0, self.coefficient, self._shear, before, origin - start)
+
+    def settle(self, contact: PenaltyContact, points: NDArray, stiffness: NDArray, origin: NDArray) -> float:
+        """Remember an equilibrium and return how far the cone is used, from -1 to 1.
 
         Args:
             contact: without friction.
@@ -90,63 +105,37 @@ class Friction:
             stiffness: of each point (p,) [N/m].
             origin: of the object (x, z) [m].
         """
-        return _rub_all(contact, points, stiffness, self.describe(origin))
-
-    def describe(self, origin: NDArray) -> "Rubbing":
-        """Returns what acts along the surface with the object's origin (x, z) [m]."""
-        before, start = self._before or (_NO_HISTORY[1], origin)
-        return Rubbing(0.0, self.coefficient, self._shear, before, origin - start)
-
-    def settle(self, contact: PenaltyContact, points: NDArray, stiffness: NDArray, origin: NDArray) -> float:
-        """Remembers an equilibrium; arguments as for `rub`. Returns how far the cone is used, from -1 to 1."""
-        rubbed = self.rub(contact, points, stiffness, origin)
-        self._before, self._shear = (points.copy(), origin.copy()), rubbed.shear
-        return rubbed.mobilised
+        there = apply_traction(contact, points, stiffness, self.describe(origin))
+        self._before, self._shear = (points.copy(), origin.copy()), there.shear
+        return there.mobilised
 
 
-class Rubbing(NamedTuple):
-    """What acts along the surface while an object presses.
-
-    Attributes:
-        lean: that all forces have [-], where friction is not followed.
-        coefficient: of friction; below zero where it is not followed.
-        shear: of each point before (p,) [N].
-        before: where each point was then (p, 3) [m]; none of them where nothing has moved yet.
-        moved: of the object since then (x, z) [m].
-    """
-
-    lean: float
-    coefficient: float
-    shear: NDArray
-    before: NDArray
-    moved: NDArray
-
-
-_NO_HISTORY = np.zeros(0), np.zeros((0, 3)), np.zeros(2)
 _FORCE, _SPRING, _CHANGE = 0, 1, 3
-# What `rub_point` writes of each point: force, two columns of springs, four of changes, along x and z.
+# What `add_traction` writes of each point: force, two columns of springs, four of changes, along x and z.
 POINT_SHAPE = (2, 7)
 
 
-def _rub_all(contact: PenaltyContact, points: NDArray, stiffness: NDArray, rubbing: Rubbing) -> RubbedContact:
-    """Returns the contact of all points with what acts along the surface."""
-    return _rub((contact.forces, contact.springs, contact.by_shape), points, stiffness, rubbing)
+def apply_traction(
+    contact: PenaltyContact, points: NDArray, stiffness: NDArray, traction: Traction
+) -> TangentialContact:
+    """Return the contact of surface points (p, 3) [m] of some stiffness (p,) [N/m] with what acts along the surface."""
+    return _apply((contact.forces, contact.springs, contact.by_shape), points, stiffness, traction)
 
 
 @njit(**_OPTIONS)
-def _add_lean(lean, touch, out):
-    """Adds what a lean of one point's force makes of its springs and of its derivatives by the place, in place."""
-    out[0, _SPRING] += lean * touch.kxz
-    out[0, _SPRING + 1] += lean * touch.kzz
-    out[1, _SPRING] -= lean * touch.kxx
-    out[1, _SPRING + 1] -= lean * touch.kxz
+def _add_ratio(ratio, touch, out):
+    """Adds what a traction ratio of one point's force makes of its springs and of its derivatives by the place, in place."""
+    out[0, _SPRING] += ratio * touch.kxz
+    out[0, _SPRING + 1] += ratio * touch.kzz
+    out[1, _SPRING] -= ratio * touch.kxx
+    out[1, _SPRING + 1] -= ratio * touch.kxz
     for i in range(_CHANGE, _CHANGE + 3):
-        ahead, aside = out[0, i], out[1, i]
-        out[0, i], out[1, i] = ahead + lean * aside, aside - lean * ahead
+        x, z = out[0, i], out[1, i]
+        out[0, i], out[1, i] = x + ratio * z, z - ratio * x
 
 
 @njit(**_OPTIONS)
-def rub_point(rubbing, touch, p, x, z, stiffness, out):
+def add_traction(traction, touch, p, x, z, stiffness, out):
     """Writes point p, at x and z [m], with what acts along the surface to out (2, 7); see `POINT_SHAPE`.
 
     Returns:
@@ -157,22 +146,22 @@ def rub_point(rubbing, touch, p, x, z, stiffness, out):
     out[1, 0], out[1, 1], out[1, 2] = fz, touch.kxz, touch.kzz
     out[0, 3], out[0, 4], out[0, 5], out[0, 6] = -touch.kxx, touch.bx, touch.kxz, fz
     out[1, 3], out[1, 4], out[1, 5], out[1, 6] = -touch.kxz, touch.bz, touch.kzz, -fx
-    if rubbing.coefficient < 0.0:
-        _add_lean(rubbing.lean, touch, out)
-        out[0, 0] += rubbing.lean * fz
-        out[1, 0] -= rubbing.lean * fx
+    if traction.coefficient < 0.0:
+        _add_ratio(traction.ratio, touch, out)
+        out[0, 0] += traction.ratio * fz
+        out[1, 0] -= traction.ratio * fx
         return 0.0, 0.0
     normal = np.hypot(fx, fz)
     if normal <= 0.0:
         return 0.0, 0.0
     tx, tz = fz / normal, -fx / normal
-    slip, before = 0.0, rubbing.before
+    slip, before = 0.0, traction.before
     if len(before) > 0:
-        slip = tx * (x - before[p, 0] - rubbing.moved[0]) + tz * (z - before[p, 2] - rubbing.moved[1])
-    shear, limit = rubbing.shear[p] - stiffness * slip, rubbing.coefficient * normal
+        slip = tx * (x - before[p, 0] - traction.moved[0]) + tz * (z - before[p, 2] - traction.moved[1])
+    shear, limit = traction.shear[p] - stiffness * slip, traction.coefficient * normal
     if abs(shear) > limit:
         shear = limit if shear > 0.0 else -limit
-        _add_lean(shear / normal, touch, out)
+        _add_ratio(shear / normal, touch, out)
     else:
         for a, ta in ((0, tx), (1, tz)):
             out[a, _SPRING] += stiffness * ta * tx
@@ -185,7 +174,7 @@ def rub_point(rubbing, touch, p, x, z, stiffness, out):
 
 
 @njit(**_OPTIONS)
-def _rub(contact, points, stiffness, rubbing):
+def _apply(contact, points, stiffness, traction):
     """Returns the contact (forces, springs, by_shape) at all points with what acts along the surface."""
     forces, springs, by_shape = contact
     count = len(points)
@@ -194,7 +183,7 @@ def _rub(contact, points, stiffness, rubbing):
     for p in range(count):
         xz = springs[p, 0, 2]
         parts = forces[p, 0], forces[p, 2], springs[p, 0, 0], xz, springs[p, 2, 2], by_shape[p, 0], by_shape[p, 2]
-        shear[p], limit = rub_point(rubbing, Touch(*parts), p, points[p, 0], points[p, 2], stiffness[p], out)
+        shear[p], limit = add_traction(traction, Touch(*parts), p, points[p, 0], points[p, 2], stiffness[p], out)
         total += shear[p]
         allowed += limit
         for a in range(2):
@@ -202,4 +191,4 @@ def _rub(contact, points, stiffness, rubbing):
             stiff[p, 2 * a, 0], stiff[p, 2 * a, 2] = out[a, _SPRING], out[a, _SPRING + 1]
             for i in range(4):
                 changes[p, 2 * a, i] = out[a, _CHANGE + i]
-    return RubbedContact(pushed, stiff, changes, shear, total / allowed if allowed > 0.0 else 0.0)
+    return TangentialContact(pushed, stiff, changes, shear, total / allowed if allowed > 0.0 else 0.0)

@@ -15,9 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact, RubbedContact
+from finforce_ifea.contact_mechanics.friction import (
+    Friction,
+    TangentialContact,
+    Traction,
+    apply_traction,
+    constant_traction,
+)
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, FaceProfile, Indenter, RoundIndenter
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.model import Across, JawModel
 from finforce_ifea.jaw.face import FaceLine
@@ -57,7 +62,7 @@ class PressedState(NamedTuple):
         touches: whether any surface point is in contact.
         correction: Newton step of the unknowns towards equilibrium (size,); with contact, within the model's reach.
         modes: motions of the unknowns by depth [per m], shape and height [per m], (size, 3); where forces
-            may lean, by that too (size, 4).
+            have a traction ratio, by that too (size, 4).
         force: total contact force on the jaw after `correction` (3,) [N].
         force_modes: its derivatives (3, 3 or 4), columns as in modes.
         pressure_point: pressure centre on the deformed surface (3,) [m]; NaN without contact.
@@ -83,7 +88,8 @@ class RollingContact:
     """A model, its contact surface, and the object pressed into it.
 
     Attributes:
-        rubbing: what acts along the surface: a lean of all forces, or friction with its history.
+        indenter: the object.
+        traction_ratio: of tangential to normal force at all points, where friction is not followed.
         bearable: force beyond which no equilibrium is believed [N], infinite where nobody knows.
     """
 
@@ -101,11 +107,15 @@ class RollingContact:
         )
         self.face, self.face_x = face, face.plane
         self.indenter: Indenter = RoundIndenter()
-        self.rubbing: LeaningContact | Friction = LeaningContact()
+        self.traction_ratio, self._friction = 0.0, None
 
     def set_indenter(self, indenter: Indenter) -> None:
         """Takes another object, which is pressed in from now on."""
         self.indenter = indenter
+
+    def set_traction_ratio(self, ratio: float) -> None:
+        """Take another ratio of tangential to normal force from now on."""
+        self.traction_ratio = ratio
 
     def begin(self, height: float) -> NDArray:
         """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
@@ -120,25 +130,29 @@ class RollingContact:
         """The undeformed surface, for objects to touch."""
         return profile_surface(self.surface, self.face)
 
-    def rub(self, points: NDArray, place: NDArray) -> RubbedContact:
-        """Returns the contact of surface points (p, 3) [m] with the object at a place (3,)."""
-        return self.rubbing.rub(*self._press(points, place))
-
-    def _press(self, points: NDArray, place: NDArray) -> tuple[PenaltyContact, NDArray, NDArray, NDArray]:
-        """Returns what friction is asked with: the contact without it, points, stiffness, the object's origin."""
+    def press(self, points: NDArray, place: NDArray) -> TangentialContact:
+        """Return the contact of surface points (p, 3) [m] with the object at a place (3,)."""
         stiffness = self.surface.stiffness
         contact = self.indenter.press(points, stiffness, self.face_x, place)
-        return contact, points, stiffness, np.array([-place[DEPTH], place[HEIGHT]])
+        return apply_traction(contact, points, stiffness, self._describe_traction(place))
 
-    def with_friction(self) -> RollingContact:
-        """Returns another contact of the same jaw, of which friction is not known but followed."""
+    def _describe_traction(self, place: NDArray) -> Traction:
+        """Return what acts along the surface with the object at a place (3,)."""
+        if self._friction is None:
+            return constant_traction(self.traction_ratio)
+        return self._friction.describe(_find_origin(place))
+
+    def with_friction(self, friction: Friction) -> RollingContact:
+        """Return another contact of the same jaw, whose friction is followed."""
         other = copy(self)
-        other.rubbing = Friction(len(self.surface.points))
+        other._friction = friction
         return other
 
     def settle(self, q: NDArray, place: NDArray) -> float:
-        """Remembers an equilibrium for the friction; returns how far the cone is used, from -1 to 1."""
-        return self.rubbing.settle(*self._press(self.place_points(q), place))
+        """Remember an equilibrium for the friction; return how far the cone is used, from -1 to 1."""
+        points, stiffness = self.place_points(q), self.surface.stiffness
+        contact = self.indenter.press(points, stiffness, self.face_x, place)
+        return self._friction.settle(contact, points, stiffness, _find_origin(place))
 
     def place_points(self, q: NDArray) -> NDArray:
         """Returns the surface points (p, 3) [m] of the deformed jaw."""
@@ -152,7 +166,7 @@ class RollingContact:
         """
         model, probe = self.model, self.surface.probe
         points = self.place_points(q)
-        contact = self.rub(points, place)
+        contact = self.press(points, place)
         state = model.linearize(q)
         model.stiffen(state.tangent, probe, q, 0.5 * (contact.springs + contact.springs.transpose(0, 2, 1)))
         imbalance = model.load(probe, q, contact.forces) - state.force
@@ -183,6 +197,11 @@ class RollingContact:
             return self.indenter.find_gap(self.place_points(q + share * step), self.face_x, place)
 
         return find_share_that_meets(find_gap) * step
+
+
+def _find_origin(place: NDArray) -> NDArray:
+    """Return x and z [m] that move as the object at a place (3,) does."""
+    return np.array([-place[DEPTH], place[HEIGHT]])
 
 
 def find_share_that_meets(find_gap: Callable[[float], float]) -> float:

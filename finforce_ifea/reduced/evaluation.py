@@ -13,10 +13,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from finforce.elimination import eliminate
-from finforce_ifea.contact_mechanics.friction import POINT_SHAPE, Friction, LeaningContact, Rubbing, rub_point
+from finforce_ifea.contact_mechanics.friction import POINT_SHAPE, Traction, add_traction
 from finforce_ifea.contact_mechanics.indenter import (
-    DEPTH,
-    HEIGHT,
     Indenter,
     PressedObject,
     RoundIndenter,
@@ -228,7 +226,6 @@ class ReducedContact(RollingContact):
     """A reduced model, its contact surface, and the object pressed into it.
 
     Attributes:
-        rubbing: what acts along the surface: a lean of all forces, or friction with its history.
         packed: `ReducedJaw` as a plain tuple.
         bearable: force beyond which no equilibrium is believed [N]: half of the largest that is stored, beside the
             clamp; in its middle the bench finger bears a sixth of that.
@@ -238,7 +235,7 @@ class ReducedContact(RollingContact):
         """Keeps the model, its contact surface, one point per height, and the undeformed inner face."""
         self.model, self.surface, self.face, self.face_x = model, surface, face, face.plane
         self.indenter: Indenter = RoundIndenter()
-        self.rubbing: LeaningContact | Friction = LeaningContact()
+        self.traction_ratio, self._friction = 0.0, None
         shares = share_rows(model.manifold.heights, surface.heights)
         upper = np.clip(np.searchsorted(model.manifold.heights, surface.heights) - 1, 0, shares.shape[1] - 1)
         share = shares[np.arange(len(upper)), upper]
@@ -276,8 +273,8 @@ class ReducedContact(RollingContact):
 
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
         """Linearises the equilibrium with the object at a place (depth, shape, height); see `RollingContact`."""
-        rubbing = self.rubbing.describe(np.array([-place[DEPTH], place[HEIGHT]]))
-        return linearize_reduced(self.packed, tuple(self.indenter.pressed), tuple(rubbing), q, place)
+        traction = self._describe_traction(place)
+        return linearize_reduced(self.packed, tuple(self.indenter.pressed), tuple(traction), q, place)
 
     def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
         """See `RollingContact`."""
@@ -408,7 +405,7 @@ def place_contact(points, low, share, moves):
 
 @njit(**_OPTIONS)
 def _add_springs(out, weight, row, low, share, stiffness):
-    """Adds a point's springs, see `rub_point`, seen from a row with a weight, to the band stiffness (2 n, 7)."""
+    """Adds a point's springs, see `add_traction`, seen from a row with a weight, to the band stiffness (2 n, 7)."""
     for j in range(2):
         other = low + j
         if other < 0:
@@ -421,7 +418,7 @@ def _add_springs(out, weight, row, low, share, stiffness):
 
 @njit(**_OPTIONS)
 def _add_to_clamp(out, weight, share, held, grip):
-    """Adds what the clamp takes of a point, see `rub_point`, to held (2, 5), and its springs to grip (2, 2)."""
+    """Adds what the clamp takes of a point, see `add_traction`, to held (2, 5), and its springs to grip (2, 2)."""
     for a in range(2):
         held[a, 0] += weight * out[a, 0]
         for c in range(4):
@@ -431,7 +428,7 @@ def _add_to_clamp(out, weight, share, held, grip):
 
 
 @njit(**_OPTIONS)
-def _gather(jaw, pressed, pose, rubbing, points):
+def _gather(jaw, pressed, pose, traction, points):
     """Returns the contact of an object with contact points (p, 3) [m] at the rows."""
     count = jaw.loads.shape[2]
     loads, stiffness, held, grip = np.zeros((count, 5)), np.zeros((count, 7)), np.zeros((2, 5)), np.zeros((2, 2))
@@ -444,7 +441,7 @@ def _gather(jaw, pressed, pose, rubbing, points):
         touch = touch_object(pressed, pose, x, z, jaw.stiffness[p], weights)
         if touch.kxx == 0.0 and touch.kzz == 0.0:
             continue
-        rub_point(rubbing, touch, p, x, z, jaw.stiffness[p], out)
+        add_traction(traction, touch, p, x, z, jaw.stiffness[p], out)
         size = np.hypot(out[0, 0], out[1, 0])
         total += size
         for a in range(3):
@@ -506,7 +503,7 @@ def _solve_rows(q, compliance, loads, stiffness):
 
 
 @njit(**_OPTIONS)
-def _change_energy(jaw, pressed, pose, rubbing, points, motion, share, work):
+def _change_energy(jaw, pressed, pose, traction, points, motion, share, work):
     """Returns by how much the energy changes along a step of which a share has been made; see `_find_share`."""
     out, weights, change = np.zeros(POINT_SHAPE), np.zeros((6, 4)), work[0] + share * work[1]
     for p in range(len(points)):
@@ -515,13 +512,13 @@ def _change_energy(jaw, pressed, pose, rubbing, points, motion, share, work):
             continue
         touch = touch_object(pressed, pose, x, z, jaw.stiffness[p], weights)
         if touch.kxx != 0.0 or touch.kzz != 0.0:
-            rub_point(rubbing, touch, p, x, z, jaw.stiffness[p], out)
+            add_traction(traction, touch, p, x, z, jaw.stiffness[p], out)
             change -= out[0, 0] * motion[p, 0] + out[1, 0] * motion[p, 2]
     return change
 
 
 @njit(**_OPTIONS)
-def _find_share(jaw, pressed, pose, rubbing, points, moves, q, step):
+def _find_share(jaw, pressed, pose, traction, points, moves, q, step):
     """Returns the share of a step up to which the energy of jaw and object falls; corners make it rise again.
 
     Along a step of the loads that moves the rows by du and contact points (p, 3) by dx, it changes by
@@ -533,7 +530,7 @@ def _find_share(jaw, pressed, pose, rubbing, points, moves, q, step):
     for k in range(len(moves)):
         work[0] += q[k] * (moved[k] - moves[k])
         work[1] += step[k] * (moved[k] - moves[k])
-    parts = (jaw, pressed, pose, rubbing, points, motion)
+    parts = (jaw, pressed, pose, traction, points, motion)
     share, low, high = 1.0, 0.0, 1.0
     if _change_energy(*parts, 1.0, work) <= _TOO_FAR * abs(_change_energy(*parts, 0.0, work)):
         return 1.0
@@ -586,7 +583,7 @@ def read_grid(rods, height):
 
 
 @njit(**_OPTIONS)
-def linearize_reduced(jaw, pressed, rubbing, q, place):
+def linearize_reduced(jaw, pressed, traction, q, place):
     """Returns one linearised equilibrium as `PressedState`.
 
     Plain tuples are handed over from Python several times as fast as named ones.
@@ -594,15 +591,15 @@ def linearize_reduced(jaw, pressed, rubbing, q, place):
     Args:
         jaw: `ReducedJaw` as a plain tuple.
         pressed: `PressedObject` as a plain tuple.
-        rubbing: `Rubbing` as a plain tuple.
+        traction: `Traction` as a plain tuple.
         q: unknowns (2 n + 2,).
         place: depth [m], shape and height [m] of the object (3,).
     """
-    jaw, pressed, rubbing = ReducedJaw(*jaw), PressedObject(*pressed), Rubbing(*rubbing)
+    jaw, pressed, traction = ReducedJaw(*jaw), PressedObject(*pressed), Traction(*traction)
     count = jaw.loads.shape[2]
     moves = follow(jaw.moves, jaw.compliance, jaw.loads, q)
     points, pose = place_contact(jaw.points, jaw.low, jaw.share, moves), pose_object(pressed, jaw.face_x, place)
-    contact = _gather(jaw, pressed, pose, rubbing, points)
+    contact = _gather(jaw, pressed, pose, traction, points)
     touches = contact.size > 0.0
     steps, moved = _solve_rows(q, jaw.compliance, contact.loads, contact.stiffness)
     size = moved / LARGEST_MOVE
@@ -625,7 +622,7 @@ def linearize_reduced(jaw, pressed, rubbing, q, place):
             modes[k, c] = steps[k, c + 1]
             force_modes[axis, c] += steps[k, c + 1]
     if touches and size > _LARGE_STEP and correction[count] == 0.0 and correction[count + 1] == 0.0:
-        share = _find_share(jaw, pressed, pose, rubbing, points, moves, q, correction)
+        share = _find_share(jaw, pressed, pose, traction, points, moves, q, correction)
         for k in range(len(correction)):
             correction[k] *= share
         for axis in range(0, 3, 2):

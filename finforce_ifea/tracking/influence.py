@@ -17,7 +17,6 @@ from finforce_ifea.contact_mechanics.indenter import DEPTH
 from finforce_ifea.contact_mechanics.pressed_jaw import RollingContact
 from finforce_ifea.observation import Contact
 from finforce_ifea.tare import Tare
-from finforce_ifea.tracking.track import fit_load
 
 _HEIGHTS = 13
 _TOUCH = 3e-5
@@ -115,6 +114,38 @@ def measure_influence(contact: RollingContact, probe: Any, keypoints: int) -> In
         modes = contact.model.project(probe, q, state.modes)
         motions[row] = modes[:, ::2, DEPTH] / stiffness[row]
     return InfluenceCoefficients(heights=heights, motions=motions, stiffness=stiffness)
+
+
+# Standard deviation of an offset that all key points share [m]: a depth scale wrong by 1 % at 0.15 m.
+_COMMON_OFFSET = 1.5e-3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoadFit:
+    """Least squares of one mode: its gain (2 n,) on the offsets, and the standard deviation of what it finds."""
+
+    gain: NDArray
+    stddev: float
+
+
+def fit_load(modes: NDArray, deviation: NDArray) -> LoadFit:
+    """Returns the fit of one mode (n, 2) to offsets of n key points, each off by chance by its deviation (n,) [m].
+
+    All together are off by chance, too, as a wrong depth scale moves them alike.
+    """
+    common = np.broadcast_to(np.eye(2), (len(modes), 2, 2))
+    design = np.concatenate([modes[:, :, None], common], axis=2) / deviation[:, None, None]
+    design = np.concatenate([design.reshape(-1, 3), np.diag([0.0, 1.0, 1.0]) / _COMMON_OFFSET])
+    covariance = np.linalg.pinv(design.T @ design)
+    gain = (covariance @ design.T)[0, :-3] / np.repeat(deviation, 2)
+    return LoadFit(gain=gain, stddev=float(np.sqrt(max(covariance[0, 0], 1e-300))))
+
+
+def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
+    """Returns by how many standard deviations one mode (K, 2) explains the offsets of a tare; see `fit_load`."""
+    seen = tare.counts > 0
+    fit = fit_load(modes[seen], np.sqrt(offset_stddev**2 + tare.offset_variance(0.0)[seen]))
+    return float(fit.gain @ tare.offsets[seen][:, [0, 2]].ravel() / fit.stddev)
 
 
 # An object is away that stands in front of the undeformed surface by more than this and what its place may err [m].

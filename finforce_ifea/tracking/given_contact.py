@@ -1,6 +1,5 @@
 """Force at a given contact from key points, image after image, and whether they have the load somewhere else."""
 
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -15,9 +14,15 @@ from finforce_ifea.observation import Contact
 from finforce_ifea.paper_inverse import InverseResult, Problem, solve_inverse
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
-from finforce_ifea.tracking.influence import InfluenceCoefficients
-from finforce_ifea.tracking.place_update import doubt_place
-from finforce_ifea.tracking.track import Track, compute_magnitude_stddev, explain_offsets
+from finforce_ifea.tracking.contact_filter import question_location
+from finforce_ifea.tracking.contact_state import (
+    MIDDLE_STDDEV,
+    UNSEEN_TRACTION,
+    ContactState,
+    blank_contact_state,
+    measure_along,
+)
+from finforce_ifea.tracking.influence import InfluenceCoefficients, explain_offsets
 
 _NEIGHBOUR = 1e-3
 _KNOWN_LOADS = 32
@@ -31,7 +36,7 @@ _MEDIAN_SQUARE = 2.4
 _TOLERATED_MISFIT = 2.0
 
 
-class PointTracker:
+class GivenContactTracker:
     """Solves the inverse problem of each frame from the last state.
 
     With solver "paper" the load is a point force on the nearest candidate, all accepted key points count alike, and
@@ -43,7 +48,7 @@ class PointTracker:
         self, jaw: Jaw, mechanics: Mechanics, settings: EstimatorSettings, response: InfluenceCoefficients
     ) -> None:
         """Keeps the jaw, whose key points lie on it; `response` is that of the unloaded one."""
-        self._watch = PlaceWatch(response, settings)
+        self._watch = LocationWatch(response, settings)
         self.jaw, self.mechanics, self.settings = jaw, mechanics, settings
         self.paper = settings.solver == "paper"
         self._energy_weights = parse_energy_weights(settings, len(jaw.candidates))
@@ -141,10 +146,17 @@ class PointTracker:
         self._probe_pair = self._known[key]
         return self._probe_pair
 
-    def update(self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None) -> Track | None:
-        """Takes the key points (K, 3) [m], NaN where unused; returns None when too few are left.
+    def update(
+        self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None, gravity: NDArray | None = None
+    ) -> ContactState | None:
+        """Take the key points of an image; return None when too few are left.
 
-        `stddev` (K, 3) [m] are their stated standard deviations.
+        Args:
+            points: (K, 3) [m], NaN where unused.
+            tare: offsets and noise.
+            dt: time since the last image [s], of no use here.
+            stddev: stated standard deviations (K, 3) [m].
+            gravity: of no use here.
 
         Raises:
             UnobservableError: They do not tell the force.
@@ -153,7 +165,7 @@ class PointTracker:
         known = np.isfinite(targets[:, 0])
         noise = tare.point_noise(stddev)
         scatter = np.trace(noise.plane, axis1=1, axis2=2) / 2.0 / noise.trust
-        variance = scatter + noise.standing + tare.offset_variance(self.settings.offset_stddev)
+        variance = scatter + noise.bias + tare.offset_variance(self.settings.offset_stddev)
         try:
             if self.paper:
                 result, weights = self._solve(targets, None), known.astype(float)
@@ -181,52 +193,38 @@ class PointTracker:
         self._misfit = np.sqrt(scale) / _TOLERATED_MISFIT
         return np.where(known, 1.0 / (1.0 + distance / scale / self.settings.gate**2) ** 2, 0.0)
 
-    def _report(self, result: InverseResult, targets: NDArray, weights: NDArray, variance: NDArray) -> Track:
-        force = result.forces.sum(0)
+    def _report(self, result: InverseResult, targets: NDArray, weights: NDArray, variance: NDArray) -> ContactState:
+        """Return the contact state of a solved image."""
+        force, model = result.forces.sum(0), self.mechanics.model
         size = np.linalg.norm(result.forces, axis=1)
         share = size / size.sum() if size.any() else np.full(len(size), 1.0 / len(size))
         undeformed = np.concatenate([self._load(height)[0] for height in self._heights])
-        deformed = self.mechanics.model.positions(self._probe_pair[0], result.q)
         covariance = result.covariance
         if self.paper:
             covariance = covariance * float(np.mean(variance[np.isfinite(targets[:, 0])]))
             covariance += np.outer(result.bias, result.bias)
-        magnitude = float(np.linalg.norm(force))
-        stddev = compute_magnitude_stddev(force, result.directions, covariance)
-        moves = self.mechanics.model.positions(self.probe, result.q) - self._rest
-        doubt = blank_doubt()
+        positions, m = model.positions(self.probe, result.q), len(covariance)
+        state, magnitude = blank_contact_state(), float(np.linalg.norm(force))
+        state["force"], state["magnitude"] = force, magnitude
+        state["covariance"][:m, :m], state["force_modes"][:, :m] = covariance, result.directions
+        state["stddev"] = measure_along(force, state["force_modes"].copy(), state["covariance"].copy())
+        state["pressure_point"] = share @ model.positions(self._probe_pair[0], result.q)
+        state["pressure_location"] = share @ undeformed
+        for name in ("residual", "condition", "kkt", "iterations", "converged"):
+            state[name] = getattr(result, name)
+        state["misfit"] = self._misfit
         if result.converged and not self.paper:
-            miss = targets - self.mechanics.model.positions(self.probe, result.q)
-            doubt = self._watch.doubt(miss[:, ::2], weights / variance, magnitude)
-        return Track(
-            covariance=covariance,
-            force=force,
-            magnitude=magnitude,
-            stddev=stddev,
-            force_modes=result.directions,
-            pressure_point=share @ deformed,
-            pressure_place=share @ undeformed,
-            weights=weights,
-            stiffening=1.0,
-            residual=result.residual,
-            misfit=self._misfit,
-            away=doubt.away,
-            mistaken=doubt.mistaken,
-            place_error=doubt.share,
-            place_stddev=doubt.stddev,
-            condition=result.condition,
-            kkt=result.kkt,
-            iterations=result.iterations,
-            converged=result.converged,
-            sound=bool(
-                np.isfinite(result.q).all()
-                and np.isfinite(force).all()
-                and result.smallest_det > 0
-                and np.abs(moves).max() < _FARTHEST_MOVE
-            ),
-            quiet=magnitude < _QUIET_SIGMA * stddev,
-            loaded=magnitude > 2.0 * _QUIET_SIGMA * stddev,
-        )
+            self._watch.judge((targets - positions)[:, ::2], weights / variance, state)
+        traction = UNSEEN_TRACTION * self.settings.friction
+        state["y_stddev"], state["lateral_force"] = MIDDLE_STDDEV, np.nan
+        state["lateral_stddev"] = state["traction_stddev"] = traction
+        is_finite = np.isfinite(result.q).all() and np.isfinite(force).all()
+        is_near = np.abs(positions - self._rest).max() < _FARTHEST_MOVE
+        state["sound"] = is_finite and is_near and result.smallest_det > 0
+        state["quiet"] = magnitude < _QUIET_SIGMA * state["stddev"]
+        state["loaded"] = magnitude > 2.0 * _QUIET_SIGMA * state["stddev"]
+        self.used = weights > 0
+        return state
 
     def significance(self, tare: Tare, stddev: float) -> float:
         """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
@@ -262,29 +260,7 @@ _TRAVEL = 0.3
 _SUREST = 2e-3
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlaceDoubt:
-    """What is to be thought of a given place.
-
-    Attributes:
-        away: how far the key points alone would have the load from there [m].
-        mistaken: probability that it is not there.
-        stddev: of the place [m].
-        share: relative standard deviation of the force that follows.
-    """
-
-    away: float
-    mistaken: float
-    stddev: float
-    share: float
-
-
-def blank_doubt() -> PlaceDoubt:
-    """Returns no doubt at all."""
-    return PlaceDoubt(away=0.0, mistaken=0.0, stddev=0.0, share=0.0)
-
-
-class PlaceWatch:
+class LocationWatch:
     """Averages where the key points would have the load, and says how far the given place can be believed.
 
     A load F at the height z moves the key points by F U(z). What is left of their residuals r once F has been fitted,
@@ -305,7 +281,7 @@ class PlaceWatch:
 
     def reset(self) -> None:
         """Forgets where the key points had the load."""
-        self._away, self._information = 0.0, 0.0
+        self._offset, self._information = 0.0, 0.0
 
     def follow(self, heights: NDArray, weights: NDArray) -> None:
         """Takes a load's heights (n,) [m] and their weights (n,) over; another mean height is another load.
@@ -318,35 +294,34 @@ class PlaceWatch:
         self._height = height
         self._spread = float(np.average((heights - height) ** 2, weights=weights))
 
-    def doubt(self, residuals: NDArray, precision: NDArray, force: float) -> PlaceDoubt:
-        """Returns what one frame and those before say of the place.
+    def judge(self, residuals: NDArray, precision: NDArray, state: ContactState) -> None:
+        """Fill in what one image and those before tell of the location.
 
         Args:
             residuals: of the key points in the plane (K, 2) [m], measured minus modelled.
             precision: (K,) [1/m^2], 0 for what is not used.
-            force: [N].
+            state: with the magnitude of the force.
         """
-        used = precision > 0.0
+        used, force = precision > 0.0, float(state["magnitude"])
         motion, slope = self._response.at(self._height)[used], self._response.slope_at(self._height)[used]
         weights, left = precision[used, None], residuals[used]
         own = max(float((weights * motion**2).sum()), 1e-300)
         sensitivity = float((weights * motion * slope).sum()) / own
-        beside = slope - sensitivity * motion
-        information = force**2 * float((weights * beside**2).sum())
-        asked = force * float((weights * beside * left).sum()) / max(information, 1e-300)
+        beyond_force = slope - sensitivity * motion
+        information = force**2 * float((weights * beyond_force**2).sum())
+        asked = force * float((weights * beyond_force * left).sum()) / max(information, 1e-300)
         self._average(asked, information)
         depth = force / self._response.stiffness_at(self._height)
         given = self._prior_variance + self._spread + (_TRAVEL * depth) ** 2
         spread = 1.0 / max(self._information, 1e-9) + _SUREST**2
-        mistaken, beyond = doubt_place(self._away, spread, given, 0.0)
+        mistaken, beyond = question_location(self._offset, spread, given, 0.0)
         stddev = float(np.sqrt(given + beyond))
-        return PlaceDoubt(
-            away=self._away, mistaken=float(mistaken), stddev=stddev, share=float(abs(sensitivity) * stddev)
-        )
+        state["offset"], state["mistaken"] = self._offset, mistaken
+        state["height_stddev"], state["location_error"] = stddev, abs(sensitivity) * stddev
 
     def _average(self, asked: float, information: float) -> None:
         """Takes what a frame asks for [m] with its information [1/m^2] into the average."""
         kept = self._information * (1.0 - 1.0 / self._memory)
         if information > 0.0:
-            self._away = (kept * self._away + information * asked) / (kept + information)
+            self._offset = (kept * self._offset + information * asked) / (kept + information)
         self._information = kept + information

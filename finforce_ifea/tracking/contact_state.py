@@ -1,0 +1,245 @@
+"""What one image tells of a contact: the state, its uncertainty, the elastic force, and when to reject it.
+
+The state x is depth [m], shape and height [m] of the pressing object. Records of these types are read by name in
+Python, as `state["x"]`, and in compiled code, as `state.x`.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from finforce_ifea.relaxation import relax_force
+
+_OPTIONS = {"cache": True, "error_model": "numpy"}
+_V, _M = (np.float64, 3), (np.float64, (3, 3))
+
+# The contact that a tracker has found in an image. What was estimated is x where a contact is tracked, the force [N]
+# where its location is given.
+CONTACT_STATE = np.dtype(
+    [
+        ("x", *_V),
+        ("x_model", *_V),  # where the mechanics stands: never above the surface
+        ("x_asked", *_V),  # that the key points ask for
+        ("moved", *_V),  # of x_asked since the forecast
+        ("speed", float),  # of the depth [m/s]
+        ("spread", float, (2, 2)),  # covariance of depth and speed
+        ("covariance", *_M),  # of what was estimated, the misfit included
+        ("force", *_V),  # elastic force on the jaw [N]
+        ("force_modes", *_M),  # its derivative by what was estimated
+        ("pressing", *_V),  # force before the last step [N]
+        ("by_traction", *_V),  # derivative of the force by the traction ratio [N]
+        ("pressure_point", *_V),  # pressure centre on the deformed surface [m]
+        ("pressure_location", *_V),  # the same on the undeformed surface [m]
+        ("traction_ratio", float),  # of tangential to normal force, with which the state was found
+        ("magnitude", float),  # of the force [N]
+        ("stddev", float),  # of the force along itself [N]
+        ("depth", float),  # below first touch [m]
+        ("depth_variance", float),  # [m^2]
+        ("height_stddev", float),  # of the pressure centre [m]
+        ("used", int),  # key points with a weight
+        ("known", int),  # key points that were measured
+        ("agreed", int),  # key points that agree with the forecast
+        ("jump", float),  # median depth that the key points ask for one by one, about the model's own [m]
+        ("jumped", bool),  # whether the depth changed beyond what was expected
+        ("residual", float),  # weighted root mean square [m]
+        ("misfit", float),  # averaged residuals over their standard deviations, about 1 where the model fits
+        ("kkt", float),  # what is left of the objective's gradient, relative to its parts
+        ("condition", float),  # of what was solved, scaled
+        ("offset", float),  # contact location that the key points alone ask for, from the stated one [m]
+        ("mistaken", float),  # probability that the stated location is wrong
+        ("location_error", float),  # relative standard deviation of the force that the location leaves
+        ("stiffening", float),  # force over depth relative to that of first touch
+        ("extrapolation", float),  # distance of the shape from the stored ones, as a share of what these are good for
+        ("ambiguity", float),  # change of the force by an iteration that did not converge [N]
+        ("bearable", float),  # force beyond which no equilibrium is believed [N]
+        ("y", float),  # of the pressure along the width [m]
+        ("y_stddev", float),  # [m]
+        ("lateral_force", float),  # along y [N]; NaN where it is unknown
+        ("lateral_stddev", float),  # of the lateral force as a share of all force
+        ("traction_stddev", float),  # of the traction ratio along the finger
+        ("traction_leak", float),  # change of the force along x by one along the finger
+        ("iterations", int),
+        ("converged", bool),  # whether the last iteration changed nothing that matters
+        ("sound", bool),  # whether the mesh is in order and the numbers are finite
+        ("quiet", bool),  # whether nothing seems to press
+        ("loaded", bool),  # whether something surely presses
+    ],
+    align=True,
+)
+ContactState = np.void
+
+# One key point of an image: what was measured, and what is left of it at a state of the contact. In the plane means
+# along x and z, with y known.
+KEYPOINT = np.dtype(
+    [
+        ("measured", *_V),  # offsets and lateral motion removed, NaN where unused [m]
+        ("rest", *_V),  # of the undeformed model [m]
+        ("tare_noise", float, (2, 2)),  # covariance in the plane in an image like those of the tare [m^2]
+        ("gain", float, 2),  # regression of the noise along x and z on that along y
+        ("width_variance", float),  # along y in such an image [m^2]
+        ("trust", float),  # variance in the tare over that in this image
+        ("offset_variance", float),  # of what is constant [m^2]
+        ("r", float, 2),  # residual in the plane about the forecast, zero where unused [m]
+        ("modes", float, (2, 4)),  # its derivatives by x and by the traction ratio
+        ("weight", float),  # agreement times trust, 0 to 1
+        ("noise", float, (2, 2)),  # covariance in the plane in an image as noisy as this one [m^2]
+        ("bias", float),  # variance that no averaging removes [m^2]
+        ("lateral", float),  # residual along y, zero where unused [m]
+        ("lateral_noise", float),  # its variance [m^2]
+    ]
+)
+
+# Residuals of a key point averaged over the last images. An image in which the finger was hardly pressed tells hardly
+# anything of shape and height: the derivatives are averaged alike.
+AVERAGE = np.dtype([("residual", float, 2), ("modes", float, (2, 3)), ("count", float)])
+
+# Half of the friction cone is one standard deviation of an unseen traction ratio.
+UNSEEN_TRACTION = 0.5
+# Standard deviation of a lateral location of which nobody knows [m].
+MIDDLE_STDDEV = 3e-3
+
+
+def blank_contact_state() -> ContactState:
+    """Return a contact state in which nothing was estimated and nothing is wrong."""
+    state = np.zeros((), CONTACT_STATE)[()]
+    for name in ("stiffening", "condition"):
+        state[name] = 1.0
+    state["ambiguity"] = state["bearable"] = np.inf
+    state["used"] = state["known"] = state["agreed"] = 1
+    return state
+
+
+# An ambiguous state, as between two corners of an object, matters where the force changes by more than this [N].
+_AMBIGUOUS = 0.15
+# Beyond these a force is rejected: misfit of the shape, stiffening, standard deviation [N], its share of the force.
+_LARGEST_MISFIT = 2.0
+_LARGEST_STIFFENING = 5.0
+_VAGUE_FORCE, _VAGUE_SHARE = 1.0, 0.25
+# Shapes so many times as far from the stored ones as they are good for.
+_FARTHEST_SHAPE = 2.0
+# Share of the key points that has to agree.
+_MAJORITY = 0.5
+# A location that is so surely wrong, and by at least so much [m].
+_MISTAKEN, _LEAST_OFFSET = 0.99, 4e-3
+
+
+def find_rejection_reason(state: ContactState, *, settles: bool) -> str:
+    """Return why the force of a contact state must be rejected, empty where it can be trusted.
+
+    Args:
+        state: of one image.
+        settles: whether the solver iterates until nothing changes, so that one that has not is rejected.
+    """
+    magnitude, agreement = state["magnitude"], state["agreed"] / state["known"]
+    if settles and not state["converged"] and state["ambiguity"] > _AMBIGUOUS:
+        return f"the shape has not settled within {state['iterations']} iterations; is the contact location right?"
+    if state["extrapolation"] > _FARTHEST_SHAPE:
+        return "the jaw's shape is too far from the stored ones; solver solid or frame knows any shape"
+    if state["misfit"] > _LARGEST_MISFIT:
+        misfit = f"{state['misfit']:.1f} standard deviations"
+        return f"the key points do not fit this contact ({misfit}); is its location right?"
+    if state["stiffening"] > _LARGEST_STIFFENING:
+        times = f"{state['stiffening']:.0f} times"
+        return f"the jaw seems {times} as stiff as at the given height; is the contact elsewhere?"
+    if agreement <= _MAJORITY:
+        return f"only {100 * agreement:.0f} % of the key points agree with the jaw's shape"
+    if state["mistaken"] > _MISTAKEN and abs(state["offset"]) > _LEAST_OFFSET:
+        return f"the contact is off its stated location: the key points have it {1e3 * state['offset']:+.0f} mm away"
+    if magnitude > state["bearable"]:
+        most = f"expected {state['bearable']:.0f} N at most"
+        return f"the shape would take {magnitude:.0f} N, {most}; is the contact elsewhere?"
+    if not state["stddev"] <= max(_VAGUE_FORCE, _VAGUE_SHARE * magnitude):
+        return f"the visible key points tell the force only within {state['stddev']:.2g} N"
+    return ""
+
+
+@njit(**_OPTIONS)
+def measure_along(force: NDArray, modes: NDArray, covariance: NDArray) -> float:
+    """Return the standard deviation [N] of a force (3,) along itself, along -x where it is zero.
+
+    Args:
+        force: (3,) [N].
+        modes: derivative of the force by what was estimated (3, m).
+        covariance: of what was estimated (m, m).
+    """
+    magnitude = np.sqrt((force * force).sum())
+    direction = force / magnitude if magnitude > 0.0 else np.array([-1.0, 0.0, 0.0])
+    m, total = modes.shape[1], 0.0
+    mode = np.zeros(m)
+    for i in range(m):
+        for a in range(3):
+            mode[i] += direction[a] * modes[a, i]
+    for i in range(m):
+        for j in range(m):
+            total += mode[i] * covariance[i, j] * mode[j]
+    return np.sqrt(total)
+
+
+# What two jaws hold does not slide out, though their bent faces are inclined: friction takes up the force along the
+# finger, and the magnitude that belongs to the same shape is larger, by a share of the tangent of the inclination.
+_INCLINED = 0.3
+# Share of a force that nobody has seen along z.
+UNSEEN_ALONG = 0.3
+
+
+@njit(**_OPTIONS)
+def compute_force(state, relaxation, dt, error, sliding, out):
+    """Write the force that the material gives now, and what belongs to it, to out (7, 3).
+
+    The rows are force [N], torque about the jaw frame's origin [N m], their standard deviations, contact point [m],
+    contact location [m] and direction; the last three are NaN without a force.
+
+    Args:
+        state: see `CONTACT_STATE`.
+        relaxation: the finger's, see `Relaxation.packed`, which is advanced by dt.
+        dt: time since the last force [s].
+        error: relative standard deviation of the mechanics.
+        sliding: friction of an object that may slide along the finger, 0 for one that does not.
+        out: (7, 3).
+
+    Returns:
+        The magnitude and its standard deviation [N].
+    """
+    force, torque, stddev, torque_stddev, arm, undeformed, normal = out
+    modes, covariance = state.force_modes, state.covariance
+    fit, before = measure_along(state.force, modes, covariance), _measure_length(state.force)
+    relax_force(state.force, relaxation, dt, force)
+    if before > 0.0 and np.isfinite(state.lateral_force):
+        force[1] = state.lateral_force * _measure_length(force) / before
+    magnitude, inclined = _measure_length(force), 0.0
+    if sliding > 0.0:
+        inclined = _INCLINED * min(sliding, abs(force[2]) / max(abs(force[0]), 1e-9))
+    # the mechanics errs in the direction as in the magnitude
+    wrong = (error**2 + inclined**2) * magnitude**2
+    along = state.traction_stddev
+    leaked, inclination = (state.traction_leak * along * magnitude) ** 2, (along * magnitude) ** 2
+    # a larger force is more inclined: where it is hardly known, its direction is not known either
+    inclination += (UNSEEN_ALONG * fit**2 / max(magnitude + fit, 1e-300)) ** 2
+    more = (wrong + leaked, (state.lateral_stddev * magnitude) ** 2, wrong + inclination)
+    for a in range(3):
+        variance = more[a]
+        for i in range(3):
+            for j in range(3):
+                variance += modes[a, i] * covariance[i, j] * modes[a, j]
+        stddev[a] = np.sqrt(variance)
+        arm[a], undeformed[a] = state.pressure_point[a], state.pressure_location[a]
+    arm[1] = undeformed[1] = state.y
+    arm_stddev = (0.0, state.y_stddev, state.height_stddev)
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        torque[a] = arm[b] * force[c] - arm[c] * force[b]
+        variance = (arm[b] * stddev[c]) ** 2 + (arm[c] * stddev[b]) ** 2
+        variance += (arm_stddev[b] * force[c]) ** 2 + (arm_stddev[c] * force[b]) ** 2
+        torque_stddev[a] = np.sqrt(variance)
+    for a in range(3):
+        if magnitude > 0.0:
+            normal[a] = force[a] / magnitude
+        else:
+            arm[a] = undeformed[a] = normal[a] = np.nan
+    return magnitude, np.sqrt(fit**2 + wrong + leaked)
+
+
+@njit(**_OPTIONS)
+def _measure_length(vector):
+    """Return the length of a vector (3,)."""
+    return np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)

@@ -1,0 +1,377 @@
+"""Depth, shape and height of the pressing object from key points, image after image, on the deformed jaw.
+
+The shape of an unknown object is its radius, that of a known outline its tilt.
+"""
+
+from __future__ import annotations
+
+from math import hypot, nan, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, OutlineIndenter, RoundIndenter, expect_object
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact
+from finforce_ifea.contact_mechanics.torsion import Torsion
+from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
+from finforce_ifea.observation import Contact
+from finforce_ifea.settings import EstimatorSettings
+from finforce_ifea.tare import PointNoise, Tare
+from finforce_ifea.tracking.contact_search import LOADED_DEPTH, TOUCH_DEPTH, ContactSearch, find_x_model
+from finforce_ifea.tracking.contact_state import (
+    MIDDLE_STDDEV,
+    UNSEEN_TRACTION,
+    ContactState,
+)
+from finforce_ifea.tracking.friction import SMOOTH, Coefficient, FrictionEstimate, SlipHistory, leave_play
+from finforce_ifea.tracking.held_weight import LARGEST_RATIO, HeldWeight, project_response
+from finforce_ifea.tracking.influence import explain_offsets, measure_influence
+from finforce_ifea.tracking.lateral_load import LateralLoad
+
+_IMAGES_RELEASED = 15
+_LOST_STDDEV = 1e-3
+# The height may leave what was given by this many of its standard deviations; beyond, the contact is another one.
+_FARTHEST_HEIGHT = 8.0
+# Shapes so many times as far from the stored ones as these are good for are left to the full mechanics, until the
+# object has gone back to this share of its depth.
+_BEYOND_STORED, _BACK = 1.0, 0.8
+# What of the friction the mechanics does not follow, and a traction ratio that is never excluded [-].
+_UNFOLLOWED, _TRACTION = 0.25, 0.08
+# What is kept of the averaged residuals where an object slides.
+_KEPT = 0.5
+# Of an unknown weight, as a share of the normal force, and the least normal force that counts [N].
+_WEIGHT, _LEAST_NORMAL = 0.15, 0.1
+
+
+class _Fidelity(NamedTuple):
+    """One of the mechanics of a jaw: its contact, the probe of the key points, and these at rest (K, 3) [m]."""
+
+    contact: RollingContact
+    probe: Any
+    rest: NDArray
+
+
+class ContactTracker:
+    """Tracks the contact with the pressing object; holds the jaw in equilibrium with it.
+
+    Where a reduced jaw bends as none of its stored shapes does, as around large flat things, the full one takes over.
+
+    Attributes:
+        roughness: what is known of the object's friction.
+        slips: how far the object makes use of it.
+        response: of the unloaded jaw, see `InfluenceCoefficients`.
+    """
+
+    def __init__(
+        self,
+        mechanics: Mechanics,
+        keypoints: NDArray,
+        settings: EstimatorSettings,
+        torsion: Torsion | None = None,
+        smooth: Coefficient = SMOOTH,
+    ) -> None:
+        """Attach the key points to the model.
+
+        Args:
+            mechanics: of the jaw.
+            keypoints: (K, 3) [m, undeformed].
+            settings: of the estimator.
+            torsion: response to what acts laterally; None where unknown.
+            smooth: friction of the objects of the calibration.
+
+        Raises:
+            MeshError: A key point is off the jaw.
+        """
+        self.settings = settings
+        self._fidelities = [
+            _attach(each.contact, keypoints) for each in (mechanics, mechanics.full) if each is not None
+        ]
+        self._use(0)
+        self._search = ContactSearch(len(keypoints), settings)
+        self._search.expectation["farthest"] = _FARTHEST_HEIGHT * settings.height_stddev
+        self.response = measure_influence(self._contact, self._probe, len(keypoints))
+        self._outline: OutlineIndenter | None = None
+        self.slips = SlipHistory(self._contact)
+        self.roughness = FrictionEstimate(settings, smooth)
+        self._lateral = LateralLoad(torsion, len(keypoints), UNSEEN_TRACTION * settings.friction)
+        self._held = HeldWeight(self._lateral.half_width)
+        self.reset()
+
+    def reset(self, height: float | None = None) -> None:
+        """Start anew, unloaded, with an unknown object that will first touch at `height` [m], the middle if None."""
+        settings = self.settings
+        self._given = height
+        self._use(0)
+        height = float(np.median(self._contact.surface.heights)) if height is None else height
+        self._press(RoundIndenter())
+        self._contact.set_traction_ratio(0.0)
+        self._expect(
+            np.array([np.log(settings.radius), height]),
+            np.array([settings.radius_log_stddev, settings.height_stddev]) ** 2,
+        )
+        self._begin()
+
+    def _use(self, fidelity: int) -> None:
+        """Take one of the mechanics for the next images."""
+        self._fidelity = fidelity
+        self._contact, self._probe, self._rest = self._fidelities[fidelity]
+
+    def _press(self, indenter: RoundIndenter | OutlineIndenter) -> None:
+        """Take another object, and what the search is allowed with it."""
+        self._contact.set_indenter(indenter)
+        expectation, shapes = self._search.expectation, indenter.shape_range
+        expectation["lowest"], expectation["highest"] = shapes.low, shapes.high
+        expectation["largest_change"], expectation["settled_change"] = shapes.largest_change, shapes.settled_change
+        expectation["has_corners"] = indenter.has_corners
+
+    def _expect(self, mean: NDArray, variance: NDArray) -> None:
+        """Expect an object of some shape and height (2,), each with its variance (2,)."""
+        self._search.expectation["mean"], self._search.expectation["variance"] = mean, variance
+
+    @property
+    def _mean(self) -> NDArray:
+        """Expected shape and height (2,)."""
+        return self._search.expectation["mean"]
+
+    def _change_fidelity(self, state: ContactState) -> None:
+        """Go on with the full mechanics where the shape is too far from those stored, and back where it bends less."""
+        before, pressed = self._contact, float(state["x"][DEPTH])
+        if self._fidelity == 0 and state["extrapolation"] > _BEYOND_STORED and len(self._fidelities) > 1:
+            self._left = (self.q.copy(), _BACK * pressed)
+            q = before.model.expand(self.q)
+            self._use(1)
+        elif self._fidelity == 1 and pressed < self._left[1]:
+            q = self._left[0]
+            self._use(0)
+        else:
+            return
+        self._contact.set_indenter(before.indenter)
+        self._contact.set_traction_ratio(before.traction_ratio)
+        self._search.resume(q)
+
+    def vertices(self) -> NDArray:
+        """Return the deformed mesh vertices (n, 3) [m], in mesh order."""
+        return self._contact.model.vertices(self.q)
+
+    def positions(self) -> NDArray:
+        """Return the key points (K, 3) [m] of the deformed jaw."""
+        return self._contact.model.positions(self._probe, self.q)
+
+    @property
+    def q(self) -> NDArray:
+        """The jaw's unknowns (size,)."""
+        return self._search.q
+
+    @property
+    def used(self) -> NDArray:
+        """Which key points of the last image count (K,)."""
+        return self._search.points["weight"] > 0
+
+    def give_shape(self) -> NDArray:
+        """Return the shape (size,) for another tracker to begin with."""
+        return self.q if self._fidelity == 0 else self._left[0]
+
+    def _begin(self) -> None:
+        """Start with the undeformed jaw and an object that just touches."""
+        self._use(0)
+        self._search.begin(self._contact, self._mean)
+        self._led = self._mean.copy()
+        self.slips.reset()
+        self._held.reset()
+        self._lateral.reset()
+        self._released, self._jumped, self._slides = 0, False, False
+
+    def _forget_contact(self) -> None:
+        """Expect any object again, as the next one may be."""
+        self._led = self._mean.copy()
+        self._search.forget(self._mean)
+
+    def update(
+        self, points: NDArray, tare: Tare, dt: float, stddev: NDArray | None = None, gravity: NDArray | None = None
+    ) -> ContactState | None:
+        """Take the key points of an image; return None when too few agree.
+
+        Args:
+            points: (K, 3) [m], NaN where unused.
+            tare: offsets and noise.
+            dt: time since the last image [s].
+            stddev: stated standard deviations (K, 3) [m].
+            gravity: its direction (3,) in the jaw's frame; None where unknown.
+        """
+        noise = tare.point_noise(stddev)
+        measured = points - tare.offsets
+        held = self._lateral.by_force * self._held.lateral if self._is_known else None
+        if held is not None:
+            measured -= self._lateral.motions + held
+        self._fill(measured, tare, noise)
+        is_sudden = bool(self._released or self._jumped)
+        if not self._search.find(self._contact, self._probe, dt, is_sudden=is_sudden):
+            self._search.lose(_LOST_STDDEV)
+            return None
+        state = self._search.state
+        state["traction_ratio"] = self._contact.traction_ratio
+        self._jumped = bool(state["jumped"])
+        self._released = self._released + 1 if state["depth"] < TOUCH_DEPTH else 0
+        if self._released >= _IMAGES_RELEASED:  # the next object may be any again, and nothing hangs on the jaw yet
+            self._forget_contact()
+            if self.settings.held == "yes":
+                self._held.reset()
+                self._contact.set_traction_ratio(0.0)
+        if held is not None and state["converged"] and state["depth"] >= LOADED_DEPTH and not self._jumped:
+            self._follow_traction(noise.gain, dt, gravity)
+        self._complete(state)
+        if held is not None:
+            self._lateral.update(
+                points[:, 1] - tare.offsets[:, 1] - held[:, 1] - self._rest[:, 1], self._search.points, state
+            )
+        self._change_fidelity(state)
+        return state
+
+    def _fill(self, measured: NDArray, tare: Tare, noise: PointNoise) -> None:
+        """Fill in the key points of an image, measured (K, 3) [m]."""
+        points = self._search.points
+        points["measured"], points["rest"] = measured, self._rest
+        points["tare_noise"], points["gain"] = noise.plane, noise.gain
+        points["width_variance"], points["trust"] = noise.width_variance, noise.trust
+        points["offset_variance"] = tare.offset_variance(self.settings.offset_stddev) + noise.bias
+
+    def significance(self, tare: Tare, stddev: float) -> float:
+        """Return by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
+        return explain_offsets(self.rest_modes(), tare, stddev)
+
+    def rest_modes(self) -> NDArray:
+        """Return how the key points of the undeformed jaw move in x and z by the depth (K, 2) [m/m]."""
+        q = np.zeros(self._contact.model.size)
+        pressed = self._contact.linearize(q, find_x_model(self._contact, np.r_[-1.0, self._mean]))
+        return self._contact.model.project(self._probe, q, pressed.modes)[:, [0, 2], DEPTH]
+
+    def forget(self) -> None:
+        """Forget what was learnt of the object."""
+        self.roughness.reset()
+        self.reset()
+
+    @property
+    def _is_known(self) -> bool:
+        """Whether the object is known by its outline."""
+        return self._outline is self._contact.indenter
+
+    def _follow_traction(self, gain: NDArray, dt: float, gravity: NDArray | None) -> None:
+        """Follow the traction of an object that is held; that of one that slides is left to `learn`."""
+        if self.settings.held != "yes":
+            self._slides = True
+            return
+        response = tuple(project_response(each, gain) for each in (self._lateral.by_force, self._lateral.by_moment))
+        search, prior = self._search, self._search.expectation["variance"]
+        wanted = self._held.update(search.points, search.state, response, prior, dt, gravity)
+        self._contact.set_traction_ratio(min(max(wanted, -LARGEST_RATIO), LARGEST_RATIO))
+
+    def learn(self) -> None:
+        """Learn what the last image tells of friction, which its force did not wait for."""
+        if not self._slides:
+            return
+        self._slides = False
+        state, mean = self._search.state, self._mean
+        before, known = self.slips.mobilised, self.roughness.coefficient.mean
+        self.slips.set_indenter(self._contact.indenter)
+        expected = np.r_[state["x_model"][DEPTH], mean]
+        mobilised = self.slips.follow(self.give_shape(), expected, sqrt(state["depth_variance"]), known)
+        self.roughness.update(self._search.points, state, mean, self._search.expectation["variance"], before)
+        self._contact.set_traction_ratio(self.roughness.coefficient.mean * mobilised)
+
+    def resume(self, q: NDArray) -> None:
+        """Start anew from the shape (size,) that another tracker has found."""
+        self.reset()
+        self._search.resume(q.copy())
+
+    def follow(self, contact: Contact) -> None:
+        """Take over where a contact's object is: its outline, or its height as that of first touch."""
+        if contact.outline is not None:
+            self._follow_outline(contact)
+            return
+        height = float(expect_object(contact, self.settings).mean[1])
+        if self._given is None:
+            self.reset(height)
+        if abs(height - self._given) > _FARTHEST_HEIGHT * self.settings.height_stddev:
+            self._mean[1] = height
+            self._forget_contact()  # another object
+        self._search.expectation["stiffness"] = self.response.stiffness_at(height)
+        self._given = self._mean[1] = height
+
+    def _follow_outline(self, contact: Contact) -> None:
+        """Take the outline's tilt and height as what is to be expected; an outline cut anew keeps the contact."""
+        before = self._contact.indenter
+        if contact.outline.across is not None:
+            self._lateral.expect(*contact.outline.across)
+        expected = expect_object(contact, self.settings, self._outline)
+        self._expect(expected.mean, expected.variance)
+        self._lead()
+        self._outline = after = expected.indenter
+        self._press(after)
+        height = float(expected.mean[1])
+        self._given, self._search.expectation["stiffness"] = None, self.response.stiffness_at(height)
+        is_off = abs(self._search.state["x"][HEIGHT] - height) > _FARTHEST_HEIGHT * self.settings.height_stddev
+        is_same = isinstance(before, OutlineIndenter) and after.resembles(before)
+        if isinstance(before, OutlineIndenter) and not is_same:
+            self.roughness.reset()
+        if is_off or not is_same:
+            self._begin()
+        elif after is not before:
+            change = after.field.front - before.field.front
+            self._search.shift(change)
+            self.slips.shift(change)
+
+    def _lead(self) -> None:
+        """Take the contact along where the object slides or tilts, beyond what its pose may be off by chance.
+
+        The averaged residuals are those of an object that stays where it is, and would hold the contact back.
+        """
+        chance, moved = np.sqrt(self._search.expectation["variance"]), self._mean - self._led
+        change = np.array([leave_play(moved[0], chance[0]), leave_play(moved[1], chance[1])])
+        if change.any():
+            self._led += change
+            self._search.lead(change, _KEPT)
+            self._held.lead(change)
+
+    def _complete(self, state: ContactState) -> None:
+        """Fill in what is known of the traction of a contact, and what the jaw bears."""
+        normal = hypot(state["force"][0], state["force"][2])
+        if not self._is_known:
+            traction = UNSEEN_TRACTION * self.settings.friction
+            load, leak = (0.0, MIDDLE_STDDEV, nan, traction), 0.0
+        else:
+            load, traction, leak = (
+                self._find_lateral(normal),
+                self._find_traction(normal),
+                self._find_leak(state, normal),
+            )
+        state["y"], state["y_stddev"], state["lateral_force"], state["lateral_stddev"] = load
+        state["traction_stddev"], state["traction_leak"] = traction, leak
+        state["bearable"] = self._fidelities[0].contact.bearable
+
+    def _find_lateral(self, normal: float) -> NDArray:
+        """Return what acts laterally, see `LateralLoad`; what a lifted object may do there is uncertainty."""
+        load, held = self._lateral.load.copy(), self._held
+        if self.settings.held == "yes" and held.lateral_stddev < np.inf:
+            load[2] += held.lateral
+            load[3] = hypot(load[3], held.lateral_stddev / max(normal, _LEAST_NORMAL))
+        return load
+
+    def _find_leak(self, state: ContactState, normal: float) -> float:
+        """Return by how much a held object's force [N] along the finger changes that along x [-]."""
+        if self.settings.held != "yes" or normal < _LEAST_NORMAL:
+            return 0.0
+        return float(state["by_traction"][0] / normal - state["force_modes"][0, DEPTH] * self._held.leverage)
+
+    def _find_traction(self, normal: float) -> float:
+        """Return the standard deviation of the traction ratio of a force [N] along the finger [-]."""
+        if self.settings.held == "yes":
+            return sqrt(min(self._held.stddev / max(normal, _LEAST_NORMAL), _WEIGHT) ** 2 + _TRACTION**2)
+        found = self.roughness.coefficient
+        return sqrt((found.stddev * self.slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _TRACTION**2)
+
+
+def _attach(contact: RollingContact, keypoints: NDArray) -> _Fidelity:
+    """Return the mechanics of a contact with key points (K, 3) [m]; raises MeshError when one is off the jaw."""
+    probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
+    return _Fidelity(contact, probe, contact.model.positions(probe, np.zeros(contact.model.size)))
