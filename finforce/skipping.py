@@ -16,7 +16,7 @@ EVERYWHERE = (LATE, UNHEARD)
 # of a solver
 AWAY = "no object near"
 IDLE = "idle image"
-SOLVER = (AWAY, IDLE)
+SOLVER = (IDLE,)
 # of a contact estimator, which has AWAY and IDLE, too
 STILL = "nothing moved"
 RESTING = "grasp rests"

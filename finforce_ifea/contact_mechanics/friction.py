@@ -124,7 +124,7 @@ def apply_traction(
 
 @njit(**_OPTIONS)
 def _add_ratio(ratio, touch, out):
-    """Adds what a traction ratio of one point's force makes of its springs and of its derivatives by the place, in place."""
+    """Add what a traction ratio makes of the springs of one point and of its derivatives by the place, in place."""
     out[0, _SPRING] += ratio * touch.kxz
     out[0, _SPRING + 1] += ratio * touch.kzz
     out[1, _SPRING] -= ratio * touch.kxx

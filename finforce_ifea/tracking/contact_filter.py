@@ -61,6 +61,7 @@ def forecast_state(state, dt, is_sudden, expectation, forecast):
         expectation: see `EXPECTATION`.
         forecast: see `FORECAST`.
     """
+    state, expectation, forecast = state[()], expectation[()], forecast[()]
     spread, power = state.spread, expectation.acceleration**2
     a, b, c = spread[0, 0], spread[0, 1], spread[1, 1]
     mixed = b + dt * c + power * dt**3 / 2.0
@@ -104,37 +105,14 @@ def weigh_keypoints(points, positions, motions, x, x_model, forecast, expectatio
         expectation: see `EXPECTATION`.
         state: see `CONTACT_STATE`; gets the numbers of key points and the jump.
     """
-    count, below = len(points), x[0] - x_model[0]
+    state, expectation, forecast = state[()], expectation[()], forecast[()]
     depth_variance = min(forecast.spread[0, 0], _WIDEST_FORECAST**2)
-    asked, information, least = np.zeros(count), np.zeros(count), np.inf
-    state.used = state.known = state.agreed = 0
-    for k in range(count):
+    state.known, state.jump = _measure_residuals(points, positions, motions, x[0] - x_model[0], expectation)
+    level = _measure_noise_level(points, state.jump)
+    state.used = state.agreed = 0
+    for k in range(len(points)):
         point = points[k]
         point.weight = 0.0
-        point.bias = point.offset_variance + _MODEL_FLOOR**2
-        for a in range(3):
-            point.bias += expectation.model_error**2 * (positions[k, a] - point.rest[a]) ** 2
-        for i in range(4):
-            point.modes[0, i], point.modes[1, i] = motions[k, 0, i], motions[k, 2, i]
-        least = min(least, point.tare_noise[0, 0] + point.tare_noise[1, 1])
-    for k in range(count):
-        point = points[k]
-        point.r[0] = point.r[1] = 0.0
-        if not np.isfinite(point.measured[0] + point.measured[1] + point.measured[2]):
-            point.lateral = np.nan
-            continue
-        h0, h1 = point.modes[0, 0], point.modes[1, 0]
-        point.lateral = point.measured[1] - positions[k, 1]
-        point.r[0] = point.measured[0] - positions[k, 0] - point.gain[0] * point.lateral - h0 * below
-        point.r[1] = point.measured[2] - positions[k, 2] - point.gain[1] * point.lateral - h1 * below
-        information[k] = h0 * h0 + h1 * h1
-        asked[k] = (h0 * point.r[0] + h1 * point.r[1]) / max(information[k], 1e-12)
-        information[k] *= point.trust * least / (point.tare_noise[0, 0] + point.tare_noise[1, 1])
-        state.known += 1
-    state.jump = _weighted_median(asked, information)
-    level = _measure_noise_level(points, state.jump)
-    for k in range(count):
-        point = points[k]
         for a in range(2):
             for b in range(2):
                 point.noise[a, b] = point.tare_noise[a, b] * level
@@ -154,6 +132,40 @@ def weigh_keypoints(points, positions, motions, x, x_model, forecast, expectatio
             state.agreed += point.weight >= _BELIEVED * point.trust
         else:
             point.r[0] = point.r[1] = point.lateral = 0.0
+
+
+@njit(**_OPTIONS)
+def _measure_residuals(points, positions, motions, below, expectation):
+    """Fill in the residuals at the model's own state, asked for a depth that is `below` [m] deeper, NaN along y where unused.
+
+    Returns:
+        The number of points that were measured, and the median of the depths that they ask for one by one [m].
+    """
+    count, known, least = len(points), 0, np.inf
+    asked, information = np.zeros(count), np.zeros(count)
+    for k in range(count):
+        point = points[k]
+        point.bias = point.offset_variance + _MODEL_FLOOR**2
+        for a in range(3):
+            point.bias += expectation.model_error**2 * (positions[k, a] - point.rest[a]) ** 2
+        for i in range(4):
+            point.modes[0, i], point.modes[1, i] = motions[k, 0, i], motions[k, 2, i]
+        least = min(least, point.tare_noise[0, 0] + point.tare_noise[1, 1])
+    for k in range(count):
+        point = points[k]
+        point.r[0] = point.r[1] = 0.0
+        if not np.isfinite(point.measured[0] + point.measured[1] + point.measured[2]):
+            point.lateral = np.nan
+            continue
+        h0, h1 = point.modes[0, 0], point.modes[1, 0]
+        point.lateral = point.measured[1] - positions[k, 1]
+        point.r[0] = point.measured[0] - positions[k, 0] - point.gain[0] * point.lateral - h0 * below
+        point.r[1] = point.measured[2] - positions[k, 2] - point.gain[1] * point.lateral - h1 * below
+        information[k] = h0 * h0 + h1 * h1
+        asked[k] = (h0 * point.r[0] + h1 * point.r[1]) / max(information[k], 1e-12)
+        information[k] *= point.trust * least / (point.tare_noise[0, 0] + point.tare_noise[1, 1])
+        known += 1
+    return known, _weighted_median(asked, information)
 
 
 @njit(**_OPTIONS)
@@ -231,6 +243,7 @@ def update_state(points, average, extended, forecast, expectation, state):
         expectation: see `EXPECTATION`.
         state: see `CONTACT_STATE`.
     """
+    state, expectation, forecast = state[()], expectation[()], forecast[()]
     information, innovation, pull = _weigh_depth(points, average)
     innovation /= information
     spread = widen_forecast(forecast, innovation, 1.0 / information)

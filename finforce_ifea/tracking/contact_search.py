@@ -59,9 +59,9 @@ class ContactSearch:
         self.settings = settings
         self.points = np.zeros(count, KEYPOINT)
         self.state, self._found = blank_contact_state(), blank_contact_state()
-        self._forecast = np.zeros((), FORECAST)[()]
+        self._forecast = np.zeros((), FORECAST)
         self._average, self._extended = np.zeros(count, AVERAGE), np.zeros(count, AVERAGE)
-        self.expectation = np.zeros((), EXPECTATION)[()]
+        self.expectation = np.zeros((), EXPECTATION)
         for name in ("acceleration", "memory", "model_error", "gate"):
             self.expectation[name] = getattr(settings, name)
 
@@ -100,10 +100,10 @@ class ContactSearch:
         expectation, forecast, found, model = self.expectation, self._forecast, self._found, contact.model
         forecast_state(self.state, dt, is_sudden, expectation, forecast)
         x = forecast["x"].copy()
-        x_model = find_x_model(contact, x)
+        x_model, _ = find_x_model(contact, x)
         q = self.q + self._modes @ (x_model - self.state["x_model"])
         updated, settled, iteration, share = False, False, 0, 1.0
-        last, moved, far, in_vain = np.zeros(3), np.zeros(3), np.inf, 0
+        last, moved, depth, far, in_vain = np.zeros(3), np.zeros(3), 0.0, np.inf, 0
         while not settled and iteration < self.settings.iterations and in_vain < 2:
             iteration += 1
             pressed = contact.linearize(q, x_model)
@@ -117,7 +117,7 @@ class ContactSearch:
                 # towards the median depth that the points ask for, which disagree with the forecast
                 jump, before = float(found["jump"]), x_model
                 x[DEPTH] += min(max(jump, -_LARGEST_LEAP), _LARGEST_LEAP)
-                x_model = find_x_model(contact, x)
+                x_model, _ = find_x_model(contact, x)
                 q = q + limit_step(model, pressed.modes[:, DEPTH] * (x_model[DEPTH] - before[DEPTH]))
                 in_vain = in_vain + 1 if abs(jump) > far - _LEAST_APPROACH else 0
                 far = abs(jump)
@@ -129,7 +129,7 @@ class ContactSearch:
             if expectation["has_corners"] and (aim - x)[1:] @ last[1:] < 0.0:
                 share *= 0.5
             last, before, x = aim - x, x_model, aim
-            x_model = find_x_model(contact, x)
+            x_model, depth = find_x_model(contact, x)
             moved = x_model - before
             q = q + limit_step(model, pressed.modes[:, :3] @ moved)
             settled = _is_settled(found, pressed.size, x, moved, share, expectation)
@@ -138,19 +138,16 @@ class ContactSearch:
         self.q, self._modes = q, pressed.modes[:, :3]
         self._average, self._extended = self._extended, self._average
         self.state, self._found = found, self.state
-        self._conclude(contact, pressed, x, x_model, moved)
+        found["x"], found["x_model"], found["depth"] = x, x_model, depth
+        self._conclude(pressed, moved)
         found["iterations"], found["converged"] = iteration, settled
         if settled:
             found["ambiguity"] = 0.0
         return True
 
-    def _conclude(
-        self, contact: RollingContact, pressed: PressedState, x: NDArray, x_model: NDArray, moved: NDArray
-    ) -> None:
+    def _conclude(self, pressed: PressedState, moved: NDArray) -> None:
         """Complete the state after a search whose last step moved the model from the pressed state by (3,)."""
         state = self.state
-        state["x"], state["x_model"] = x, x_model
-        state["depth"] = x[DEPTH] - contact.find_touch(x)
         state["by_traction"] = pressed.force_modes[:, 3]
         state["pressing"], state["force_modes"] = pressed.force, pressed.force_modes[:, :3]
         state["pressure_point"], state["pressure_location"] = pressed.pressure_point, pressed.pressure_place
@@ -168,17 +165,17 @@ class ContactSearch:
         self.state["x_model"][DEPTH] += change
 
 
-def find_x_model(contact: RollingContact, x: NDArray) -> NDArray:
-    """Return the state (3,) at which the mechanics stands for x: nowhere above the surface."""
-    reached = x.copy()
-    reached[DEPTH] = max(x[DEPTH], contact.find_touch(x) + _LEAST_DEPTH)
-    return reached
+def find_x_model(contact: RollingContact, x: NDArray) -> tuple[NDArray, float]:
+    """Return the state (3,) at which the mechanics stands for x, never above the surface, and the depth below [m]."""
+    x_model, touch = x.copy(), contact.find_touch(x)
+    x_model[DEPTH] = max(x[DEPTH], touch + _LEAST_DEPTH)
+    return x_model, x[DEPTH] - touch
 
 
 @njit(**_OPTIONS)
 def _bound_step(state, x, share, expectation):
     """Return the state asked for (3,), within a share of where the linearisation about the present one holds."""
-    aim = np.empty(3)
+    state, expectation, aim = state[()], expectation[()], np.empty(3)
     change = (_LARGEST_MOVE, share * expectation.largest_change, share * LARGEST_SHIFT)
     for i in range(3):
         aim[i] = min(max(state.x_asked[i], x[i] - change[i]), x[i] + change[i])
@@ -191,6 +188,7 @@ def _bound_step(state, x, share, expectation):
 @njit(**_OPTIONS)
 def _is_settled(state, correction, x, moved, share, expectation):
     """Whether an iteration that moved the model by (3,), to x, changed nothing that matters."""
+    state, expectation = state[()], expectation[()]
     change = (_SETTLED_MOVE, expectation.settled_change, _SETTLED_MOVE)
     for i in range(3):
         missing = state.x_asked[i] - x[i] if share > _UNDECIDED else 0.0
@@ -202,6 +200,7 @@ def _is_settled(state, correction, x, moved, share, expectation):
 @njit(**_OPTIONS)
 def _complete_state(state, moved, q, expectation):
     """Fill in the force after the last step, its uncertainty, and whether all numbers are finite."""
+    state, expectation = state[()], expectation[()]
     misfit, depth = max(1.0, state.misfit**2), state.depth
     continued = max(0.0, depth / _LEAST_DEPTH) if depth < _LEAST_DEPTH else 1.0
     changed, total = 0.0, q.sum()

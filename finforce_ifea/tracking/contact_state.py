@@ -66,7 +66,7 @@ CONTACT_STATE = np.dtype(
     ],
     align=True,
 )
-ContactState = np.void
+ContactState = NDArray  # of this type and no dimension
 
 # One key point of an image: what was measured, and what is left of it at a state of the contact. In the plane means
 # along x and z, with y known.
@@ -101,7 +101,7 @@ MIDDLE_STDDEV = 3e-3
 
 def blank_contact_state() -> ContactState:
     """Return a contact state in which nothing was estimated and nothing is wrong."""
-    state = np.zeros((), CONTACT_STATE)[()]
+    state = np.zeros((), CONTACT_STATE)
     for name in ("stiffening", "condition"):
         state[name] = 1.0
     state["ambiguity"] = state["bearable"] = np.inf
@@ -201,6 +201,7 @@ def compute_force(state, relaxation, dt, error, sliding, out):
         The magnitude and its standard deviation [N].
     """
     force, torque, stddev, torque_stddev, arm, undeformed, normal = out
+    state = state[()]
     modes, covariance = state.force_modes, state.covariance
     fit, before = measure_along(state.force, modes, covariance), _measure_length(state.force)
     relax_force(state.force, relaxation, dt, force)

@@ -222,9 +222,8 @@ class ContactTracker:
             self._follow_traction(noise.gain, dt, gravity)
         self._complete(state)
         if held is not None:
-            self._lateral.update(
-                points[:, 1] - tare.offsets[:, 1] - held[:, 1] - self._rest[:, 1], self._search.points, state
-            )
+            motions = (points - tare.offsets - held - self._rest)[:, 1]
+            self._lateral.update(motions, self._search.points, state)
         self._change_fidelity(state)
         return state
 
@@ -243,7 +242,7 @@ class ContactTracker:
     def rest_modes(self) -> NDArray:
         """Return how the key points of the undeformed jaw move in x and z by the depth (K, 2) [m/m]."""
         q = np.zeros(self._contact.model.size)
-        pressed = self._contact.linearize(q, find_x_model(self._contact, np.r_[-1.0, self._mean]))
+        pressed = self._contact.linearize(q, find_x_model(self._contact, np.r_[-1.0, self._mean])[0])
         return self._contact.model.project(self._probe, q, pressed.modes)[:, [0, 2], DEPTH]
 
     def forget(self) -> None:
@@ -340,11 +339,8 @@ class ContactTracker:
             traction = UNSEEN_TRACTION * self.settings.friction
             load, leak = (0.0, MIDDLE_STDDEV, nan, traction), 0.0
         else:
-            load, traction, leak = (
-                self._find_lateral(normal),
-                self._find_traction(normal),
-                self._find_leak(state, normal),
-            )
+            load, traction = self._find_lateral(normal), self._find_traction(normal)
+            leak = self._find_leak(state, normal)
         state["y"], state["y_stddev"], state["lateral_force"], state["lateral_stddev"] = load
         state["traction_stddev"], state["traction_leak"] = traction, leak
         state["bearable"] = self._fidelities[0].contact.bearable

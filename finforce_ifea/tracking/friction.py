@@ -132,6 +132,7 @@ def _judge(variance, mean, smooth, rough):
 def _explain(image, k, row, left):
     """Fill in the derivatives (6, 2) of key point k by depth, shape, height, mu, b and c, and what is left to them."""
     points, state, mean, mobilised = image
+    state = state[()]
     point, normal = points[k], np.hypot(state.pressing[0], state.pressing[2])
     for a in range(2):
         by_traction = point.modes[a, 3]

@@ -211,6 +211,7 @@ def _find_left(image, offset, before):
     Their depth is the one that was found.
     """
     points, state, response, (upright, lateral) = image
+    state = state[()]
     left, normal = np.empty((len(points), 3)), np.hypot(state.pressing[0], state.pressing[2])
     for k in range(len(points)):
         point = points[k]
@@ -233,6 +234,7 @@ def _accumulate(image, left, weights, beyond, information, vector):
     that a force along the finger is taken for [m/N].
     """
     points, state, (by_force, by_moment), (_, lateral) = image
+    state = state[()]
     A, g, normal = np.zeros((6, 6)), np.zeros(6), np.hypot(state.pressing[0], state.pressing[2])
     rows = np.zeros((6, 2))
     for k in range(len(weights)):

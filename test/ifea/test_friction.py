@@ -13,7 +13,7 @@ import pytest
 from estimator_fakes import BENCH, PERIOD, circle, contact_with
 from scipy.interpolate import interp1d
 
-from finforce_ifea.contact_mechanics.friction import Friction, LeaningContact
+from finforce_ifea.contact_mechanics.friction import Friction, apply_traction, constant_traction
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact, press_cylinder
 from finforce_ifea.estimator import JawEstimator
@@ -21,10 +21,8 @@ from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
 from finforce_ifea.observation import Observation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tracking.friction_estimate import Coefficient, FrictionEstimate
-from finforce_ifea.tracking.held_weight import HeldWeight
-from finforce_ifea.tracking.place_tracker import find_upright_lean
-from finforce_ifea.tracking.slip_history import SlipHistory, leave_play
+from finforce_ifea.tracking.friction import Coefficient, FrictionEstimate, SlipHistory, leave_play
+from finforce_ifea.tracking.held_weight import HeldWeight, find_upright_ratio
 
 FOLDER = Path(__file__).parents[1] / "data"
 RUBBED, SMOOTH = np.load(FOLDER / "rubbed_bench.npz"), np.load(FOLDER / "pressed_bench_mooney.npz")
@@ -47,57 +45,55 @@ def flat(count=5):
 
 class TestCone:
     def test_a_point_that_is_dragged_pulls_back_until_it_slides(self):
-        friction, (contact, points, stiffness), rest = Friction(5), flat(), np.zeros(2)
-        friction.coefficient = 0.5
+        friction, (contact, points, stiffness), rest = Friction(5, 0.5), flat(), np.zeros(2)
         assert friction.settle(contact, points, stiffness, rest) == 0.0
         moved = points + [0.0, 0.0, 20e-6]  # 0.2 N of 0.5
-        stuck = friction.rub(contact, moved, stiffness, rest)
+        stuck = apply_traction(contact, moved, stiffness, friction.describe(rest))
         np.testing.assert_allclose(stuck.forces[:, 2], -0.2)
         assert stuck.mobilised == pytest.approx(-0.4)
-        far = friction.rub(contact, points + [0.0, 0.0, 1e-3], stiffness, rest)
+        far = apply_traction(contact, points + [0.0, 0.0, 1e-3], stiffness, friction.describe(rest))
         np.testing.assert_allclose(far.forces[:, 2], -0.5)
         assert far.mobilised == -1.0
 
     def test_an_object_that_is_dragged_takes_the_points_along(self):
-        friction, (contact, points, stiffness), rest = Friction(5), flat(), np.zeros(2)
-        friction.coefficient = 0.5
+        friction, (contact, points, stiffness), rest = Friction(5, 0.5), flat(), np.zeros(2)
         friction.settle(contact, points, stiffness, rest)
         np.testing.assert_allclose(
-            friction.rub(contact, points, stiffness, np.array([0.0, 20e-6])).forces[:, 2], 0.2, atol=1e-12
+            apply_traction(contact, points, stiffness, friction.describe(np.array([0.0, 20e-6]))).forces[:, 2],
+            0.2,
+            atol=1e-12,
         )
 
     def test_the_way_back_begins_where_the_way_there_ended(self):
-        friction, (contact, points, stiffness), rest = Friction(5), flat(), np.zeros(2)
-        friction.coefficient = 0.5
+        friction, (contact, points, stiffness), rest = Friction(5, 0.5), flat(), np.zeros(2)
         friction.settle(contact, points, stiffness, rest)
         friction.settle(contact, points + [0.0, 0.0, 1e-3], stiffness, rest)
-        back = friction.rub(contact, points + [0.0, 0.0, 0.95e-3], stiffness, rest)
+        back = apply_traction(contact, points + [0.0, 0.0, 0.95e-3], stiffness, friction.describe(rest))
         np.testing.assert_allclose(back.forces[:, 2], 0.0, atol=1e-9)
         friction.reset()
-        assert friction.rub(contact, points, stiffness, rest).mobilised == 0.0
+        assert apply_traction(contact, points, stiffness, friction.describe(rest)).mobilised == 0.0
 
     def test_without_friction_nothing_acts_along_the_face(self):
         friction, (contact, points, stiffness), rest = Friction(5), flat(), np.zeros(2)
         friction.settle(contact, points, stiffness, rest)
-        rubbed = friction.rub(contact, points + [0.0, 0.0, 1e-3], stiffness, rest)
+        rubbed = apply_traction(contact, points + [0.0, 0.0, 1e-3], stiffness, friction.describe(rest))
         np.testing.assert_array_equal(rubbed.forces, contact.forces)
 
-    @pytest.mark.parametrize("lean", [0.0, 0.4, -0.3])
-    def test_changes_of_a_leaning_contact_are_derivatives(self, lean):
+    @pytest.mark.parametrize("ratio", [0.0, 0.4, -0.3])
+    def test_changes_at_a_constant_traction_ratio_are_derivatives(self, ratio):
         points = np.stack([np.full(40, 0.0145), np.zeros(40), np.linspace(0.035, 0.045, 40)], axis=1)
-        stiffness, leaning = np.full(40, 1e4), LeaningContact()
+        stiffness = np.full(40, 1e4)
 
         def press(depth=1e-3, height=0.04, turn=0.0, shift=(0.0, 0.0, 0.0)):
             moved = points + shift
             contact = press_cylinder(moved, stiffness, 0.014 + 0.0125 - depth, height, 0.0125)
-            leaning.lean = lean + turn
-            return leaning.rub(contact, moved, stiffness, np.zeros(2))
+            return apply_traction(contact, moved, stiffness, constant_traction(ratio + turn))
 
         there, step = press(), 1e-8
         by_depth = (press(depth=1e-3 + step).forces - press(depth=1e-3 - step).forces) / (2 * step)
         by_height = (press(height=0.04 + step).forces - press(height=0.04 - step).forces) / (2 * step)
-        by_lean = (press(turn=1e-6).forces - press(turn=-1e-6).forces) / 2e-6
-        for column, change in ((0, by_depth), (2, by_height), (3, by_lean)):
+        by_ratio = (press(turn=1e-6).forces - press(turn=-1e-6).forces) / 2e-6
+        for column, change in ((0, by_depth), (2, by_height), (3, by_ratio)):
             np.testing.assert_allclose(there.changes[:, :, column], change, atol=1e-3 * np.abs(change).max())
         for axis in (0, 2):
             move = step * np.eye(3)[axis]
@@ -115,9 +111,9 @@ class TestHistory:
         ("place", "loading", "unloading"), [("lower", 0.02, 0.18), ("middle", 0.02, 0.10), ("upper", 0.08, 0.30)]
     )
     def test_friction_is_used_as_the_independent_program_has_it(self, place, loading, unloading):
-        """The share of the cone, from the force's lean against the normal force of the model; 1 mm is left out."""
+        """The share of the cone, from the force's inclination to the normal force of the model; 1 mm is left out."""
         contact, height = mechanics().contact, HEIGHTS[place]
-        history = SlipHistory(contact.with_friction())
+        history = SlipHistory(contact)
         history.set_indenter(OutlineIndenter(circle(0.0125)))
         contact.set_indenter(OutlineIndenter(circle(0.0125)))
         depths, forces = 1e-3 * RUBBED[f"25_{place}_depth"], RUBBED[f"25_{place}_force"]
@@ -128,10 +124,10 @@ class TestHistory:
                 for _ in range(12):
                     state = contact.linearize(q, here)
                     q = q + (state.correction if state.touches else contact.approach(q, state.correction, here))
-                contact.rubbing.lean = 0.3 * history.follow(q, here, 0.0, 0.3)
+                contact.set_traction_ratio(0.3 * history.follow(q, here, 0.0, 0.3))
             last = depth
             errors.append(np.linalg.norm(contact.linearize(q, here).force - force) / np.linalg.norm(force))
-        contact.rubbing.lean = 0.0
+        contact.set_traction_ratio(0.0)
         there = np.arange(len(depths)) <= np.argmax(depths)
         assert np.sqrt(np.mean(np.array(errors)[there & (depths > 1.5e-3)] ** 2)) < loading
         assert np.sqrt(np.mean(np.array(errors)[~there & (depths > 1.5e-3)] ** 2)) < unloading
@@ -235,17 +231,17 @@ def test_coefficients_that_are_none_are_refused(name, value):
 
 
 class TestHeld:
-    @pytest.mark.parametrize("lean", [0.0, 0.3, -0.2])
-    def test_the_upright_lean_takes_up_what_the_faces_lean(self, lean):
+    @pytest.mark.parametrize("ratio", [0.0, 0.3, -0.2])
+    def test_the_upright_ratio_takes_up_what_the_faces_are_inclined(self, ratio):
         normal = np.array([-5.0, 0.0, -1.0])
-        leaning = np.array([normal[0] + lean * normal[2], 0.0, normal[2] - lean * normal[0]])
-        upright = find_upright_lean(leaning, lean)
+        force = np.array([normal[0] + ratio * normal[2], 0.0, normal[2] - ratio * normal[0]])
+        upright = find_upright_ratio(force, ratio)
         assert upright == pytest.approx(0.2)
         assert normal[2] - upright * normal[0] == pytest.approx(0.0)
 
     def test_friction_has_its_bounds(self):
-        assert find_upright_lean(np.array([-1.0, 0.0, -5.0]), 0.0) == 0.9
-        assert find_upright_lean(np.zeros(3), 0.0) == 0.0
+        assert find_upright_ratio(np.array([-1.0, 0.0, -5.0]), 0.0) == 0.9
+        assert find_upright_ratio(np.zeros(3), 0.0) == 0.0
 
     def test_what_the_jaws_hold_has_no_force_along_them(self):
         free, _, _ = played(False, "lower")

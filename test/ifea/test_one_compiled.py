@@ -6,12 +6,12 @@ from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.reduced.evaluation import linearize_reduced
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tracking.place_search import _find_reduced
+from finforce_ifea.tracking.contact_filter import update_state, weigh_keypoints
 
 
 @pytest.mark.parametrize("held", ["no", "yes"])
-def test_the_search_for_a_place_is_compiled_once(held):
+def test_the_search_for_a_contact_is_compiled_once(held):
     for solver in ("linear", "reduced"):
         JawEstimator(load_jaw("bench"), settings=EstimatorSettings(solver=solver, held=held)).warm_up()
-    assert len(_find_reduced.signatures) == 1
-    assert len(linearize_reduced.signatures) == 1
+    for kernel in (update_state, weigh_keypoints, linearize_reduced):
+        assert len(kernel.signatures) == 1

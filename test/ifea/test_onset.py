@@ -9,7 +9,7 @@ from estimator_fakes import Recording as Press
 from mechanics_fakes import BENCH
 
 from finforce_ifea.observation import Contact, Observation
-from finforce_ifea.tracking.place_update import Forecast, _allow_for_manoeuvre
+from finforce_ifea.tracking.contact_filter import FORECAST, widen_forecast
 
 NOISE = np.array([0.15e-3, 0.30e-3, 0.15e-3])
 REST, TARGET, SEEN = 60, 0.004, 0.1
@@ -87,30 +87,32 @@ def jump(depth):
 
 
 def forecast(unsure):
-    return Forecast(np.zeros(3), 0.0, np.diag([0.02e-3, 1e-3]) ** 2, unsure)
+    expected = np.zeros((), FORECAST)[()]
+    expected["spread"], expected["unsure"] = np.diag([0.02e-3, 1e-3]) ** 2, unsure
+    return expected
 
 
 def test_a_jump_at_rest_is_a_new_speed():
     jump, noise = 0.4e-3, 0.09e-3**2
-    spread = _allow_for_manoeuvre(forecast(PERIOD), jump, noise)
+    spread = widen_forecast(forecast(PERIOD), jump, noise)
     gain = spread[0] / (spread[0, 0] + noise)
     assert gain[0] * jump == pytest.approx(jump, rel=0.06)
     assert gain[1] * jump == pytest.approx(jump / PERIOD, rel=0.06)
 
 
 def test_a_jump_under_load_leaves_the_speed_to_the_images_that_follow():
-    spread = _allow_for_manoeuvre(forecast(0.0), 0.4e-3, 0.09e-3**2)
+    spread = widen_forecast(forecast(0.0), 0.4e-3, 0.09e-3**2)
     assert spread[0, 0] > 0.3e-3**2
     assert spread[0, 1] == 0.0
 
 
 def test_no_object_is_faster_than_the_fastest():
     jump, noise = 4e-3, 0.09e-3**2
-    spread = _allow_for_manoeuvre(forecast(PERIOD), jump, noise)
+    spread = widen_forecast(forecast(PERIOD), jump, noise)
     assert spread[1, 0] / spread[0, 0] * jump == pytest.approx(0.05, rel=0.01)
 
 
 @pytest.mark.parametrize("unsure", [0.0, PERIOD])
 def test_chance_is_no_manoeuvre(unsure):
     expected = forecast(unsure)
-    np.testing.assert_array_equal(_allow_for_manoeuvre(expected, 0.2e-3, 0.09e-3**2), expected.spread)
+    np.testing.assert_array_equal(widen_forecast(expected, 0.2e-3, 0.09e-3**2), expected["spread"])

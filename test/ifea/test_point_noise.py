@@ -111,7 +111,7 @@ def test_nothing_stated_is_the_pooled_noise_for_all():
         np.testing.assert_allclose(noise.plane[k], tare.noise[::2, ::2] - np.outer(gain, shared), rtol=1e-12)
         np.testing.assert_allclose(noise.gain[k], gain, rtol=1e-12)
     np.testing.assert_array_equal(noise.trust, 1.0)
-    np.testing.assert_allclose(noise.standing, 0.0, atol=1e-12 * np.trace(tare.noise))
+    np.testing.assert_allclose(noise.bias, 0.0, atol=1e-12 * np.trace(tare.noise))
     stated = tare.point_noise(np.sqrt(np.diag(tare.noise)) * COARSE[:, None])
     np.testing.assert_allclose(stated.trust, COARSE**-2.0)
 
@@ -177,16 +177,16 @@ def test_a_common_factor_within_the_scatter_changes_nothing():
 
 def test_what_is_stated_far_beyond_the_scatter_stands_still():
     usual = match_stated(scatter_of(STATED), stated_by(4.0 * STATED, 4000), FLOOR)
-    standing = compute_point_noise(usual, 4.0 * STATED).standing
+    bias = compute_point_noise(usual, 4.0 * STATED).bias
     # twice 16 - 1 times the variance in plane, of which the tare's 4000 images tell the scatter within a few per cent
-    np.testing.assert_allclose(standing, 30.0 * STATED[:, 0] ** 2, rtol=0.05)
-    assert not compute_point_noise(usual, None).standing.any()
+    np.testing.assert_allclose(bias, 30.0 * STATED[:, 0] ** 2, rtol=0.05)
+    assert not compute_point_noise(usual, None).bias.any()
     later = STATED * np.where(np.arange(len(STATED)) == 2, 5.0, 4.0)[:, None]
-    doubtful = compute_point_noise(usual, later).standing
-    np.testing.assert_allclose(np.delete(doubtful, 2), np.delete(standing, 2))
+    doubtful = compute_point_noise(usual, later).bias
+    np.testing.assert_allclose(np.delete(doubtful, 2), np.delete(bias, 2))
     assert doubtful[2] == pytest.approx(48.0 * STATED[2, 0] ** 2, rel=0.05)
     modest = match_stated(scatter_of(STATED), stated_by(0.9 * STATED, 4000), FLOOR)
-    assert not compute_point_noise(modest, 0.9 * STATED).standing.any()
+    assert not compute_point_noise(modest, 0.9 * STATED).bias.any()
 
 
 def test_a_detector_that_errs_anew_in_every_shape_is_believed_as_far_as_it_says():

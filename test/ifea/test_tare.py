@@ -5,7 +5,7 @@ import pytest
 from mechanics_fakes import BENCH
 
 from finforce_ifea.tare import StatedNoise, blank_tare, compute_point_noise, compute_tare
-from finforce_ifea.tracking.track import explain_offsets
+from finforce_ifea.tracking.influence import explain_offsets
 
 REST = BENCH.keypoints
 NOISE = np.array([0.2e-3, 0.4e-3, 0.1e-3])
