@@ -136,7 +136,7 @@ def weigh_keypoints(points, positions, motions, x, x_model, forecast, expectatio
 
 @njit(**_OPTIONS)
 def _measure_residuals(points, positions, motions, below, expectation):
-    """Fill in the residuals at the model's own state, asked for a depth that is `below` [m] deeper, NaN along y where unused.
+    """Fill in the residuals at the model's own state, NaN along y where unused; the depth asked for is `below` it [m].
 
     Returns:
         The number of points that were measured, and the median of the depths that they ask for one by one [m].

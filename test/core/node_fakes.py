@@ -56,7 +56,7 @@ class FakeEstimator:
     """Answers every image with `answer`, after checking it as a real one does."""
 
     surface_triangles = np.array([[0, 1, 2], [0, 2, 3]])
-    tared = False
+    tared = is_idle = False
     friction = (0.0, 0.02)
     mobilised = 0.0
 

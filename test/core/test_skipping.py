@@ -28,16 +28,16 @@ TENTH = 100_000_000  # ns
 class TestRules:
     def test_only_rules_that_exist_can_be_off(self):
         with pytest.raises(SkippingError, match="no rule 'no object'; expected .*no object near"):
-            Skips(rules.SOLVER, ("no object",))
-        assert Skips(rules.SOLVER, ("",)).allows(rules.AWAY)
+            Skips(rules.CONTACT, ("no object",))
+        assert Skips(rules.CONTACT, ("",)).allows(rules.AWAY)
 
     def test_one_rule_or_all_can_be_off(self):
-        one, everything = Skips(rules.SOLVER, (rules.AWAY,)), Skips(rules.SOLVER, (ALL,))
+        one, everything = Skips(rules.CONTACT, (rules.AWAY,)), Skips(rules.CONTACT, (ALL,))
         assert not one.allows(rules.AWAY) and one.allows(rules.IDLE)
-        assert not any(everything.allows(rule) for rule in (*rules.SOLVER, *EVERYWHERE))
+        assert not any(everything.allows(rule) for rule in (*rules.CONTACT, *EVERYWHERE))
 
     def test_the_diagnostics_say_how_often_each_was_applied(self):
-        skips = Skips(rules.SOLVER, (rules.IDLE,))
+        skips = Skips(rules.CONTACT, (rules.IDLE,))
         skips.count(rules.AWAY)
         skips.count(rules.AWAY, 2)
         said = skips.describe()

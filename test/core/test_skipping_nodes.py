@@ -9,7 +9,7 @@ from geometry_msgs.msg import WrenchStamped
 from node_fakes import FakeEstimator, keypoint_cloud, ros_domain, start_solver
 from sensor_msgs.msg import PointCloud2
 
-from finforce.skipping import ALL, AWAY, IDLE, UNHEARD, UNNEEDED
+from finforce.skipping import ALL, IDLE, UNHEARD, UNNEEDED
 from finforce_contact.jaw_contact import AWAY_FOR
 
 TENTH = 100_000_000

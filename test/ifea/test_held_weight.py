@@ -87,9 +87,8 @@ def test_a_weight_that_turns_is_followed_though_it_moves_the_object_from_one_jaw
     held = begin()
     follow(held, [frame() for _ in range(30)])
     angles = np.linspace(0.0, 4.0 * np.pi, 480)
-    turned = follow(
-        held, [frame(0.5 * np.cos(a), x=(depth, 0.0, 0.04)) for a, depth in zip(angles, places, strict=True)]
-    )
+    depths = 3e-3 + 1e-3 * np.sin(angles)
+    turned = follow(held, [frame(0.5 * np.cos(a), x=(d, 0.0, 0.04)) for a, d in zip(angles, depths, strict=True)])
     assert np.abs(turned - 0.5 * np.cos(angles))[30:].max() < 0.05
 
 
