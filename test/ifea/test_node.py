@@ -276,7 +276,7 @@ def test_two_jaws_hold_what_they_press_unless_told_otherwise(probe, parameters, 
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     asked = []
 
-    def build(jaw, parameters, settings, outlined):
+    def build(jaw, parameters, settings):
         asked.append(settings.held)
         return FakeEstimator()
 
