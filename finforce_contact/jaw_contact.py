@@ -6,7 +6,8 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from itertools import pairwise
-from typing import NamedTuple, TypeVar
+from time import perf_counter
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from finforce.transforms import invert_pose
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_ifea.estimator import JawEstimator
-from finforce_ifea.observation import Observation, Solution
+from finforce_ifea.observation import Contact, Observation, Solution
 from finforce_ifea.tracking.influence import is_out_of_reach
 
 AWAY_FOR = 10  # images in a row, after which the object is taken to stay away: a second, of the ten that are looked at
@@ -38,6 +39,43 @@ class PassedImage(NamedTuple):
     read: Callable[[], NDArray]
 
 
+Wrench = tuple[NDArray, NDArray]  # force (3,) [N] and torque (3,) [N m] about the jaw's origin
+
+
+class ContactSource(Protocol):
+    """Gives the contact of one image after the other.
+
+    Attributes:
+        name: what it is, for reports.
+        estimate: what a contact estimator said last; None for a contact that was given.
+    """
+
+    name: str
+    estimate: ContactEstimate | None
+
+    def contact_at(self, stamp: int) -> Contact | None:
+        """Return the contact of an image [ns]; None when nothing is known."""
+
+    def learn(self, stamp: int, surface: NDArray, wrench: Wrench | None) -> None:
+        """Take what the solver made of that image: vertices (n, 3) [m], jaw frame, and a wrench that is trusted."""
+
+
+class GivenContact:
+    """One contact for all images; None for none."""
+
+    estimate = None
+
+    def __init__(self, contact: Contact | None, name: str = "given") -> None:
+        self.contact, self.name = contact, name
+
+    def contact_at(self, stamp: int) -> Contact | None:
+        """Return it."""
+        return self.contact
+
+    def learn(self, stamp: int, surface: NDArray, wrench: Wrench | None) -> None:
+        """Learn nothing."""
+
+
 class ContactLoop:
     """The contact estimator of one jaw in the loop with the solver of that jaw.
 
@@ -48,6 +86,8 @@ class ContactLoop:
         estimator: of this jaw.
         max_age: greatest distance between the stamps of an image and of the surface and wrench used for it [ns].
     """
+
+    name = "estimate"
 
     def __init__(self, estimator: ContactEstimator, *, max_age: int = 200_000_000) -> None:
         self.estimator = estimator
@@ -120,6 +160,22 @@ class ContactLoop:
     def _fresh(self, kept: tuple[int, ValueT] | None, stamp: int) -> ValueT | None:
         return kept[1] if kept and abs(stamp - kept[0]) <= self._max_age else None
 
+    @property
+    def estimate(self) -> ContactEstimate | None:
+        """What the estimator said last."""
+        return self.last.estimate if self.last else None
+
+    def contact_at(self, stamp: int) -> Contact | None:
+        """Return the contact of an image [ns]; see `update`."""
+        self.update(stamp)
+        return self.last.estimate.contact
+
+    def learn(self, stamp: int, surface: NDArray, wrench: Wrench | None) -> None:
+        """Keep what the solver made of an image [ns], for the next one."""
+        self.keep_surface(stamp, surface)
+        if wrench is not None:
+            self.take_wrench(stamp, wrench)
+
     def has_surface(self) -> bool:
         """Say whether the last contact was found on the deformed jaw; else the undeformed one stood for it."""
         return self.last is not None and self._fresh(self._surface, self.last.stamp) is not None
@@ -132,15 +188,24 @@ class ContactLoop:
 
 
 class ForceLoop:
-    """Contact and force of one jaw, image after image: the contact estimator and the solver, each fed by the other.
+    """Contact and force of one jaw, image after image: where the contact comes from and the solver feed each other.
+
+    Attributes:
+        contact: where the contact comes from.
+        force: the solver.
+        given: the contact that the last image was solved with.
+        contact_ms: time that the contact of the last image took [ms].
+        force_ms: time that the solver took for it [ms].
 
     Args:
-        contact: the contact estimator, with the object's mesh and the jaw as calibrated (`force.jaw`).
+        contact: a contact estimator, with the object's mesh and the jaw as calibrated (`force.jaw`), or any source.
         force: the solver of that jaw, with the same mesh density.
     """
 
-    def __init__(self, contact: ContactEstimator, force: JawEstimator) -> None:
-        self.contact, self.force = ContactLoop(contact), force
+    def __init__(self, contact: ContactEstimator | ContactSource, force: JawEstimator) -> None:
+        self.contact = ContactLoop(contact) if isinstance(contact, ContactEstimator) else contact
+        self.force, self.given = force, None
+        self.contact_ms = self.force_ms = 0.0
 
     def take_pose(self, stamp: float, T_jaw_object: NDArray) -> None:
         """Take the object's pose (4, 4) [m] in the jaw frame, in an image [s].
@@ -161,14 +226,19 @@ class ForceLoop:
             ObservationError: the key points are not those of the jaw.
             PoseError: a pose makes no sense.
         """
+        self.given = None
+        begin = perf_counter()
         for pose in poses:
             self.take_pose(*pose)
         stamp = round(observation.stamp / SECOND)
-        estimate = self.contact.update(stamp)
-        solution = self.force.update(observation, estimate.estimate.contact if estimate else None)
-        self.contact.keep_surface(stamp, self.force.surface())
-        if solution.trusted:
-            self.contact.take_wrench(stamp, (solution.force, solution.torque))
+        self.given = self.contact.contact_at(stamp)
+        found = perf_counter()
+        solution = self.force.update(observation, self.given)
+        solved = perf_counter()
+        wrench = (solution.force, solution.torque) if solution.trusted else None
+        self.contact.learn(stamp, self.force.surface(), wrench)
+        self.force_ms = 1e3 * (solved - found)
+        self.contact_ms = 1e3 * (perf_counter() - begin) - self.force_ms
         return solution
 
 

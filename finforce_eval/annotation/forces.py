@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError
+from finforce_contact.jaw_contact import ContactSource, ForceLoop
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_source import ContactSource
 from finforce_eval.evaluation.evaluate import Estimator, check_keypoint_count
 from finforce_eval.evaluation.manipulation import find_distances
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_ifea.grasp_force import Grasp, Wrench, combine_wrenches, single_jaw_grasp
-from finforce_ifea.observation import Contact, Observation, Solution
+from finforce_ifea.observation import Contact, Solution
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,28 +126,17 @@ def _estimate_jaw(
 ) -> JawForces:
     """Return the forces on one jaw; an image that is refused is not answered, and says why."""
     track = recording.jaw(side).keypoints
-    log = _Log(side, track.stamps)
-    for index in range(len(track.stamps)):
-        log.take(index, *_answer(track.observation(index), int(track.stamps[index]), estimator, source))
+    log, loop = _Log(side, track.stamps), ForceLoop(source, estimator)
+    for index, stamp in enumerate(track.stamps.tolist()):
+        try:
+            solution = loop.update(track.observation(index))
+        except (ObservationError, RecordingError) as error:
+            solution = str(error)
+        log.take(index, solution, loop.given)
         if watch is not None:
-            vertices = np.array(estimator.surface())
-            watch(Shape(side, int(track.stamps[index]), vertices, np.asarray(estimator.surface_triangles)))
+            watch(Shape(side, stamp, np.array(estimator.surface()), np.asarray(estimator.surface_triangles)))
         progress(1)
     return log.forces
-
-
-def _answer(
-    observation: Observation, stamp: int, estimator: Estimator, source: ContactSource
-) -> tuple[Solution | str, Contact | None]:
-    """Return the solution of one image [ns], or why it was refused; and its contact."""
-    contact = None
-    try:
-        contact = source.contact_at(stamp)
-        solution = estimator.update(observation, contact)
-    except (ObservationError, RecordingError) as error:
-        return str(error), contact
-    source.learn(stamp, estimator.surface(), (solution.force, solution.torque) if solution.trusted else None)
-    return solution, contact
 
 
 class _Log:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce_contact.jaw_contact import ContactSource, ForceLoop
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_source import ContactSource
 from finforce_eval.evaluation.evaluate import Estimator
 from finforce_eval.recordings.tracks import Recording
 
@@ -69,12 +69,10 @@ def estimate_pressing(
     progress: Callable[[int], Any] = lambda frames: None,
 ) -> NDArray[np.float64]:
     """Return the estimated force along the closing direction of every image (n,) [N], NaN where there is none."""
-    track = recording.jaw(side).keypoints
+    track, loop = recording.jaw(side).keypoints, ForceLoop(source, estimator)
     pressing = np.full(len(track.stamps), np.nan)
-    for index, stamp in enumerate(track.stamps):
-        solution = estimator.update(track.observation(index), source.contact_at(int(stamp)))
-        wrench = (solution.force, solution.torque) if solution.trusted else None
-        source.learn(int(stamp), estimator.surface(), wrench)
+    for index in range(len(pressing)):
+        solution = loop.update(track.observation(index))
         if solution.trusted:
             pressing[index] = abs(solution.force[0])
         progress(1)

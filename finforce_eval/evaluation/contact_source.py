@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from finforce.errors import PoseError
 from finforce.stamps import SECOND
-from finforce_contact.jaw_contact import ContactLoop
+from finforce_contact.jaw_contact import ContactLoop, ContactSource, GivenContact
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.scoring import ONSET_FORCE
 from finforce_eval.recordings.objects import ObjectTrack, find_mesh, has_object, mean_pose, require_mesh, track_object
@@ -20,92 +19,43 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.observation import Contact
 
-Wrench = tuple[NDArray[np.float64], NDArray[np.float64]]
+ROUNDING = 500  # [ns] to which a stamp in seconds since 1970 is known
 
 
-class ContactSource(Protocol):
-    """Gives the contact for one image after the other.
-
-    Attributes:
-        name: what it is, for the report.
-        estimate: what the contact estimator said last (a ContactEstimate); None for a contact that was given.
-    """
-
-    name: str
-    estimate: Any
-
-    def contact_at(self, stamp: int) -> Contact | None:
-        """Return the contact for an image [ns]; None when nothing is known."""
-
-    def learn(self, stamp: int, surface: NDArray[np.float64], wrench: Wrench | None) -> None:
-        """Take what the solver made of that image.
-
-        Args:
-            stamp: of the image [ns].
-            surface: deformed vertices (n, 3) [m], jaw frame.
-            wrench: force (3,) [N] and torque (3,) [N m] about the jaw's origin; None when not trusted.
-        """
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GivenContact:
-    """One contact for all images."""
-
-    contact: Contact | None
-    name: str = "given"
-    estimate: None = None
-
-    def contact_at(self, stamp: int) -> Contact | None:
-        """Return it."""
-        return self.contact
-
-    def learn(self, stamp: int, surface: NDArray[np.float64], wrench: Wrench | None) -> None:
-        """Learn nothing."""
-
-
-class EstimatedContact:
+class RecordedContact(ContactLoop):
     """The contact estimator's loop, given the poses of a recording as they come.
 
     Args:
         estimator: a fresh ContactEstimator.
         track: the object's poses in the jaw frame.
-        name: for the report.
         delay: after which a pose arrives [ns].
+        name: for reports.
     """
 
-    def __init__(self, estimator: Any, track: ObjectTrack, name: str, delay: int = 0) -> None:
-        """Start before the first pose."""
-        self.name, self._delay = name, delay
-        self.estimate: Any = None
-        self._loop, self._track, self._next = ContactLoop(estimator), track, 0
+    def __init__(self, estimator: Any, track: ObjectTrack, delay: int = 0, name: str = "estimate") -> None:
+        super().__init__(estimator)
+        self.name, self._delay, self._track, self._next = name, delay, track, 0
 
     def contact_at(self, stamp: int) -> Contact | None:
-        """Give the poses that have arrived by an image to the estimator, and return what it says of the image.
+        """Give the poses that have arrived by an image [ns] to the estimator, and return its contact.
 
         Raises:
             RecordingError: the estimator refuses a pose.
         """
-        while self._next < len(self._track.stamps) and self._track.stamps[self._next] + self._delay <= stamp:
-            self._take_pose(self._next)
+        arrivals, now = self._track.stamps + self._delay, stamp + ROUNDING
+        while self._next < len(arrivals) and arrivals[self._next] <= now:
+            self._take_recorded(self._next)
             self._next += 1
-        self._loop.update(stamp)
-        self.estimate = self._loop.last.estimate
-        return self.estimate.contact
+        return super().contact_at(stamp)
 
-    def _take_pose(self, index: int) -> None:
+    def _take_recorded(self, index: int) -> None:
         """Give one pose to the estimator."""
         stamp = int(self._track.stamps[index])
         camera = None if self._track.cameras is None else self._track.cameras[index]
         try:
-            self._loop.take_pose(stamp, self._track.poses[index], camera=camera)
+            self.take_pose(stamp, self._track.poses[index], camera=camera)
         except PoseError as error:
             raise RecordingError(f"object pose at {SECOND * stamp:.3f} s: {error}") from error
-
-    def learn(self, stamp: int, surface: NDArray[np.float64], wrench: Wrench | None) -> None:
-        """Keep what the solver found, for the next image."""
-        self._loop.keep_surface(stamp, surface)
-        if wrench is not None:
-            self._loop.take_wrench(stamp, wrench)
 
 
 # Poses from which the place of first touch is averaged at least.
@@ -127,9 +77,9 @@ def build_source(choice: ContactChoice, recording: Recording, jaw: Jaw, mesh: st
     mode = choice.mode_for(recording, jaw.side)
     if mode == FIXED:
         height = choice.height(recording)
-        return GivenContact(contact=Contact.fixed(jaw, height), name=f"fixed:{1e3 * height:g}")
+        return GivenContact(Contact.fixed(jaw, height), f"fixed:{1e3 * height:g}")
     estimator = build_estimator(choice, mode, recording, jaw, mesh)
-    return EstimatedContact(estimator, track_object(recording, jaw.side), name=mode, delay=choice.pose_delay)
+    return RecordedContact(estimator, track_object(recording, jaw.side), choice.pose_delay, name=mode)
 
 
 def build_estimator(choice: ContactChoice, mode: str, recording: Recording, jaw: Jaw, mesh: str = "default") -> Any:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from time import perf_counter
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError, ObservationError
+from finforce_contact.jaw_contact import ContactSource, ForceLoop
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_source import ContactSource
 from finforce_eval.evaluation.manipulation import ManipulationStats, score_manipulation
 from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_detection
@@ -183,22 +182,21 @@ class StepLog:
         self.status = np.full(frames, "", dtype="U32")
         self.step_ms = np.zeros(frames)
         self.surface0 = np.array(estimator.surface())
-        self.contacts = ContactLog(recording, side, source, InnerSurface(self.surface0, jaw.face))
+        self.loop = ForceLoop(source, estimator)
+        self.contacts = ContactLog(recording, side, self.loop, InnerSurface(self.surface0, jaw.face))
         self.snapshot: Snapshot | None = None
         self.largest = 0.0
         self.message = ""
 
     def step(self, index: int) -> None:
-        """Give image `index` to estimator and contact source."""
-        contact = self.contacts.before(index)
-        observation = self.track.observation(index)
-        begin = perf_counter()
-        solution = self.estimator.update(observation, contact)
-        self.step_ms[index] = 1e3 * (perf_counter() - begin)
+        """Let the loop answer image `index`, and keep what it said."""
+        solution = self.loop.update(self.track.observation(index))
+        contact = self.loop.given
+        self.step_ms[index] = self.loop.force_ms
         self.status[index] = solution.status
         self.used[index] = solution.keypoints_used
         self.residual[index] = solution.residual
-        self.contacts.after(index, self.estimator.surface(), solution)
+        self.contacts.keep(index)
         if solution.trusted:
             self._keep(index, solution, contact)
         else:
@@ -273,11 +271,11 @@ class StepLog:
 
 
 class ContactLog:
-    """Asks the contact source around each step and keeps what it said, and where the truth was."""
+    """Keeps what the loop said of the contact, and where the truth was."""
 
-    def __init__(self, recording: Recording, side: str, source: ContactSource, surface: InnerSurface) -> None:
+    def __init__(self, recording: Recording, side: str, loop: ForceLoop, surface: InnerSurface) -> None:
         """Make room for every image."""
-        self._source, self._surface = source, surface
+        self._loop, self._surface = loop, surface
         self._stamps = recording.jaw(side).keypoints.stamps
         self._lines = true_lines(recording, side, self._stamps, surface.face_x)
         frames = len(self._stamps)
@@ -285,35 +283,25 @@ class ContactLog:
         self._touching = np.zeros(frames, dtype=bool)
         self._status = np.full(frames, "", dtype="U16")
 
-    def before(self, index: int) -> Contact | None:
-        """Return the contact for an image."""
-        begin = perf_counter()
-        contact = self._source.contact_at(int(self._stamps[index]))
-        self._ms[index] = 1e3 * (perf_counter() - begin)
+    def keep(self, index: int) -> None:
+        """Keep the contact of image `index`, and find the true place on the deformed surface."""
+        contact, estimate = self._loop.given, self._loop.contact.estimate
         if contact is not None and len(contact.points):
             self._given[index] = np.average(contact.points[:, 2], weights=contact.weights)
-        return contact
-
-    def after(self, index: int, surface: NDArray[np.float64], solution: Any) -> None:
-        """Hand the solver's answer to the source and find the true place on the deformed surface."""
-        wrench = (solution.force, solution.torque) if solution.trusted else None
-        begin = perf_counter()
-        self._source.learn(int(self._stamps[index]), surface, wrench)
-        self._ms[index] += 1e3 * (perf_counter() - begin)
-        if self._source.estimate is not None:
-            self._touching[index] = self._source.estimate.touching
-            self._status[index] = self._source.estimate.status
+        self._ms[index] = self._loop.contact_ms
+        if estimate is not None:
+            self._touching[index], self._status[index] = estimate.touching, estimate.status
+        surface = self._loop.force.surface()
         self._truth[index] = self._surface.cut(surface, self._lines.points[index], self._lines.directions[index])
 
     def series(self) -> ContactSeries:
         """Return the time series."""
-        is_estimated = self._source.estimate is not None
-        nothing = np.full(len(self._stamps), np.nan)
+        is_estimated = self._loop.contact.estimate is not None
         return ContactSeries(
-            source=self._source.name,
+            source=self._loop.contact.name,
             given=self._given,
             truth=self._truth,
             touching=self._touching if is_estimated else None,
             status=self._status,
-            step_ms=self._ms if is_estimated else nothing,
+            step_ms=self._ms if is_estimated else np.full(len(self._stamps), np.nan),
         )

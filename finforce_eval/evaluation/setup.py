@@ -9,8 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from finforce.errors import FinforceError
+from finforce_contact.jaw_contact import ContactSource
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.contact_source import ContactChoice, ContactSource, build_source, parse_contacts
+from finforce_eval.evaluation.contact_source import ContactChoice, build_source, parse_contacts
 from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.results import CaseResult, parse_changes

@@ -7,8 +7,9 @@ import pytest
 from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, make_recording
 
 from finforce.errors import PoseError
+from finforce_contact.jaw_contact import ForceLoop
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_source import EstimatedContact
+from finforce_eval.evaluation.contact_source import RecordedContact
 from finforce_eval.evaluation.evaluate import evaluate_recording
 from finforce_eval.recordings.objects import ObjectTrack, track_object
 
@@ -25,7 +26,7 @@ def run(track, *, lost=(), touching=lambda update: True):
     forces = [None if k in lost else force for k, force in enumerate(recording.jaws["left"].truth.force)]
     solver, fake = FakeEstimator(forces), FakeContactEstimator(touching)
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    source = EstimatedContact(fake, track, "estimate")
+    source = RecordedContact(fake, track)
     result = evaluate_recording(recording, jaw, source, factory=lambda: solver)
     return result, solver, fake
 
@@ -113,7 +114,19 @@ def test_pose_that_the_estimator_refuses_is_named():
             raise PoseError(f"the camera at {camera} is inside")
 
     recording = make_recording()
-    source = EstimatedContact(Strict(), track_object(recording, "left"), "estimate")
+    source = RecordedContact(Strict(), track_object(recording, "left"))
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
     with pytest.raises(RecordingError, match=r"case: object pose at 1000.000 s: the camera at \[.*\] is inside"):
         evaluate_recording(recording, jaw, source, factory=lambda: FakeEstimator([]))
+
+
+def test_a_pose_of_the_image_itself_is_used_with_it_whatever_the_date():
+    recording = make_recording()
+    shift = 1_790_000_000_123_456_789 - START
+    track = ObjectTrack(stamps=START + shift + PERIOD * np.arange(9), poses=np.tile(np.eye(4), (9, 1, 1)))
+    fake = FakeContactEstimator()
+    loop = ForceLoop(RecordedContact(fake, track), FakeEstimator(np.zeros((9, 3))))
+    for count in range(9):
+        observation = recording.jaws["left"].keypoints.observation(count)
+        loop.update(replace(observation, stamp=1e-9 * (START + shift + PERIOD * count)))
+        assert kinds(fake.calls).count("pose") == count + 1

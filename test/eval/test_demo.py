@@ -10,9 +10,9 @@ import pytest
 from eval_fakes import FakeEstimator, FakeJaw
 from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 
+from finforce_contact.jaw_contact import GivenContact
 from finforce_eval.cli import demo
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_source import GivenContact
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.scoring import score_grasp
@@ -113,7 +113,7 @@ def test_without_the_truth_of_a_jaw_nothing_is_said_of_the_grasp(played):
 def replay_of(recording):
     forces = recording.truth("left").force
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    result = evaluate_recording(recording, jaw, GivenContact(contact=None), factory=lambda: FakeEstimator(forces))
+    result = evaluate_recording(recording, jaw, GivenContact(None), factory=lambda: FakeEstimator(forces))
     grasp, lag = grasp_of(recording, 0.03)
     return Replay(
         evaluation=score_results([result], [recording]),

@@ -7,8 +7,9 @@ import pytest
 from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, make_recording
 
 from finforce.errors import FinforceError, ObservationError
+from finforce_contact.jaw_contact import GivenContact
 from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.contact_source import EstimatedContact, GivenContact, parse_contacts
+from finforce_eval.evaluation.contact_source import RecordedContact, parse_contacts
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.tables import evaluation_json, format_table, markdown_contact_table, markdown_table
 from finforce_eval.recordings.objects import track_object
@@ -25,7 +26,7 @@ def truth_of(recording):
 def run(recording, forces, **options):
     estimator = FakeEstimator(forces)
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    result = evaluate_recording(recording, jaw, GivenContact(contact=CONTACT), factory=lambda: estimator, **options)
+    result = evaluate_recording(recording, jaw, GivenContact(CONTACT), factory=lambda: estimator, **options)
     return result, estimator
 
 
@@ -164,7 +165,7 @@ def test_frame_that_the_estimator_refuses_is_named():
             raise ObservationError("odd")
 
     with pytest.raises(ObservationError, match="case: frame 0: odd"):
-        evaluate_recording(make_recording(), FakeJaw(), GivenContact(contact=CONTACT), factory=lambda: Refusing([]))
+        evaluate_recording(make_recording(), FakeJaw(), GivenContact(CONTACT), factory=lambda: Refusing([]))
 
 
 def test_two_cases_of_one_name_are_refused():
@@ -225,7 +226,7 @@ def test_tables_have_a_row_per_case_and_one_for_all():
 
 
 def estimated(recording, gain=1.0):
-    source = EstimatedContact(FakeContactEstimator(), track_object(recording, "left"), "estimate")
+    source = RecordedContact(FakeContactEstimator(), track_object(recording, "left"))
     estimator = FakeEstimator(truth_of(recording) * gain)
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
     return evaluate_recording(recording, jaw, source, factory=lambda: estimator)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from eval_fakes import FakeEstimator, FakeJaw, make_recording
 
+from finforce_contact.jaw_contact import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_source import GivenContact
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.kept import Kept, load_kept, save_kept
 from finforce_eval.figures.html_report import ForceCourse, write_html
@@ -142,7 +142,7 @@ def test_a_click_on_a_head_sorts(browser, tmp_path):
 def evaluated(name="pressed"):
     recording = make_recording(name)
     forces = recording.jaws["left"].truth.force * 1.1
-    jaw, source = FakeJaw(), GivenContact(contact=None)
+    jaw, source = FakeJaw(), GivenContact(None)
     jaw = replace(jaw, keypoints=recording.jaws["left"].keypoints.points[0])
     return recording, evaluate_recording(recording, jaw, source, factory=lambda: FakeEstimator(forces))
 

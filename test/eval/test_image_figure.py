@@ -8,8 +8,8 @@ import pytest
 from eval_fakes import FakeEstimator, FakeJaw, make_recording
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 
+from finforce_contact.jaw_contact import GivenContact
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_source import GivenContact
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.figures.report import write_report
@@ -48,7 +48,7 @@ def recording(tmp_path_factory):
 def result(recording):
     jaw, forces = FakeJaw(keypoints=np.zeros((4, 3))), list(recording.truth("left").force)
     forces[0] = None
-    return evaluate_recording(recording, jaw, GivenContact(contact=None), factory=lambda: FakeEstimator(forces))
+    return evaluate_recording(recording, jaw, GivenContact(None), factory=lambda: FakeEstimator(forces))
 
 
 @pytest.fixture(scope="module")

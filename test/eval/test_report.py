@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from eval_fakes import BOX, BOX_TRIANGLES, FakeEstimator, FakeJaw, drawn_hues, make_recording
 
-from finforce_eval.evaluation.contact_source import GivenContact
+from finforce_contact.jaw_contact import GivenContact
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.figures.report import write_report
 
@@ -21,9 +21,7 @@ def evaluate(name, *, gain=1.1, phases=True, lost=()):
     for index in lost:
         forces[index] = None
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    return evaluate_recording(
-        recording, jaw, GivenContact(contact=None), factory=lambda: FakeEstimator(forces)
-    ), recording
+    return evaluate_recording(recording, jaw, GivenContact(None), factory=lambda: FakeEstimator(forces)), recording
 
 
 @pytest.mark.parametrize("phases", [False, True])

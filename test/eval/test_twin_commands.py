@@ -8,9 +8,9 @@ from eval_fakes import FakeEstimator, FakeJaw
 from PIL import Image
 from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 
+from finforce_contact.jaw_contact import GivenContact
 from finforce_eval.cli import twin as twin_commands
 from finforce_eval.cli.main import main
-from finforce_eval.evaluation.contact_source import GivenContact
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.tables import evaluation_json, format_sight, format_table, markdown_sight
@@ -121,7 +121,7 @@ def evaluation(tmp_path_factory):
     found = detect_keypoints(recording, FakeDetector(recording), watch=ImageWatch())
     late = np.vstack((np.zeros((1, 3)), recording.truth("left").force[:-1]))
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
-    result = evaluate_recording(found, jaw, GivenContact(contact=None), factory=lambda: FakeEstimator(late))
+    result = evaluate_recording(found, jaw, GivenContact(None), factory=lambda: FakeEstimator(late))
     return score_results([result], [found])
 
 
@@ -153,7 +153,7 @@ def test_the_detector_of_two_jaws_is_timed_once(tmp_path):
         evaluate_recording(
             found,
             FakeJaw(keypoints=np.zeros((4, 3)), side=side),
-            GivenContact(contact=None),
+            GivenContact(None),
             side=side,
             factory=lambda: FakeEstimator([np.zeros(3)] * 12),
         )

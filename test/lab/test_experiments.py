@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from eval_fakes import make_recording
+from eval_fakes import FakeContactEstimator, make_recording
 
 from finforce.errors import FinforceError
 from finforce.transforms import pose_from_quaternion
@@ -20,7 +20,7 @@ from finforce_contact.reconstruction.result import GeneratedMesh
 from finforce_eval.cli.main import main
 from finforce_eval.engine.tasks import Manifest
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.contact_source import EstimatedContact
+from finforce_eval.evaluation.contact_source import RecordedContact
 from finforce_eval.evaluation.manipulation import NetForces
 from finforce_eval.machine import describe_sources
 from finforce_eval.recordings.image_files import read_generated_pose
@@ -432,23 +432,13 @@ def test_damaged_splats_are_refused(tmp_path, change, words):
 
 
 def test_poses_that_are_late_come_late():
-    track = ObjectTrack(stamps=np.array([0, 100, 200]), poses=np.tile(np.eye(4), (3, 1, 1)))
-    taken = []
-
-    class Loop:
-        last = None
-
-        def take_pose(self, stamp, T_jaw_object, covariance=None, camera=None):
-            taken.append(stamp)
-
-        def update(self, stamp):
-            self.last = SimpleNamespace(estimate=SimpleNamespace(contact=None))
-
-    source = EstimatedContact(None, track, "estimate", delay=150)
-    source._loop = Loop()
-    for stamp in (100, 150, 249, 350):
+    track = ObjectTrack(stamps=1000 * np.array([0, 100, 200]), poses=np.tile(np.eye(4), (3, 1, 1)))
+    fake = FakeContactEstimator()
+    source = RecordedContact(fake, track, delay=150_000)
+    for stamp in (100_000, 150_000, 249_000, 350_000):
         source.contact_at(stamp)
-        assert taken == [when for when in (0, 100, 200) if when + 150 <= stamp]
+        taken = [round(1e9 * when) for name, when, *_ in fake.calls if name == "pose"]
+        assert taken == [when for when in (0, 100_000, 200_000) if when + 150_000 <= stamp]
 
 
 @pytest.mark.parametrize(
