@@ -10,7 +10,7 @@ from finforce_ifea.identification.identification import CalibrationCase
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tracking.friction_estimate import Coefficient
+from finforce_ifea.tracking.friction import Coefficient
 
 # A coefficient that is known no better than this is none; more loops do not tell the errors of the mechanics apart.
 _VAGUE, _LEAST_STDDEV = 0.15, 0.03
