@@ -28,8 +28,16 @@ from finforce_eval.figures.figures import BLACK, BLUE, GREY, ORANGE, new_figure,
 from finforce_eval.machine import describe_machine, write_figures
 from finforce_sim.gripper.pressing import PressedGrasp
 from finforce_sim.scenes.scenarios import build_scenario
-from lab.experiments.grasp_sensors import EstimatorSensor, build_plant
-from lab.experiments.grasp_world import GraspCase, GraspTrace, NoisySensor, Plant, World, build_spring
+from lab.experiments.grasp_world import (
+    EstimatorSensor,
+    GraspCase,
+    GraspTrace,
+    NoisySensor,
+    Plant,
+    World,
+    build_plant,
+    build_spring,
+)
 
 FORCES = (1.0, 2.0, 3.0, 4.0, 5.0)  # [N]
 SPEEDS = (0.004, 0.008)  # [m/s] of the opening: 4 mm/s of the opening, and of each jaw

@@ -1,4 +1,4 @@
-"""The subcommand `experiment`: the letter's experiments on the twin or on recordings of one's own."""
+"""The subcommand `experiment`: the paper's experiments on the twin or on recordings of one's own."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ QUICK_SIZE = "320x240"
 
 # what each does, its module and its class
 EXPERIMENTS = {
-    "bench": ("Table I: nine cylinders pressed on one jaw", "letter_tables", "BenchExperiment"),
-    "places": ("Table II: what knowing the place is worth", "letter_tables", "PlacesExperiment"),
+    "bench": ("Table I: nine cylinders pressed on one jaw", "paper_tables", "BenchExperiment"),
+    "places": ("Table II: what knowing the place is worth", "paper_tables", "PlacesExperiment"),
     "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp", "GraspExperiment"),
     "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation", "ManipulationExperiment"),
     "chip": ("what breaks at 5.43 N, grasped to 5 N by force, position and current", "chip", "ChipExperiment"),

@@ -1,1 +1,1 @@
-"""The experiments of the letter, each by one command: cases that can be resumed, figures, and a page."""
+"""The experiments of the paper, each by one command: cases that can be resumed, figures, and a page."""

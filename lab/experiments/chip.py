@@ -1,4 +1,4 @@
-"""The letter's potato chip: something that bears 5 N and breaks at 5.43 N, grasped by force, by place, by current."""
+"""The paper's potato chip: something that bears 5 N and breaks at 5.43 N, grasped by force, by place, by current."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ from typing import Any
 import numpy as np
 
 from finforce_eval.errors import OptionError
+from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE, new_figure, style_axes
+from finforce_sim.gripper.pressing import PressedGrasp
+from finforce_sim.scenes.scenarios import build_scenario
 from lab.experiments.experiment import Case, Findings, ResultTable, leave_out
+from lab.experiments.grasp_world import EstimatorSensor, GraspCase, ImageSensor, NoisySensor, World, build_plant
 from lab.experiments.runs import RunOptions
 
 BEARS, BREAKS = 5.0, 5.43  # [N]
@@ -39,7 +43,7 @@ class ChipExperiment:
     name: str = "chip"
     title: str = "Grasping something that breaks"
     about: str = (
-        "The letter grasps and lifts a potato chip with the force of its camera in the loop, raising the threshold by "
+        "The paper grasps and lifts a potato chip with the force of its camera in the loop, raising the threshold by "
         "1 N until the chip breaks: it bore 5 N and broke at 5.43 N. Here a thing that breaks when the true force "
         "reaches 5.43 N is grasped to 5 N through the driver and the emulated gripper, its frames, delays and steps "
         "of the position included. It lies up to 4 mm higher or lower than in the grasp that was taught, and its "
@@ -63,9 +67,6 @@ class ChipExperiment:
 
     def run(self, case: Case, folder: Path) -> dict[str, Any]:
         """Return the figures of a grasp; see `Experiment`."""
-        from lab.experiments.grasp_sensors import EstimatorSensor, ImageSensor, build_plant
-        from lab.experiments.grasp_world import GraspCase, NoisySensor, World
-
         way, seed, untold = case.settings["way"], case.settings["seed"], []
         pressed = _lay(seed)
         grasp = GraspCase(plant=build_plant(OBJECT, pressed), force=BEARS, speed=SPEED, latency=LATENCY, seed=seed)
@@ -93,9 +94,7 @@ class ChipExperiment:
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return how many broke; see `Experiment`."""
-        from lab.experiments.pictures import draw_chips
-
-        draw_chips(figures, BEARS, BREAKS).savefig(folder / "chips.png")
+        draw_chips(figures).savefig(folder / "chips.png")
         summary, rows = {}, []
         for way, words in WAYS.items():
             members = [row for row in figures.values() if row["way"] == way]
@@ -132,11 +131,8 @@ def _tell_end(name: str, row: Mapping[str, Any]) -> str:
     return f" {name} ended early: {row['error']}{last}."
 
 
-def _lay(seed: int | None) -> Any:
+def _lay(seed: int | None) -> PressedGrasp:
     """Return the twin's grasp of the thing: as it was taught (None), or as a seed lays it."""
-    from finforce_sim.gripper.pressing import PressedGrasp
-    from finforce_sim.scenes.scenarios import build_scenario
-
     height, scale = HEIGHT, 1.0
     if seed is not None:
         rng = np.random.default_rng((seed, 7))
@@ -150,3 +146,23 @@ def find_taught_opening() -> float:
     """Return the opening [m] that makes 5 N where the thing lay when it was taught."""
     taught = _lay(None)
     return float(taught.touch_opening - 2.0 * taught.find_closing(BEARS))
+
+
+def draw_chips(figures: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return a figure of the true forces [N] over time, a panel for each way of grasping."""
+    ways = list(dict.fromkeys(row["way"] for row in figures.values()))
+    figure = new_figure(4.2 * len(ways), 3.2)
+    panels = figure.subplots(1, len(ways), squeeze=False, sharey=True)[0]
+    for axes, way in zip(panels, ways, strict=True):
+        style_axes(axes)
+        members = [row for row in figures.values() if row["way"] == way]
+        for row in members:
+            colour = ORANGE if row["is_broken"] else BLUE
+            axes.plot(row["seconds"], row["force"], color=colour, linewidth=0.9, alpha=0.7)
+        axes.axhline(BREAKS, color=BLACK, linewidth=0.9, dashes=(4, 2))
+        axes.axhline(BEARS, color=GREEN, linewidth=0.9, dashes=(4, 2))
+        broken = sum(row["is_broken"] for row in members)
+        axes.set_title(f"by {way}: {broken} of {len(members)} broken", loc="left", fontsize=10)
+        axes.set(xlabel="after first touch [s]", xlim=(-0.5, 8.0))
+    panels[0].set_ylabel("true force [N]")
+    return figure

@@ -71,7 +71,7 @@ class Experiment(Protocol):
     Attributes:
         name: of the command line.
         title: of the page.
-        about: what is done, and how it differs from the letter's own.
+        about: what is done, and how it differs from the paper's own.
     """
 
     name: str

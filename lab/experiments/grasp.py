@@ -1,4 +1,4 @@
-"""The letter's on-robot evaluation: an object grasped, held and let go, the grasp force against the measured one."""
+"""The paper's on-robot evaluation: an object grasped, held and let go, the grasp force against the measured one."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from finforce_eval.evaluation.results import ONSET, force_delays
 from finforce_eval.evaluation.scoring import rms
 from finforce_eval.evaluation.setup import evaluate_all
 from finforce_eval.evaluation.tables import format_number
+from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE, new_figure, style_axes
 from lab.experiments.experiment import Case, Findings, ResultTable, leave_out
 from lab.experiments.runs import RunOptions, build_setup, keep_poses
 
 SCENES = {"cylinder": "grasp_cylinder", "cube": "grasp_cube", "asymmetric": "grasp_asymmetric"}
 PLACES = {"lower": 0.024, "middle": 0.040, "upper": 0.058}  # [m] of the object's middle
-# elastic force [N], in the ratio of the letter's currents of 300, 500 and 800 mA, and each jaw's speed [m/s]: the
+# elastic force [N], in the ratio of the paper's currents of 300, 500 and 800 mA, and each jaw's speed [m/s]: the
 # softest of the nine grasps, the cylinder at the middle, bears 4.8 N before the jaws meet
 LEVELS = {"low": (1.5, 0.001), "medium": (2.5, 0.002), "high": (4.0, 0.004)}
 HOLD = {"settle": 0.5, "record": 2.5, "clearance": 0.003}  # [s, s, m]
 QUICK = {"settle": 0.2, "record": 0.6, "clearance": 0.001}
 QUICK_CASES = (("cylinder", "middle", "high"), ("cube", "upper", "medium"), ("asymmetric", "lower", "high"))
 RISEN, FALLEN = 0.97, 0.75  # of the largest true force: where loading ends, and where letting go begins
+COLOURS = {"low": BLUE, "medium": GREEN, "high": ORANGE}
 PHASES = ("all", "load", "hold", "release")
 DRAWN_EVERY = 2  # images
 
@@ -111,7 +113,7 @@ class GraspExperiment:
     name: str = "grasp"
     title: str = "Grasps: force against the measured one"
     about: str = (
-        "The letter grasps a cylinder, a cube and an asymmetric object, each with a load cell inside, at three places "
+        "The paper grasps a cylinder, a cube and an asymmetric object, each with a load cell inside, at three places "
         "with three motor currents, five times each. Here the objects, places and the ratio of the forces are the "
         "same; finger, camera and objects are rendered, the material relaxes, seeds differ from grasp to grasp, and "
         "force stands for current: the motor's nominal force would shut the jaws on each of them. The contact is not "
@@ -152,8 +154,6 @@ class GraspExperiment:
         summary = {level: summarise(members) for level, members in groups.items()}
         pictures = {}
         if not self.options.bags:
-            from lab.experiments.pictures import draw_grasps
-
             draw_grasps(figures).savefig(folder / "grasps.png")
             pictures["Measured (dashed) and estimated grasp force"] = "grasps.png"
         tables = [_level_table(summary), _case_table(figures)]
@@ -229,13 +229,13 @@ def _level_table(summary: Mapping[str, Mapping[str, Any]]) -> ResultTable:
         )
         for level, one in summary.items()
     ]
-    rows.append(("letter", "135", "-", "0.19 to 0.78", "0.08 to 0.56", "-", "-", "1.8 to 7.0", "0.7 to 5.1", "-", "-",
+    rows.append(("paper", "135", "-", "0.19 to 0.78", "0.08 to 0.56", "-", "-", "1.8 to 7.0", "0.7 to 5.1", "-", "-",
                  "-", "250"))  # fmt: skip
     note = (
         "Mean ± standard deviation over the grasps of each grasp's error of min(|F_left|, |F_right|), while the true "
         "force is above 0.02 N; loading ends at 97 % of the largest force, letting go begins at 75 %. NRMSD: of each "
         "grasp's own range of force. Shows after: from 0.02 N of true force to an estimate above 0.1 N, computed. "
-        "Letter: ranges without its worst case, the highest force at the lower place."
+        "Paper: ranges without its worst case, the highest force at the lower place."
     )
     return ResultTable(title="**By force**", head=head, rows=rows, note=note)
 
@@ -249,3 +249,26 @@ def _case_table(figures: Mapping[str, Mapping[str, Any]]) -> ResultTable:
         numbers += [row["nrmsd_pct"]["all"], row["hidden"]["rmse_N"]["all"], row["answered_pct"]]
         rows.append((name, *map(format_number, numbers)))
     return ResultTable(title="**Each grasp**", head=head, rows=rows)
+
+
+def draw_grasps(figures: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return a figure with a panel for each object and place, measured and estimated force over time."""
+    shapes = list(dict.fromkeys(row["object"] for row in figures.values()))
+    places = list(dict.fromkeys(row["place"] for row in figures.values()))
+    figure = new_figure(3.6 * len(places), 2.5 * len(shapes) + 0.4)
+    panels = figure.subplots(len(shapes), len(places), squeeze=False, sharey=True)
+    for row in figures.values():
+        axes = panels[shapes.index(row["object"])][places.index(row["place"])]
+        course = {name: np.array(values, dtype=float) for name, values in row["course"].items()}
+        begin = course["seconds"][np.flatnonzero(course["truth"] > 0.02)[:1]].sum()
+        axes.plot(course["seconds"] - begin, course["found"], color=COLOURS[row["level"]], linewidth=1.2)
+        axes.plot(course["seconds"] - begin, course["truth"], color=BLACK, linewidth=0.9, dashes=(4, 2))
+    for shape, line in zip(shapes, panels, strict=True):
+        line[0].set_ylabel("grasp force [N]")
+        for place, axes in zip(places, line, strict=True):
+            style_axes(axes)
+            axes.set_title(f"{shape}, {place}", loc="left", fontsize=10)
+            axes.set_xlim(left=-1.0)
+    for axes in panels[-1]:
+        axes.set_xlabel("after first touch [s]")
+    return figure

@@ -1,4 +1,4 @@
-"""The letter's manipulation force: a held weight is turned, and its pull comes out of the difference of both jaws."""
+"""The paper's manipulation force: a held weight is turned, and its pull comes out of the difference of both jaws."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from finforce_eval.evaluation.manipulation import NetForces, join_net
 from finforce_eval.evaluation.scoring import rms
 from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
 from finforce_eval.evaluation.tables import format_number
+from finforce_eval.figures.figures import BLACK, BLUE, new_figure
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_sim.gripper.footage import START
@@ -34,7 +35,7 @@ JAWS = {"as they are": 0.0, "swapped": np.pi}  # the weight goes over to the oth
 # A quarter of a turn and back, with less rest; what is held must be still for 0.8 s before it is lifted.
 QUICK = {"turn_angle": 0.5 * np.pi, "record": 0.4, "clearance": 0.002}
 LEAST = 0.5  # [N] of true net force, from which on it has a direction
-LETTER = {("roll", "bright"): "0.12 ± 0.00", ("roll", "dim"): "0.28 ± 0.02"}
+PAPER = {("roll", "bright"): "0.12 ± 0.00", ("roll", "dim"): "0.28 ± 0.02"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +46,7 @@ class ManipulationExperiment:
     name: str = "manipulation"
     title: str = "A held weight that is turned"
     about: str = (
-        "The letter grasps a calibration weight of 100 g (0.98 N), turns the gripper once round and back, with a lamp "
+        "The paper grasps a calibration weight of 100 g (0.98 N), turns the gripper once round and back, with a lamp "
         "and without, five times each, and compares the manipulation force of Eq. 3 with the weight along gravity. "
         "Here the turn is rendered: about where a level gripper points (roll: gravity presses on one jaw and then on "
         "the other, and acts across the fingers between), about the axis along which the jaws close (x: it never "
@@ -81,8 +82,6 @@ class ManipulationExperiment:
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return errors along gravity by light; see `Experiment`."""
-        from lab.experiments.pictures import draw_weights
-
         draw_weights(figures).savefig(folder / "weights.png")
         groups = sorted({(row.get("axis", ""), row.get("light", "")) for row in figures.values()})
         summary, rows = {}, []
@@ -97,12 +96,12 @@ class ManipulationExperiment:
             if told:
                 summary[name] |= {"told_along_rmse_N": float(np.mean(told)), "told_std": float(np.std(told))}
                 cells[1] = f"{np.mean(told):.3f} ± {np.std(told):.3f}"
-            rows.append((axis, light, str(len(members)), *cells, LETTER.get((axis, light), "-")))
+            rows.append((axis, light, str(len(members)), *cells, PAPER.get((axis, light), "-")))
         note = (
             "RMSE of the net force of both jaws (Eq. 3) along the true one, while that is above 0.5 N; direction told: "
             "the solvers know which way gravity points in the gripper, as an arm does."
         )
-        head = ("axis", "light", "turns", "along gravity/N", "direction told/N", "letter/N")
+        head = ("axis", "light", "turns", "along gravity/N", "direction told/N", "paper/N")
         first = ResultTable(title="**By axis and light**", head=head, rows=rows, note=note)
         head = ("turn", "along gravity/N", "bias/N", "across/N", "x/N", "y/N", "z/N", "within 3σ/%", "answered/%")
         cells = [(name, *(format_number(row[key], 3) for key in KEYS)) for name, row in figures.items()]
@@ -165,3 +164,19 @@ def score_weight(net: NetForces) -> dict[str, Any]:
             "found": np.round(found, 4).tolist(),
         },
     }
+
+
+def draw_weights(figures: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return a figure of the net force along gravity over gravity's direction in the gripper, a panel for each turn."""
+    columns = min(len(figures), 4)
+    rows = -(-len(figures) // columns)
+    figure = new_figure(3.2 * columns, 3.4 * rows + 0.2)
+    for number, (name, row) in enumerate(figures.items()):
+        axes = figure.add_subplot(rows, columns, number + 1, projection="polar")
+        course = row["course"]
+        axes.plot(course["angle"], course["found"], color=BLUE, linewidth=0.9)
+        axes.plot(course["angle"], course["truth"], color=BLACK, linewidth=1.0, dashes=(4, 2))
+        axes.set_title(name, fontsize=10)
+        axes.set_rlim(0.0, 1.3 * max([*course["truth"], 0.1]))
+        axes.tick_params(labelsize=7)
+    return figure

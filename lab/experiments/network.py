@@ -1,23 +1,36 @@
-"""The letter's comparison: an end-to-end network, on what it was trained on and on what it was not."""
+"""The paper's comparison: an end-to-end network, on what it was trained on and on what it was not."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import hashlib
+import json
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from finforce_eval.errors import RecordingError
+from finforce.optional import import_cv2
+from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.scoring import rms
 from finforce_eval.evaluation.setup import evaluate_all
+from finforce_eval.figures.figures import BLACK, BLUE, ORANGE, new_figure, style_axes
+from finforce_eval.recordings.images import StampedImage
+from finforce_keypoints.networks.network import CPU, open_session
+from finforce_keypoints.networks.side_network import METADATA
 from lab.experiments.experiment import Case, Findings, ResultTable, leave_out
-from lab.experiments.force_network import ForceNetwork
 from lab.experiments.grasp import join_jaws
 from lab.experiments.runs import RunOptions, build_setup
 
+SHOWN = 10  # images that the network is given at a time
+HEIGHT, WIDTH = 120, 160  # [px] of its images
+KIND = "force_from_images"
+LAYOUT = (("images",), ("force",))
+SHIPPED = Path(__file__).parents[1] / "data" / "force_network" / "force_network.onnx"
 GRASP = {"settle": 0.2, "record": 0.6, "clearance": 0.003, "closing_speed": 0.004}
 FIRM, SOFT, SLIGHT = 0.006, 0.004, 0.0015  # [m] of each jaw beyond first touch
 SEEN, OBJECT, PLACE, LIGHT = "as trained", "another object", "another place", "dim light"
@@ -44,6 +57,61 @@ QUICK = ("cylinder_firm", "asymmetric_firm", "cube_upper", "cylinder_dim")
 QUICK_GRASP = {"settle": 0.1, "record": 0.3, "clearance": 0.001, "closing_speed": 0.008}
 
 
+def reduce_image(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a colour image (h, w, 3) as the network is shown it, (120, 160, 3)."""
+    return import_cv2().resize(np.ascontiguousarray(color), (WIDTH, HEIGHT), interpolation=import_cv2().INTER_AREA)
+
+
+class ForceNetwork:
+    """An end-to-end network that `lab.training.baseline` has written.
+
+    Args:
+        path: of the ONNX file.
+
+    Raises:
+        OptionError: it is another kind of network.
+        ModelError: it cannot be loaded.
+        MissingDependencyError: onnxruntime is not installed.
+    """
+
+    def __init__(self, path: str | Path = SHIPPED) -> None:
+        self.path = Path(path)
+        self._session = open_session(self.path, 1, (CPU,))
+        text = self._session.get_modelmeta().custom_metadata_map.get(METADATA, "")
+        try:
+            self.about = json.loads(text)
+            is_known = self.about["kind"] == KIND
+        except (ValueError, TypeError, KeyError, RecursionError):
+            is_known = False
+        inputs, outputs = (tuple(self._session.get_inputs()), tuple(self._session.get_outputs()))
+        names = (tuple(item.name for item in inputs), tuple(item.name for item in outputs))
+        shape = list(inputs[0].shape)[1:]
+        if not is_known or names != LAYOUT or shape != [SHOWN, HEIGHT, WIDTH, 3]:
+            raise OptionError(
+                f"{path}: got a network of {', '.join(names[0])} {shape} to {', '.join(names[1])} with metadata "
+                f"{text[:120]!r}, expected one of lab.training.baseline.train"
+            )
+
+    @cached_property
+    def sha256(self) -> str:
+        """The SHA-256 of the file."""
+        return hashlib.sha256(self.path.read_bytes()).hexdigest()
+
+    def predict(self, images: NDArray[np.uint8]) -> NDArray:
+        """Return the grasp force (b,) [N] in the last of each row of images (b, 10, 120, 160, 3)."""
+        return self._session.run(None, {"images": np.asarray(images)})[0].astype(float)
+
+    def follow(self, images: Iterable[StampedImage]) -> tuple[NDArray[np.int64], NDArray]:
+        """Return stamps (n,) [ns] of images and the grasp force (n,) [N] in each; NaN before the tenth."""
+        shown: deque[NDArray] = deque(maxlen=SHOWN)
+        stamps, forces = [], []
+        for stamp, image in images:
+            shown.append(reduce_image(image.color))
+            stamps.append(stamp)
+            forces.append(float(self.predict(np.stack(shown)[None])[0]) if len(shown) == SHOWN else np.nan)
+        return np.array(stamps, dtype=np.int64), np.array(forces)
+
+
 @dataclass(frozen=True, kw_only=True)
 class NetworkExperiment:
     """Grasps that are judged by finforce and by an end-to-end network; of the twin, or recordings with images."""
@@ -52,7 +120,7 @@ class NetworkExperiment:
     name: str = "network"
     title: str = "Against an end-to-end network"
     about: str = (
-        "The letter trains a network on images and forces alone (ResNet-50 features of ten images, a transformer), and "
+        "The paper trains a network on images and forces alone (ResNet-50 features of ten images, a transformer), and "
         "finds that it fails on what it has not seen. The network here is of the same kind, with a smaller encoder, "
         "trained on rendered grasps of a cylinder and a cube in bright light; both methods see the same images. "
         "finforce also has the object's mesh and poses, and the finger's model; the network has neither."
@@ -101,8 +169,6 @@ class NetworkExperiment:
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return both methods' errors by what the network had seen; see `Experiment`."""
-        from lab.experiments.pictures import draw_networks
-
         draw_networks(figures).savefig(folder / "network.png")
         groups = list(dict.fromkeys(row.get("group", "recordings") for row in figures.values()))
         summary = {}
@@ -148,3 +214,25 @@ def _compare(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         "network_nrmsd_pct": 100.0 * float(np.nanmean(theirs / span)),
         "ratio": float(np.nanmean(theirs) / np.nanmean(ours)),
     }
+
+
+def draw_networks(figures: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return a figure of the grasp force by both methods over time, a panel for each grasp."""
+    columns = min(len(figures), 4)
+    rows = -(-len(figures) // columns)
+    figure = new_figure(3.6 * columns, 2.5 * rows + 0.4)
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    for axes in panels.flat[len(figures) :]:
+        axes.set_visible(False)
+    for axes, (name, row) in zip(panels.flat, figures.items(), strict=False):
+        style_axes(axes)
+        course = {key: np.array(values, dtype=float) for key, values in row["course"].items()}
+        axes.plot(course["seconds"], course["network"], color=ORANGE, linewidth=1.0)
+        axes.plot(course["seconds"], course["found"], color=BLUE, linewidth=1.2)
+        axes.plot(course["seconds"], course["truth"], color=BLACK, linewidth=0.9, dashes=(4, 2))
+        axes.set_title(f"{name} ({row.get('group', 'recording')})", loc="left", fontsize=9)
+    for line in panels:
+        line[0].set_ylabel("grasp force [N]")
+    for axes in panels[-1]:
+        axes.set_xlabel("time [s]")
+    return figure

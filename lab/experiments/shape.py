@@ -34,11 +34,11 @@ from lab.experiments.runs import RunOptions
 
 FORMS = ("glb", "ply")
 IMAGES, QUICK_OBJECTS = 2, ("cube", "bottle")
-DISTANCES = (13e-3, 16e-3)  # [m] of the raw mesh from the true one, as the letter's
+DISTANCES = (13e-3, 16e-3)  # [m] of the raw mesh from the true one, as the paper's
 HIDDEN, MASK_ERROR = 0.2, 1.0  # share of the object's pixels, [px] of the mask's outline
 ERROR = GuessError(stretch=0.03, bend=0.5e-3)
 SPLATS, SPREAD, STRAYS = 20000, 3e-3, 300  # count, of the mesh's size, count of faint ones
-LETTER = {"cylinder": (13.39, 2.80, 2.36), "cube": (14.69, 6.69, 3.53), "asymmetric": (15.69, 3.26, 3.35)}
+PAPER = {"cylinder": (13.39, 2.80, 2.36), "cube": (14.69, 6.69, 3.53), "asymmetric": (15.69, 3.26, 3.35)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class ShapeExperiment:
     name: str = "shape"
     title: str = "Generated meshes brought to scale"
     about: str = (
-        "The letter has SAM 3D Objects make a mesh from one image and brings it to scale by depth. That needs a large "
+        "The paper has SAM 3D Objects make a mesh from one image and brings it to scale by depth. That needs a large "
         "GPU and is not run: here a mesh with wrong proportions and dents is written as SAM 3D Objects writes its own, "
         "normalised, in its axes, with its layout: as GLB, and as Gaussian splats in a PLY file. Both go through the "
         "same functions as `finforce reconstruct`. A fifth of the object is hidden, the mask's outline off by a pixel."
@@ -111,12 +111,12 @@ class ShapeExperiment:
                     one = {key: _mean([row[key] for row in members]) for key in COLUMNS}
                     summary[f"{name}_{form}"] = one
                     rows.append((name, form, *(f"{one[key]:.2f}" for key in COLUMNS)))
-            if name in LETTER:
-                raw, coarse, fine = LETTER[name]
-                rows.append((name, "letter", f"{raw:.2f}", f"{coarse:.2f}", "-", f"{fine:.2f}"))
-        head = ("object", "file", "raw/mm", "scaled coarsely/mm", "robust/mm", "as the letter/mm")
+            if name in PAPER:
+                raw, coarse, fine = PAPER[name]
+                rows.append((name, "paper", f"{raw:.2f}", f"{coarse:.2f}", "-", f"{fine:.2f}"))
+        head = ("object", "file", "raw/mm", "scaled coarsely/mm", "robust/mm", "as the paper/mm")
         note = (
-            "Mean Chamfer distance from the true mesh in the camera's frame; nan: refused. The letter's objects and "
+            "Mean Chamfer distance from the true mesh in the camera's frame; nan: refused. The paper's objects and "
             "raw meshes are its own."
         )
         table = ResultTable(title="**Distance from the true mesh**", head=head, rows=rows, note=note)

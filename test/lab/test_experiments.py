@@ -1,4 +1,4 @@
-"""Claims about the letter's experiments: resumed after a kill, honest of what failed, and right in what they count."""
+"""Claims about the paper's experiments: resumed after a kill, honest of what failed, and right in what they count."""
 
 import json
 import subprocess
@@ -31,23 +31,21 @@ from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench
 from finforce_sim.scenes.guesses import place_mesh
 from finforce_sim.scenes.objects import build_object
-from lab.experiments import grasp_sensors
+from lab.experiments import grasp_world
 from lab.experiments.chip import ChipExperiment
 from lab.experiments.experiment import Case, Findings, ResultTable, format_tables, run_experiment
-from lab.experiments.force_network import HEIGHT, SHOWN, WIDTH, ForceNetwork, reduce_image
 from lab.experiments.grasp import GraspCourse, GraspExperiment, score_course
-from lab.experiments.letter_tables import BenchExperiment
 from lab.experiments.manipulation import (
     ManipulationExperiment,
     score_weight,
     tell_gravity,
     true_gravity,
 )
-from lab.experiments.network import NetworkExperiment
-from lab.experiments.pose import PoseExperiment, drop_poses, flip_poses
+from lab.experiments.network import HEIGHT, SHOWN, WIDTH, ForceNetwork, NetworkExperiment, reduce_image
+from lab.experiments.paper_tables import BenchExperiment
+from lab.experiments.pose import PoseExperiment, drop_poses, flip_poses, score_poses, track_object, true_poses
 from lab.experiments.runs import RunOptions, keep_poses, list_missing, render_scene
 from lab.experiments.shape import write_generated
-from lab.experiments.tracked_poses import score_poses, track_object, true_poses
 
 DATA = Path(__file__).parents[2] / "finforce_eval" / "data"
 
@@ -307,14 +305,14 @@ class ScriptedJaw:
 
 
 def test_images_without_a_force_are_told_with_what_the_jaws_said(monkeypatch):
-    monkeypatch.setattr(grasp_sensors, "JawSensor", ScriptedJaw)
+    monkeypatch.setattr(grasp_world, "JawSensor", ScriptedJaw)
     fine, doubt, start = ("ok", ""), ("unobservable", "they do not fit"), ("waiting", "for the tare")
     script = {"left": [start, fine, fine, fine], "right": [start, fine, doubt]}
     seen = SimpleNamespace(origin_x=0.0, keypoints=np.zeros((8, 3)))
     jaws = [{"left": seen, "right": seen}] * 3 + [{"left": seen}]
     states = iter(SimpleNamespace(stamp=0.1 * n, jaws=each, T_gripper_object=np.eye(4)) for n, each in enumerate(jaws))
     pressed = SimpleNamespace(script=script, assembly=SimpleNamespace(jaws=script), state=lambda *_: next(states))
-    sensor = grasp_sensors.EstimatorSensor(pressed, 0)
+    sensor = grasp_world.EstimatorSensor(pressed, 0)
     sensor._next_pose = np.inf
     assert [sensor.measure(0.1 * n, 3.0, 0.02) for n in range(4)] == [None, 3.0, None, None]
     assert [words for _, words in sensor.untold] == [

@@ -12,7 +12,7 @@ pytest.importorskip("cv2", reason="pictures need OpenCV: pip install opencv-cont
 
 import torch
 
-from lab.experiments.force_network import HEIGHT, SHOWN, WIDTH, ForceNetwork
+from lab.experiments.network import HEIGHT, SHOWN, WIDTH, ForceNetwork
 from lab.training.baseline.network import EndToEnd
 from lab.training.baseline.scenes import GraspFilm, draw_scenario, load_films, main
 from lab.training.baseline.train import (

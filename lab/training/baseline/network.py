@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from finforce.optional import import_library
-from lab.experiments.force_network import SHOWN
+from lab.experiments.network import SHOWN
 from lab.training.commands import PURPOSE, RecipeError, import_torch
 
 torch = import_torch()

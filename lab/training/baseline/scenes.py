@@ -21,7 +21,7 @@ from finforce_sim.gripper.footage import FINGER, parse_size, set_stage
 from finforce_sim.gripper.gripper import TwinGripper
 from finforce_sim.rendering.photographer import Photographer
 from finforce_sim.scenes.scenarios import Scenario, build_scenario
-from lab.experiments.force_network import reduce_image
+from lab.experiments.network import reduce_image
 from lab.training.commands import DatasetError, one_line_errors
 from lab.training.pictures import TRAIN, VALIDATION, make_all, save_arrays
 

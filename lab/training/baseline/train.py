@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from finforce.settings import setting
 from finforce_eval.evaluation.results import ONSET
 from finforce_eval.evaluation.scoring import rms
-from lab.experiments.force_network import HEIGHT, KIND, LAYOUT, SHOWN, WIDTH
+from lab.experiments.network import HEIGHT, KIND, LAYOUT, SHOWN, WIDTH
 from lab.training.baseline.network import BACKBONES, SMALL, EndToEnd
 from lab.training.baseline.scenes import GraspFilm, load_films
 from lab.training.checkpoint import load_checkpoint

@@ -1,4 +1,4 @@
-"""The letter's static evaluations: cylinders at three places (Table I), and what knowing the place is worth (II)."""
+"""The paper's static evaluations: cylinders at three places (Table I), and what knowing the place is worth (II)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from finforce_eval.recordings.tracks import Recording
 from lab.experiments.experiment import Case, Findings, ResultTable
 from lab.experiments.runs import RunOptions, build_setup
 
-# Ø [mm] and height of the axis [mm] of the twin's cylinders, whose finger the letter's heights do not fit
+# Ø [mm] and height of the axis [mm] of the twin's cylinders, whose finger the paper's heights do not fit
 DIAMETERS = (15, 25, 35)
 HEIGHTS = {"upper": 58.0, "middle": 40.0, "lower": 24.0}
 BENCH_HEIGHTS = {"upper": 60.0, "middle": 40.0, "lower": 20.0}  # of the bench recordings [mm]
 QUICK_CASES = ((15, "upper"), (25, "middle"), (15, "lower"))
 SHORT = {"levels": 1, "settle": 0.3, "record": 0.5, "displacement": 0.004}
-# RMSE [N] of the letter, Table I by place and diameter, and Table II by real and assumed place
+# RMSE [N] of the paper, Table I by place and diameter, and Table II by real and assumed place
 TABLE_I = {"upper": (0.22, 0.52, 0.57), "middle": (0.24, 0.28, 0.24), "lower": (0.69, 0.62, 1.21)}
 TABLE_II = {
     "upper": {"estimate": 0.20, "upper": 0.22, "middle": 1.21, "lower": 5.91},
@@ -127,7 +127,7 @@ class BenchExperiment:
     name: str = "bench"
     title: str = "Table I: cylinders pressed on one jaw"
     about: str = (
-        "The letter presses cylinders of 15, 25 and 35 mm on one jaw at three places, in three levels up and down, "
+        "The paper presses cylinders of 15, 25 and 35 mm on one jaw at three places, in three levels up and down, "
         "three times, and gives the place to its solver. Here the same is done with the place given and with it "
         "estimated from the object's mesh and pose. On `twin` everything is rendered, and seen by the detector."
     )
@@ -146,18 +146,18 @@ class BenchExperiment:
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return Table I; see `Experiment`."""
         tables, summary = [], {}
-        for contact, words in (("given", "the place given, as in the letter"), (ESTIMATE, "the place estimated")):
+        for contact, words in (("given", "the place given, as in the paper"), (ESTIMATE, "the place estimated")):
             rows = []
             for place in HEIGHTS:
                 cells = [_find_cell(figures, diameter, place, contact) for diameter in DIAMETERS]
-                letter = TABLE_I[place]
-                rows.append((place, *(f"{_format(one)} ({own:.2f})" for one, own in zip(cells, letter, strict=True))))
+                paper = TABLE_I[place]
+                rows.append((place, *(f"{_format(one)} ({own:.2f})" for one, own in zip(cells, paper, strict=True))))
             known = [row["contacts"][contact]["rmse_N"] for row in figures.values()]
             known = [value for value in known if value is not None]
             note = ""
             if known:
                 summary[contact] = one = {"mean_N": float(np.mean(known)), "worst_N": float(np.max(known))}
-                note = f"Mean {one['mean_N']:.3f} N, worst {one['worst_N']:.3f} N; the letter's in brackets."
+                note = f"Mean {one['mean_N']:.3f} N, worst {one['worst_N']:.3f} N; the paper's in brackets."
             head = ("RMSE/N", *(f"Ø{diameter}" for diameter in DIAMETERS))
             tables.append(ResultTable(title=f"**With {words}**", head=head, rows=rows, note=note))
         return Findings(figures={"summary": summary, "cylinders": figures}, tables=tables)
@@ -171,7 +171,7 @@ class PlacesExperiment:
     name: str = "places"
     title: str = "Table II: what knowing the place is worth"
     about: str = (
-        "The letter presses a cylinder of 15 mm at three places and solves each with the place fixed at all three, and "
+        "The paper presses a cylinder of 15 mm at three places and solves each with the place fixed at all three, and "
         "with its contact estimator. A place at which the key points do not fit is refused here, rather than answered; "
         "such a cell shows what was answered."
     )
@@ -191,14 +191,14 @@ class PlacesExperiment:
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return Table II; see `Experiment`."""
         rows = []
-        for place, letter in TABLE_II.items():
-            cells = {contact: _find_cell(figures, DIAMETERS[0], place, contact) for contact in letter}
+        for place, paper in TABLE_II.items():
+            cells = {contact: _find_cell(figures, DIAMETERS[0], place, contact) for contact in paper}
             if any(cells.values()):
                 others = (_format(_find_cell(figures, DIAMETERS[0], place, contact)) for contact in OTHERS)
-                ours = (f"{_format(cells[contact])} ({own:.2f})" for contact, own in letter.items())
+                ours = (f"{_format(cells[contact])} ({own:.2f})" for contact, own in paper.items())
                 rows.append((place, *ours, *others))
         head = ("really at", "estimated", *(f"fixed {place}" for place in HEIGHTS), *OTHERS.values())
-        note = "RMSE [N] over the record phases, the letter's in brackets; %: share of the images that was answered."
+        note = "RMSE [N] over the record phases, the paper's in brackets; %: share of the images that was answered."
         table = ResultTable(title="**Ø15**", head=head, rows=rows, note=note)
         return Findings(figures={"cylinders": figures}, tables=[table])
 
