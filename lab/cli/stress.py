@@ -6,19 +6,19 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from finforce_eval.cli.parser import MESHES, SOLVERS, whole_number
 from finforce_eval.errors import OptionError
+from finforce_eval.machine import describe_machine, write_figures
 from lab.stress.stress import (
     Family,
     Plan,
-    Summary,
     Trial,
     find_families,
     format_summaries,
-    markdown_summaries,
     run_family,
     summarise_family,
     summarise_levels,
@@ -76,16 +76,17 @@ def worst_trials(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def write_page(
-    folder: Path, summaries: Sequence[Summary], trials: Mapping[str, Sequence[Trial]], what: Mapping
+    folder: Path, summaries: Sequence[Mapping[str, Any]], trials: Mapping[str, Sequence[Trial]], what: Mapping[str, str]
 ) -> None:
     """Write `stress.md`: the table, then each family by level with its worst trials."""
     folder.mkdir(parents=True, exist_ok=True)
-    lines = ["# Numerical stress", "", *markdown_summaries(summaries), ""]
+    lines = ["# Numerical stress", "", format_summaries(summaries), ""]
     for summary in summaries:
-        lines += [f"## {summary.name}", "", f"{what[summary.name]}.", ""]
-        lines += [f"- **broken:** {words}" for words in summary.broken] + [""] * bool(summary.broken)
-        lines += [*markdown_summaries(summarise_levels(trials[summary.name]), "level"), ""]
-        lines += [f"- {describe_trial(trial)}" for trial in worst_trials(trials[summary.name])] + [""]
+        name = summary["name"]
+        lines += [f"## {name}", "", f"{what[name]}.", ""]
+        lines += [f"- **broken:** {words}" for words in summary["broken"]] + [""] * bool(summary["broken"])
+        lines += [format_summaries(summarise_levels(trials[name]), "level"), ""]
+        lines += [f"- {describe_trial(trial)}" for trial in worst_trials(trials[name])] + [""]
     (folder / "stress.md").write_text("\n".join(lines), encoding="utf-8")
 
 
@@ -101,37 +102,32 @@ def run(options: argparse.Namespace) -> int:
     Returns:
         0; 1 when a rule is broken by a family that it is asked of.
     """
-    from finforce_eval.machine import describe_machine, write_figures
-
     families = choose_families(options.families, find_families())
     plan = Plan(seed=options.seed, solver=options.solver, mesh=options.mesh, count=options.count, jaw=options.jaw)
     trials = run_families(families, plan)
     summaries = [summarise_family(family, trials[family.name]) for family in families]
     print(format_summaries(summaries))
     for summary in summaries:
-        for words in summary.broken:
-            print(f"broken: {summary.name}: {words}")
-            print("\n".join(f"  {describe_trial(trial)}" for trial in worst_trials(trials[summary.name])))
+        for words in summary["broken"]:
+            print(f"broken: {summary['name']}: {words}")
+            print("\n".join(f"  {describe_trial(trial)}" for trial in worst_trials(trials[summary["name"]])))
     if options.json:
-        write_figures(options.json, to_json(plan, summaries, trials))
+        write_figures(options.json, {"plan": asdict(plan), "families": collect_figures(summaries, trials)})
     if options.report:
         write_page(Path(options.report), summaries, trials, {family.name: family.what for family in families})
     machine = describe_machine()
     print(f"seed {plan.seed}, solver {plan.solver}, {machine['processor']}, {machine['commit']}")
     ruled = {family.name for family in families if family.ruled}
-    return int(any(summary.broken for summary in summaries if summary.name in ruled))
+    return int(any(summary["broken"] for summary in summaries if summary["name"] in ruled))
 
 
-def to_json(plan: Plan, summaries: Sequence[Summary], trials: Mapping[str, Sequence[Trial]]) -> dict:
-    """Return plan, families, their levels and worst trials as nested mappings."""
+def collect_figures(summaries: Sequence[Mapping[str, Any]], trials: Mapping[str, Sequence[Trial]]) -> dict[str, Any]:
+    """Return families, their levels and worst trials as JSON has them."""
     return {
-        "plan": asdict(plan),
-        "families": {
-            summary.name: {
-                **asdict(summary),
-                "levels": [asdict(level) for level in summarise_levels(trials[summary.name])],
-                "worst": [asdict(trial) for trial in worst_trials(trials[summary.name])],
-            }
-            for summary in summaries
-        },
+        summary["name"]: {
+            **summary,
+            "levels": summarise_levels(trials[summary["name"]]),
+            "worst": [asdict(trial) for trial in worst_trials(trials[summary["name"]])],
+        }
+        for summary in summaries
     }

@@ -52,7 +52,7 @@ WAYS = 1e-3 * np.array([0.1, 0.3, 0.6, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 15.0,
 
 
 def run_epsilon(plan: Plan) -> Iterator[Trial]:
-    """Yields known forces found again with energy weights from 0 to 1e6: ever less, and stated with their bias."""
+    """Yield known forces found again with energy weights from 0 to 1e6: ever less, and stated with their bias."""
     jaw = build_jaw()
     mechanics = build_own_mechanics(plan, jaw)
     for seed in range(plan.share(4)):
@@ -64,7 +64,7 @@ def run_epsilon(plan: Plan) -> Iterator[Trial]:
 
 
 def _weigh(seed: int, pushed: Pushed, form: str) -> Iterator[Trial]:
-    """Yields the same problem with one energy weight after the other."""
+    """Yield the same problem with one energy weight after the other."""
     start, before = np.zeros(pushed.model.size), np.inf
     for weight in WEIGHTS:
         problem = replace(pushed.problem, energy_weight=weight, energy_form=form)
@@ -79,7 +79,7 @@ def _weigh(seed: int, pushed: Pushed, form: str) -> Iterator[Trial]:
 
 
 def _judge_weighed(result: InverseResult, pushed: Pushed, most: float) -> Trial:
-    """Returns a trial whose deviation is infinite when the force is larger than with the weight before."""
+    """Return a trial whose deviation is infinite when the force is larger than with the weight before."""
     trial = judge_inverse(result, pushed)
     force = float(np.linalg.norm(result.forces.sum(0)))
     rises = force > most * (1.0 + ROUNDING)
@@ -87,7 +87,7 @@ def _judge_weighed(result: InverseResult, pushed: Pushed, most: float) -> Trial:
 
 
 def judge_inverse(result: InverseResult, pushed: Pushed) -> Trial:
-    """Returns how the force of an inverse problem compares; its deviation is noise, bias and rounding together."""
+    """Return how the force of an inverse problem compares; its deviation is noise, bias and rounding together."""
     force = result.forces.sum(0)
     error = float(np.linalg.norm(force - pushed.force))
     noise = float(np.sqrt(np.trace(result.directions @ result.covariance @ result.directions.T)))
@@ -109,7 +109,7 @@ def judge_inverse(result: InverseResult, pushed: Pushed) -> Trial:
 
 
 def run_modulus(plan: Plan) -> Iterator[Trial]:
-    """Yields presses and estimates of jaws from 1e3 to 1e12 Pa, whose forces go with Young's modulus to rounding."""
+    """Yield presses and estimates of jaws from 1e3 to 1e12 Pa, whose forces go with Young's modulus to rounding."""
     for height in (0.02, 0.04, 0.06):
         expected = None
         for modulus in (MODULUS, *MODULI):
@@ -127,7 +127,7 @@ def run_modulus(plan: Plan) -> Iterator[Trial]:
 
 
 def _scale_estimates(plan: Plan, seed: int) -> Iterator[Trial]:
-    """Yields the same noisy press, estimated with one modulus after the other."""
+    """Yield the same noisy press, estimated with one modulus after the other."""
     first = estimate_press(plan, seed, MODULUS)
     for modulus in MODULI:
         yield attempt(
@@ -139,7 +139,7 @@ def _scale_estimates(plan: Plan, seed: int) -> Iterator[Trial]:
 
 
 def estimate_press(plan: Plan, seed: int, modulus: float) -> Solution:
-    """Returns what an estimator of a jaw of some modulus [Pa] says at the end of a press with noise."""
+    """Return what an estimator of a jaw of some modulus [Pa] says at the end of a press with noise."""
     bench = Bench(plan, jaw=build_jaw(modulus))
     history = bench.history(height=0.04, radius=0.0125, depth=3e-3)
     session = open_session(bench, plan.random("modulus", seed), history=history)
@@ -162,7 +162,7 @@ def _judge_scaled(solution: Solution, first: Solution, ratio: float) -> Trial:
 
 
 def run_poisson(plan: Plan) -> Iterator[Trial]:
-    """Yields the stiffness of every kind of element from nu = 0 to 0.499: right within 20 %, or warned of."""
+    """Yield the stiffness of every kind of element from nu = 0 to 0.499: right within 20 %, or warned of."""
     for ratio in RATIOS:
         jaw = build_jaw(ratio=ratio)
         expected = measure_compliance(jaw, jaw.build_mesh("fine"))
@@ -188,7 +188,7 @@ class Compliance:
 
 
 def measure_compliance(jaw: Jaw, mesh: VolumeMesh) -> Compliance:
-    """Returns the compliance of a mesh against a force along -x at the middle of its inner surface."""
+    """Return the compliance of a mesh against a force along -x at the middle of its inner surface."""
     model = SolidModel(mesh, jaw.material)
     rest, point = np.zeros(model.size), np.array([[jaw.inner_face_x, 0.0, 0.04]])
     probe, state = model.attach(point, 1e-3), model.linearize(rest)
@@ -199,7 +199,7 @@ def measure_compliance(jaw: Jaw, mesh: VolumeMesh) -> Compliance:
 
 
 def measure_warned(jaw: Jaw, mesh: VolumeMesh) -> Compliance:
-    """Returns the compliance and whether this mesh's locking would be warned of, were it a file."""
+    """Return the compliance and whether this mesh's locking would be warned of, were it a file."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         warn_of_locking(replace(jaw, drawing=None), mesh)
@@ -221,7 +221,7 @@ def _judge_compliance(found: Compliance, expected: Compliance) -> Trial:
 
 
 def run_pressing(plan: Plan) -> Iterator[Trial]:
-    """Yields presses from 1e-4 to 1e3 N, and on until the jaw buckles: in equilibrium and stable, or refused."""
+    """Yield presses from 1e-4 to 1e3 N, and on until the jaw buckles: in equilibrium and stable, or refused."""
     jaw = build_jaw()
     mechanics = build_own_mechanics(plan, jaw)
     for seed in range(plan.share(24)):
@@ -238,7 +238,7 @@ def run_pressing(plan: Plan) -> Iterator[Trial]:
 
 
 def run_buckling(plan: Plan) -> Iterator[Trial]:
-    """Yields forces along the finger and across its tip, through its limit points, found again from key points."""
+    """Yield forces along the finger and across its tip, through its limit points, found again from key points."""
     jaw = build_jaw()
     # a planar model has no third axis
     solver = "solid" if plan.solver == "frame" else plan.solver
@@ -280,12 +280,12 @@ _SIDES = (-0.00577, 0.00577)
 
 
 def build_jaw(modulus: float = MODULUS, ratio: float = RATIO) -> Jaw:
-    """Returns the bench jaw of a material, Young's modulus [Pa] and Poisson's ratio."""
+    """Return the bench jaw of a material, Young's modulus [Pa] and Poisson's ratio."""
     return replace(load_jaw("bench"), material=Material(young_modulus=modulus, poisson_ratio=ratio))
 
 
 def build_own_mechanics(plan: Plan, jaw: Jaw, **settings) -> Mechanics:
-    """Returns the mechanics of the plan's solver, the solid's where that has no tangent of its own."""
+    """Return the mechanics of the plan's solver, the solid's where that has no tangent of its own."""
     solver = plan.solver if plan.solver in OWN_MECHANICS else "solid"
     return build_mechanics(jaw, EstimatorSettings(solver=solver, mesh=plan.mesh, **settings))
 
@@ -311,7 +311,7 @@ class Pusher:
     """Pushes a jaw at the height of a contact, or pulls it along, and poses the inverse problem of that place."""
 
     def __init__(self, mechanics: Mechanics, jaw: Jaw, height: float, *, axes: str = "normal") -> None:
-        """Attaches contact points, their neighbours along the finger and the key points."""
+        """Attach contact points, their neighbours along the finger and the key points."""
         self.model = mechanics.model
         sides = _SIDES if self.model.rotations is None else (0.0,)
         points = np.array([[jaw.inner_face_x, y, height] for y in sides])
@@ -330,7 +330,7 @@ class Pusher:
         self._rest = self.model.positions(self.problem.contacts, np.zeros(self.model.size))
 
     def push(self, size: float, steps: int = 10) -> Pushed:
-        """Returns the equilibrium with a force of `size` [N] against the surface, reached in `steps`.
+        """Return the equilibrium with a force of `size` [N] against the surface, reached in `steps`.
 
         Raises:
             ContactError: There is none that Newton's method finds.
@@ -342,7 +342,7 @@ class Pusher:
         return self._describe(q, force)
 
     def pull(self, direction: NDArray, way: float, q: NDArray) -> Pushed:
-        """Returns the equilibrium in which the points have moved by `way` [m] along a direction (3,), from q.
+        """Return the equilibrium in which the points have moved by `way` [m] along a direction (3,), from q.
 
         A stiff spring along the direction holds them there, so that loads beyond a limit point are reached.
 
@@ -398,13 +398,13 @@ class Rig:
     rigid: RigidObject = RigidCylinder(radius=0.0125)
 
     def press(self, depth: float) -> list[PressState]:
-        """Returns the equilibria a little before a depth [m], at it and a little beyond."""
+        """Return the equilibria a little before a depth [m], at it and a little beyond."""
         surface, face = self.mechanics.contact.surface, self.jaw.inner_face_x
         depths = [share * depth for share in (1.0 - _LITTLE, 1.0, 1.0 + _LITTLE)]
         return press_jaw(self.mechanics.model, surface, face, self.rigid, self.height, depths)
 
     def judge(self, presses: list[PressState], expected: NDArray, tolerance: float) -> Trial:
-        """Returns how a press compares with an expected force (3,) [N], within three times a share of it.
+        """Return how a press compares with an expected force (3,) [N], within three times a share of it.
 
         The residual is what is left of the equilibrium, over the force. The energy balance is that of the way from the
         first to the last of the presses: the work -F_x dx less what jaw and surface store, over the work.
@@ -440,7 +440,7 @@ class Rig:
 
 
 def measure_condition(model: JawModel, q: NDArray) -> float:
-    """Returns an estimate of the condition number of the tangent stiffness at q in the 1-norm."""
+    """Return an estimate of the condition number of the tangent stiffness at q in the 1-norm."""
     stored = model.linearize(q).tangent
     matrix = sparse_from_banded(stored) if isinstance(stored, np.ndarray) else model.sparse_tangent(stored)
     factor = model.factorise(stored)
@@ -463,13 +463,13 @@ class Program:
     lower: NDArray
 
     def measure(self, x: NDArray) -> float:
-        """Returns the objective less its constant part, |A x|^2 / 2 + b A x."""
+        """Return the objective less its constant part, |A x|^2 / 2 + b A x."""
         moved = self.A @ x
         return float(0.5 * moved @ moved + self.b @ moved)
 
 
 def draw_program(random: np.random.Generator, kind: str) -> Program:
-    """Draws a program with 1 to 42 unknowns of which none, some or all are bounded."""
+    """Draw a program with 1 to 42 unknowns of which none, some or all are bounded."""
     m = int(random.integers(1, MOST + 1))
     rows = int(random.integers(m, 3 * m + 3))
     A, b = random.normal(size=(rows, m)), random.normal(size=rows)
@@ -489,14 +489,14 @@ def draw_program(random: np.random.Generator, kind: str) -> Program:
 
 
 def solve_second(program: Program) -> NDArray:
-    """Returns what SciPy's bounded-variable least squares finds (m,)."""
+    """Return what SciPy's bounded-variable least squares finds (m,)."""
     scale = np.linalg.norm(program.A, axis=0)
     bounds = (np.where(program.lower <= -UNBOUNDED, -np.inf, 0.0), np.inf)
     return lsq_linear(program.A / scale, -program.b, bounds, tol=1e-14, method="bvls").x / scale
 
 
 def judge_program(solution: ProgramSolution, program: Program) -> Trial:
-    """Returns a trial whose error is that of the objective, relative to its size, beside the second solver's."""
+    """Return a trial whose error is that of the objective, relative to its size, beside the second solver's."""
     x, other = solution.multipliers, solve_second(program)
     scale = np.linalg.norm(program.A, axis=0)
     condition = float(np.linalg.cond(program.A / scale)) ** 2
@@ -515,7 +515,7 @@ def judge_program(solution: ProgramSolution, program: Program) -> Trial:
 
 
 def run_programs(plan: Plan) -> Iterator[Trial]:
-    """Yields programs of every kind; the KKT residual of each answer is below 1e-8 and its objective is the least."""
+    """Yield programs of every kind; the KKT residual of each answer is below 1e-8 and its objective is the least."""
     for seed in range(plan.share(3000)):
         kind = KINDS[seed % len(KINDS)]
         program = draw_program(plan.random("programs", seed), kind)

@@ -55,7 +55,7 @@ class SessionStep:
 
 
 def noise_of(random: np.random.Generator, shape: tuple[int, ...], scale: float = 1.0) -> NDArray:
-    """Returns the noise (..., 3) [m] of a bench camera, `scale` times as large."""
+    """Return the noise (..., 3) [m] of a bench camera, `scale` times as large."""
     scatter = ACROSS * random.normal(size=(*shape, 3))
     return scale * (scatter + ALONG * random.normal(size=(*shape, 1)) * SIGHT)
 
@@ -83,7 +83,7 @@ class Session:
     level: str = ""
 
     def steps(self, depths: NDArray, *, scale: float = 1.0) -> list[SessionStep]:
-        """Returns one step for each depth (n,) [m], a period apart, with `scale` times a bench camera's noise."""
+        """Return one step for each depth (n,) [m], a period apart, with `scale` times a bench camera's noise."""
         clean = self.history.keypoints(depths) + self.offsets
         points = clean + noise_of(self.random, clean.shape[:2], scale)
         forces, torques = self.history.forces(depths), self.history.torques(depths)
@@ -101,13 +101,13 @@ class Session:
         ]
 
     def press(self, *, scale: float = 1.0) -> list[SessionStep]:
-        """Returns the steps of a press: three images of rest, 0.4 s of ramp, 0.7 s of hold."""
+        """Return the steps of a press: three images of rest, 0.4 s of ramp, 0.7 s of hold."""
         depth = self.history.depth
         rising = np.linspace(0.0, depth, 13)[1:]
         return self.steps(np.concatenate([np.zeros(3), rising, np.full(20, depth)]), scale=scale)
 
     def play(self, seed: int, steps: Iterable[SessionStep]) -> Iterator[Trial]:
-        """Gives steps to the estimator and yields one trial each."""
+        """Give steps to the estimator and yields one trial each."""
         for step in steps:
             yield attempt(
                 seed,
@@ -125,7 +125,7 @@ def open_session(
     tare: float = 1.0,
     level: str = "",
 ) -> Session:
-    """Draws a press unless one is given, and lets the estimator tare on images with `tare` times the usual noise.
+    """Draw a press unless one is given, and lets the estimator tare on images with `tare` times the usual noise.
 
     The estimator is told the height of first touch, off by what its settings call that height's deviation.
     """
@@ -146,20 +146,20 @@ def open_session(
 
 
 def take_another(session: Session, random: np.random.Generator) -> Session:
-    """Returns the session with another press and what is told of it, the estimator going on as it is."""
+    """Return the session with another press and what is told of it, the estimator going on as it is."""
     history = session.bench.press(random)
     error = session.bench.estimator.settings.height_stddev * random.normal()
     return replace(session, history=history, contact=Contact.fixed(session.bench.jaw, history.height + error))
 
 
 def update(bench: Bench, step: SessionStep) -> Solution:
-    """Returns what the bench's estimator says of a step."""
+    """Return what the bench's estimator says of a step."""
     seen = Observation(stamp=step.stamp, points=step.points, likelihood=step.likelihood, stddev=step.stddev)
     return bench.estimator.update(seen, step.contact)
 
 
 def judge(solution: Solution, step: SessionStep, balance: float = math.nan) -> Trial:
-    """Returns how a solution compares with the truth: along x, along z, in magnitude and in torque."""
+    """Return how a solution compares with the truth: along x, along z, in magnitude and in torque."""
     error = solution.force - step.force
     magnitude = np.linalg.norm(solution.force) - np.linalg.norm(step.force)
     torque = solution.torque - step.torque
@@ -189,13 +189,13 @@ def judge(solution: Solution, step: SessionStep, balance: float = math.nan) -> T
 
 
 def compare(errors: NDArray, stated: NDArray) -> float:
-    """Returns the largest of the errors over their stated standard deviations; no error needs none."""
+    """Return the largest of the errors over their stated standard deviations; no error needs none."""
     ratio = np.divide(errors, stated, out=np.full(len(errors), np.inf), where=stated > 0.0)
     return float(np.where(errors > 1e-9, ratio, 0.0).max())
 
 
 def describe(errors: NDArray, stated: NDArray) -> str:
-    """Returns errors and standard deviations in words."""
+    """Return errors and standard deviations in words."""
     names = ("x", "z", "magnitude", "torque")
     return ", ".join(f"{n} {e:.3g} ± {s:.2g}" for n, e, s in zip(names, errors, stated, strict=True))
 
@@ -235,7 +235,7 @@ class Bench:
     """One jaw with an estimator, and the same mechanics to press it with."""
 
     def __init__(self, plan: Plan, *, modulus: float = 1.0, jaw: Jaw | None = None, **settings) -> None:
-        """Builds the bench jaw, or another one, with `modulus` times its Young's modulus."""
+        """Build the bench jaw, or another one, with `modulus` times its Young's modulus."""
         self.plan = plan
         jaw = jaw or load_jaw(plan.jaw)
         self._reach = jaw.candidates[[0, -1], 2]
@@ -250,7 +250,7 @@ class Bench:
         self.mechanics = self.estimator.mechanics if own else build_mechanics(self.jaw, full)
 
     def press(self, random: np.random.Generator, *, depth: float | None = None) -> PressHistory:
-        """Returns a press by a drawn cylinder at a drawn height, `depth` [m] deep or drawn too.
+        """Return a press by a drawn cylinder at a drawn height, `depth` [m] deep or drawn too.
 
         A press that slips off or buckles is drawn anew.
         """
@@ -263,7 +263,7 @@ class Bench:
                 continue
 
     def history(self, *, height: float, radius: float, depth: float) -> PressHistory:
-        """Returns the press of a cylinder at a height and depth [m] that are meant for the bench finger.
+        """Return the press of a cylinder at a height and depth [m] that are meant for the bench finger.
 
         Another finger is pressed at the same share of its candidates, and a shorter one as much less.
 
@@ -291,7 +291,7 @@ class Bench:
         )
 
     def _balance(self, presses: list[PressState], rigid: RigidCylinder, height: float, grid: NDArray) -> float:
-        """Returns work less energy of a press, over the energy; that of the springs of the surface counts."""
+        """Return work less energy of a press, over the energy; that of the springs of the surface counts."""
         model, surface = self.mechanics.model, self.mechanics.contact.surface
         pushes = np.array([0.0, *(-press.force[0] for press in presses)])
         work = float(PchipInterpolator(grid, pushes).integrate(grid[0], grid[-1]))

@@ -1,4 +1,4 @@
-"""Shifts an exported network's likelihoods so that the threshold loses a wanted share of the points that can be seen.
+"""Shift an exported network's likelihoods so that the threshold loses a wanted share of the points that can be seen.
 
 `python -m lab.training.calibrate FOLDER DATASET --lost 0.05 -o FOLDER`
 """

@@ -1,4 +1,4 @@
-"""Judges an exported network on labelled pictures: `python -m lab.training.evaluate FOLDER DATASET --worst worst.png`.
+"""Judge an exported network on labelled pictures: `python -m lab.training.evaluate FOLDER DATASET --worst worst.png`.
 
 Knows no PyTorch: it runs the network as the product does.
 """

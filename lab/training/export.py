@@ -1,4 +1,4 @@
-"""Writes a trained network as the files that the product uses.
+"""Write a trained network as the files that the product uses.
 
 `python -m lab.training.export RUN/checkpoint.pt -o FOLDER --dataset DATA`
 """

@@ -1,4 +1,4 @@
-"""Trains the shipped network further on a user's labelled images.
+"""Train the shipped network further on a user's labelled images.
 
 `python -m lab.training.finetune CollectedData_X.csv --camera camera.yaml --jaw FILE --network FOLDER -o FOLDER`
 """

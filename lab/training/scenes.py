@@ -187,7 +187,7 @@ def _rod(rng: np.random.Generator, radius: NDArray, half: float, *, round_: bool
 
 
 class FingerScenes:
-    """Draws the pictures of one finger, the same for the same seed.
+    """Draw the pictures of one finger, the same for the same seed.
 
     Args:
         seed: of finger and scenes.

@@ -1,4 +1,4 @@
-"""Trains the key point network: `python -m lab.training.train DATASET -o RUN`."""
+"""Train the key point network: `python -m lab.training.train DATASET -o RUN`."""
 
 from __future__ import annotations
 

@@ -26,14 +26,14 @@ from lab.stress.stress import (
 
 
 def broken(trials, **rules):
-    return summarise("made", trials, **rules).broken
+    return summarise("made", trials, **rules)["broken"]
 
 
 # --- the rule: right within what is stated, or not sure
 
 
 def test_answers_within_what_they_state_break_no_rule():
-    assert broken(answers(200)) == ()
+    assert broken(answers(200)) == []
 
 
 def test_a_liar_is_caught():
@@ -41,28 +41,28 @@ def test_a_liar_is_caught():
 
 
 def test_one_in_a_hundred_may_be_beyond_three_sigma():
-    assert broken(answers(99) + answers(1, error=0.04)) == ()
+    assert broken(answers(99) + answers(1, error=0.04)) == []
     assert broken(answers(98) + answers(2, error=0.04))
 
 
 def test_a_liar_who_says_that_it_is_not_sure_is_none():
-    assert broken(answers(194) + answers(6, error=50.0, sure=False)) == ()
+    assert broken(answers(194) + answers(6, error=50.0, sure=False)) == []
 
 
 def test_an_error_without_any_stated_deviation_is_a_lie():
     assert broken(answers(10, stddev=0.0))
     assert broken(answers(10, stddev=float("nan")))
-    assert broken(answers(10, error=0.0, stddev=0.0)) == ()
+    assert broken(answers(10, error=0.0, stddev=0.0)) == []
 
 
 def test_the_farthest_component_decides():
     assert broken(answers(10, deviation=3.1))
-    assert broken(answers(10, deviation=2.9)) == ()
+    assert broken(answers(10, deviation=2.9)) == []
 
 
 def test_who_is_never_sure_is_useless():
     silent = answers(10, sure=False)
-    assert broken(silent) == ()
+    assert broken(silent) == []
     assert "0.0 % of the answers are sure" in broken(silent, least_sure=0.5)[0]
 
 
@@ -71,26 +71,26 @@ def test_who_is_never_sure_is_useless():
 
 def test_a_step_of_eleven_medians_is_caught_and_one_of_nine_is_not():
     assert "11.0 times the median" in broken(answers(50) + answers(1, step_time=11e-3))[0]
-    assert broken(answers(50) + answers(1, step_time=9e-3)) == ()
-    assert broken(answers(50) + answers(1, step_time=11e-3), timed=False) == ()
+    assert broken(answers(50) + answers(1, step_time=9e-3)) == []
+    assert broken(answers(50) + answers(1, step_time=11e-3), timed=False) == []
 
 
 def test_a_nan_that_leaves_is_caught():
-    assert broken(answers(50) + answers(1, nan=True)) == ("1 answers are not finite",)
+    assert broken(answers(50) + answers(1, nan=True)) == ["1 answers are not finite"]
 
 
 def test_our_errors_are_refusals_and_any_other_is_a_crash():
     assert fail_with(refuse).outcome == "refused"
-    assert broken([*answers(5), fail_with(refuse)]) == ()
+    assert broken([*answers(5), fail_with(refuse)]) == []
     crashed = fail_with(divide)
     assert crashed.outcome == "crashed" and "ZeroDivisionError" in crashed.note
-    assert broken([*answers(5), crashed]) == ("1 trials crashed",)
+    assert broken([*answers(5), crashed]) == ["1 trials crashed"]
 
 
 def test_a_step_that_hangs_is_ended():
     hung = fail_with(lambda: time.sleep(5.0), limit=0.05)
     assert hung.outcome == "hung"
-    assert broken([*answers(5), hung]) == ("1 trials hung",)
+    assert broken([*answers(5), hung]) == ["1 trials hung"]
 
 
 def test_nothing_in_a_step_keeps_it_from_being_ended():
@@ -102,7 +102,7 @@ def test_nothing_in_a_step_keeps_it_from_being_ended():
 
 
 def test_no_trials_are_no_success():
-    assert broken([]) == ("no trial was run",)
+    assert broken([]) == ["no trial was run"]
 
 
 def test_a_family_that_fails_between_its_steps_is_a_crash():
@@ -141,20 +141,19 @@ def test_figures_are_of_what_they_say():
     trials = answers(3, error=0.02, residual=1e-5, condition=4.0, energy_balance=-0.2)
     trials += answers(1, sure=False, converged=False, error=9.0, residual=1.0)
     summary = summarise("made", trials)
-    assert (summary.n, summary.converged, summary.sure) == (4, 0.75, 0.75)
-    assert summary.worst_error == 0.02 and summary.worst_residual == 1e-5
-    assert summary.median_sigmas == pytest.approx(2.0) and summary.worst_balance == 0.2
-    assert summary.worst_condition == 4.0
+    expected = {"n": 4, "converged": 0.75, "sure": 0.75, "worst_error": 0.02, "worst_residual": 1e-5}
+    expected |= {"median_sigmas": pytest.approx(2.0), "worst_balance": 0.2, "worst_condition": 4.0}
+    assert {key: summary[key] for key in expected} == expected
 
 
 def test_levels_keep_their_order():
     trials = answers(2, level="b") + answers(1, level="a") + answers(1, level="b")
-    assert [(level.name, level.n) for level in summarise_levels(trials)] == [("b", 3), ("a", 1)]
+    assert [(level["name"], level["n"]) for level in summarise_levels(trials)] == [("b", 3), ("a", 1)]
 
 
 def test_table_has_one_row_per_summary_and_no_nan():
     lines = format_summaries([summarise("first", answers(2)), summarise("second", [])]).splitlines()
-    assert len(lines) == 4 and lines[2].startswith("first") and "nan" not in "".join(lines)
+    assert len(lines) == 4 and lines[2].startswith("| first") and "nan" not in "".join(lines)
 
 
 def test_worst_trials_begin_with_what_is_broken():
@@ -168,7 +167,7 @@ def test_page_shows_what_is_broken(tmp_path):
     trials = run_family(family, Plan())
     write_page(tmp_path / "report", [summarise_family(family, trials)], {"made": trials}, {"made": "made up"})
     page = (tmp_path / "report" / "stress.md").read_text()
-    assert "**broken:** 50.0 %" in page and "| far |" in page
+    assert "**broken:** 50.0 %" in page and "| far " in page
 
 
 # --- plans and the command

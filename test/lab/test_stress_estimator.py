@@ -42,13 +42,13 @@ def play(steps):
 def test_family_breaks_no_rule(name):
     family = replace(find_families()[name], timed=False)
     summary = summarise_family(family, run_family(family, Plan(solver="frame", count=SHORT[name], seed=1)))
-    assert summary.broken == () and summary.n > 0
+    assert summary["broken"] == [] and summary["n"] > 0
 
 
 def test_forces_of_a_long_run_do_not_drift():
     family = replace(find_families()["long"], timed=False)
     trials = run_family(family, Plan(solver="frame", count=1500))
-    assert summarise_family(family, trials).broken == ()
+    assert summarise_family(family, trials)["broken"] == []
     assert "memory" in trials[-1].note
 
 

@@ -23,14 +23,14 @@ from lab.stress.mechanics import (
     run_buckling,
     run_epsilon,
 )
-from lab.stress.mechanics_meshes import CHANGES, parts_of, run_kind, try_mesh
+from lab.stress.meshes import CHANGES, parts_of, run_kind, try_mesh
 from lab.stress.stress import Plan, summarise
 
 COARSE, FRAME = Plan(solver="solid", mesh="coarse"), Plan(solver="frame")
 
 
 def broken(trials):
-    return summarise("", list(trials), timed=False).broken
+    return summarise("", list(trials), timed=False)["broken"]
 
 
 # --- stiffness

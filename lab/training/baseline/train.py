@@ -1,4 +1,4 @@
-"""Trains the end-to-end network: `python -m lab.training.baseline.train DATA -o RUN`."""
+"""Train the end-to-end network: `python -m lab.training.baseline.train DATA -o RUN`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Stress by key points, by loads and by time: few points, noisy or wrong ones, forces of any size, odd stamps."""
+"""Stress by what an estimator is given: key points, loads, stamps and contacts.
+
+Few key points, noisy or wrong ones; forces of any size; odd stamps; contacts that switch in every image or are wrong.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.errors import FinforceError
 from finforce_eval.replay.processes import resident_bytes
+from finforce_ifea.observation import Contact, ObjectOutline
 from lab.stress.session import PERIOD, Bench, Session, SessionStep, noise_of, open_session, take_another
 from lab.stress.stress import Family, Plan, Trial
 
@@ -22,7 +27,7 @@ FARTHEST_SHIFT = 0.01
 
 
 def run_subsets(plan: Plan) -> Iterator[Trial]:
-    """Yields trials with random subsets of the key points, down to none; some hidden for good, some now and then."""
+    """Yield trials with random subsets of the key points, down to none; some hidden for good, some now and then."""
     bench = Bench(plan)
     count = len(bench.jaw.keypoints)
     for seed in range(plan.share(3 * (count + 1))):
@@ -39,7 +44,7 @@ def run_subsets(plan: Plan) -> Iterator[Trial]:
 
 
 def run_noise(plan: Plan) -> Iterator[Trial]:
-    """Yields trials with noise from 0 to 10 mm, from the start or only after a tare that saw the usual noise."""
+    """Yield trials with noise from 0 to 10 mm, from the start or only after a tare that saw the usual noise."""
     bench = Bench(plan)
     for seed in range(plan.share(6 * len(NOISES))):
         random = plan.random("noise", seed)
@@ -50,7 +55,7 @@ def run_noise(plan: Plan) -> Iterator[Trial]:
 
 
 def run_gross(plan: Plan) -> Iterator[Trial]:
-    """Yields trials in which a share of the key points lies anywhere in the workspace, with high likelihood."""
+    """Yield trials in which a share of the key points lies anywhere in the workspace, with high likelihood."""
     bench = Bench(plan)
     for seed in range(plan.share(10 * len(SHARES))):
         random = plan.random("gross", seed)
@@ -66,7 +71,7 @@ def run_gross(plan: Plan) -> Iterator[Trial]:
 
 
 def run_clusters(plan: Plan) -> Iterator[Trial]:
-    """Yields trials in which a share of the key points errs together: shifted alike, or as of another press."""
+    """Yield trials in which a share of the key points errs together: shifted alike, or as of another press."""
     bench = Bench(plan)
     for seed in range(plan.share(10 * len(SHARES))):
         random = plan.random("clusters", seed)
@@ -86,13 +91,13 @@ def run_clusters(plan: Plan) -> Iterator[Trial]:
 
 
 def _draw_wrong(bench: Bench, random: np.random.Generator, share: float) -> NDArray:
-    """Returns the indices of the key points that are wrong."""
+    """Return the indices of the key points that are wrong."""
     count = len(bench.jaw.keypoints)
     return random.permutation(count)[: round(share * count)]
 
 
 def _draw_places(bench: Bench, random: np.random.Generator) -> NDArray:
-    """Returns places (K, 3) [m] anywhere in the workspace."""
+    """Return places (K, 3) [m] anywhere in the workspace."""
     return bench.jaw.keypoints + random.uniform(-WORKSPACE, WORKSPACE, bench.jaw.keypoints.shape)
 
 
@@ -102,7 +107,7 @@ DEPTH, LEAST_DEPTH, RADIUS = 4e-3, 1e-4, 12e-3
 
 
 def run_forces(plan: Plan) -> Iterator[Trial]:
-    """Yields presses with 1e-4 to 1e3 N: on jaws that it bends by millimetres, and on the usual one up to 1 N."""
+    """Yield presses with 1e-4 to 1e3 N: on jaws that it bends by millimetres, and on the usual one up to 1 N."""
     usual = Bench(plan)
     for seed in range(plan.share(2 * len(FORCES))):
         random = plan.random("forces", seed)
@@ -123,7 +128,7 @@ def run_forces(plan: Plan) -> Iterator[Trial]:
 
 
 def run_model_error(plan: Plan) -> Iterator[Trial]:
-    """Yields presses of a jaw whose key points move by 1 % more or less each, and whose force is 1 % off."""
+    """Yield presses of a jaw whose key points move by 1 % more or less each, and whose force is 1 % off."""
     bench = Bench(plan)
     for seed in range(plan.share(30)):
         random = plan.random("model", seed)
@@ -141,7 +146,7 @@ def run_model_error(plan: Plan) -> Iterator[Trial]:
 
 
 def run_jumps(plan: Plan) -> Iterator[Trial]:
-    """Yields loads that jump: to any depth, in a random walk, on and off, from one press to another."""
+    """Yield loads that jump: to any depth, in a random walk, on and off, from one press to another."""
     bench = Bench(plan)
     for seed in range(plan.share(8 * len(JUMPS))):
         random = plan.random("jumps", seed)
@@ -151,7 +156,7 @@ def run_jumps(plan: Plan) -> Iterator[Trial]:
 
 
 def _jump(session: Session, kind: str, random: np.random.Generator, count: int = 60) -> list[SessionStep]:
-    """Returns `count` steps whose depth changes as `kind` says."""
+    """Return `count` steps whose depth changes as `kind` says."""
     deepest = session.history.depth
     if kind == "teleport":
         return session.steps(np.repeat(random.uniform(0.0, deepest, count // 4), 4))
@@ -175,7 +180,7 @@ PRESSES = 8
 
 
 def run_stamps(plan: Plan) -> Iterator[Trial]:
-    """Yields presses whose stamps are not those of a camera."""
+    """Yield presses whose stamps are not those of a camera."""
     bench = Bench(plan)
     for seed in range(plan.share(8 * len(STAMPS))):
         random = plan.random("stamps", seed)
@@ -187,7 +192,7 @@ def run_stamps(plan: Plan) -> Iterator[Trial]:
 
 
 def _draw_periods(kind: str, random: np.random.Generator, count: int) -> np.ndarray:
-    """Returns the time [s] from each image to the next."""
+    """Return the time [s] from each image to the next."""
     periods = np.full(count, PERIOD)
     odd = random.random(count) < 0.3
     match kind:
@@ -207,7 +212,7 @@ def _draw_periods(kind: str, random: np.random.Generator, count: int) -> np.ndar
 
 
 def run_long(plan: Plan) -> Iterator[Trial]:
-    """Yields one in ten steps of a long run of presses; each tenth of the run is a level, so that drift shows."""
+    """Yield one in ten steps of a long run of presses; each tenth of the run is a level, so that drift shows."""
     bench, random = Bench(plan), plan.random("long")
     session = open_session(bench, random)
     presses = [session, *(take_another(session, random) for _ in range(PRESSES - 1))]
@@ -224,7 +229,7 @@ def run_long(plan: Plan) -> Iterator[Trial]:
 
 
 def _press_on(presses: list[Session], random: np.random.Generator, count: int) -> Iterator[SessionStep]:
-    """Yields `count` steps: rest, a ramp, a hold, a ramp back, with one press after the other."""
+    """Yield `count` steps: rest, a ramp, a hold, a ramp back, with one press after the other."""
     done = 0
     while done < count:
         session = presses[int(random.integers(len(presses)))]
@@ -234,6 +239,135 @@ def _press_on(presses: list[Session], random: np.random.Generator, count: int) -
         for step in session.steps(depths)[: count - done]:
             done += 1
             yield replace(step, stamp=session.start + done * PERIOD)
+
+
+KINDS = ("height", "outline", "fixed", "none", "no rows", "regions")
+WRONG = (
+    "wrong height",
+    "wrong outline",
+    "larger outline",
+    "wrong fixed",
+    "outline and height in turn",
+    "of the object before",
+)
+RIGHT = ("height", "outline", "fixed", "regions")
+OUTLINE_STDDEV = np.array([1e-4, 3e-4, 3e-3])
+CORNERS = 90
+FARTHEST = 0.045
+
+
+def run_contacts(plan: Plan) -> Iterator[Trial]:
+    """Yield presses with another kind of contact in every image, or in every few."""
+    bench = Bench(plan)
+    for seed in range(plan.share(30)):
+        random = plan.random("contacts", seed)
+        lasts = (1, 2, 5, 12)[seed % 4]
+        session = open_session(bench, random, level=f"another every {lasts} images")
+        offered = {kind: _contact_of(kind, session, random) for kind in KINDS}
+        steps, kind = [], "height"
+        for index, step in enumerate(session.press() + session.press()):
+            kind = KINDS[int(random.integers(len(KINDS)))] if index % lasts == 0 else kind
+            steps.append(replace(step, stamp=session.start + (index + 1) / 30, contact=offered[kind]))
+        yield from session.play(seed, steps)
+
+
+def run_wrong(plan: Plan) -> Iterator[Trial]:
+    """Yield presses whose contact is said to be up to 45 mm away from where it is, or of another object."""
+    bench = Bench(plan)
+    for seed in range(plan.share(12 * len(WRONG))):
+        random = plan.random("wrong", seed)
+        kind = WRONG[seed % len(WRONG)]
+        session = open_session(bench, random, level=kind)
+        first, second = _contact_of(kind, session, random), session.contact
+        steps = session.press()
+        if kind == "of the object before":
+            later, last = take_another(session, random).press(), steps[-1].stamp - session.start
+            yield from session.play(seed, steps)
+            steps = [replace(step, stamp=step.stamp + last) for step in later]
+            first = session.contact
+        for index, step in enumerate(steps):
+            given = second if kind == "outline and height in turn" and index % 2 else first
+            steps[index] = replace(step, contact=given)
+        yield from session.play(seed, steps)
+
+
+def run_right(plan: Plan) -> Iterator[Trial]:
+    """Yield presses whose contact is told in every form there is, and is right."""
+    bench = Bench(plan)
+    for seed in range(plan.share(12 * len(RIGHT))):
+        random = plan.random("right", seed)
+        kind = RIGHT[seed % len(RIGHT)]
+        session = open_session(bench, random, level=kind)
+        contact = _contact_of(kind, session, random)
+        yield from session.play(seed, [replace(step, contact=contact) for step in session.press()])
+
+
+def run_axes(plan: Plan) -> Iterator[Trial]:
+    """Yield presses whose force at a given place has three axes; one refusal where a model is planar."""
+    bench = _build_three(plan)
+    if bench is None:
+        yield Trial(level="planar model", outcome="refused", note="forces in three axes need a solid")
+        return
+    for seed in range(plan.share(12)):
+        random = plan.random("axes", seed)
+        session = open_session(bench, random, level="three axes")
+        contact = _contact_of("fixed", session, random)
+        yield from session.play(seed, [replace(step, contact=contact) for step in session.press()])
+
+
+def _build_three(plan: Plan) -> Bench | None:
+    """Return a bench whose loads have three axes; None where the model bends in a plane alone, as a frame does."""
+    try:
+        bench = Bench(plan, force_axes="three")
+    except FinforceError:
+        return None
+    return bench if bench.estimator.mechanics.model.rotations is None else None
+
+
+def _contact_of(kind: str, session: Session, random: np.random.Generator) -> Contact | None:
+    """Return the contact of a session in the form, or with the error, that `kind` names."""
+    height, radius = session.history.height, session.history.radius
+    heights = session.bench.jaw.candidates[:, 2]
+    away = float(np.clip(height + random.choice((-1, 1)) * random.uniform(5e-3, FARTHEST), heights[0], heights[-1]))
+    match kind:
+        case "none":
+            return None
+        case "no rows":
+            return Contact(points=np.zeros((0, 3)), weights=np.zeros(0))
+        case "height":
+            return session.contact
+        case "wrong height":
+            return Contact.fixed(session.bench.jaw, away)
+        case "fixed":
+            return replace(session.contact, free=False)
+        case "wrong fixed":
+            return replace(Contact.fixed(session.bench.jaw, away), free=False)
+        case "regions":
+            return _region(session, 3e-3)
+        case "outline":
+            error = OUTLINE_STDDEV * random.normal(size=3)
+            return _round(session, height + error[1], radius, error[2])
+        case "larger outline":
+            return _round(session, height, radius * random.uniform(1.5, 3.0), 0.0)
+        case _:
+            return _round(session, away, radius, 0.0)
+
+
+def _region(session: Session, half: float) -> Contact:
+    """Return a contact of three heights about the right one, `half` [m] apart, with weights."""
+    points = np.repeat(session.contact.points, 3, axis=0)
+    points[:, 2] += half * np.array([-1.0, 0.0, 1.0])
+    return Contact(points=points, weights=np.array([0.25, 0.5, 0.25]))
+
+
+def _round(session: Session, height: float, radius: float, tilt: float) -> Contact:
+    """Return a contact with the outline of a cylinder about a height [m]."""
+    angles = np.linspace(0.0, 2 * np.pi, CORNERS, endpoint=False)
+    circle: NDArray = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    face = session.bench.jaw.inner_face_x
+    origin = np.array([face + radius, height])
+    outline = ObjectOutline(polygons=(circle,), origin=origin, tilt=tilt, stddev=OUTLINE_STDDEV)
+    return Contact(points=np.array([[face, 0.0, height]]), weights=np.ones(1), outline=outline)
 
 
 FAMILIES = (
@@ -246,4 +380,8 @@ FAMILIES = (
     Family(name="jumps", what="targets that jump between images", run=run_jumps),
     Family(name="stamps", what="stamps that stall, jitter, repeat or leap", run=run_stamps),
     Family(name="long", what="one in ten of many steps without a new start", run=run_long),
+    Family(name="contacts", what="another contact in every image", run=run_contacts),
+    Family(name="wrong", what="contacts said to be where they are not", run=run_wrong, ruled=False),
+    Family(name="right", what="contacts in every form there is", run=run_right),
+    Family(name="axes", what="forces in three axes at a given place", run=run_axes),
 )

@@ -30,11 +30,11 @@ class PressedOutline:
     """A rigid outline for the forward problem; depth counts from first touch with the undeformed jaw."""
 
     def __init__(self, polygons: tuple[NDArray, ...], length: float) -> None:
-        """Builds the field of polygons (n, 2) [m] for a jaw of some length [m]; raises ContactError if too small."""
+        """Build the field of polygons (n, 2) [m] for a jaw of some length [m]; raises ContactError if too small."""
         self._indenter, self._length = OutlineIndenter(polygons), length
 
     def find_origin(self, face_x: float, depth: float, height: float) -> float:
-        """Returns x [m] of the outline's origin at a depth and height [m]."""
+        """Return x [m] of the outline's origin at a depth and height [m]."""
         return face_x + self._indenter.field.front - float(self._place(depth, height)[0])
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
@@ -58,7 +58,7 @@ class PressedImage:
 
 
 def plan_depths(scene: HardScene) -> NDArray:
-    """Returns the depth of the object in each image (n,) [m], from well clear of the jaw on."""
+    """Return the depth of the object in each image (n,) [m], from well clear of the jaw on."""
     last = min(scene.depth, 0.0)
     approach = np.linspace(-CLEAR + last, last, APPROACH)
     rise = np.linspace(0.0, scene.depth, RISE + 1)[1:] if scene.depth > 0.0 else np.full(RISE, last)
@@ -66,7 +66,7 @@ def plan_depths(scene: HardScene) -> NDArray:
 
 
 def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
-    """Returns what is true in each image; an object that no outline describes leaves the jaw as it is.
+    """Return what is true in each image; an object that no outline describes leaves the jaw as it is.
 
     Raises:
         ContactError: The jaw has no equilibrium with the object.
@@ -95,7 +95,7 @@ def press_scene(bench: Bench, scene: HardScene) -> list[PressedImage]:
 
 
 def _frame_of(bench: Bench, T: NDArray, press: PressState | None) -> PressedImage:
-    """Returns the truth at a pose, with the jaw at rest without a press."""
+    """Return the truth at a pose, with the jaw at rest without a press."""
     if press is None:
         return PressedImage(T=T, points=bench.jaw.keypoints, force=np.zeros(3), torque=np.zeros(3))
     model = bench.mechanics.model
@@ -104,7 +104,7 @@ def _frame_of(bench: Bench, T: NDArray, press: PressState | None) -> PressedImag
 
 
 def rotation_of(tilt: float) -> NDArray:
-    """Returns the turn (3, 3) by a tilt [rad] from x to z."""
+    """Return the turn (3, 3) by a tilt [rad] from x to z."""
     c, s = np.cos(tilt), np.sin(tilt)
     return np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
 
@@ -113,7 +113,7 @@ class Chain:
     """Contact estimator and solver of one jaw, fed as their nodes are."""
 
     def __init__(self, bench: Bench, scene: HardScene, random: np.random.Generator) -> None:
-        """Starts both anew and lets the solver tare while the object is clear."""
+        """Start both anew and lets the solver tare while the object is clear."""
         self._bench, self._random = bench, random
         self._contact = ContactEstimator(bench.jaw, mesh=scene.mesh, settings=ContactSettings(mesh=bench.plan.mesh))
         self._offsets = OFFSET * random.normal(size=bench.jaw.keypoints.shape)
@@ -121,7 +121,7 @@ class Chain:
         bench.estimator.reset()
 
     def see(self, frame: PressedImage) -> SessionStep:
-        """Returns the next image of what is true, with noise; the contact is not known yet."""
+        """Return the next image of what is true, with noise; the contact is not known yet."""
         self._stamp += PERIOD
         noise = noise_of(self._random, (len(frame.points),))
         return SessionStep(
@@ -134,7 +134,7 @@ class Chain:
         )
 
     def solve(self, step: SessionStep, T: NDArray) -> Solution:
-        """Returns what both make of an image and a pose T_jaw_object (4, 4)."""
+        """Return what both make of an image and a pose T_jaw_object (4, 4)."""
         T = T.copy()
         T[:3, 3] += POSE_NOISE * self._random.normal(size=3)
         self._contact.take_pose(step.stamp, T)
@@ -148,7 +148,7 @@ class Chain:
 
 
 def run_objects(plan: Plan) -> Iterator[Trial]:
-    """Yields every scene, image by image."""
+    """Yield every scene, image by image."""
     bench = Bench(plan)
     for scene in build_scenes():
         frames = press_scene(bench, scene)
@@ -157,7 +157,7 @@ def run_objects(plan: Plan) -> Iterator[Trial]:
 
 
 def play_scene(bench: Bench, scene: HardScene, frames: list[PressedImage], seed: int) -> Iterator[Trial]:
-    """Yields the images of a scene after the tare, each a step of contact estimator and solver."""
+    """Yield the images of a scene after the tare, each a step of contact estimator and solver."""
     chain = Chain(bench, scene, bench.plan.random("objects", scene.name, seed))
     tare = [frames[0]] * bench.estimator.settings.tare_frames
     for index, frame in enumerate([*tare, *frames]):
@@ -207,7 +207,7 @@ class HardScene:
 
 
 def build_prism(section: NDArray, length: float = LENGTH) -> ObjectMesh:
-    """Returns the closed prism along y over a convex section (n, 2) of x and z [m], counterclockwise from x to z."""
+    """Return the closed prism along y over a convex section (n, 2) of x and z [m], counterclockwise from x to z."""
     count = len(section)
     ring = np.stack([section[:, 0], np.full(count, -0.5 * length), section[:, 1]], axis=1)
     a, b = np.arange(count), (np.arange(count) + 1) % count
@@ -222,29 +222,29 @@ def build_prism(section: NDArray, length: float = LENGTH) -> ObjectMesh:
 
 
 def circle(radius: float) -> NDArray:
-    """Returns a round section (n, 2) [m]."""
+    """Return a round section (n, 2) [m]."""
     angles = 2.0 * np.pi * np.arange(AROUND) / AROUND
     return radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def rectangle(size_x: float, size_z: float) -> NDArray:
-    """Returns a rectangular section (4, 2) [m]."""
+    """Return a rectangular section (4, 2) [m]."""
     return 0.5 * np.array([[-size_x, -size_z], [size_x, -size_z], [size_x, size_z], [-size_x, size_z]])
 
 
 def leave_open(mesh: ObjectMesh) -> ObjectMesh:
-    """Returns a mesh without some triangles of its ends."""
+    """Return a mesh without some triangles of its ends."""
     kept = mesh.triangles[: int(0.9 * len(mesh.triangles))]
     return ObjectMesh(vertices=mesh.vertices, triangles=kept, watertight=False, name="open prism")
 
 
 def in_single_precision(mesh: ObjectMesh) -> ObjectMesh:
-    """Returns a mesh with vertices in single precision."""
+    """Return a mesh with vertices in single precision."""
     return replace(mesh, vertices=mesh.vertices.astype(np.float32))
 
 
 def build_scenes() -> tuple[HardScene, ...]:
-    """Returns the scenes."""
+    """Return the scenes."""
     rod, bar = build_prism(circle(0.0125)), build_prism(rectangle(0.03, 0.03))
     return (
         HardScene(name="rod", mesh=rod),

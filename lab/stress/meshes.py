@@ -33,7 +33,7 @@ class Parts:
     clamped: NDArray
 
     def build(self) -> VolumeMesh:
-        """Returns the mesh as a reader of files does, checks included."""
+        """Return the mesh as a reader of files does, checks included."""
         kind = "hexes" if np.shape(self.elements)[1] == 8 else "tets"
         mesh = build_volume_mesh(nodes=self.nodes, clamped=self.clamped, **{kind: self.elements})
         check_connection(mesh)
@@ -44,7 +44,7 @@ Change = Callable[[Parts, np.random.Generator], Parts]
 
 
 def thin_layer(thickness: float) -> Change:
-    """Returns a change that moves the middle layer of nodes to within a `thickness` [m] of a side."""
+    """Return a change that moves the middle layer of nodes to within a `thickness` [m] of a side."""
 
     def change(parts: Parts, random: np.random.Generator) -> Parts:
         nodes = parts.nodes.copy()
@@ -61,7 +61,7 @@ def thin_layer(thickness: float) -> Change:
 
 
 def skew(share: float) -> Change:
-    """Returns a change that moves inner nodes of hexahedra across the width by up to a share of their room."""
+    """Return a change that moves inner nodes of hexahedra across the width by up to a share of their room."""
 
     def change(parts: Parts, random: np.random.Generator) -> Parts:
         nodes, width = parts.nodes.copy(), parts.nodes[:, 1].max()
@@ -73,7 +73,7 @@ def skew(share: float) -> Change:
 
 
 def pull_corner(share: float) -> Change:
-    """Returns a change that moves the corner of one element towards the opposite one, through it above 1."""
+    """Return a change that moves the corner of one element towards the opposite one, through it above 1."""
 
     def change(parts: Parts, random: np.random.Generator) -> Parts:
         nodes, element = parts.nodes.copy(), parts.elements[int(random.integers(len(parts.elements)))]
@@ -85,7 +85,7 @@ def pull_corner(share: float) -> Change:
 
 
 def add_element(way: tuple[float, float, float], shared: int) -> Change:
-    """Returns a change that adds a copy of the first element, moved by `way` [m], with some nodes of the original."""
+    """Return a change that adds a copy of the first element, moved by `way` [m], with some nodes of the original."""
 
     def change(parts: Parts, random: np.random.Generator) -> Parts:
         first, count = parts.elements[0], len(parts.nodes)
@@ -170,12 +170,12 @@ SHAPES = tuple(change for name, change in CHANGES.items() if name.startswith(("a
 
 
 def split_parts(parts: Parts) -> Parts:
-    """Returns hexahedra as 10-node tetrahedra."""
+    """Return hexahedra as 10-node tetrahedra."""
     return parts_of(to_tet10(parts.build()))
 
 
 def keep_parts(parts: Parts) -> Parts:
-    """Returns hexahedra as they are."""
+    """Return hexahedra as they are."""
     return parts
 
 
@@ -183,12 +183,12 @@ KINDS = {"hexahedra": keep_parts, "10-node": split_parts}
 
 
 def parts_of(mesh: VolumeMesh) -> Parts:
-    """Returns what a mesh was built from."""
+    """Return what a mesh was built from."""
     return Parts(nodes=mesh.nodes, elements=mesh.elements, clamped=mesh.clamped)
 
 
 def build_rig(jaw: Jaw, mesh: VolumeMesh) -> Rig:
-    """Returns a jaw of a given mesh, ready to be pressed."""
+    """Return a jaw of a given mesh, ready to be pressed."""
     model = SolidModel(mesh, jaw.material)
     surface = build_contact_surface(jaw, mesh, model, across="half" if model.symmetric else "both")
     contact = RollingContact(model, surface, jaw.face)
@@ -205,7 +205,7 @@ class Tried:
 
 
 def try_mesh(jaw: Jaw, parts: Parts) -> Tried:
-    """Returns what becomes of a mesh; raises what the package says of a bad one."""
+    """Return what becomes of a mesh; raises what the package says of a bad one."""
     mesh = parts.build()
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -215,13 +215,13 @@ def try_mesh(jaw: Jaw, parts: Parts) -> Tried:
 
 
 def run_meshes(plan: Plan) -> Iterator[Trial]:
-    """Yields meshes with one fault each: refused in our words, or with the force of the mesh without it."""
+    """Yield meshes with one fault each: refused in our words, or with the force of the mesh without it."""
     for kind in KINDS:
         yield from run_kind(plan, kind)
 
 
 def run_kind(plan: Plan, kind: str) -> Iterator[Trial]:
-    """Yields the faulty meshes of one kind of element."""
+    """Yield the faulty meshes of one kind of element."""
     # at this ratio no element locks by its volume, so that only shape is at stake
     jaw, into = build_jaw(ratio=0.3), KINDS[kind]
     boxes = parts_of(jaw.build_mesh("coarse"))
@@ -240,7 +240,7 @@ def run_kind(plan: Plan, kind: str) -> Iterator[Trial]:
 
 
 def _apply(order: tuple, parts: Parts, random: np.random.Generator) -> Parts:
-    """Returns parts after two steps, of which a change takes random numbers and a split does not."""
+    """Return parts after two steps, of which a change takes random numbers and a split does not."""
     for step in order:
         parts = step(parts) if step in KINDS.values() else step(parts, random)
     return parts
@@ -259,7 +259,7 @@ def _judge(tried: Tried, right: NDArray, tolerance: float) -> Trial:
 
 
 def run_single(plan: Plan) -> Iterator[Trial]:
-    """Yields meshes in single precision, whose forces are those of double precision to its rounding."""
+    """Yield meshes in single precision, whose forces are those of double precision to its rounding."""
     jaw = build_jaw()
     for density in ("coarse", "default"):
         for kind, change in (("hexahedra", lambda m: m), ("10-node", to_tet10))[: 2 if density == "coarse" else 1]:
