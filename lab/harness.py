@@ -97,6 +97,12 @@ PARTS = (
     Part(name="onset", title="From the onset of a force until it shows"),
     Part(name="endurance", title="An hour of grasps: growth of memory, drift of the force, lost images"),
     Part(name="skipping", title="CPU time of each node in three scenes, with the skip rules and without"),
+    Part(name="mechanics", title="Mechanics against an independent program, and the shipped fingers"),
+    Part(name="images", title="From images to forces on unseen scenes, beside true key points"),
+    Part(name="pose_tracking", title="Errors, losses and time of the object tracker on rendered sequences"),
+    Part(name="reconstruction", title="Reconstructed meshes: distance from the true ones"),
+    Part(name="driver_faults", title="Random faults between the gripper driver and an emulated gripper"),
+    Part(name="grasp_faults", title="Grasps by force in which something goes wrong"),
 )
 
 

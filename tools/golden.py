@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from finforce_eval.machine import write_figures
+
 ROOT = Path(__file__).parents[1]
 TOLERANCE = 1e-6  # [N, m] below which two series are equal: another order of a sum
 TIMES = ("_ms", "time", "seconds", "clock", "machine", "commit", "version", "processor", "memory")
@@ -57,9 +59,10 @@ def freeze_stress(folder: Path) -> None:
 
 def freeze_driver(folder: Path) -> None:
     """Keep the tallies of faults between driver and gripper, alone and in grasps by force."""
-    faults, grasps = str(folder / "driver_faults.json"), str(folder / "grasp_faults.json")
-    run_tool("-m", "lab.benchmarks.driver_faults", "--faults", "2000", "--json", faults)
-    run_tool("-m", "lab.benchmarks.grasp_faults", "--cases", "400", "--json", grasps)
+    from lab.bench import driver_faults, grasp_faults
+
+    for name, tally in (("driver_faults", driver_faults.run_all(2000)), ("grasp_faults", grasp_faults.play_all(400))):
+        write_figures(folder / f"{name}.json", {"seed": 1, **tally.plain()})
 
 
 def freeze_chain(folder: Path, bags: list[str]) -> None:

@@ -20,7 +20,7 @@ from finforce.camera import ImageError, project
 from finforce.skipping import ALL, Skips
 from finforce.transforms import pose_from_quaternion
 from finforce_eval.evaluation.keypoint_source import Detector, KeypointSource, SideLog, build_records, with_detections
-from finforce_eval.evaluation.results import DetectionErrors, DetectionStats, compare_detection, detection_stats
+from finforce_eval.evaluation.results import DetectionErrors, compare_detection, detection_stats
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
@@ -131,7 +131,7 @@ def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int |
             **percentiles(spent),
             "CPU p50/ms": 1e3 * float(np.median(cpu[name])),
             "CPU mean/ms": 1e3 * float(np.mean(cpu[name])),
-            **sight_columns(detection_stats(series[name])),
+            **sight_columns(asdict(detection_stats(series[name]))),
         }
         for name, spent in seconds.items()
     ]
@@ -151,9 +151,9 @@ def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int |
     )
 
 
-def sight_columns(stats: DetectionStats) -> dict[str, float]:
-    """Return how well key points were seen as columns of a table."""
-    found = {name: np.nan if value is None else value for name, value in asdict(stats).items()}
+def sight_columns(stats: Mapping[str, float | None]) -> dict[str, float]:
+    """Return the fields of `DetectionStats`, how well key points were seen, as columns of a table."""
+    found = {name: np.nan if value is None else value for name, value in stats.items()}
     return {
         "pixel error median/px": found["pixel_median_px"],
         "pixel error p95/px": found["pixel_p95_px"],

@@ -16,11 +16,14 @@ from lab.harness import PARTS, Part, draw_tradeoff, figures_json, format_figures
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "folder of recordings of the bench finger that the solvers run on, too"
+    text = "folder of recordings: those of the bench finger that the solvers run on, too, or those that images makes"
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
-    text = "jaw file or shipped jaw that the solvers run on, pressed by its own solid model"
+    text = "jaw file or shipped jaw of the parts solvers and images; of the latter several, separated by commas"
     parser.add_argument("--jaw", metavar="NAME", help=text)
     parser.add_argument("--minutes", type=float, metavar="N", help="duration of the part endurance")
+    text = "repetitions of each case of the parts images, pose_tracking and reconstruction; faults or grasps of others"
+    parser.add_argument("--count", type=int, metavar="N", help=text)
+    parser.add_argument("--model", metavar="FOLDER", help="network of the part images, in place of the shipped one")
     text = f"parts to measure: {', '.join(part.name for part in PARTS)}; without it those of `make bench`"
     parser.add_argument("--parts", metavar="A,B", help=text)
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON")
@@ -31,7 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Measure the parts, print each one's tables, write the JSON and the pictures."""
-    given = {name: getattr(options, name) for name in ("folder", "jaw", "minutes")}
+    given = {name: getattr(options, name) for name in ("folder", "jaw", "minutes", "count", "model")}
     given = {name: value for name, value in given.items() if value is not None}
     machine, content = describe_machine(), {}
     for number, part in enumerate(select_parts(options.parts or ("solvers" if given else None))):

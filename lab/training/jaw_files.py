@@ -3,7 +3,7 @@
 The fingers are those of the validation's seeds. Each is written as a section alone, and its jaw file is made of that as
 a user's would be: what `finforce jaw` refuses is left out, and named. Grasps of them, from images to forces:
 
-    python -m lab.benchmarks.images RECORDINGS --scenes cylinder --jaws FOLDER/*.yaml
+    finforce bench RECORDINGS --parts images --quick --jaw FOLDER/a.yaml,FOLDER/b.yaml
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ import pytest
 from finforce_driver.machine.exchange import Exchange
 from finforce_driver.machine.knowledge import ReplyFilter
 from finforce_sim.emulator.faults import FaultKind
-from lab.benchmarks.driver_faults import FaultRun, choose_kinds
+from lab.bench.driver_faults import FaultRun, choose_kinds
 
 
 def total(tally):

@@ -55,6 +55,25 @@ def make_recording(name="case", *, frames=60, keypoints=4, phases=True, truth=Tr
     )
 
 
+def pack_mcap(bag, path, compression):
+    """Write the messages of a bag to an mcap file as rosbag2 does: chunks with checksums."""
+    from mcap.writer import CompressionType, Writer
+    from rosbags.rosbag2 import Reader
+
+    kinds = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
+    with Reader(bag) as reader, path.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 16, compression=kinds[compression])
+        writer.start("ros2", "test")
+        channels = {}
+        for each in reader.connections:
+            schema = writer.register_schema(each.msgtype, "ros2msg", each.msgdef.data.encode())
+            channels[each.id] = writer.register_channel(each.topic, "cdr", schema)
+        for each, time, data in reader.messages():
+            writer.add_message(channels[each.id], time, bytes(data), time)
+        writer.finish()
+    return path
+
+
 def make_poses(stamps):
     """Poses that do not move."""
     count = len(stamps)

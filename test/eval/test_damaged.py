@@ -4,12 +4,11 @@ import struct
 
 import numpy as np
 import pytest
-from eval_fakes import make_recording
+from eval_fakes import make_recording, pack_mcap
 
 from finforce_eval.errors import DamagedError, OutOfBoundsError, RecordingError
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
-from lab.benchmarks.fuzz_files import pack_mcap
 
 KINDS = [("mcap", ""), ("mcap", "lz4"), ("mcap", "zstd"), ("sqlite3", "")]
 CHUNK = 0x06

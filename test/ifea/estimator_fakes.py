@@ -1,6 +1,6 @@
 """Recordings of a pressed bench finger: shapes and forces of an independent program, with seeded camera noise.
 
-data/pressed_bench.npz is described in test_truth.py.
+lab/data/pressed_bench.npz is described in test_truth.py.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from finforce_ifea.observation import Contact, ObjectOutline, Observation, Solut
 from finforce_ifea.settings import EstimatorSettings
 
 PERIOD = 1 / 30
-TRUTH = np.load(Path(__file__).parents[1] / "data" / "pressed_bench.npz")
+TRUTH = np.load(Path(__file__).parents[2] / "lab" / "data" / "pressed_bench.npz")
 PLACES = {20: "lower", 40: "middle", 60: "upper"}
 # The modulus of the truth; the mechanics is 2 % off on the average, see test_truth.py.
 CALIBRATION = Calibration(young_modulus=MODULUS, force_error=0.02)

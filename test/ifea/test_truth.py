@@ -1,6 +1,6 @@
 """The mechanics beside an independent finite element program: nine cylinders pressed on the bench finger.
 
-data/pressed_bench.npz holds key points [mm] and forces [N] of CalculiX 2.20 (20-node hexahedra, large displacement,
+lab/data/pressed_bench.npz holds key points [mm] and forces [N] of CalculiX 2.20 (20-node hexahedra, large displacement,
 frictionless contact, St. Venant-Kirchhoff, E = 30 MPa, nu = 0.45) at depths of 1 to 10 mm, for cylinders of 15, 25 and
 35 mm at heights of 20, 40 and 60 mm. The bounds are what was measured, rounded up.
 """
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mechanics_fakes import BENCH, HEIGHTS, bench_mechanics, bench_press
 
-TRUTH = np.load(Path(__file__).parents[1] / "data" / "pressed_bench.npz")
+TRUTH = np.load(Path(__file__).parents[2] / "lab" / "data" / "pressed_bench.npz")
 CASES = [(diameter, place) for diameter in (15, 25, 35) for place in HEIGHTS]
 DEPTHS = tuple(range(1, 11))
 # Largest error of the force's magnitude [%] over all depths.

@@ -1,6 +1,4 @@
-"""Ten thousand grasps by force in which something goes wrong, judged by the true force on the object.
-
-    python -m lab.benchmarks.grasp_faults [--cases 10000] [--seed 1] [--jobs 1] [--json report/grasp_faults.json]
+"""Grasps by force in which something goes wrong, judged by the true force on the object.
 
 Each case is one grasp of 1 to 5 N on fingers of 0.3 to 1.3 N/mm, on either firmware variant in stepped time: up to six
 random faults on the line, in the gripper or of its cable; in most cases a camera that is blind, freezes, dies, lags,
@@ -17,19 +15,15 @@ reads low, jumps or speaks nonsense for a while; and a user who stops, presses t
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 from collections import Counter
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from random import Random
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from tqdm import tqdm
 
 from finforce_driver.errors import BackOffError, DriverError, GripperTimeoutError
@@ -37,10 +31,10 @@ from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import hold_force
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
 from finforce_driver.state import GripperState, MoveOutcome, Phase
-from finforce_eval.machine import describe_machine, write_figures
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.faults import FaultKind, PlannedFault
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
+from lab.harness import Figures
 
 LIMIT = GraspSettings().force_limit  # [N]
 FAULTS_FROM, PERIOD, MOST = 1.2, 0.5, 6  # [s], [s], faults of the line and the gripper
@@ -56,6 +50,29 @@ CREEP = 2.2  # [counts] of closing that are none
 _LEFT_OUT = (FaultKind.OTHER_MASTER, FaultKind.STUCK, FaultKind.SLIPPING)
 KINDS = tuple(kind for kind in FaultKind if kind not in _LEFT_OUT)
 CAMERA = ("sound", "blind", "frozen", "dead", "slow", "low", "jumping", "nonsense", "negative")
+
+
+COMPLAINTS = ("pressed", "holds something else", "ready in motion", "motion after stop", "not told")
+
+
+def measure(quick: bool, count: int = 10_000) -> Figures:
+    """Return what came of many grasps.
+
+    Args:
+        quick: 50 grasps.
+        count: grasps.
+    """
+    tally = play_all(50 if quick else count)
+    plain = tally.plain()
+    rows = [{"complaint": name, "n": tally.complaints[name]} for name in COMPLAINTS]
+    ends = [{"end": words, "n": number} for words, number in tally.ends.most_common()]
+    excess = ", ".join(f"{name} {value:.2f}" for name, value in plain["excess"].items())
+    notes = [
+        f"{tally.cases} grasps, {tally.faults.total()} faults. True force beyond the set one [N]: {excess}.",
+        f"Seeds with a complaint: {', '.join(map(str, tally.wrong)) or 'none'}.",
+    ]
+    tables = {"grasp_faults": pd.DataFrame(rows), "ends": pd.DataFrame(ends)}
+    return Figures(tables=tables, notes=notes, more={"tally": plain})
 
 
 class FaultyCamera:
@@ -131,16 +148,21 @@ class GraspTally:
         self.wrong += other.wrong
         self.excess += other.excess
 
+    def plain(self) -> dict[str, Any]:
+        """Return counts by what they count, and percentiles of the excess [N]."""
+        found = {name: dict(value) if isinstance(value, Counter) else value for name, value in vars(self).items()}
+        values = np.quantile(self.excess, (0.5, 0.95, 0.99, 1.0)).tolist()
+        return {**found, "excess": dict(zip(("median", "p95", "p99", "max"), values, strict=True))}
+
 
 class FaultyGrasp(World):
     """One grasp in which something goes wrong.
 
     Args:
         seed: of everything random.
-        tracing: print what is wrong.
     """
 
-    def __init__(self, seed: int, tracing: bool = False) -> None:
+    def __init__(self, seed: int) -> None:
         self._draw = draw = Random(seed)
         stiffness, rise = draw.choice(((300.0, 1.0), (700.0, 1.0), (1300.0, 1.0), (400.0, 3.0)))
         goal, variant = draw.uniform(1.0, 5.0), draw.choice(("new", "old"))
@@ -151,7 +173,7 @@ class FaultyGrasp(World):
         camera = FaultyCamera(draw.choice(CAMERA), (start, start + draw.uniform(0.1, 3.0)), seed)
         super().__init__(case, camera, None, self._plan(draw))
         self.tally = GraspTally(cases=1)
-        self._camera, self._tracing, self._seed = camera, tracing, seed
+        self._camera, self._seed = camera, seed
         self._act = draw.choice(("stop", "stop", "estop", "none", "none", "none"))
         self._act_at = draw.uniform(0.1, 4.0)
         self._began = self._ended = math.nan
@@ -253,10 +275,7 @@ class FaultyGrasp(World):
         self._least = opening if self._least == math.inf else self._least
 
     def _complain(self, what: str) -> None:
-        if self._tracing and what not in self.tally.complaints:
-            print(f"{self._seed} {self.clock.now():.3f} {what}: true {self.force:.2f} N, {self._camera.kind}")
-            print(f"   {self._case} {self._camera.span} began {self._began:.2f} ended {self._ended:.2f}")
-            print(f"   {self.gripper.state}\n   {self.adapter.injected}")
+        """Count a complaint once a grasp."""
         self.tally.complaints[what] = 1
 
     @staticmethod
@@ -272,56 +291,10 @@ class FaultyGrasp(World):
         ]
 
 
-def play(seed: int, tracing: bool = False) -> GraspTally:
-    """Return what came of one grasp."""
-    with np.errstate(all="ignore"):
-        return FaultyGrasp(seed, tracing).play()
-
-
-def play_all(cases: int, seed: int, jobs: int) -> GraspTally:
-    """Return what came of many, under a progress bar."""
+def play_all(cases: int, seed: int = 1) -> GraspTally:
+    """Return what came of many grasps."""
     tally = GraspTally()
-    for one in tqdm(_results(range(seed, seed + cases), jobs), total=cases, disable=None, leave=False):
-        tally.add(one)
+    with np.errstate(all="ignore"):
+        for number in tqdm(range(seed, seed + cases), unit="grasp", disable=None, leave=False):
+            tally.add(FaultyGrasp(number).play())
     return tally
-
-
-def _results(seeds: range, jobs: int) -> Iterator[GraspTally]:
-    if jobs == 1:
-        yield from map(play, seeds)
-        return
-    with ProcessPoolExecutor(jobs) as pool:
-        yield from pool.map(play, seeds, chunksize=20)
-
-
-def main() -> int:
-    """Run, print, write; a complaint makes it fail."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--trace", action="store_true", help="print what is wrong")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    if options.trace:
-        for seed in range(options.seed, options.seed + options.cases):
-            play(seed, tracing=True)
-        return 0
-    tally = play_all(options.cases, options.seed, options.jobs)
-    excess = np.quantile(tally.excess, (0.5, 0.95, 0.99, 1.0))
-    names = ("pressed", "holds something else", "ready in motion", "motion after stop", "not told")
-    print(f"{tally.cases} grasps, {sum(tally.faults.values())} faults, cameras: {dict(tally.cameras)}")
-    print("\n".join(f"{name:22s} {tally.complaints[name]}" for name in names))
-    print("true force beyond the set one: median {:.2f}, p95 {:.2f}, p99 {:.2f}, largest {:.2f} N".format(*excess))
-    print("ends:", "; ".join(f"{count} {words}" for words, count in tally.ends.most_common(12)))
-    machine = describe_machine()
-    print(f"{machine['processor']}, {machine['commit']}")
-    if options.json:
-        figures = {name: dict(value) if isinstance(value, Counter) else value for name, value in vars(tally).items()}
-        figures["excess"] = dict(zip(("median", "p95", "p99", "max"), excess.tolist(), strict=True))
-        write_figures(options.json, {"seed": options.seed, **figures})
-    return int(bool(tally.complaints))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,26 +1,23 @@
-"""Ten thousand random faults between the gripper driver and an emulated gripper: wrong states, hangs, crashes, motion.
-
-    python -m lab.benchmarks.driver_faults [--json report/driver_faults.json] [--faults 10000] [--seed 1]
+"""Random faults between the gripper driver and an emulated gripper: wrong states, hangs, crashes, motion.
 
 Driver and gripper live in stepped time, in runs of 100 faults of every kind that the emulator can inject, on both
 firmware variants and with adapters of different latencies, while a user moves, holds, stops, clears and calibrates at
-random and objects come and go. Every state that the driver reports is compared with the truth (`Oracle`),
-every order that leaves with what was asked for. At the end of a run the faults cease, and the gripper has to get back
-to work.
+random and objects come and go. Every state that the driver reports is compared with the truth (`Oracle`), every order
+that leaves with what was asked for (`Guard`). At the end of a run the faults cease, and the gripper has to get back to
+work.
 """
 
 from __future__ import annotations
 
-import argparse
 import logging
 import math
-import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Any
 
+import pandas as pd
 from tqdm import tqdm
 
 from finforce_driver.can.bus import CanMessage
@@ -31,13 +28,13 @@ from finforce_driver.machine.machine import INHERITED
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_driver.units import GripperScale
-from finforce_eval.machine import describe_machine, write_figures
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, draw_plan
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 from finforce_sim.emulator.mechanism import Jaws
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
+from lab.harness import Figures
 
 PER_RUN = 100
 PERIOD = 0.4  # [s] in which one fault is injected
@@ -46,6 +43,41 @@ STANDSTILL = 200  # turns without time passing: a hang
 RECOVERY_TIME = 120.0  # [s] in which the gripper has to work again: a calibration may fail after 35 s and be repeated
 SPEEDS = (0.002, 0.004, 0.02, 0.1, 0.3)  # [m/s]
 LATENCIES = (0.0003, 0.001, 0.003, 0.012)  # [s]
+
+
+def measure(quick: bool, count: int = 10_000) -> Figures:
+    """Return what came of many faults.
+
+    Args:
+        quick: 300 faults.
+        count: faults.
+    """
+    tally = run_all(300 if quick else count)
+    plain = tally.plain()
+    counted = {
+        "faults injected": plain["faults"],
+        "states compared": plain["phases"],
+        "moves judged": plain["outcomes"],
+        "orders sent": tally.orders,
+        "wrong states": plain["wrong"],
+        "unintended orders": plain["motion"],
+        "hangs": tally.hangs,
+        "crashes": plain["crashes"],
+        "not back to work": tally.unrecovered,
+        "against good practice": plain["violations"],
+    }
+    rows = [
+        {
+            "what": what,
+            "n": sum(found.values()) if isinstance(found, dict) else found,
+            "which": ", ".join(f"{key} {number}" for key, number in found.items()) if isinstance(found, dict) else "",
+        }
+        for what, found in counted.items()
+    ]
+    worst = ", ".join(f"{name} {value:.3f}" for name, value in tally.worst.items())
+    return Figures(
+        tables={"driver_faults": pd.DataFrame(rows)}, notes=[f"Largest differences: {worst}."], more={"tally": plain}
+    )
 
 
 class _Complaints(logging.Handler):
@@ -67,13 +99,11 @@ class FaultRun:
         seed: of everything random.
         count: number of faults.
         kinds: of faults.
-        tracing: print what happens.
     """
 
-    def __init__(self, seed: int, count: int, kinds: Sequence[FaultKind], tracing: bool = False) -> None:
+    def __init__(self, seed: int, count: int, kinds: Sequence[FaultKind]) -> None:
         self.tally = FaultTally()
         self._random = Random(seed)
-        self._tracing = tracing
         self._until = START + count * PERIOD
         self.clock, self.emulated = VirtualClock(), EmulatedGripper(("new", "old")[seed % 2])
         sound = EmulatedAdapter(
@@ -104,8 +134,6 @@ class FaultRun:
             self.adapter.replug()
             self._recover()
         except Exception as error:
-            if self._tracing:
-                raise
             self.tally.crashes[f"{type(error).__name__}: {error}"] += 1
         finally:
             logging.getLogger("finforce_driver").removeHandler(complaints)
@@ -188,13 +216,8 @@ class FaultRun:
         self.tally.phases[state.phase.value] += 1
         if state.outcome is not self.oracle.outcome:
             self.tally.outcomes[state.outcome.value] += 1
-        complaints = self.oracle.check(state, self._goal, self._stopped, self._clearing)
+        self.tally.wrong.update(self.oracle.check(state, self._goal, self._stopped, self._clearing))
         self._clearing &= state.estopped or self._stopped
-        self.tally.wrong.update(complaints)
-        if self._tracing and complaints:
-            print(
-                f"{self.clock.now():.3f} {complaints} {state}\n   {self.tape.truths[-1]} {self.adapter.injected[-3:]}"
-            )
 
     def _watch_message(self, message: CanMessage) -> None:
         """Check a message that leaves."""
@@ -203,10 +226,7 @@ class FaultRun:
             goal = self.gripper.scale.counts_of(self._goal) if self._allowed else None
             # jaws that move by somebody's order when a link comes up are held where they are, as documented
             allowed = self._allowed or self.gripper.state.message == INHERITED
-            complaints = self.guard.check(decode_move(message), goal, self._stopped, allowed)
-            self.tally.motion.update(complaints)
-            if self._tracing and complaints:
-                print(f"{self.clock.now():.3f} {complaints} {decode_move(message)} {self.gripper.state}")
+            self.tally.motion.update(self.guard.check(decode_move(message), goal, self._stopped, allowed))
         self._send(message)
 
     def _recover(self) -> None:
@@ -229,8 +249,6 @@ class FaultRun:
             except DriverError:
                 continue
         self.tally.unrecovered += 1
-        if self._tracing:
-            print("unrecovered", self.gripper.state)
 
     def _works(self) -> bool:
         """Return whether a move reaches its goal."""
@@ -247,7 +265,7 @@ def choose_kinds(seed: int) -> tuple[FaultKind, ...]:
     return tuple(LINE_FAULTS) if seed % 3 == 0 else tuple(FaultKind)
 
 
-def run_all(faults: int, seed: int) -> FaultTally:
+def run_all(faults: int, seed: int = 1) -> FaultTally:
     """Return the tally of enough runs for a number of faults."""
     tally = FaultTally()
     with tqdm(total=faults, disable=None, leave=False) as bar:
@@ -256,27 +274,6 @@ def run_all(faults: int, seed: int) -> FaultTally:
             tally.add(run.run())
             bar.update(PER_RUN)
     return tally
-
-
-def main() -> None:
-    """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--faults", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--trace", action="store_true", help="one run with all that is wrong in it")
-    parser.add_argument("--json")
-    options = parser.parse_args()
-    if options.trace:
-        print_tally(FaultRun(options.seed, PER_RUN, choose_kinds(options.seed), tracing=True).run())
-        return
-    began = time.perf_counter()
-    tally = run_all(options.faults, options.seed)
-    print_tally(tally)
-    machine = describe_machine()
-    print(f"{time.perf_counter() - began:.0f} s on {machine['processor']}, {machine['commit']}")
-    if options.json:
-        figures = {name: tally_json(value) for name, value in vars(tally).items()}
-        write_figures(options.json, {"seed": options.seed, **figures})
 
 
 WINDOW = 0.06  # [s] a reply may be as old as its time-out, and is stamped when it comes
@@ -519,26 +516,9 @@ class FaultTally:
         for name, value in other.worst.items():
             self.worst[name] = max(self.worst.get(name, 0.0), value)
 
-
-def tally_json(value: Any) -> Any:
-    """Return a count, or counts by what they count in words."""
-    return {str(key): number for key, number in value.items()} if isinstance(value, dict) else value
-
-
-def print_tally(tally: FaultTally) -> None:
-    """Print what came out."""
-    print(f"faults injected          {sum(tally.faults.values()):>8}  {dict(tally.faults.most_common())}")
-    print(f"states compared          {tally.states:>8}  {dict(tally.phases)}")
-    print(f"moves judged                       {dict(tally.outcomes)}")
-    print(f"orders sent              {tally.orders:>8}")
-    print(f"wrong states             {sum(tally.wrong.values()):>8}  {dict(tally.wrong)}")
-    print(f"unintended orders        {sum(tally.motion.values()):>8}  {dict(tally.motion)}")
-    print(f"hangs                    {tally.hangs:>8}")
-    print(f"crashes                  {sum(tally.crashes.values()):>8}  {dict(tally.crashes)}")
-    print(f"not back to work         {tally.unrecovered:>8}")
-    print(f"largest differences                { ({name: round(value, 3) for name, value in tally.worst.items()}) }")
-    print(f"against good practice              {dict(tally.violations)}")
-
-
-if __name__ == "__main__":
-    main()
+    def plain(self) -> dict[str, Any]:
+        """Return counts, or counts by what they count in words, by name."""
+        return {
+            name: {str(key): number for key, number in value.items()} if isinstance(value, dict) else value
+            for name, value in vars(self).items()
+        }

@@ -1,0 +1,103 @@
+"""From images to forces on twin scenes that no network was trained on, beside true key points.
+
+The scenes are recorded into a folder once and read again later. Every seed has its own textures, lights, background and
+noise; the finger is the one of the calibration `twin`. Another jaw than `bench` is found by the network of any finger
+and calibrated with true key points on the same recording: what images add is then what the key points add.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from finforce.errors import FinforceError
+from finforce_eval.cli.main import main as finforce
+from lab.bench.detection import sight_columns, time_product
+from lab.bench.scenes import BENCH, FIRST_SEED, UNSEEN, record_unseen, scene_folder
+from lab.harness import Figures
+
+QUICK_SCENE = "cylinder"
+
+
+def measure(
+    quick: bool, folder: Path | str | None = None, jaw: str = BENCH, count: int = 1, model: str = ""
+) -> Figures:
+    """Return pixel errors and force errors of every scene, seed and jaw.
+
+    Args:
+        quick: one scene.
+        folder: of the recordings; that of rendered scenes in the user's cache without one.
+        jaw: shipped jaws or jaw files, separated by commas.
+        count: seeds of each scene.
+        model: folder of another network than the shipped one.
+    """
+    folder = Path(folder) if folder else scene_folder() / "unseen"
+    folder.mkdir(parents=True, exist_ok=True)
+    scenes = [QUICK_SCENE] if quick else list(UNSEEN)
+    rows, notes = [], []
+    for scene, name, seed in product(scenes, jaw.split(","), range(FIRST_SEED, FIRST_SEED + count)):
+        about = {"scene": scene, "jaw": Path(name).stem, "seed": seed}
+        try:
+            rows.append(about | measure_scene(record_unseen(scene, seed, folder, name), name, model))
+        except FinforceError as error:  # a finger that cannot be used is a finding, too
+            notes.append(f"{' '.join(map(str, about.values()))}: {error}")
+    product_ms = 1e3 * float(np.median([time_product() for _ in range(25)]))
+    meaning = (
+        "True, image: RMSE of the force with key points that are true and that were found; late: from 0.02 N of true "
+        f"force to an estimate above 0.1 N. A product of two matrices of 512 x 512 takes {product_ms:.2f} ms here."
+    )
+    return Figures(tables={"images": pd.DataFrame(rows)}, notes=[meaning, *notes])
+
+
+def measure_scene(bag: Path, jaw: str, model: str) -> dict[str, Any]:
+    """Return the errors of the key points in images, and of the forces with these and with true ones.
+
+    Raises:
+        FinforceError: the jaw cannot be calibrated there, or no force is told.
+    """
+    words = ["--jaw", jaw, "--calibration", calibrate(bag, jaw)]
+    images = evaluate(bag, "images", [*words, *(["--detector", f"model={model}"] if model else [])])
+    true, found = evaluate(bag, "truth", words)["all"]["rmse_N"], images["all"]["rmse_N"]
+    return {
+        **sight_columns(images["sight"]),
+        "true/N": true,
+        "image/N": found,
+        "added/N": found - true,
+        "solved/%": 100.0 * (1.0 - images["record_skipped"] / images["record_frames"]),
+        "detector p50/ms": images["detector_ms"]["p50"],
+        "detector p95/ms": images["detector_ms"]["p95"],
+        "late/ms": (images["delay"] or {}).get("median_ms") or np.nan,
+    }
+
+
+def evaluate(bag: Path, source: str, words: Sequence[str]) -> dict[str, Any]:
+    """Return what `finforce evaluate` tells of a recording by key points of a source.
+
+    Raises:
+        FinforceError: it tells no force.
+    """
+    answer = bag / f"{source}.json"
+    answer.unlink(missing_ok=True)
+    if finforce(["evaluate", str(bag), "--from", source, "--json", str(answer), *words]) != 0:
+        raise FinforceError(f"{bag.name}: no force with key points from {source}")
+    return json.loads(answer.read_text(encoding="utf-8"))["all"]
+
+
+def calibrate(bag: Path, jaw: str) -> str:
+    """Return the calibration of a jaw in a recording: the twin's own, or a file made there by true key points.
+
+    Raises:
+        FinforceError: it cannot be calibrated.
+    """
+    if jaw == BENCH:
+        return "twin"
+    file = bag / "calibration.yaml"
+    if not file.exists() and finforce(["calibrate", str(bag), "--jaw", jaw, "--from", "truth", "-o", str(file)]) != 0:
+        raise FinforceError(f"{bag.name}: {jaw} cannot be calibrated there")
+    return str(file)

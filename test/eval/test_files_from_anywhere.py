@@ -1,0 +1,189 @@
+"""Claims about files from anywhere: damaged ones are read or refused, harmful ones are refused."""
+
+import functools
+import os
+import shutil
+import sqlite3
+import struct
+import zlib
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from eval_fakes import make_recording, pack_mcap
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+import finforce_ifea
+import finforce_keypoints
+from finforce.errors import FinforceError
+from finforce_contact.mesh.object_mesh import load_object_mesh
+from finforce_eval.recordings.image_files import read_depth, read_image, read_intrinsics
+from finforce_eval.recordings.recording import read_recording
+from finforce_eval.recordings.writer import write_recording
+from finforce_ifea.jaw.calibration import load_calibration
+from finforce_ifea.jaw.jaw import load_jaw
+from finforce_keypoints.networks.metadata import read_metadata
+
+JAWS, MODELS = Path(finforce_ifea.__file__).parent / "jaw", Path(finforce_keypoints.__file__).parent / "models"
+BOX = trimesh.creation.box((0.03, 0.04, 0.05))
+
+
+def make_image(path):
+    Image.effect_noise((64, 48), 40).convert("RGB").save(path)
+
+
+def make_bag(path, compression):
+    pack_mcap(write_recording(make_recording(frames=200), path.parent / "plain"), path, compression)
+
+
+def make_database(path):
+    plain = write_recording(make_recording(frames=200), path.parent / "plain", storage="sqlite3")
+    shutil.copyfile(next(plain.glob("*.db3")), path)
+
+
+def make_depth(path):
+    np.save(path, np.full((12, 16), 0.3, np.float32))
+
+
+def copy_of(source):
+    return functools.partial(shutil.copyfile, source)
+
+
+# name of the file: what makes a good one, what reads it
+FILES = {
+    "plain.mcap": (functools.partial(make_bag, compression=""), read_recording),
+    "zstd.mcap": (functools.partial(make_bag, compression="zstd"), read_recording),
+    "bag.db3": (make_database, read_recording),
+    "jaw.yaml": (copy_of(JAWS / "jaws" / "bench.yaml"), load_jaw),
+    "calibration.yaml": (copy_of(JAWS / "calibrations" / "bench.yaml"), load_calibration),
+    "pytorch_config.yaml": (copy_of(MODELS / "plane" / "pytorch_config.yaml"), read_metadata),
+    "box.stl": (BOX.export, load_object_mesh),
+    "box.ply": (BOX.export, load_object_mesh),
+    "box.obj": (BOX.export, load_object_mesh),
+    "image.png": (make_image, read_image),
+    "image.jpg": (make_image, read_image),
+    "depth.npy": (make_depth, read_depth),
+    "k.json": (
+        lambda path: path.write_text('{"fx": 430.0, "fy": 430.0, "cx": 320.0, "cy": 240.0, "D": [0, 0, 0, 0, 0]}'),
+        lambda path: read_intrinsics([str(path)], (480, 640)),
+    ),
+}
+PLACE = st.floats(0.0, 1.0, exclude_max=True)
+CHANGES = st.lists(
+    st.one_of(
+        st.tuples(st.just("set"), PLACE, st.binary(min_size=1, max_size=8)),
+        st.tuples(st.just("insert"), PLACE, st.binary(min_size=1, max_size=40)),
+        st.tuples(st.sampled_from(("cut", "drop", "double")), PLACE, st.just(b"")),
+    ),
+    min_size=1,
+    max_size=3,
+)
+
+
+def damage(content, changes):
+    """Return bytes with changes, each at its share of the length."""
+    for kind, share, data in changes:
+        at = int(share * len(content))
+        part = content[at : at + max(1, len(content) // 20)]
+        rest = {
+            "set": data + content[at + len(data) :],
+            "insert": data + content[at:],
+            "cut": b"",
+            "drop": content[at + len(part) :],
+            "double": part + content[at:],
+        }[kind]
+        content = content[:at] + rest
+    return content
+
+
+@pytest.fixture(scope="module", params=FILES)
+def good(request, tmp_path_factory):
+    """A good file that can be read, its content, and what reads it."""
+    make, read = FILES[request.param]
+    path = tmp_path_factory.mktemp("good") / request.param
+    make(path)
+    read(path)
+    return path, path.read_bytes(), read
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(changes=CHANGES)
+def test_a_damaged_file_is_read_or_refused(good, changes):
+    path, content, read = good
+    path.write_bytes(damage(content, changes))
+    try:
+        read(path)
+    except FinforceError as error:
+        assert str(error)
+
+
+def make_endless_view(path, table):
+    """Write a database whose messages never end, or hold a gigabyte."""
+    endless = (
+        "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i+1 FROM n) SELECT i id, 1 topic_id, i timestamp FROM n"
+    )
+    with closing(sqlite3.connect(path)) as base:
+        base.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT,"
+            " offered_qos_profiles TEXT, type_description_hash TEXT);"
+            "INSERT INTO topics VALUES (1, '/left/keypoints', 'x', 'cdr', '', '');" + table.format(endless=endless)
+        )
+
+
+def make_png(path, side):
+    """Write a picture that announces more pixels than it holds."""
+
+    def part(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    head = part(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
+    data = part(b"IDAT", zlib.compress(bytes(1 << 20), 9))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + head + data + part(b"IEND", b""))
+
+
+def make_pickle(path):
+    np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+
+
+ALIASES = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{name}: &{name} [{','.join(['*' + before] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+HARMFUL = {
+    "aliases.yaml": (lambda path: path.write_text(ALIASES), load_jaw),
+    "nested.yaml": (lambda path: path.write_text("a: " + "[" * 5000 + "]" * 5000), load_calibration),
+    "object.yaml": (lambda path: path.write_text("!!python/object/apply:os.system ['true']"), load_calibration),
+    "nested.json": (lambda path: path.write_text('{"fx":' * 100_000 + "1" + "}" * 100_000), FILES["k.json"][1]),
+    "view.db3": (lambda path: make_endless_view(path, "CREATE VIEW messages AS {endless}"), read_recording),
+    "computed.db3": (
+        lambda path: make_endless_view(
+            path,
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
+            " data BLOB AS (zeroblob(1000000000))); INSERT INTO messages(topic_id, timestamp) VALUES (1, 1)",
+        ),
+        read_recording,
+    ),
+    "length.mcap": (
+        lambda path: path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, 1 << 63) + bytes(100)),
+        read_recording,
+    ),
+    "huge.png": (functools.partial(make_png, side=100_000), read_image),
+    "pickle.npy": (make_pickle, read_depth),
+}
+
+
+@pytest.mark.parametrize("name", HARMFUL)
+def test_a_harmful_file_is_refused(tmp_path, name):
+    make, read = HARMFUL[name]
+    make(tmp_path / name)
+    with pytest.raises(FinforceError):
+        read(tmp_path / name)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "jaw.yaml")
+    with pytest.raises(FinforceError):
+        load_jaw(tmp_path / "jaw.yaml")
