@@ -71,8 +71,9 @@ class Health:
         self._last: Outcome | None = None
         self._arrived = self._published = 0
 
-    def arrive(self, superseded: int = 0) -> None:
-        """Count a message that arrived, and those that a newer one had overtaken."""
+    def arrive(self, superseded: int = 0, source: str = "") -> None:
+        """Count a message that arrived, those that a newer one had overtaken, and keep where it came from."""
+        self.source = source or self.source
         self._arrived += 1 + superseded
         self._arrivals.append(monotonic())
         self._refused["superseded"] += superseded

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from threading import RLock
@@ -15,7 +15,7 @@ from finforce.camera import ImageError
 from finforce.errors import FinforceError, MissingDependencyError, ObservationError
 from finforce.messages import check_cloud, decode_keypoints, pose_from_message, stamp_of, wrench_from_message
 from finforce.ros import node as ros
-from finforce.skipping import CONTACT, LATE, RESTING, Skips
+from finforce.skipping import CONTACT, RESTING, Skips
 from finforce.stamps import SECOND
 from finforce_contact.camera_feed import DepthFeed, StampedPose
 from finforce_contact.errors import ReconstructionError
@@ -321,29 +321,14 @@ def subscribe(
 
 
 def _subscribe_camera(qos: ros.QosWatch, session: ContactSession, handlers: Handlers) -> None:
-    """Subscribe to the images in which the object is found; an image that a newer one overtook is passed over."""
+    """Subscribe to the images in which the object is found."""
     take_info, group = partial(handlers.on_image, session.take_camera), handlers.camera_group
     qos.subscription(ros.CameraInfo, f"{CAMERA}/color/camera_info", take_info, ros.SENSOR, callback_group=group)
     for topic, take in (
         ("object_mask", session.take_mask),
         (f"{CAMERA}/aligned_depth_to_color/image_raw", session.take_depth),
     ):
-        _subscribe_newest(qos, topic, partial(handlers.on_image, take), handlers)
-
-
-def _subscribe_newest(
-    qos: ros.QosWatch, topic: str, take: Callable[[Any], Awaitable[None]], handlers: Handlers
-) -> None:
-    """Subscribe to the newest of the images on a topic."""
-    skips = handlers.skips
-
-    async def on_image(message: Any) -> None:
-        if skips.allows(LATE):
-            message, late = ros.take_newest(images.current, message)
-            skips.count(LATE, late)
-        await take(message)
-
-    images = ros.LargeSubscription(qos, ros.Image, topic, on_image, callback_group=handlers.camera_group)
+        ros.LargeSubscription(qos, ros.Image, topic, partial(handlers.on_image, take), callback_group=group)
 
 
 def detections_type() -> type:

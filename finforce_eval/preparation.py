@@ -106,7 +106,7 @@ def compile_detector() -> None:
     for network in (BENCH, ANY_FINGER):
         parameters = DetectorParameters(model=str(network))
         with suppress(MissingDependencyError):  # without its library it is not used either
-            build_detector(load_jaws(parameters), parameters).detector.warm_up()
+            build_detector(load_jaws(parameters), parameters).warm_up()
 
 
 # The longest first.

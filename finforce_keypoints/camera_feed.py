@@ -13,17 +13,16 @@ from finforce.camera import CameraIntrinsics, ImageError
 from finforce.messages import camera_from_info, check_frame, color_from_image, depth_from_image, same_camera, stamp_of
 from finforce.stamps import SECOND, Synchronizer
 from finforce_keypoints.errors import SyncError
-from finforce_keypoints.images import ImagePair, ImageWatch, RgbdImage, check_image
+from finforce_keypoints.images import ImagePair, RgbdImage
 from finforce_keypoints.parameters import ALIGNED, AUTO, NO_DEPTH, DetectorParameters
 
 SILENCE = 1.0  # s without an image, after which another colour topic may be the camera's
 COLOR, DEPTH = "color", "depth"
 WAITING = 3  # colour images that may wait for their depth: a tenth of a second at 30 Hz
-PROMPT = 5  # images in a row whose depth came in time, after which that is expected of the next one
 
 
 class RgbdFeed:
-    """Brings the images of a camera together by their stamps, the newest first, and refuses what no camera sees.
+    """Brings the images of a camera together by their stamps, the newest first.
 
     A colour image waits for its depth image; one that a newer whole image overtook is passed over. Where depth may be
     missing, the first image that waited in vain is taken alone, and so are those after it, until depth comes again. Of
@@ -35,7 +34,7 @@ class RgbdFeed:
         topic: the colour topic that is listened to, None before the first image.
 
     Args:
-        parameters: frame, topics, unit of depth and greatest distance of stamps.
+        parameters: frame, topics, unit of depth and maximum difference of stamps.
         clock: the time [s] of an arrival.
     """
 
@@ -45,14 +44,8 @@ class RgbdFeed:
         self.camera: CameraIntrinsics | None = None
         self.passed = 0
         self.topic: str | None = None
-        self._in_time = 0
         self._heard = clock()
         self.reset()
-
-    @property
-    def is_prompt(self) -> bool:
-        """Whether the depth of the last PROMPT colour images came before newer ones overtook them."""
-        return self._in_time >= PROMPT
 
     @property
     def source(self) -> str:
@@ -62,13 +55,7 @@ class RgbdFeed:
     def reset(self) -> None:
         """Forget all images; intrinsics and topic stay."""
         self._images = Synchronizer({COLOR: None, DEPTH: WAITING + 1}, self._tolerance)
-        self._read: tuple[Any, NDArray[np.uint8]] | None = None
         self._alone = self._parameters.depth == NO_DEPTH
-        self._forget_colors()
-
-    def _forget_colors(self) -> None:
-        self._images.reset(COLOR)
-        self._watch = ImageWatch(self._parameters.frozen_after)
 
     def take_info(self, info: Any) -> None:
         """Take a sensor_msgs/CameraInfo.
@@ -86,7 +73,7 @@ class RgbdFeed:
         now = self._clock()
         if self.topic != topic and (self.topic is None or now - self._heard > SILENCE):
             self.topic = topic
-            self._forget_colors()
+            self._images.reset(COLOR)
         if self.topic == topic:
             self._heard = now
         return self.topic == topic
@@ -108,7 +95,8 @@ class RgbdFeed:
         if self._parameters.depth == ALIGNED:
             raise self._missing_depth(waiting.popleft().stamp)
         self._alone = True
-        self.pass_over()
+        self.passed += len(waiting)
+        self._images.reset(COLOR)
         return ImagePair(stamp_of(message), message, None)
 
     def take_depth(self, message: Any) -> ImagePair | None:
@@ -123,54 +111,23 @@ class RgbdFeed:
         if pair is None:
             return None
         color, depth = pair
-        self._in_time += 1
-        waiting, overtaken = self._images.entries(COLOR), 0
+        waiting = self._images.entries(COLOR)
         while waiting.popleft() is not color:
-            overtaken += 1
-        self._count_passed(overtaken)
+            self.passed += 1
         return ImagePair(color.stamp, color.value, depth.value)
 
-    def pass_over(self) -> None:
-        """Forget the colour images that wait: one after them has been answered."""
-        self._count_passed(len(self._images.entries(COLOR)))
-        self._images.reset(COLOR)
-
-    def _count_passed(self, count: int) -> None:
-        """Note that so many colour images were overtaken while they waited."""
-        self.passed += count
-        if count:
-            self._in_time = 0
-
-    def read_color(self, message: Any) -> NDArray[np.uint8]:
-        """Return the colours (h, w, 3) of a colour image; the last one is decoded once, however often it is read.
-
-        Raises:
-            ObservationError: the frame is another one.
-            ImageError: the image cannot be used, or the intrinsics are not known yet.
-        """
-        if self.camera is None:
-            raise ImageError(f"images came, but no camera_info on {self._parameters.info_topic} yet")
-        if self._read is None or self._read[0] is not message:
-            check_frame(message, self._parameters.camera_frame, "the colour image")
-            self._read = message, color_from_image(message)
-        return self._read[1]
-
     def decode(self, pair: ImagePair) -> RgbdImage:
-        """Return the whole image of a pair after having refused what cannot be one.
+        """Return the image of a pair.
 
         Raises:
             ObservationError: a frame is another one.
             ImageError: the images cannot be used, or the intrinsics are not known yet.
         """
-        image = RgbdImage(
-            stamp=SECOND * pair.stamp,
-            color=self.read_color(pair.color),
-            depth=self._read_depth(pair.depth),
-            camera=self.camera,
-        )
-        check_image(image)
-        self._watch.check(image)
-        return image
+        if self.camera is None:
+            raise ImageError(f"images came, but no camera_info on {self._parameters.info_topic} yet")
+        check_frame(pair.color, self._parameters.camera_frame, "the colour image")
+        color, depth = color_from_image(pair.color), self._read_depth(pair.depth)
+        return RgbdImage(stamp=SECOND * pair.stamp, color=color, depth=depth, camera=self.camera)
 
     def _read_depth(self, message: Any) -> NDArray | None:
         """Return the depth (h, w) [m] of a depth image; None without one, or of an empty one that is not needed."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from finforce.health import Level, Outcome, Report
 
 if TYPE_CHECKING:
-    from finforce_keypoints.build import FinderCard
     from finforce_keypoints.camera_feed import RgbdFeed
+    from finforce_keypoints.detector import KeypointDetector
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
 LEAST_VISIBLE = 3  # key points; a solver gives no force with fewer
@@ -40,11 +40,11 @@ def report_of_rest(alarms: Sequence[Outcome], values: Mapping[str, str]) -> Repo
     return Report(level=level, message="; ".join([*said, "rests: nobody subscribes to the key points"]), values=values)
 
 
-def describe(feed: RgbdFeed, card: FinderCard, found: JawKeypoints | None) -> dict[str, str]:
-    """Return what is known of the camera, the finder and a jaw's last key points, as text."""
+def describe(feed: RgbdFeed, method: str, found: JawKeypoints | None) -> dict[str, str]:
+    """Return what is known of the camera, the pixel_detector and a jaw's last key points, as text."""
     camera = feed.camera
     known = {
-        "finder": card.name,
+        "detection_method": method,
         "colour images": feed.topic or "none yet",
         "camera": "no camera_info yet" if camera is None else f"{camera.width} x {camera.height}",
         "overtaken while waiting for depth": str(feed.passed),
@@ -66,13 +66,13 @@ def _describe_jaw(found: JawKeypoints) -> dict[str, str]:
     }
 
 
-def describe_names(names: Sequence[str], card: FinderCard) -> str:
+def describe_names(names: Sequence[str], detector: KeypointDetector) -> str:
     """Return, as JSON, what the rows of the key point clouds are, which of them to join, and who finds them."""
     said: Mapping[str, object] = {
         "names": list(names),
         "skeleton": build_skeleton(names),
-        "model": card.name,
-        "sha256": card.sha256,
+        "model": detector.name,
+        "sha256": detector.sha256,
     }
     return json.dumps(said)
 
@@ -95,9 +95,6 @@ def build_skeleton(names: Sequence[str]) -> list[list[int]]:
         pairs += [[one[number], other[number]] for number in sorted(one.keys() & other.keys())]
     return pairs
 
-
-if TYPE_CHECKING:
-    from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
 RADIUS = 4.0  # px
 COLORS = {  # by the reason why a key point is not used

@@ -17,7 +17,7 @@ class NamingError(KeypointError, ValueError):
 
 
 class DetectionError(KeypointError, ValueError):
-    """An image cannot be searched for key points with this finder."""
+    """An image cannot be searched for key points with this method."""
 
 
 class DetectorSettingsError(KeypointError, ValueError):

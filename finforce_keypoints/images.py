@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics, ImageError
 from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError
 
+FROZEN_AFTER = 2  # repetitions of a picture, to the bit, after which a camera counts as frozen
 _WATCHED_STEP = 8  # every so many rows and columns are looked at
 _DARKEST = 10  # of 255: a picture whose brightest hundredth is below this shows nothing
 _BRIGHTEST_PERCENT = 99.0
@@ -112,7 +113,7 @@ def _sum_tiles(values: NDArray) -> NDArray:
 class ImageWatch:
     """Notices a camera that gives black pictures, or the same one, or the same part of one, again and again."""
 
-    def __init__(self, frozen_after: int = 5) -> None:
+    def __init__(self, frozen_after: int = FROZEN_AFTER) -> None:
         """Keeps after how many identical pictures in a row the camera counts as frozen."""
         self._frozen_after = frozen_after
         self.reset()

@@ -1,4 +1,4 @@
-"""The parameters of a key point detector node, and what they name."""
+"""The parameters of a key point detector node and its settings."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.settings import TimeParameters, check_bounds, setting
+from finforce.skipping import IDLE, STILL
 from finforce.transforms import pose_from_quaternion, pose_numbers
 from finforce_keypoints.errors import DetectorSettingsError
 
@@ -20,80 +21,64 @@ CAMERA = "/camera/camera"
 COLOR_TOPIC, OLD_COLOR_TOPIC = f"{CAMERA}/color/image_raw", f"{CAMERA}/color/image_rect_raw"
 DEPTH_TOPIC = f"{CAMERA}/aligned_depth_to_color/image_raw"
 INFO_TOPIC = f"{CAMERA}/color/camera_info"
+RULES = (STILL, IDLE)  # of what is skipped
 DEPTHS = ALIGNED, AUTO, NO_DEPTH = ("aligned", "auto", "none")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorParameters(TimeParameters):
-    """What a key point detector node is told beside the settings of its parts; units stand in the metadata."""
+    """Parameters of a key point detector node, in addition to the settings of its parts."""
 
-    jaws: str = setting("both", "the jaws that are looked for", choices=("left", "right", "both"))
-    jaw_file: str = setting("bench", "jaw file, or the name of a shipped jaw")
-    camera_frame: str = setting("camera_color_optical_frame", "frame of the images and of the jaws' poses")
+    jaws: str = setting("both", "Jaws that are looked for", choices=("left", "right", "both"))
+    jaw_file: str = setting("bench", "Jaw file, or name of a shipped jaw")
+    camera_frame: str = setting("camera_color_optical_frame", "Frame of the images and of the jaw poses")
     T_gripper_camera: tuple[float, ...] = setting(
-        pose_numbers(ROBOT_CAMERA), "x, y, z [m], qx, qy, qz, qw of the colour camera in the gripper's frame"
+        pose_numbers(ROBOT_CAMERA), "Pose of the colour camera in the gripper frame: x, y, z [m], qx, qy, qz, qw"
     )
     color_topics: tuple[str, ...] = setting(
         (COLOR_TOPIC, OLD_COLOR_TOPIC),
-        "colour images; the first topic that brings one is used, until it is silent; .../compressed: jpeg or png",
+        "Colour image topics; the first one that brings an image is used until it is silent; .../compressed: jpeg, png",
         topic=True,
     )
-    depth_topic: str = setting(DEPTH_TOPIC, "depth images, aligned to the colour images", topic=True)
+    depth_topic: str = setting(DEPTH_TOPIC, "Topic of depth images, aligned to the colour images", topic=True)
     depth: str = setting(
         ALIGNED,
-        "aligned: every colour image needs its depth image; auto: one without is used alone; none: colour alone",
+        "Use of depth: aligned (required for every colour image), auto (used where there is some), none",
         choices=DEPTHS,
     )
-    info_topic: str = setting(INFO_TOPIC, "intrinsics of the colour camera", topic=True)
-    finder: str = setting(
+    info_topic: str = setting(INFO_TOPIC, "Topic of the colour camera's intrinsics", topic=True)
+    detection_method: str = setting(
         "network",
-        "what finds the key points: a network that sees the jaws' side planes (the shipped one), any DeepLabCut "
-        "network that sees the image, or printed dots without a network",
+        "Pixel detector: network (sees the rectified side planes; the shipped one), frame (a DeepLabCut network that "
+        "sees the image), dots (printed dots, no network)",
         choices=("network", "frame", "dots"),
+        alias="finder",
     )
-    model: str = setting("", "folder of a network; empty: the shipped one for the finger")
+    model: str = setting("", "Folder of the network; empty: the shipped one for the finger")
     names: tuple[str, ...] = setting(
         ("",),
-        "body parts of a frame network whose names are not those of key points, each as BODYPART=NAME, as in "
-        "'finger one=left_inner_1'; '-' for what is on no jaw",
+        "Names of body parts of a frame network, each as BODYPART=NAME, as in 'finger one=left_inner_1'; '-' for what "
+        "is on no jaw",
     )
-    stride: int = setting(0, "image pixels per heatmap cell; 0: as the network's files say", "px", 0, 64)
-    locref_std: float = setting(0.0, "scale of the network's offsets; 0: as the network's files say", "px", 0.0, 1000.0)
-    apply_sigmoid: str = setting(
-        "auto", "whether heatmaps go through a sigmoid; auto: as the files say", choices=("auto", "yes", "no")
-    )
-    normalize: str = setting(
-        "auto", "whether pictures are normalised; auto: as the files say", choices=("auto", "yes", "no")
-    )
-    input_size: tuple[int, ...] = setting(
-        (0, 0), "height and width of the training's images [px]; zeros: as the network's files say"
-    )
-    allow_resize: bool = setting(False, "let a network see images of another size than its training's, letterboxed")
-    threads: int = setting(2, "threads of the network", "1", 1, 64)
-    depth_scale: float = setting(0.001, "one step of a 16-bit depth image", "m", 1e-6, 0.01)
+    allow_resize: bool = setting(False, "Whether a network may see images of another size than its training's, scaled")
+    threads: int = setting(2, "Number of network threads", "1", 1, 64)
+    depth_scale: float = setting(0.001, "Depth unit of 16-bit depth images", "m", 1e-6, 0.01)
     sync_tolerance: float = setting(
-        0.008, "greatest distance between the stamps of a colour and a depth image that belong together", "s", 0.0, 0.1
+        0.008, "Maximum difference between the stamps of a colour image and its depth image", "s", 0.0, 0.1
     )
     skip_off: tuple[str, ...] = setting(
-        ("",), "rules that are not applied, by their names in the diagnostics after `skipped:`, or all"
-    )
-    frozen_after: int = setting(
-        2, "repetitions of a picture, to the bit, after which the camera counts as frozen", "1", 1, 1000
+        ("",), "Skip rules that are off, by their names in the diagnostics after `skipped:`; all: every rule"
     )
 
     def __post_init__(self) -> None:
         """Refuse values that are not among their choices or out of their bounds.
 
         Raises:
-            DetectorSettingsError: there is one, or no colour topic is named, or `input_size` is not two sizes.
+            DetectorSettingsError: there is one, or no colour topic is named.
         """
         check_bounds(self, DetectorSettingsError)
         if not any(self.color_topics):
             raise DetectorSettingsError(f"color_topics: got {self.color_topics}, expected at least one topic")
-        if len(self.input_size) != 2 or min(self.input_size) < 0:
-            raise DetectorSettingsError(
-                f"input_size: got {tuple(self.input_size)}, expected height and width [px], or two zeros"
-            )
 
     @property
     def sides(self) -> tuple[str, ...]:
@@ -104,6 +89,60 @@ class DetectorParameters(TimeParameters):
     def camera_pose(self) -> NDArray:
         """T_gripper_camera (4, 4); raises PoseError unless it is seven finite numbers with a unit quaternion."""
         return pose_from_quaternion(self.T_gripper_camera[:3], self.T_gripper_camera[3:])
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectorSettings:
+    """Settings of `KeypointDetector`."""
+
+    likelihood: float = setting(0.6, "Minimum likelihood of a key point", "1", 0.0, 1.0)
+    plane_depth: bool = setting(
+        False, "Whether key points without depth are used, on the plane that the side of the jaw is known to be"
+    )
+    quantum: float = setting(1e-3, "Step of the depth image", "m", 0.0, 0.01)
+    scale_stddev: float = setting(0.015, "Relative error that all depths of a camera share (1 sigma)", "1", 0.0, 0.1)
+    workspace_closing: float = setting(
+        0.025, "Maximum displacement of a key point along the closing axis", "m", 1e-3, 0.5
+    )
+    workspace_width: float = setting(4e-3, "Maximum displacement of a key point along the jaw's y", "m", 1e-4, 0.5)
+    workspace_length: float = setting(0.012, "Maximum displacement of a key point along the jaw's z", "m", 1e-3, 0.5)
+    readout: float = setting(
+        0.0,
+        "Readout time of a rolling shutter, from the first row's exposure to the last one's, the stamp",
+        "s",
+        0.0,
+        0.1,
+    )
+    opening_min: float = setting(0.010, "Minimum distance of a jaw from the middle of the grasp", "m", 0.0, 0.5)
+    opening_max: float = setting(0.080, "Maximum distance of a jaw from the middle of the grasp", "m", 1e-3, 0.5)
+    largest_speed: float = setting(0.3, "Maximum closing speed of a jaw", "m/s", 1e-3, 10.0)
+    reference_tolerance: float = setting(
+        5e-3, "Maximum distance of a reference point from its line of motion", "m", 1e-4, 0.1
+    )
+    largest_offset: float = setting(
+        0.015,
+        "Maximum distance of the middle between two jaws from the gripper's",
+        "m",
+        1e-3,
+        1.0,
+        alias="largest_beside",
+    )
+    rest_tolerance: float = setting(
+        1.1e-3, "Distance of key points at rest from the jaw file (RMS) above which a warning is given", "m", 1e-4, 0.1
+    )
+    lost_images: int = setting(5, "Images without a jaw, or without its key points, until it is lost", "1", 1, 1000)
+
+    def __post_init__(self) -> None:
+        """Refuse values out of bounds.
+
+        Raises:
+            DetectorSettingsError: a setting is outside its bounds, or a lower bound is above its upper one.
+        """
+        check_bounds(self, DetectorSettingsError)
+        if self.opening_max <= self.opening_min:
+            raise DetectorSettingsError(
+                f"opening_max: got {self.opening_max:g} m, expected more than opening_min, {self.opening_min:g} m"
+            )
 
 
 def is_compressed(topic: str) -> bool:

@@ -15,11 +15,9 @@ from finforce.transforms import pose_numbers
 from finforce_keypoints.diagnostics import build_skeleton, describe_names, draw_keypoints
 from finforce_keypoints.geometry.jaw_localizer import REASONS
 from finforce_keypoints.parameters import DetectorParameters
-from finforce_keypoints.settings import ANNOTATED
 
 if TYPE_CHECKING:
-    from finforce.skipping import Skips
-    from finforce_keypoints.build import FinderCard
+    from finforce_keypoints.detector import KeypointDetector
     from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 
 
@@ -39,21 +37,20 @@ class DetectorOutputs:
         qos: makes publishers and watches them.
         parameters: which jaws, and the camera's frame.
         names: of the rows of the clouds; sent once, and kept for whoever comes later.
-        card: of the finder.
-        skips: what may be left out.
+        detector: that finds them.
     """
 
     def __init__(
-        self, qos: ros.QosWatch, parameters: DetectorParameters, names: Sequence[str], card: FinderCard, skips: Skips
+        self, qos: ros.QosWatch, parameters: DetectorParameters, names: Sequence[str], detector: KeypointDetector
     ) -> None:
-        sides, self._skips = parameters.sides, skips
+        sides = parameters.sides
         self._frame, self._skeleton = parameters.camera_frame, build_skeleton(names)
         self.keypoints = {side: qos.publisher(ros.PointCloud2, f"{side}/keypoints", ros.RESULT) for side in sides}
         self.pose = {side: qos.publisher(ros.PoseStamped, f"{side}/jaw_pose", ros.RESULT) for side in sides}
         self.annotated = qos.publisher(ros.Image, "~/annotated", ros.RESULT)
         self.names = qos.publisher(ros.String, "~/keypoint_names", ros.LATCHED)
         self._kept: dict[str, _Kept] = {}
-        self.names.publish(ros.String(data=describe_names(names, card)))
+        self.names.publish(ros.String(data=describe_names(names, detector)))
 
     @property
     def are_heard(self) -> bool:
@@ -81,8 +78,7 @@ class DetectorOutputs:
 
     def send_annotated(self, stamp: int, color: NDArray, found: Mapping[str, JawKeypoints]) -> None:
         """Send the image at `stamp` [ns], (h, w, 3), with what was found in it, while someone subscribes."""
-        if self._skips.allows(ANNOTATED) and not self.annotated.get_subscription_count():
-            self._skips.count(ANNOTATED)
+        if not self.annotated.get_subscription_count():
             return
         header = ros.Header(stamp=ros.stamp_message(stamp), frame_id=self._frame)
         self.annotated.publish(ros.image_message(header, draw_keypoints(color, found.values(), self._skeleton)))

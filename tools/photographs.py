@@ -25,8 +25,8 @@ from finforce.optional import import_cv2
 from finforce_eval.recordings.steel import HALF_BASE, points_from_picture
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_keypoints.build import ANY_FINGER
-from finforce_keypoints.detectors.locators import AnyFinger
-from finforce_keypoints.geometry.hole_grid import GridCamera, find_grid_camera
+from finforce_keypoints.detectors.side_plane import AnyFinger
+from finforce_keypoints.geometry.extrinsics import GridCamera, find_grid_camera
 from finforce_keypoints.geometry.side_picture import find_side, map_picture, project_plane, take_picture
 from finforce_keypoints.networks.side_network import SideNetwork
 

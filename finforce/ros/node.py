@@ -68,7 +68,7 @@ from finforce.stamps import NANOSECONDS  # noqa: F401 - for those with stamps
 
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-STEADY = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
+STEADY = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # the newest alone
 REQUESTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # one that is passed over waits for ever
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

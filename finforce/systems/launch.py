@@ -49,7 +49,7 @@ def solver_arguments(*, images: str = "false", parameter_file: str = NONE, use_s
             choices=SWITCH,
             description="find the key points in images of a camera; else they come by topic",
         ),
-        Argument("finder", default_value=NONE, description="key points by network, frame (DeepLabCut) or dots"),
+        Argument("detection_method", default_value=NONE, description="network, frame (DeepLabCut) or dots"),
         Argument("model", default_value=NONE, description="folder of a network"),
         Argument(
             "depth",

@@ -184,7 +184,7 @@ def detector_processes(jaws: str, options: SolverOptions) -> list[Process]:
         return []
     asked = {
         "jaw_file": options.jaw_file,
-        "finder": options.finder,
+        "detection_method": options.detection_method,
         "model": options.model,
         "depth": DEPTHS.get(options.depth, ""),
         "T_gripper_camera": read_numbers("T_gripper_camera", options.T_gripper_camera, 7),
@@ -276,7 +276,7 @@ class SolverOptions:
     pose_topic: str = ""
     pose_origin: str = ""
     images: bool = False
-    finder: str = ""
+    detection_method: str = ""
     model: str = ""
     depth: str = ""
     T_gripper_camera: str = ""

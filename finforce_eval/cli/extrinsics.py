@@ -19,8 +19,7 @@ from finforce_eval.evaluation.keypoint_source import KeypointSource, build_recor
 from finforce_eval.evaluation.setup import read_recordings
 from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.geometry.extrinsics import Extrinsics
-from finforce_keypoints.geometry.hole_grid import GridCamera, find_grid_camera
+from finforce_keypoints.geometry.extrinsics import Extrinsics, GridCamera, find_grid_camera
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

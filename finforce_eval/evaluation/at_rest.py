@@ -18,7 +18,7 @@ from finforce_keypoints.geometry.extrinsics import Extrinsics, SeenJaw, find_ext
 
 ROUNDS = 4  # of finding the key points with the place found before
 # [m]; a guess is allowed to be far off
-LOOSE = {"detector.reference_tolerance": 0.02, "detector.largest_beside": 0.5, "detector.lost_images": 1000}
+LOOSE = {"detector.reference_tolerance": 0.02, "detector.largest_offset": 0.5, "detector.lost_images": 1000}
 STILL = 0.05e-3  # [m] below which another round changes nothing
 OFTEN = 0.5  # share of the images in which a jaw, and a key point, has to be seen
 

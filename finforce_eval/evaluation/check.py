@@ -314,13 +314,13 @@ def _flip(image: RgbdImage, *, rows: bool, columns: bool) -> RgbdImage:
 
 def _score(image: RgbdImage, source: KeypointSource, recording: Recording, pose: NDArray) -> float:
     """Return the mean likelihood of the key points, the jaws looked for all along the closing axis."""
-    from finforce_keypoints.build import build_finder
+    from finforce_keypoints.build import build_pixel_detector
     from finforce_keypoints.parameters import load_jaws
 
     given = {**source.node_parameters(recording), "T_gripper_camera": [float(number) for number in pose_numbers(pose)]}
     parameters, settings, dots = build_records(given)
-    finder = build_finder(load_jaws(parameters), parameters, settings, dots).finder
-    found = finder.find(image, dict.fromkeys(recording.jaws))
+    pixel_detector = build_pixel_detector(load_jaws(parameters), parameters, settings, dots)
+    found = pixel_detector.detect(image, dict.fromkeys(recording.jaws))
     return float(np.mean([found[side].likelihood.mean() if side in found else 0.0 for side in recording.jaws]))
 
 

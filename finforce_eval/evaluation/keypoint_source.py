@@ -22,12 +22,11 @@ from finforce_eval.evaluation.results import parse_changes
 from finforce_eval.recordings.images import DEPTH_ENDS, PAIRED, ImageTrack
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, KeypointTrack, PoseTrack, Recording
 from finforce_keypoints.errors import KeypointError
-from finforce_keypoints.images import ImageWatch, RgbdImage
+from finforce_keypoints.images import RgbdImage
 
 if TYPE_CHECKING:
     from finforce_keypoints.detectors.dots import DotSettings
-    from finforce_keypoints.parameters import DetectorParameters
-    from finforce_keypoints.settings import DetectorSettings
+    from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
 
 SOURCES = IMAGES, KEYPOINTS, TRUTH = ("images", "keypoints", "truth")
 _BY_ENDS = "images of a recording are found by the ends of their topics"
@@ -124,7 +123,7 @@ class KeypointSource:
         if live is not None:
             raise OptionError(f"--detector {live}: means nothing offline; leave it out, or use finforce replay")
         parameters, settings, dots = build_records(self.node_parameters(recording))
-        return build_detector(load_jaws(parameters), parameters, settings, dots).detector
+        return build_detector(load_jaws(parameters), parameters, settings, dots)
 
     @property
     def pairing(self) -> int:
@@ -135,14 +134,11 @@ class KeypointSource:
     def _detect(self, recording: Recording) -> Recording:
         from tqdm import tqdm
 
-        from finforce_keypoints.images import ImageWatch
-
         detector, parameters = self.build(recording), build_records(self.node_parameters(recording)).parameters
-        watch = ImageWatch(parameters.frozen_after)
         images = choose_images(recording, parameters.depth)
         recording = replace(recording, images=replace(images, depth_scale=parameters.depth_scale))
         with tqdm(total=len(recording.images), unit="image", desc=recording.name, disable=None, leave=False) as bar:
-            return detect_keypoints(recording, detector, watch=watch, progress=bar.update)
+            return detect_keypoints(recording, detector, progress=bar.update)
 
 
 def choose_images(recording: Recording, depth: str) -> ImageTrack:
@@ -178,8 +174,7 @@ def build_records(given: Mapping[str, Any]) -> DetectorRecords:
 def _record_types() -> dict[str, type]:
     """Return the types of a detector's records by the prefix of their parameters."""
     from finforce_keypoints.detectors.dots import DotSettings
-    from finforce_keypoints.parameters import DetectorParameters
-    from finforce_keypoints.settings import DetectorSettings
+    from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
 
     return {"": DetectorParameters, "detector": DetectorSettings, "dots": DotSettings}
 
@@ -317,7 +312,7 @@ class Reasons:
 
 
 def detect_keypoints(
-    recording: Recording, detector: Detector, *, watch: ImageWatch, progress: Callable[[int], Any] = lambda images: None
+    recording: Recording, detector: Detector, *, progress: Callable[[int], Any] = lambda images: None
 ) -> Recording:
     """Return a recording with the key points and jaw poses that a detector finds in its images.
 
@@ -326,7 +321,6 @@ def detect_keypoints(
     Args:
         recording: with images.
         detector: a fresh one, of the recording's jaws.
-        watch: notices a camera that fails, as in the node.
         progress: called with the number of images done since its last call.
 
     Raises:
@@ -338,7 +332,6 @@ def detect_keypoints(
     for stamp, image in images:
         begin = perf_counter()
         try:
-            watch.check(image)
             found = detector.detect(image)
         except (KeypointError, ImageError) as error:
             found = {}

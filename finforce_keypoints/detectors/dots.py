@@ -13,8 +13,8 @@ from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import ROBOT_CAMERA, OpeningRange
 from finforce.optional import import_cv2
 from finforce.settings import check_bounds, setting
+from finforce_keypoints.detectors import PixelDetection
 from finforce_keypoints.errors import DetectorSettingsError
-from finforce_keypoints.pixel_finder import PixelFinding
 
 _LARGEST_ELONGATION = 4.0  # a disc that is seen at 75 degrees off its normal
 _DIMMEST = 8  # of 255: darker pixels have no colour
@@ -207,8 +207,8 @@ class _Match:
     cost: float
 
 
-class DotFinder:
-    """Finds dots and tells by their expected places and by their neighbours which is which; a `PixelFinder`.
+class DotDetector:
+    """Finds dots and tells by their expected places and by their neighbours which is which; a `PixelDetector`.
 
     The displacements of a jaw's dots from their undeformed places are taken for a smooth field, found from the base to
     the tip: a dot that is hidden stays without a dot, and its neighbours' dots stay theirs.
@@ -233,13 +233,14 @@ class DotFinder:
             MissingDependencyError: OpenCV is not installed.
         """
         import_cv2()
+        self.name, self.sha256 = "dots", ""
         self._settings, self._opening = settings or DotSettings(), opening or OpeningRange()
         self._T_gripper_camera = ROBOT_CAMERA if T_gripper_camera is None else np.asarray(T_gripper_camera)
         self._points = {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in jaws.items()}
         self._fields: dict[str, NDArray] = {}
 
-    def find(self, image: RgbdImage, expected: Mapping[str, NDArray | None]) -> Mapping[str, PixelFinding]:
-        """Return the dots of every jaw; see `PixelFinder`."""
+    def detect(self, image: RgbdImage, expected: Mapping[str, NDArray | None]) -> Mapping[str, PixelDetection]:
+        """Return the dots of every jaw; see `PixelDetector`."""
         candidates = {side: self._place(side, pose, image.camera) for side, pose in expected.items()}
         dots = self._see(np.asarray(image.color), [pattern for some in candidates.values() for pattern in some])
         chosen, matches = {}, {}
@@ -251,14 +252,14 @@ class DotFinder:
                 best = int(np.argmin([match.cost for match in tried]))
                 chosen[side], matches[side] = patterns[best], tried[best]
         matches = _settle(chosen, matches, dots)
-        findings = {}
+        detections = {}
         for side, match in matches.items():
             if (match.dots >= 0).sum() >= LEAST_DOTS:
-                findings[side] = self._describe(chosen[side], match, dots)
+                detections[side] = self._describe(chosen[side], match, dots)
                 self._fields[side] = match.field
             else:
                 self._fields.pop(side, None)
-        return findings
+        return detections
 
     def _place(self, side: str, T_camera_jaw: NDArray | None, camera: CameraIntrinsics) -> list[_Pattern]:
         """Return where a jaw is expected, or all places where a lost one can be; none behind the camera."""
@@ -292,8 +293,8 @@ class DotFinder:
                 return match
         return _grow(pattern, dots.pixels, gate, np.zeros((len(_FIELD_STDDEV), 2)), _GROWTH)
 
-    def _describe(self, pattern: _Pattern, match: _Match, dots: Dots) -> PixelFinding:
-        """Return the finding of one jaw: likely are dots of the right size and shape.
+    def _describe(self, pattern: _Pattern, match: _Match, dots: Dots) -> PixelDetection:
+        """Return the detection of one jaw: likely are dots of the right size and shape.
 
         A dot that is partly hidden is smaller, and its centroid is off by up to the part that is hidden.
         """
@@ -307,7 +308,7 @@ class DotFinder:
         shape = np.clip(dots.fills[index], 0.0, 1.0)
         likelihood = np.where(found, np.exp(-0.5 * odd**2) * shape, 0.0)
         hidden = 0.5 * diameter * np.abs(1.0 - np.minimum(ratio, 1.0))
-        return PixelFinding(
+        return PixelDetection(
             pixels=np.where(found[:, None], dots.pixels[index], np.nan),
             likelihood=likelihood,
             stddev=np.where(found, np.hypot(_CENTROID_STDDEV, hidden), np.inf),

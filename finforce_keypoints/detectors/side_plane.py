@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import HALF_TURN, OpeningRange
 from finforce.transforms import pose_numbers
-from finforce_keypoints.errors import GeometryError
+from finforce_keypoints.detectors import REFERENCE, PixelDetection
+from finforce_keypoints.errors import GeometryError, ModelError
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
-from finforce_keypoints.pixel_finder import PixelFinding
+from finforce_keypoints.geometry.template import draw_template, find_motions, find_shape, fit_grid, span_shapes
+from finforce_keypoints.networks.side_network import Places
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_keypoints.images import RgbdImage
-    from finforce_keypoints.networks.side_network import Places
+    from finforce_keypoints.networks.model import KeypointModel
+    from finforce_keypoints.networks.side_network import SideNetwork, Template
 
 SAME_PLACE = 1e-3  # [m] by which a jaw may move before its picture is mapped anew; places are exact all the same
 SEARCH_STEP = 24.0  # [px] between the places where a lost jaw is looked for; the network finds one half as far away
@@ -31,10 +34,14 @@ class SideLocator(Protocol):
     """A network that finds the points of jaws in pictures of their sides.
 
     Attributes:
+        name: of the network's folder.
+        sha256: of its files.
         grids: of its pictures, by side.
         shifts: of the grids from picture to picture (n, 2) [px], over and over again.
     """
 
+    name: str
+    sha256: str
     grids: Mapping[str, PlaneGrid]
     shifts: NDArray
 
@@ -63,7 +70,7 @@ class _View:
     mapping: NDArray
 
 
-class PlaneFinder:
+class SidePlaneDetector:
     """Finds key points with a network, in pictures that look the same from every camera.
 
     A jaw that was lost is looked for along the closing axis.
@@ -85,6 +92,7 @@ class PlaneFinder:
         T_gripper_camera: NDArray,
         opening: OpeningRange | None = None,
     ) -> None:
+        self.name, self.sha256 = f"network {locator.name}", locator.sha256
         self._locator, self._T_gripper_camera, self._opening = locator, T_gripper_camera, opening or OpeningRange()
         for jaw in jaws.values():
             check_camera_side(jaw, T_gripper_camera)
@@ -95,8 +103,8 @@ class PlaneFinder:
         self._camera: CameraIntrinsics | None = None
         self._moves: dict[str, NDArray] = {}
 
-    def find(self, image: RgbdImage, expected: Mapping[str, NDArray | None]) -> Mapping[str, PixelFinding]:
-        """Return where the key points of each jaw are; see `PixelFinder`."""
+    def detect(self, image: RgbdImage, expected: Mapping[str, NDArray | None]) -> Mapping[str, PixelDetection]:
+        """Return where the key points of each jaw are; see `PixelDetector`."""
         if image.camera is not self._camera:
             self._kept, self._camera, self._moves = {}, image.camera, {}
         self._moves = {side: moves for side, moves in self._moves.items() if expected.get(side) is not None}
@@ -105,7 +113,7 @@ class PlaneFinder:
         if not views:
             return {}
         places = self._locate(image, views)
-        found: dict[str, PixelFinding] = {}
+        found: dict[str, PixelDetection] = {}
         again: list[_View] = []
         for side, pose in expected.items():
             mine = [number for number, view in enumerate(views) if view.side == side]
@@ -152,8 +160,8 @@ class PlaneFinder:
             jaw[:3, 3] += shift * jaw[:3, 0]
         return jaw
 
-    def _describe(self, view: _View, places: Places, number: int) -> PixelFinding:
-        """Return the finding of one picture, in pixels of the image; the next one begins where its points are."""
+    def _describe(self, view: _View, places: Places, number: int) -> PixelDetection:
+        """Return the detection of one picture, in pixels of the image; the next one begins where its points are."""
         if places.moves is not None and places.likelihood[number].mean() >= LEAST_SCORE:
             self._moves[view.side] = places.moves[number] + view.shift
         plane, grid, camera = self._planes[view.side], view.grid, self._camera
@@ -164,7 +172,7 @@ class PlaneFinder:
         across = [np.hypot(*(other - pixels).T) * grid.scale / 1e-3 for other in beside]
         stddev = places.stddev[number] * np.sqrt(0.5 * (across[0] ** 2 + across[1] ** 2))
         known = np.isfinite(pixels).all(axis=1)
-        return PixelFinding(
+        return PixelDetection(
             pixels=pixels,
             likelihood=np.where(known, places.likelihood[number], 0.0),
             stddev=np.where(known, stddev, np.inf),
@@ -191,3 +199,94 @@ def check_camera_side(jaw: Jaw, T_gripper_camera: NDArray) -> None:
 def find_rest(jaw: Jaw) -> NDArray:
     """Return x and z (K + 1, 2) [m] of a jaw's key points and its reference point at rest."""
     return np.vstack((jaw.keypoints, jaw.reference_point))[:, [0, 2]]
+
+
+# Where in its picture a point lies decides by how much a network of heat maps puts it beside its place: in pictures two
+# pixels apart those errors are hardly alike, so that they average out over time.
+SHIFTS = 6.0 * (np.outer(np.arange(8), [0.7549, 0.5698]) % 1.0) - 3.0  # [px]
+
+
+class AnyFinger:
+    """The network of any finger, which is told what a finger looks like at rest.
+
+    Args:
+        network: that compares pictures with templates.
+        jaws: by side.
+    """
+
+    shifts = STRAIGHT
+
+    def __init__(self, network: SideNetwork, jaws: Mapping[str, Jaw]) -> None:
+        self._network, self.name, self.sha256 = network, network.path.name, network.sha256
+        shapes = {side: find_shape(jaw) for side, jaw in jaws.items()}
+        self.grids = {side: fit_grid(shape, network.width, network.height) for side, shape in shapes.items()}
+        self._templates: dict[str, Template] = {}
+        for side, grid in self.grids.items():
+            points = grid.pixels(find_rest(jaws[side]))
+            together = span_shapes(find_motions(jaws[side]), points, grid.scale)
+            self._templates[side] = network.prepare(draw_template(shapes[side], grid), points, together)
+
+    def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
+        """Return where the points are; see `SideLocator`."""
+        return self._network.locate(pictures, [self._templates[side] for side in sides], starts)
+
+
+class OneFinger:
+    """A network with a heat map for each point of one finger.
+
+    Args:
+        model: whose body parts are the jaw file's key points and "reference", with `finforce: plane` in its metadata.
+        jaws: by side.
+
+    Raises:
+        ModelError: names or plane of the metadata do not fit.
+    """
+
+    shifts = SHIFTS
+
+    def __init__(self, model: KeypointModel, jaws: Mapping[str, Jaw]) -> None:
+        self._model, self.name, self.sha256 = model, model.path.parent.name, model.sha256
+        self.grids = dict.fromkeys(jaws, grid_from_metadata(model.metadata.extra))
+        self._rows = {side: _order_names(model, jaw) for side, jaw in jaws.items()}
+
+    def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
+        """Return where the points are, wherever they were before; see `SideLocator`."""
+        peaks = self._model.locate(pictures)
+        rows = np.stack([self._rows[side] for side in sides])
+        return Places(
+            pixels=np.take_along_axis(peaks.pixels, rows[..., None], axis=1),
+            likelihood=np.take_along_axis(peaks.likelihood, rows, axis=1),
+            stddev=np.take_along_axis(peaks.stddev, rows, axis=1),
+        )
+
+
+def _order_names(model: KeypointModel, jaw: Jaw) -> NDArray:
+    """Return which peak is which key point of a jaw, the reference point last, (K + 1,).
+
+    Raises:
+        ModelError: a name is missing, or there is one that the jaw does not have.
+    """
+    wanted = (*jaw.keypoint_names, REFERENCE)
+    if set(model.names) != set(wanted):
+        missing, more = sorted(set(wanted) - set(model.names)), sorted(set(model.names) - set(wanted))
+        raise ModelError(
+            f"{model.path.name}: body parts missing: {', '.join(missing) or 'none'}; not of the jaw '{jaw.name}': "
+            f"{', '.join(more) or 'none'}; expected its key points and '{REFERENCE}' (another jaw file?)"
+        )
+    return np.array([model.names.index(name) for name in wanted])
+
+
+def grid_from_metadata(extra: Mapping[str, Any]) -> PlaneGrid:
+    """Return the grid that stands as `plane` in a network's own section of its metadata.
+
+    Raises:
+        ModelError: there is none, or it is incomplete.
+    """
+    plane = extra.get("plane")
+    names = [entry.name for entry in fields(PlaneGrid)]
+    if not isinstance(plane, Mapping) or any(not isinstance(plane.get(name), (int, float)) for name in names):
+        raise ModelError(
+            f"finforce.plane: got {plane!r}, expected numbers {', '.join(names)} [m, px]; a network of whole images "
+            "is used as a frame model"
+        )
+    return PlaneGrid(**{name: plane[name] for name in names})

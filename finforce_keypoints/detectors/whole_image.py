@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.optional import import_cv2
+from finforce_keypoints.detectors import PixelDetection
 from finforce_keypoints.errors import DetectionError
-from finforce_keypoints.pixel_finder import PixelFinding
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
@@ -51,8 +51,8 @@ class _CropView:
     is_mirrored: bool = False
 
 
-class FrameFinder:
-    """Finds the key points of all jaws with one run of a network; a `PixelFinder`.
+class WholeImageDetector:
+    """Finds the key points of all jaws with one run of a network; a `PixelDetector`.
 
     A network of both jaws sees the image once. A network of one jaw sees one part of it for each jaw, in one batch:
     around the jaw where it is expected, else the half of the image on the jaw's side; the right jaw is mirrored, so
@@ -77,13 +77,14 @@ class FrameFinder:
             crop: whether the jaws are cut out at the training's scale while they are tracked, where the network takes
                 any size.
         """
+        self.name, self.sha256 = f"frame {model.path.stem}", model.sha256
         self._model, self._names = model, names
         self._allow_resize, self._crop = allow_resize, crop
         self._is_frozen = model.frozen_size != (None, None)
         self._points = {side: np.vstack((jaw.keypoints, jaw.reference_point)) for side, jaw in jaws.items()}
 
-    def find(self, image: RgbdImage, expected: Mapping[str, NDArray | None]) -> Mapping[str, PixelFinding]:
-        """Return the key points of every jaw; see `PixelFinder`.
+    def detect(self, image: RgbdImage, expected: Mapping[str, NDArray | None]) -> Mapping[str, PixelDetection]:
+        """Return the key points of every jaw; see `PixelDetector`.
 
         Raises:
             DetectionError: the image is not of the training's size, or the network gives no sensible offsets.
@@ -93,7 +94,7 @@ class FrameFinder:
         views = self._plan(image.camera, expected)
         peaks = self._model.locate(np.stack([self._show(color, view, scale) for view in views]))
         check_offsets(peaks)
-        findings = {}
+        detections = {}
         for number, view in enumerate(views):
             pixels = _map_back(peaks.pixels[number], view, scale)
             is_known = _contains(view.canvas, pixels)
@@ -103,8 +104,10 @@ class FrameFinder:
             for side in view.sides:
                 rows = self._names.rows[side]
                 if likelihood[rows].any():
-                    findings[side] = PixelFinding(pixels=pixels[rows], likelihood=likelihood[rows], stddev=stddev[rows])
-        return findings
+                    detections[side] = PixelDetection(
+                        pixels=pixels[rows], likelihood=likelihood[rows], stddev=stddev[rows]
+                    )
+        return detections
 
     def _find_scale(self, size: tuple[int, int]) -> float:
         """Return network pixels per image pixel for an image of some height and width."""

@@ -20,6 +20,7 @@ from finforce.lens import project_point
 from finforce_ifea.jaw.jaw import Jaw
 
 _OPTIONS = {"cache": True, "error_model": "numpy", "nogil": True}
+WINDOW, EDGE = 3e-3, 0.4e-3  # [m] around a key point, and inside the edges where depths are mixed, that is sampled
 _SPACING = 0.15e-3  # of the raster on which the finger's side is drawn [m]
 _STRIDES = (3, 2, 1)  # every so many points of it are sampled: a pixel is 0.25 to 0.5 mm
 _ENOUGH = 24  # samples; a thin band is sampled more densely for as many, then nearer to its edges
@@ -69,7 +70,7 @@ class DepthEvidence:
     nearer: NDArray
 
 
-def build_side_samples(jaw: Jaw, window: float, edge: float) -> SideSamples:
+def build_side_samples(jaw: Jaw, window: float = WINDOW, edge: float = EDGE) -> SideSamples:
     """Return places on the jaw's side, `edge` [m] inside its outline and at most `window` [m] from a key point.
 
     Where a band is too thin for enough of them, they lie nearer to its edges.
@@ -303,10 +304,10 @@ class SideModel:
     """
 
     places: NDArray
-    offset: float
-    tilt: float
-    bow: float
-    relief: float
+    offset: float = 0.2e-3
+    tilt: float = 0.02
+    bow: float = 0.2
+    relief: float = 0.06e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -3,24 +3,18 @@
 A camera that is not where it is said to be shifts, turns and stretches the picture of a jaw's side, all of it an affine
 map of the side's places; a load bends the finger, which is none. A load moves the key points along the closing axis, a
 camera's errors move them across it, too. By both, the two are told apart.
-
-A network places the reference point a little differently in every light and before every background, and all key points
-of the jaw would share the error. What surrounds the point is rigid and does not change: registered image by
-image, it tells ten times as exactly how far it has slid since the first ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project, rays_from_pixels
-from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import Jaw
+from finforce_keypoints.detectors import PixelDetection
 from finforce_keypoints.geometry.depth import (
     DepthEvidence,
     DepthScale,
@@ -34,157 +28,14 @@ from finforce_keypoints.geometry.depth import (
     sample_depths,
     weigh_depths,
 )
-from finforce_keypoints.geometry.jaw_pose import Origin, OriginFinder, OriginTrack
-from finforce_keypoints.geometry.side_picture import PlaneGrid, SidePlane, map_picture, take_picture
+from finforce_keypoints.geometry.jaw_pose import Origin, OriginEstimator, OriginTrack, ReferencePatch
 from finforce_keypoints.images import RgbdImage, lie_inside
-from finforce_keypoints.pixel_finder import PixelFinding
-from finforce_keypoints.settings import DetectorSettings
+from finforce_keypoints.parameters import DetectorSettings
 
-SCALE = 0.25e-3  # [m] of a pixel of the patch
-HALF = 20  # [px] of the patch's width and height
-BLUR = 1.5  # [px] standard deviation; wide enough that a slide by a pixel is still linear
-TEMPLATE_IMAGES = 30  # over which template and anchor are averaged
-ITERATIONS = 5
-SETTLED = 0.02  # [px] that a last iteration may move
-FARTHEST = 2.0e-3  # [m] between the network's place and the registered one
-LEAST_LIKENESS = 0.75  # correlation with the template, below which something else is seen
-STDDEV = 0.04e-3  # [m] of a registered slide
-_INNER = (slice(3, -3), slice(3, -3))  # the border's gradients are one-sided
-FORGOTTEN_AFTER = 15  # images in a row without likeness: the light or the thing itself has changed
-
-
-@dataclass(frozen=True, kw_only=True)
-class Slide:
-    """How a patch lies beside the template.
-
-    Attributes:
-        x: way along the jaw's x [px].
-        likeness: their correlation, brightness and contrast aside.
-    """
-
-    x: float
-    likeness: float
-
-
-class ReferencePatch:
-    """Follows the reference point of one jaw by what surrounds it.
-
-    Args:
-        jaw: whose reference point lies on its side.
-    """
-
-    def __init__(self, jaw: Jaw) -> None:
-        x, y, z = jaw.reference_point
-        self._side = SidePlane(level=float(y))
-        size = 2 * HALF + 1
-        self._grid = PlaneGrid(scale=SCALE, x=x - HALF * SCALE, z=z - HALF * SCALE, width=size, height=size)
-        self._sign = 1.0 if jaw.side == "left" else -1.0
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the template."""
-        self._template: NDArray | None = None
-        self._matcher: PatchMatcher | None = None
-        self._count, self._anchor, self._unlike = 0, 0.0, 0
-
-    @property
-    def is_learnt(self) -> bool:
-        """Whether the template is one of enough images, so that it changes no more."""
-        return self._count >= TEMPLATE_IMAGES
-
-    def refine(
-        self, color: NDArray, camera: CameraIntrinsics, measured: Origin, place: Callable[[Origin], NDArray]
-    ) -> Origin:
-        """Return where the jaw is by its patch, or as it was measured where the patch does not show it.
-
-        Args:
-            color: image (h, w, 3) uint8.
-            camera: its intrinsics.
-            measured: origin that the network's reference point shows.
-            place: origin to T_camera_jaw (4, 4).
-        """
-        if self._template is None:
-            self._template, self._count = self._take(color, camera, place(measured)), 1
-            return measured
-        found = self._register(color, camera, measured, place)
-        if found is None:
-            self._unlike += 1
-            if self._unlike >= FORGOTTEN_AFTER:
-                self.reset()
-            return measured
-        self._unlike = 0
-        if self._count < TEMPLATE_IMAGES:
-            self._learn(self._take(color, camera, place(found)), measured.x - found.x)
-        return Origin(x=found.x + self._anchor, stddev=STDDEV)
-
-    def _learn(self, patch: NDArray, off: float) -> None:
-        """Average template and anchor with one more image, its patch taken where it was found."""
-        share = 1.0 / (self._count + 1)
-        self._template += share * (patch - self._template)
-        self._anchor += share * (off - self._anchor)
-        self._count += 1
-        self._matcher = None
-
-    def _register(
-        self, color: NDArray, camera: CameraIntrinsics, measured: Origin, place: Callable[[Origin], NDArray]
-    ) -> Origin | None:
-        """Return the origin, without the anchor, at which the patch is the template; None when it is nowhere near."""
-        x = measured.x - self._anchor
-        self._matcher = self._matcher or build_matcher(self._template)
-        for _ in range(ITERATIONS):
-            slide = self._matcher.match(self._take(color, camera, place(Origin(x=x, stddev=0.0))))
-            step = self._sign * slide.x * SCALE
-            x += step
-            if abs(x + self._anchor - measured.x) > FARTHEST or not np.isfinite(x):
-                return None
-            if abs(slide.x) < SETTLED:
-                return Origin(x=x, stddev=STDDEV) if slide.likeness >= LEAST_LIKENESS else None
-        return None
-
-    def _take(self, color: NDArray, camera: CameraIntrinsics, T_camera_jaw: NDArray) -> NDArray:
-        """Return the patch (h, w) of a jaw at a place, smoothed."""
-        picture = take_picture(color, map_picture(self._grid, self._side, T_camera_jaw, camera))
-        red, green, blue = np.moveaxis(picture.astype(np.float32), 2, 0)
-        grey = (red + green + blue) / np.float32(3.0)
-        return import_cv2().GaussianBlur(grey, (0, 0), BLUR).astype(np.float64)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PatchMatcher:
-    """Tells by how much patches have slid against one template, by least squares to first order in the slide s.
-
-    patch = a template - a (s_x d_x + s_z d_z) template + b
-
-    Attributes:
-        template: (n,) of the inner pixels, without its mean and of length 1.
-        inverse: (4, n) that gives -a s_x, -a s_z, a and b of a patch.
-    """
-
-    template: NDArray
-    inverse: NDArray
-
-    def match(self, patch: NDArray) -> Slide:
-        """Return by how much a patch (h, w) has slid."""
-        values = patch[_INNER].ravel()
-        slope_x, _, gain, _ = self.inverse @ values
-        if not gain > 0.0:
-            return Slide(x=0.0, likeness=0.0)
-        seen = values - values.sum() / values.size
-        likeness = float(seen @ self.template / max(sqrt(seen @ seen), 1e-9))
-        return Slide(x=float(-slope_x / gain), likeness=likeness)
-
-
-def build_matcher(template: NDArray) -> PatchMatcher:
-    """Return what compares patches with a template (h, w)."""
-    by_z, by_x = np.gradient(template)
-    values = template[_INNER].ravel()
-    columns = np.column_stack([by_x[_INNER].ravel(), by_z[_INNER].ravel(), values, np.ones(values.size)])
-    normal = columns.T @ columns + 1e-6 * np.eye(4)
-    known = values - values.mean()
-    known /= max(np.linalg.norm(known), 1e-9)
-    return PatchMatcher(template=known, inverse=np.linalg.solve(normal, columns.T))
-
-
+GATES = (5e-3, 2e-3)  # [m] off the known side plane, then off the one found, beyond which depth is not the finger's
+LEAST_DEPTHS, LEAST_SHARE = 6, 0.4  # samples of the finger with depth that a key point needs, and their share of all
+DEPTH_NOISE = 0.06e-3  # [m] error of the depth that the samples of one point share
+MISFIT = 5.0  # standard deviations of its depth off the fit, above which a key point is not there
 _LEAST_SEEN = 3  # points, or all there are: fewer likely ones are no jaw
 _LEAST_FOUND = 1 / 3  # share of the points that have to be likely where no jaw was known before
 REASONS = ("image", "likelihood", "depth", "workspace")
@@ -236,7 +87,7 @@ class _Seen:
     """One image, what was found in it, which points (K + 1,) are likely, their rays (K + 1, 3) and these' errors."""
 
     image: RgbdImage
-    finding: PixelFinding
+    detection: PixelDetection
     likely: NDArray
     rays: NDArray
     ray_stddev: NDArray
@@ -248,18 +99,12 @@ class JawLocalizer:
     def __init__(self, jaw: Jaw, T_gripper_camera: NDArray, settings: DetectorSettings) -> None:
         """Prepare where to sample depth on the jaw."""
         self._settings, self._sign = settings, 1.0 if jaw.side == "left" else -1.0
-        self._origin, self._track = OriginFinder(jaw, T_gripper_camera, settings), OriginTrack(settings)
+        self._origin, self._track = OriginEstimator(jaw, T_gripper_camera, settings), OriginTrack(settings)
         self._patch, self._rest_check = ReferencePatch(jaw), RestCheck(jaw.keypoints)
         self._unconfirmed = 0
-        self._samples = build_side_samples(jaw, settings.window, settings.edge)
+        self._samples = build_side_samples(jaw)
         self._rest = np.vstack((jaw.keypoints, jaw.reference_point))
-        self._model = SideModel(
-            places=self._rest[:, ::2],
-            offset=settings.offset_stddev,
-            tilt=settings.tilt_stddev,
-            bow=settings.bow_stddev,
-            relief=settings.relief_stddev,
-        )
+        self._model = SideModel(places=self._rest[:, ::2])
         self._box = np.array([settings.workspace_closing, settings.workspace_width, settings.workspace_length])
 
     def reset(self) -> None:
@@ -303,10 +148,10 @@ class JawLocalizer:
         """T_camera_jaw (4, 4) in the middle of the opening range."""
         return self._origin.place(self._origin.middle)
 
-    def imagine(self, camera: CameraIntrinsics) -> PixelFinding:
-        """Return the finding of a jaw at rest, seen without error in the middle of the opening range."""
+    def imagine(self, camera: CameraIntrinsics) -> PixelDetection:
+        """Return the detection of a jaw at rest, seen without error in the middle of the opening range."""
         T, count = self.middle, len(self._rest)
-        return PixelFinding(
+        return PixelDetection(
             pixels=project(self._rest @ T[:3, :3].T + T[:3, 3], camera),
             likelihood=np.ones(count),
             stddev=np.full(count, 0.5),
@@ -317,18 +162,18 @@ class JawLocalizer:
         forecast = self._track.forecast(stamp)
         return None if forecast is None else self._origin.place(forecast)
 
-    def locate(self, image: RgbdImage, finding: PixelFinding | None, scale: DepthScale) -> Located | None:
+    def locate(self, image: RgbdImage, detection: PixelDetection | None, scale: DepthScale) -> Located | None:
         """Return the jaw's key points, None when nobody knows where the jaw is.
 
         Args:
             image: the image, checked.
-            finding: the pixels found; None when the finder saw nothing of the jaw.
+            detection: the pixels found; None when the pixel_detector saw nothing of the jaw.
             scale: what is known of the depth image's scale beforehand.
         """
-        if finding is None:
+        if detection is None:
             self._track.update(image.stamp, None)
             return None
-        seen = self._look(image, finding)
+        seen = self._look(image, detection)
         origin = self._track.update(image.stamp, self._measure(seen))
         if origin is None:
             return None
@@ -340,15 +185,15 @@ class JawLocalizer:
             return None
         return located
 
-    def _look(self, image: RgbdImage, finding: PixelFinding) -> _Seen:
+    def _look(self, image: RgbdImage, detection: PixelDetection) -> _Seen:
         """Return the rays to the points that were found."""
-        inside = lie_inside(image, finding.pixels)
+        inside = lie_inside(image, detection.pixels)
         return _Seen(
             image=image,
-            finding=finding,
-            likely=self._find_likely(image, finding),
-            rays=rays_from_pixels(np.where(inside[:, None], finding.pixels, np.nan), image.camera),
-            ray_stddev=finding.stddev / np.sqrt(image.camera.fx * image.camera.fy),
+            detection=detection,
+            likely=self._find_likely(image, detection),
+            rays=rays_from_pixels(np.where(inside[:, None], detection.pixels, np.nan), image.camera),
+            ray_stddev=detection.stddev / np.sqrt(image.camera.fx * image.camera.fy),
         )
 
     def _measure(self, seen: _Seen) -> Origin | None:
@@ -372,14 +217,14 @@ class JawLocalizer:
         points[:, 0] -= self._sign * self._track.speed * (late - late[-1])
         stddev = compute_stddev(sight, depths, side.fit.stddev, seen.ray_stddev)
         stddev[:, 0] = np.hypot(stddev[:, 0], origin.stddev)
-        reasons = self._judge(seen.image, seen.finding, side, points)
+        reasons = self._judge(seen.image, seen.detection, side, points)
         valid = reasons == ""
         count = len(valid)
         keypoints = JawKeypoints(
             stamp=seen.image.stamp,
             points=points[:count],
-            likelihood=np.where(valid, seen.finding.likelihood[:count], 0.0),
-            pixels=seen.finding.pixels[:count],
+            likelihood=np.where(valid, seen.detection.likelihood[:count], 0.0),
+            pixels=seen.detection.pixels[:count],
             valid=valid,
             stddev=stddev[:count],
             T_camera_jaw=self._origin.place(replace(origin, x=origin.x - self._track.speed * late[-1])),
@@ -392,7 +237,7 @@ class JawLocalizer:
 
         The reference point, which tells where the jaw is, has one wherever it was found.
         """
-        camera, rows = seen.image.camera, seen.finding.pixels[:, 1].copy()
+        camera, rows = seen.image.camera, seen.detection.pixels[:, 1].copy()
         rows[-1] = project(self._rest[-1:] @ T_camera_jaw[:3, :3].T + T_camera_jaw[:3, 3], camera)[0, 1]
         return self._settings.readout * (rows / camera.height - 1.0)
 
@@ -407,10 +252,10 @@ class JawLocalizer:
         least = min(_LEAST_SEEN, len(likely))
         return likely.sum() >= (max(least, _LEAST_FOUND * len(likely)) if self.is_lost else least)
 
-    def _find_likely(self, image: RgbdImage, finding: PixelFinding) -> NDArray:
-        """Return which points (K + 1,) bool the finder believes in."""
-        likely = finding.likelihood >= self._settings.likelihood
-        return likely & lie_inside(image, finding.pixels) & np.isfinite(finding.stddev)
+    def _find_likely(self, image: RgbdImage, detection: PixelDetection) -> NDArray:
+        """Return which points (K + 1,) bool the pixel_detector believes in."""
+        likely = detection.likelihood >= self._settings.likelihood
+        return likely & lie_inside(image, detection.pixels) & np.isfinite(detection.stddev)
 
     def _fit_side(
         self, image: RgbdImage, sight: SideView, likely: NDArray, scale: DepthScale, T_camera_jaw: NDArray
@@ -424,36 +269,36 @@ class JawLocalizer:
             return SideEvidence(fit=fit, has_depth=np.full(len(expected), self._settings.plane_depth))
         points = sight.camera + expected[:, None] * sight.rays
         excess = sample_depths(image.depth, image.camera, points, self._samples, T_camera_jaw)
-        fit, settings = None, self._settings
-        for gate in (settings.wide_gate, settings.gate):
+        fit = None
+        for gate in GATES:
             away = np.zeros(len(expected)) if fit is None else fit.y / sight.rays[:, 1]
             error = scale.error if fit is None else fit.scale.error
-            evidence = weigh_depths(excess, away + error * expected, gate, settings.quantum)
+            evidence = weigh_depths(excess, away + error * expected, gate, self._settings.quantum)
             measured = self._measures(evidence)
             used = measured & likely
             fit = fit_side(
                 self._model,
                 np.where(used, evidence.excess * sight.rays[:, 1], np.nan),
-                np.hypot(evidence.stddev, settings.depth_noise) * np.abs(sight.rays[:, 1]),
+                np.hypot(evidence.stddev, DEPTH_NOISE) * np.abs(sight.rays[:, 1]),
                 np.nan_to_num(lever),
                 scale,
             )
         with np.errstate(invalid="ignore"):
-            refused = np.abs(fit.misfit) > settings.misfit
-        hole = (evidence.known < settings.least_depths) & settings.plane_depth
+            refused = np.abs(fit.misfit) > MISFIT
+        hole = (evidence.known < LEAST_DEPTHS) & self._settings.plane_depth
         return SideEvidence(fit=fit, has_depth=(measured & ~refused) | hole)
 
     def _measures(self, evidence: DepthEvidence) -> NDArray:
         """Return at which points (K + 1,) bool enough depths, and most of them, are the finger's."""
-        return (evidence.count >= self._settings.least_depths) & (evidence.share >= self._settings.least_share)
+        return (evidence.count >= LEAST_DEPTHS) & (evidence.share >= LEAST_SHARE)
 
-    def _judge(self, image: RgbdImage, finding: PixelFinding, side: SideEvidence, points: NDArray) -> NDArray:
+    def _judge(self, image: RgbdImage, detection: PixelDetection, side: SideEvidence, points: NDArray) -> NDArray:
         """Return what speaks against each key point (K,) str, the first reason that does; "" for nothing."""
         with np.errstate(invalid="ignore"):
             outside = (np.abs(points - self._rest) > self._box).any(axis=1)
         against = (
-            ~lie_inside(image, finding.pixels),
-            ~(finding.likelihood >= self._settings.likelihood),
+            ~lie_inside(image, detection.pixels),
+            ~(detection.likelihood >= self._settings.likelihood),
             ~side.has_depth | ~np.isfinite(points).all(axis=1),
             outside,
         )

@@ -1,21 +1,46 @@
-"""Where a jaw stands on the closing axis, from the rays to its rigid points."""
+"""Where a jaw stands on the closing axis: from the rays to its rigid points, what surrounds one of them, and over time.
+
+A network places the reference point a little differently in every light and before every background, and all key points
+of the jaw would share the error. What surrounds the point is rigid and does not change: registered image by
+image, it tells ten times as exactly how far it has slid since the first ones.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import jaw_in_camera
+from finforce.optional import import_cv2
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.settings import DetectorSettings
+from finforce_keypoints.geometry.side_picture import PlaneGrid, SidePlane, map_picture, take_picture
+from finforce_keypoints.parameters import DetectorSettings
 
 _BENT_AT = 0.010  # height for which the bending is given [m]
 _HIGHEST_RIGID = 3.5e-3  # key points that bend more than this say nothing about the jaw's place [m]
 _LEAST_AGREEMENT = 0.6  # share of the points near the base that stand where the jaw is said to be: of a jaw, all do
 _SET_ASIDE = 3  # consecutive places off the course that are believed when they agree
+_RIGID_STDDEV = 0.3e-3  # [m] bending of the jaw at that height; more with the square of the height
+_ORIGIN_STDDEV = 0.6e-3  # [m] a jaw whose place is less well known is not found
+_ORIGIN_GATE = 3.0  # standard deviations of an origin off the forecast, which mean that the speed has changed
+_ACCELERATION = 2e-3  # [m/s^1.5] random walk of the closing speed; what is more is noticed and followed
 _LONGEST_STEP = 0.5  # [s] without an image, after which the course starts anew
+SCALE = 0.25e-3  # [m] of a pixel of the patch
+HALF = 20  # [px] of the patch's width and height
+BLUR = 1.5  # [px] standard deviation; wide enough that a slide by a pixel is still linear
+TEMPLATE_IMAGES = 30  # over which template and anchor are averaged
+ITERATIONS = 5
+SETTLED = 0.02  # [px] that a last iteration may move
+FARTHEST = 2.0e-3  # [m] between the network's place and the registered one
+LEAST_LIKENESS = 0.75  # correlation with the template, below which something else is seen
+STDDEV = 0.04e-3  # [m] of a registered slide
+_INNER = (slice(3, -3), slice(3, -3))  # the border's gradients are one-sided
+FORGOTTEN_AFTER = 15  # images in a row without likeness: the light or the thing itself has changed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +58,7 @@ class Origin:
     shared: float = 0.0
 
 
-class OriginFinder:
+class OriginEstimator:
     """Finds the origin of one jaw, whose rotation is known, from rays to its points.
 
     A point of the rigid jaw moves on a line q(x) = p + x a, a the closing axis; it is where it comes nearest to the
@@ -47,7 +72,7 @@ class OriginFinder:
         points = np.vstack((jaw.keypoints, jaw.reference_point))
         self._starts = points @ self._T_camera_middle[:3, :3].T + self._T_camera_middle[:3, 3]
         self._axis = T_gripper_camera[0, :3].copy()
-        bent = settings.rigid_stddev * (jaw.keypoints[:, 2] / _BENT_AT) ** 2
+        bent = _RIGID_STDDEV * (jaw.keypoints[:, 2] / _BENT_AT) ** 2
         self._bent = np.append(np.where(bent < _HIGHEST_RIGID, bent, np.inf), 0.0)
         sign = -1.0 if jaw.side == "left" else 1.0
         self._low, self._high = sorted((sign * settings.opening_min, sign * settings.opening_max))
@@ -106,6 +131,138 @@ class OriginFinder:
         return np.stack((x, depth * stddev / np.sqrt(square), off))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Slide:
+    """How a patch lies beside the template.
+
+    Attributes:
+        x: way along the jaw's x [px].
+        likeness: their correlation, brightness and contrast aside.
+    """
+
+    x: float
+    likeness: float
+
+
+class ReferencePatch:
+    """Follows the reference point of one jaw by what surrounds it.
+
+    Args:
+        jaw: whose reference point lies on its side.
+    """
+
+    def __init__(self, jaw: Jaw) -> None:
+        x, y, z = jaw.reference_point
+        self._side = SidePlane(level=float(y))
+        size = 2 * HALF + 1
+        self._grid = PlaneGrid(scale=SCALE, x=x - HALF * SCALE, z=z - HALF * SCALE, width=size, height=size)
+        self._sign = 1.0 if jaw.side == "left" else -1.0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the template."""
+        self._template: NDArray | None = None
+        self._matcher: PatchMatcher | None = None
+        self._count, self._anchor, self._unlike = 0, 0.0, 0
+
+    @property
+    def is_learnt(self) -> bool:
+        """Whether the template is one of enough images, so that it changes no more."""
+        return self._count >= TEMPLATE_IMAGES
+
+    def refine(
+        self, color: NDArray, camera: CameraIntrinsics, measured: Origin, place: Callable[[Origin], NDArray]
+    ) -> Origin:
+        """Return where the jaw is by its patch, or as it was measured where the patch does not show it.
+
+        Args:
+            color: image (h, w, 3) uint8.
+            camera: its intrinsics.
+            measured: origin that the network's reference point shows.
+            place: origin to T_camera_jaw (4, 4).
+        """
+        if self._template is None:
+            self._template, self._count = self._take(color, camera, place(measured)), 1
+            return measured
+        found = self._register(color, camera, measured, place)
+        if found is None:
+            self._unlike += 1
+            if self._unlike >= FORGOTTEN_AFTER:
+                self.reset()
+            return measured
+        self._unlike = 0
+        if self._count < TEMPLATE_IMAGES:
+            self._learn(self._take(color, camera, place(found)), measured.x - found.x)
+        return Origin(x=found.x + self._anchor, stddev=STDDEV)
+
+    def _learn(self, patch: NDArray, off: float) -> None:
+        """Average template and anchor with one more image, its patch taken where it was found."""
+        share = 1.0 / (self._count + 1)
+        self._template += share * (patch - self._template)
+        self._anchor += share * (off - self._anchor)
+        self._count += 1
+        self._matcher = None
+
+    def _register(
+        self, color: NDArray, camera: CameraIntrinsics, measured: Origin, place: Callable[[Origin], NDArray]
+    ) -> Origin | None:
+        """Return the origin, without the anchor, at which the patch is the template; None when it is nowhere near."""
+        x = measured.x - self._anchor
+        self._matcher = self._matcher or build_matcher(self._template)
+        for _ in range(ITERATIONS):
+            slide = self._matcher.match(self._take(color, camera, place(Origin(x=x, stddev=0.0))))
+            step = self._sign * slide.x * SCALE
+            x += step
+            if abs(x + self._anchor - measured.x) > FARTHEST or not np.isfinite(x):
+                return None
+            if abs(slide.x) < SETTLED:
+                return Origin(x=x, stddev=STDDEV) if slide.likeness >= LEAST_LIKENESS else None
+        return None
+
+    def _take(self, color: NDArray, camera: CameraIntrinsics, T_camera_jaw: NDArray) -> NDArray:
+        """Return the patch (h, w) of a jaw at a place, smoothed."""
+        picture = take_picture(color, map_picture(self._grid, self._side, T_camera_jaw, camera))
+        red, green, blue = np.moveaxis(picture.astype(np.float32), 2, 0)
+        grey = (red + green + blue) / np.float32(3.0)
+        return import_cv2().GaussianBlur(grey, (0, 0), BLUR).astype(np.float64)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PatchMatcher:
+    """Tells by how much patches have slid against one template, by least squares to first order in the slide s.
+
+    patch = a template - a (s_x d_x + s_z d_z) template + b
+
+    Attributes:
+        template: (n,) of the inner pixels, without its mean and of length 1.
+        inverse: (4, n) that gives -a s_x, -a s_z, a and b of a patch.
+    """
+
+    template: NDArray
+    inverse: NDArray
+
+    def match(self, patch: NDArray) -> Slide:
+        """Return by how much a patch (h, w) has slid."""
+        values = patch[_INNER].ravel()
+        slope_x, _, gain, _ = self.inverse @ values
+        if not gain > 0.0:
+            return Slide(x=0.0, likeness=0.0)
+        seen = values - values.sum() / values.size
+        likeness = float(seen @ self.template / max(sqrt(seen @ seen), 1e-9))
+        return Slide(x=float(-slope_x / gain), likeness=likeness)
+
+
+def build_matcher(template: NDArray) -> PatchMatcher:
+    """Return what compares patches with a template (h, w)."""
+    by_z, by_x = np.gradient(template)
+    values = template[_INNER].ravel()
+    columns = np.column_stack([by_x[_INNER].ravel(), by_z[_INNER].ravel(), values, np.ones(values.size)])
+    normal = columns.T @ columns + 1e-6 * np.eye(4)
+    known = values - values.mean()
+    known /= max(np.linalg.norm(known), 1e-9)
+    return PatchMatcher(template=known, inverse=np.linalg.solve(normal, columns.T))
+
+
 class OriginTrack:
     """Kalman filter of a jaw's place and speed that follows changes of speed at once.
 
@@ -157,10 +314,10 @@ class OriginTrack:
         state, P = self._predict(stamp)
         error, dt = origin.x - state[0], stamp - self._stamp
         spread = np.sqrt(P[0, 0] + origin.stddev**2)
-        if abs(error) > self._settings.largest_speed * dt + self._settings.origin_gate * spread:
+        if abs(error) > self._settings.largest_speed * dt + _ORIGIN_GATE * spread:
             return self._set_aside(stamp, origin, forecast)
         self._missed, self._aside = 0, []
-        if abs(error) > self._settings.origin_gate * spread:
+        if abs(error) > _ORIGIN_GATE * spread:
             P = P + np.diag([error**2, (error / dt) ** 2])
         gain = P[:, 0] / (P[0, 0] + origin.stddev**2)
         self._stamp, self._state = stamp, state + gain * error
@@ -168,7 +325,7 @@ class OriginTrack:
         self._P = P - np.outer(gain, P[0])
         # a finger stays bent from image to image: no average of its points knows better where its base is
         self._P[0, 0] = max(self._P[0, 0], least)
-        return self._estimate() if np.sqrt(self._P[0, 0]) <= self._settings.origin_stddev else None
+        return self._estimate() if np.sqrt(self._P[0, 0]) <= _ORIGIN_STDDEV else None
 
     def rest(self, stamp: float) -> None:
         """Take it that the jaw has not moved since the last image."""
@@ -180,7 +337,7 @@ class OriginTrack:
         self._stamp, self._state = stamp, np.array([origin.x, speed])
         self._P = np.diag([origin.stddev**2, 0.01**2])
         self._aside, self._missed = [], 0
-        return self._estimate() if origin.stddev <= self._settings.origin_stddev else None
+        return self._estimate() if origin.stddev <= _ORIGIN_STDDEV else None
 
     def _miss(self, stamp: float, forecast: Origin | None) -> Origin | None:
         """Go on without an origin for a few images."""
@@ -190,7 +347,7 @@ class OriginTrack:
             return None
         self._state, self._P = self._predict(stamp)
         self._stamp = stamp
-        return forecast if forecast.stddev <= self._settings.origin_stddev else None
+        return forecast if forecast.stddev <= _ORIGIN_STDDEV else None
 
     def _set_aside(self, stamp: float, origin: Origin, forecast: Origin) -> Origin | None:
         """Keep an origin that no jaw can reach; believe it once some in a row agree."""
@@ -206,7 +363,7 @@ class OriginTrack:
 
     def _predict(self, stamp: float) -> tuple[NDArray, NDArray]:
         """Return position and speed (2,) at a time [s] and their covariance (2, 2)."""
-        dt, power = stamp - self._stamp, self._settings.acceleration**2
+        dt, power = stamp - self._stamp, _ACCELERATION**2
         F = np.array([[1.0, dt], [0.0, 1.0]])
         Q = power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
         return F @ self._state, F @ self._P @ F.T + Q

@@ -13,141 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project
-
-if TYPE_CHECKING:
-    from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
-
-LEAST_POINTS = 8  # valid key points that a jaw needs
-HALVES = (5, 10)  # [px] of the patch around a key point, larger where little is to be seen; gradients need one more
-INNER = (slice(None), slice(1, -1), slice(1, -1))  # of patches (n, s, s), without what the gradients need
-_LENGTH = 1e-3  # [m] in which shifts are solved for
-_ALIKE = 1.7  # by which shifts err more than from noise that no neighbours share; seen on twin images
-_RIDGE = 1e-3  # keeps a picture without any contrast regular
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class JawSpots:
-    """The patches of one jaw, and how its places move in the picture.
-
-    Attributes:
-        pixels: (n, s, s) places of the patches in the flat picture [px].
-        along_x: (n, 2) pixels by which a key point moves along the jaw's x [px/m].
-        along_z: (n, 2) the same along its z.
-        powers: (n, 3) 1, h and h^2 of the key points' heights, the highest one's being 1.
-    """
-
-    pixels: NDArray
-    along_x: NDArray
-    along_z: NDArray
-    powers: NDArray
-
-    def reach(self, shifts: NDArray) -> NDArray:
-        """Return how far shifts (4,) [m] move the key points along x, (n,), and all of them along z: (n + 1,) [m]."""
-        return np.abs(np.append(self.powers @ shifts[:3], shifts[3]))
-
-    def solve(self, mean: NDArray, square: NDArray) -> SpotModel:
-        """Return what answers for the differences from a mean picture.
-
-        Args:
-            mean: (n, s, s) of the patches.
-            square: (n,) mean square around each key point of what is left in pictures of a jaw that stands still.
-        """
-        by_row, by_column = np.gradient(mean, axis=(1, 2))
-        slope_x, slope_z = (
-            (by_column * way[:, 0, None, None] + by_row * way[:, 1, None, None])[INNER] * _LENGTH
-            for way in (self.along_x, self.along_z)
-        )
-        inner = mean[INNER]
-        shifts = -slope_x[..., None] * self.powers[:, None, None, :]
-        columns = (inner / 100.0, np.ones_like(inner), *np.moveaxis(shifts, -1, 0), -slope_z)
-        design = np.stack(columns, axis=-1).reshape(-1, len(columns))
-        covariance = np.linalg.inv(design.T @ design + _RIDGE * np.eye(len(columns)))
-        along_x = np.einsum("ij,jk,ik->i", self.powers, covariance[2:5, 2:5], self.powers)
-        spread = np.append(along_x, covariance[5, 5])
-        return SpotModel(
-            mean=inner.ravel(),
-            design=design,
-            inverse=covariance @ design.T,
-            square=square,
-            errors=_LENGTH * _ALIKE * np.sqrt(spread * square.mean()),
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SpotModel:
-    """What answers for the differences d (N,) of a picture from a mean one (N,): d = design @ c, (N, 6).
-
-    Attributes:
-        mean: (N,) grey values.
-        design: (N, 6) of gain, brightness, three shifts along x and one along z.
-        inverse: (6, N) c = inverse @ d.
-        square: (n,) mean square of what is left around each key point while nothing moves.
-        errors: (n + 1,) standard deviations of the key points' shifts along x, then of the one along z [m].
-    """
-
-    mean: NDArray
-    design: NDArray
-    inverse: NDArray
-    square: NDArray
-    errors: NDArray
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GreyLook:
-    """How one jaw differs from its mean picture: shifts (4,) [m], what is left around each key point (n,)."""
-
-    shifts: NDArray
-    left: NDArray
-
-
-def look_at(values: NDArray, model: SpotModel) -> GreyLook:
-    """Return how the grey values (N,) of a jaw differ from those of a model."""
-    away = values - model.mean
-    answer = model.inverse @ away
-    left = away - model.design @ answer
-    return GreyLook(shifts=_LENGTH * answer[2:], left=np.square(left).reshape(len(model.square), -1).mean(axis=1))
-
-
-def place_spots(found: JawKeypoints, camera: CameraIntrinsics, half: int = HALVES[0]) -> JawSpots | None:
-    """Return where a jaw is watched, None where too few of its key points are seen well inside the image.
-
-    Args:
-        found: its key points.
-        camera: that saw them.
-        half: of the patches' width and height [px].
-    """
-    size = np.array([camera.width, camera.height])
-    with np.errstate(invalid="ignore"):
-        inside = ((found.pixels > half + 1) & (found.pixels < size - half - 2)).all(axis=1)
-    kept = found.valid & inside
-    if kept.sum() < LEAST_POINTS:
-        return None
-    points, T = found.points[kept], found.T_camera_jaw
-    start, beside, above = (
-        project((points + step) @ T[:3, :3].T + T[:3, 3], camera)
-        for step in np.array([[0.0, 0.0, 0.0], [_LENGTH, 0.0, 0.0], [0.0, 0.0, _LENGTH]])
-    )
-    steps = np.arange(-half - 1, half + 2)
-    around = np.stack(np.meshgrid(steps, steps), axis=-1)
-    places = np.rint(found.pixels[kept]).astype(np.intp)[:, None, None] + around
-    height = points[:, 2] / points[:, 2].max()
-    return JawSpots(
-        pixels=places[..., 1] * camera.width + places[..., 0],
-        along_x=(beside - start) / _LENGTH,
-        along_z=(above - start) / _LENGTH,
-        powers=height[:, None] ** np.arange(3),
-    )
-
-
-if TYPE_CHECKING:
-    from finforce.camera import CameraIntrinsics
-    from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
+from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
+from finforce_keypoints.images import RgbdImage
 
 LARGEST_SHIFT = 0.05e-3  # [m] of a key point in one image, up to which it has not moved
 LARGEST_CREEP = 0.02e-3  # [m] the same, averaged over the last images
@@ -155,85 +27,83 @@ AVERAGED = 10  # images, over which a creep is averaged
 SIGMA = 4.0  # standard deviations of a shift that noise explains, where that is more
 LARGEST_ERROR = 0.02e-3  # [m] standard deviation of a shift, above which nobody can tell
 STRANGEST = 3.0  # mean square of what is left around one key point by that of still images: more is another thing
-JUDGED = 8  # images after which it shows whether the patches are large enough
-LEAST_IMAGES = 15  # over which the mean is taken before it stands for anything
-MOST_IMAGES = 60  # of which it is the mean at most; older ones fade
+LEARNT = 15  # images of which a reference is the mean
 MOVED = 0.3e-3  # [m] of a jaw from one image to the next, which needs no look at its picture
+LOOK_EVERY = 4.0  # [s] after which an image is looked at in full though nothing has moved
+LEAST_POINTS = 8  # valid key points that a jaw needs
+HALF = 8  # [px] of the patch around a key point, without the pixel at its edge that gradients need
+INNER = (..., slice(1, -1), slice(1, -1))
+_LENGTH = 1e-3  # [m] in which shifts are solved for
+_ALIKE = 1.7  # by which shifts err more than from noise that no neighbours share; seen on twin images
+_RIDGE = 1e-3  # keeps a picture without any contrast regular
 
 
-class JawWatch:
-    """Watches one jaw: the mean picture of its patches, and the mean of its key points over the same images.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JawSpots:
+    """Where one jaw is watched, and how its key points move in the picture.
 
-    Args:
-        found: its key points in the first image.
-        spots: where it is watched.
+    Attributes:
+        places: (3, n, s, s) of red, green and blue of the patches in the flat picture.
+        along_x: (n, 2) pixels by which a key point moves along the jaw's x [px/mm].
+        along_z: (n, 2) the same along its z.
+        powers: (n, 3) 1, h and h^2 of the key points' heights, the highest one's being 1.
     """
 
-    def __init__(self, found: JawKeypoints, spots: JawSpots) -> None:
-        self.spots = spots
-        self._creep, self._model = np.zeros(4), None
-        self._count = 0
-        self._points, self._seen = np.zeros_like(found.points), np.zeros(len(found.points))
+    places: NDArray
+    along_x: NDArray
+    along_z: NDArray
+    powers: NDArray
 
-    @property
-    def is_sure(self) -> bool:
-        """Whether the mean is one of enough images, and shows a shift well enough."""
-        return self._count >= LEAST_IMAGES and self._model.errors.max() <= LARGEST_ERROR
 
-    @property
-    def is_vague(self) -> bool:
-        """Whether the patches show too little for ever telling."""
-        return self._count >= JUDGED and self._model.errors.max() > LARGEST_ERROR
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Learnt:
+    """One image of jaws that seem to stand still: key points and grey patches (n, s, s), by side."""
+
+    found: Mapping[str, JawKeypoints]
+    patches: Mapping[str, NDArray]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StillReference:
+    """What one jaw looks like while it stands still: d = design @ c for the differences d (N,) of a picture from it.
+
+    Attributes:
+        keypoints: the means of its key points, told while nothing moves.
+        places: (3, N) of red, green and blue in the flat picture.
+        mean: (N,) grey values.
+        design: (N, 6) of gain, brightness, three shifts along x and one along z.
+        inverse: (6, N) c = inverse @ d.
+        powers: (n, 3) 1, h and h^2 of the key points' heights, the highest one's being 1.
+        square: (n,) mean square of what is left around each key point while nothing moves.
+        errors: (n + 1,) standard deviations of the key points' shifts along x, then of the one along z [m].
+    """
+
+    keypoints: JawKeypoints
+    places: NDArray
+    mean: NDArray
+    design: NDArray
+    inverse: NDArray
+    powers: NDArray
+    square: NDArray
+    errors: NDArray
 
     @property
     def limits(self) -> NDArray:
-        """Shifts (n + 1,) [m] of the key points in one image, as `JawSpots.reach`, up to which noise explains them."""
-        return np.maximum(LARGEST_SHIFT, SIGMA * self._model.errors)
+        """Shifts (n + 1,) [m] of the key points in one image, as of `reach`, up to which noise explains them."""
+        return np.maximum(LARGEST_SHIFT, SIGMA * self.errors)
 
-    def add(self, found: JawKeypoints, patches: NDArray) -> None:
-        """Average with one more image its key points and its patches (n, s, s)."""
-        first = self._count == 0
-        self._count += 1
-        share = 1.0 / min(self._count, MOST_IMAGES)
-        if first:
-            self._mean, self._place = patches.copy(), found.T_camera_jaw.copy()
-            self._square = np.full(len(patches), np.nan)
-        else:
-            left = self.look(patches[INNER].ravel()).left
-            self._square = left if self._count == 2 else self._square + share * (left - self._square)
-            self._mean += share * (patches - self._mean)
-            self._place += share * (found.T_camera_jaw - self._place)
-        known = np.isfinite(found.points).all(axis=1) & found.valid
-        self._seen += share * (known - self._seen)
-        self._points += share * (np.where(known[:, None], found.points, 0.0) - self._points)
-        self._known = None if first else self._average(found)
-        if self._count & (self._count - 1) == 0 or self._count >= LEAST_IMAGES:
-            self._model = self.spots.solve(self._mean, self._square)
+    def reach(self, shifts: NDArray) -> NDArray:
+        """Return how far shifts (4,) [m] move the key points along x, (n,), and all of them along z: (n + 1,) [m]."""
+        return np.abs(np.append(self.powers @ shifts[:3], shifts[3]))
 
-    def look(self, values: NDArray) -> GreyLook:
-        """Return how the inner grey values (N,) of a picture differ from the mean."""
-        return look_at(values, self._model)
-
-    def is_still(self, values: NDArray) -> bool:
-        """Say whether the jaw stands where it stood, by the inner grey values (N,) of a picture."""
-        seen = self.look(values)
-        is_strange = (seen.left > STRANGEST * self._square).any()  # of the first image nothing is known: NaN
-        if is_strange or (self.spots.reach(seen.shifts) > self.limits).any():
-            return False
-        self._creep += (seen.shifts - self._creep) / AVERAGED
-        return bool(self.spots.reach(self._creep).max() <= LARGEST_CREEP)
-
-    def tell(self, stamp: float) -> JawKeypoints:
-        """Return the key points of an image of `stamp` [s] in which nothing has moved: the means."""
-        return replace(self._known, stamp=stamp)
-
-    def _average(self, found: JawKeypoints) -> JawKeypoints:
-        """Return the last key points with the mean places of those that were seen in most of the images."""
-        often = self._seen >= 0.5
-        with np.errstate(invalid="ignore", divide="ignore"):
-            points = np.where(often[:, None], self._points / self._seen[:, None], found.points)
-        stddev = np.hypot(found.stddev, LARGEST_SHIFT)
-        return replace(found, points=points, stddev=stddev, T_camera_jaw=self._place.copy())
+    def measure(self, values: NDArray) -> NDArray | None:
+        """Return the shifts (4,) [m] that grey values (N,) show; None where the jaw has moved, or is hidden in part."""
+        difference = values - self.mean
+        answer = self.inverse @ difference
+        left = np.square(difference - self.design @ answer).reshape(len(self.square), -1).mean(axis=1)
+        shifts = _LENGTH * answer[2:]
+        moved = (self.reach(shifts) > self.limits).any() or (left > STRANGEST * self.square).any()
+        return None if moved else shifts
 
 
 class StillWatch:
@@ -244,106 +114,166 @@ class StillWatch:
 
     def reset(self) -> None:
         """Forget all pictures."""
-        self._last: Mapping[str, JawKeypoints] = {}
-        self._forget()
-
-    def _forget(self) -> None:
-        """Forget where the jaws stood still."""
-        self._jaws: dict[str, JawWatch] = {}
+        self.references: dict[str, StillReference] = {}
+        self._learning: list[_Learnt] = []
+        self._spots: dict[str, JawSpots | None] = {}
         self._camera: CameraIntrinsics | None = None
+        self._creep: dict[str, NDArray] = {}
         self._values = np.empty(0)
-        self._has_moved = False
-        self._doubted = False
-        self._half = HALVES[0]
+        self._moved = 0  # pictures in a row that looked moved
+        self._looked = -np.inf
 
-    def confirm(self, stamp: float, color: NDArray, camera: CameraIntrinsics) -> Mapping[str, JawKeypoints] | None:
-        """Return the key points by side of a picture (h, w, 3) uint8 in which nothing has moved, else None.
+    def confirm(self, image: RgbdImage) -> Mapping[str, JawKeypoints] | None:
+        """Return the key points by side of a picture in which nothing has moved, else None: look at it in full.
 
         A picture that is the one before to the bit says nothing: a sensor has noise.
         """
-        if camera is not self._camera or color.shape[:2] != (camera.height, camera.width) or not self._is_sure:
+        if not self.references or image.camera is not self._camera:
             return None
-        before, self._values = self._values, _gather(color, self._inner)
+        values = [gather(image.color, reference.places) for reference in self.references.values()]
+        before, self._values = self._values, np.concatenate(values)
         if np.array_equal(before, self._values):
             return None
-        if self._judge(self._values):
-            return self._tell(stamp)
-        self._has_moved = True
-        return None
+        if not all([self._is_still(side, part) for side, part in zip(self.references, values, strict=True)]):
+            self._moved += 1
+            return None
+        self._moved = 0
+        return None if image.stamp > self._looked + LOOK_EVERY else self._tell(image.stamp)
 
-    @property
-    def _is_sure(self) -> bool:
-        return bool(self._jaws) and all(jaw.is_sure for jaw in self._jaws.values())
+    def _is_still(self, side: str, values: NDArray) -> bool:
+        """Say whether a jaw stands where it stood, by the grey values (N,) of its patches."""
+        reference = self.references[side]
+        shifts = reference.measure(values)
+        if shifts is None:
+            return False
+        self._creep[side] += (shifts - self._creep[side]) / AVERAGED
+        return bool(reference.reach(self._creep[side]).max() <= LARGEST_CREEP)
 
     def _tell(self, stamp: float) -> Mapping[str, JawKeypoints]:
-        return {side: jaw.tell(stamp) for side, jaw in self._jaws.items()}
+        return {side: replace(reference.keypoints, stamp=stamp) for side, reference in self.references.items()}
 
-    def _judge(self, values: NDArray) -> bool:
-        """Say whether all jaws stand still by their inner grey values (N,)."""
-        parts = np.split(values, self._inner_ends)
-        return all([jaw.is_still(part) for jaw, part in zip(self._jaws.values(), parts, strict=True)])
+    def take(self, found: Mapping[str, JawKeypoints], image: RgbdImage) -> Mapping[str, JawKeypoints]:
+        """Take what was found of all jaws in an image, and return it, or its mean while they stand still.
 
-    def take(
-        self, found: Mapping[str, JawKeypoints], color: NDArray, camera: CameraIntrinsics
-    ) -> Mapping[str, JawKeypoints]:
-        """Take what was found of all jaws in a picture (h, w, 3), and return it, or its mean while they stand still.
-
-        A single picture that looks moved changes nothing; after a second one the mean begins anew.
+        A single picture that looks moved changes nothing; after a second one the jaws are learnt anew.
         """
-        last, self._last = self._last, found
-        has_moved, self._has_moved = self._has_moved, False
-        if not found or found.keys() != last.keys() or _have_moved(found, last):
-            self._forget()
-        elif camera is not self._camera or not self._jaws:
-            self._begin(found, color, camera)
-        elif not has_moved and self._add(found, color):
-            if self._half < HALVES[-1] and any(jaw.is_vague for jaw in self._jaws.values()):
-                self._begin(found, color, camera, HALVES[-1])
-            return self._tell(next(iter(found.values())).stamp) if self._is_sure else found
-        elif self._doubted or not self._is_sure:
-            self._begin(found, color, camera)
-        else:
-            self._doubted = True
-        return found
+        self._looked = image.stamp
+        if self.references:
+            if found.keys() == self.references.keys() and image.camera is self._camera and self._moved < 2:
+                known = {side: reference.keypoints for side, reference in self.references.items()}
+                if not have_moved(found, known):
+                    return found if self._moved else self._tell(image.stamp)
+            self.references, self._moved = {}, 0
+        self._learn(found, image)
+        return self._tell(image.stamp) if self.references else found
 
-    def _add(self, found: Mapping[str, JawKeypoints], color: NDArray, *, first: bool = False) -> bool:
-        """Add a picture to the means if it is still, as the first one is; return whether it was."""
-        patches = np.split(_gather(color, self._all), self._ends)
-        patches = [part.reshape(jaw.spots.pixels.shape) for jaw, part in zip(self._jaws.values(), patches, strict=True)]
-        is_still = first or self._judge(np.concatenate([part[INNER].ravel() for part in patches]))
-        if is_still:
-            self._doubted = False
-            for (side, jaw), part in zip(self._jaws.items(), patches, strict=True):
-                jaw.add(found[side], part)
-        return is_still
-
-    def _begin(
-        self, found: Mapping[str, JawKeypoints], color: NDArray, camera: CameraIntrinsics, half: int = HALVES[0]
-    ) -> None:
-        """Begin new means with a picture and patches of a size [px], unless too little of a jaw is seen in it."""
-        self._forget()
-        self._half = half
-        spots = {side: place_spots(jaw, camera, half) for side, jaw in found.items()}
-        if any(jaw is None for jaw in spots.values()):
+    def _learn(self, found: Mapping[str, JawKeypoints], image: RgbdImage) -> None:
+        """Learn from one more image; a motion begins anew."""
+        last = self._learning[-1].found if self._learning else found
+        if found.keys() != last.keys() or image.camera is not self._camera or have_moved(found, last):
+            self._learning = []
+        if not self._learning:
+            self._camera = image.camera
+            self._spots = {side: place_spots(jaw, image.camera) for side, jaw in found.items()}
+        if not found or None in self._spots.values():
+            self._learning = []
             return
-        self._camera = camera
-        self._all, self._ends = _join([jaw.pixels for jaw in spots.values()])
-        self._inner, self._inner_ends = _join([jaw.pixels[INNER] for jaw in spots.values()])
-        self._jaws = {side: JawWatch(found[side], jaw) for side, jaw in spots.items()}
-        self._add(found, color, first=True)
+        patches = {side: gather(image.color, spots.places) for side, spots in self._spots.items()}
+        self._learning.append(_Learnt(found=found, patches=patches))
+        if len(self._learning) == LEARNT:
+            learnt, self._learning = self._learning, []
+            references = {
+                side: build_reference(spots, [one.found[side] for one in learnt], [one.patches[side] for one in learnt])
+                for side, spots in self._spots.items()
+            }
+            if None not in references.values():
+                self.references, self._creep = references, {side: np.zeros(4) for side in references}
 
 
-def _have_moved(found: Mapping[str, JawKeypoints], last: Mapping[str, JawKeypoints]) -> bool:
-    """Say whether a jaw stands elsewhere than in the image before."""
-    return any(np.abs(jaw.T_camera_jaw - last[side].T_camera_jaw).max() > MOVED for side, jaw in found.items())
+def have_moved(found: Mapping[str, JawKeypoints], known: Mapping[str, JawKeypoints]) -> bool:
+    """Say whether a jaw stands elsewhere than it did."""
+    return any(np.abs(jaw.T_camera_jaw - known[side].T_camera_jaw).max() > MOVED for side, jaw in found.items())
 
 
-def _join(parts: Sequence[NDArray]) -> tuple[NDArray, NDArray]:
-    """Return places (3, N) of red, green and blue in the flat picture, and where the parts but the first begin."""
-    flat = np.concatenate([part.ravel() for part in parts])
-    return 3 * flat + np.arange(3)[:, None], np.cumsum([part.size for part in parts])[:-1]
+def average(found: Sequence[JawKeypoints]) -> JawKeypoints:
+    """Return the last key points with the mean places of those that were seen in at least half of the images."""
+    last, valid = found[-1], np.array([jaw.valid for jaw in found])
+    points = np.array([jaw.points for jaw in found])
+    seen = valid & np.isfinite(points).all(axis=2)
+    often = seen.mean(axis=0) >= 0.5
+    mean = np.where(seen[..., None], points, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]
+    return replace(
+        last,
+        points=np.where(often[:, None], mean, last.points),
+        stddev=np.hypot(last.stddev, LARGEST_SHIFT),
+        T_camera_jaw=np.mean([jaw.T_camera_jaw for jaw in found], axis=0),
+    )
 
 
-def _gather(color: NDArray, places: NDArray) -> NDArray:
-    """Return the grey values (N,), red and green and blue together, of a picture at places (3, N)."""
+def place_spots(found: JawKeypoints, camera: CameraIntrinsics) -> JawSpots | None:
+    """Return where a jaw is watched, None where too few of its key points are seen well inside the image."""
+    reach, size = HALF + 1, np.array([camera.width, camera.height])
+    with np.errstate(invalid="ignore"):
+        inside = ((found.pixels > reach) & (found.pixels < size - reach - 1)).all(axis=1)
+    kept = found.valid & inside
+    if kept.sum() < LEAST_POINTS:
+        return None
+    points, T = found.points[kept], found.T_camera_jaw
+    start, beside, above = (
+        project((points + step) @ T[:3, :3].T + T[:3, 3], camera)
+        for step in _LENGTH * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    )
+    steps = np.arange(-reach, reach + 1)
+    around = np.rint(found.pixels[kept]).astype(np.intp)[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1)
+    flat = 3 * (around[..., 1] * camera.width + around[..., 0])
+    return JawSpots(
+        places=np.stack((flat, flat + 1, flat + 2)),
+        along_x=beside - start,
+        along_z=above - start,
+        powers=(points[:, 2] / points[:, 2].max())[:, None] ** np.arange(3),
+    )
+
+
+def build_reference(
+    spots: JawSpots, found: Sequence[JawKeypoints], patches: Sequence[NDArray]
+) -> StillReference | None:
+    """Return what a jaw that stands still looks like; None where it moved, or too little is to be seen.
+
+    Args:
+        spots: where it is watched.
+        found: its key points in some pictures.
+        patches: grey values (n, s, s) of these.
+    """
+    mean, count = np.mean(patches, axis=0), len(spots.powers)
+    by_row, by_column = np.gradient(mean, axis=(1, 2))
+    slope_x, slope_z = (
+        (by_column * way[:, 0, None, None] + by_row * way[:, 1, None, None])[INNER]
+        for way in (spots.along_x, spots.along_z)
+    )
+    grey = mean[INNER]
+    shifts = (-slope_x * power[:, None, None] for power in spots.powers.T)
+    design = np.stack((grey / 100.0, np.ones_like(grey), *shifts, -slope_z), axis=-1).reshape(grey.size, -1)
+    covariance = np.linalg.inv(design.T @ design + _RIDGE * np.eye(design.shape[1]))
+    inverse = covariance @ design.T
+    seen = [part[INNER].ravel() for part in patches]
+    difference = np.array(seen) - grey.ravel()
+    left = (difference - difference @ inverse.T @ design.T).reshape(len(seen), count, -1)
+    square = np.square(left).mean(axis=(0, 2)) * len(seen) / (len(seen) - 1)  # the mean takes its part of the noise
+    along_x = np.einsum("ij,jk,ik->i", spots.powers, covariance[2:5, 2:5], spots.powers)
+    reference = StillReference(
+        keypoints=average(found),
+        places=spots.places[INNER].reshape(3, -1),
+        mean=grey.ravel(),
+        design=design,
+        inverse=inverse,
+        powers=spots.powers,
+        square=square,
+        errors=_LENGTH * _ALIKE * np.sqrt(np.append(along_x, covariance[5, 5]) * square.mean()),
+    )
+    is_clear = reference.errors.max() <= LARGEST_ERROR
+    return reference if is_clear and all(reference.measure(values) is not None for values in seen) else None
+
+
+def gather(color: NDArray, places: NDArray) -> NDArray:
+    """Return the grey values (...), red and green and blue together, of a picture at places (3, ...)."""
     return color.reshape(-1).take(places).sum(axis=0, dtype=np.float32)

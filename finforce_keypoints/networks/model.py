@@ -35,7 +35,6 @@ class DecodingRule:
         stride: input pixels per cell.
         locref_std: scale of the offset channels [px].
         apply_sigmoid: whether the maps are logits.
-        sub_cell: whether a peak without offsets is placed between the cells, by a parabola through the logarithms.
         pooled: whether the places that the 3 x 3 cells around a peak vote for are averaged, weighted by their scores;
             DeepLabCut takes the peak's own.
         likelihood_stddev: (n, 2) likelihood, standard deviation [px of the network's input].
@@ -44,7 +43,6 @@ class DecodingRule:
     stride: float
     locref_std: float = 7.2801
     apply_sigmoid: bool = False
-    sub_cell: bool = True
     pooled: bool = False
     likelihood_stddev: NDArray = field(default_factory=lambda: DEFAULT_STDDEV)
 
@@ -168,20 +166,18 @@ def _find_cells(heatmap: NDArray, rule: DecodingRule, size: tuple[int, int]) -> 
 
 
 def _place_by_scores(cells: _Cells, rule: DecodingRule) -> _Places:
-    """Return the centres of the peaks' cells, or the tops of parabolas through the logarithms of the scores.
+    """Return the tops of parabolas through the logarithms of the scores.
 
     Half the offset is (a - b) / (a - 2 m + b) of the logarithms a, m, b before, at and after the peak, exact for a
     Gaussian.
     """
-    scores, between = cells.scores, np.zeros((len(cells.scores), 2))
-    if rule.sub_cell:
-        peak = np.maximum(scores[:, _CENTRE], np.finfo(float).tiny)[:, None]
-        with np.errstate(invalid="ignore"):
-            logs = np.log(np.maximum(scores / peak, _LOG_FLOOR))
-        before, after = logs[:, [3, 1]], logs[:, [5, 7]]
-        bend = before + after
-        between = 0.5 * (before - after) / np.where(bend < 0.0, bend, -np.inf)
-        between = np.nan_to_num(np.clip(between, -0.5, 0.5))  # NaN: at the border of the map
+    peak = np.maximum(cells.scores[:, _CENTRE], np.finfo(float).tiny)[:, None]
+    with np.errstate(invalid="ignore"):
+        logs = np.log(np.maximum(cells.scores / peak, _LOG_FLOOR))
+    before, after = logs[:, [3, 1]], logs[:, [5, 7]]
+    bend = before + after
+    between = 0.5 * (before - after) / np.where(bend < 0.0, bend, -np.inf)
+    between = np.nan_to_num(np.clip(between, -0.5, 0.5))  # NaN: at the border of the map
     offsets = rule.stride * between
     centres = np.column_stack((cells.columns[:, _CENTRE], cells.rows[:, _CENTRE])) + 0.5
     return _Places(
@@ -228,36 +224,6 @@ _PROBE = 256  # px, of the picture that a network of any size is tried with
 _STRIDE_TOLERANCE = 0.6  # of log2(H / h / stride)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ModelOverrides:
-    """What is to hold instead of the metadata; None: as the metadata say.
-
-    Attributes:
-        stride: input pixels per heatmap cell.
-        locref_std: scale of the offset channels [px].
-        apply_sigmoid: whether the heatmaps are logits.
-        normalize: whether ImageNet's mean and standard deviation are taken off.
-        input_size: height and width of the training images [px].
-        sub_cell: whether peaks without offsets are placed between cells; they are when None.
-        pooled: whether the offsets around a peak are averaged; `finforce: pooled` in the metadata when None.
-    """
-
-    stride: float | None = None
-    locref_std: float | None = None
-    apply_sigmoid: bool | None = None
-    normalize: bool | None = None
-    input_size: tuple[int, int] | None = None
-    sub_cell: bool | None = None
-    pooled: bool | None = None
-
-    def __post_init__(self) -> None:
-        numbers = [value for value in (self.stride, self.locref_std, *(self.input_size or ())) if value is not None]
-        if not all(np.isfinite(value) and value > 0 for value in numbers):
-            raise ModelError(f"overrides {self}: expected positive stride, locref_std and input_size [px]")
-        if max(self.input_size or (0,)) > LARGEST_SIDE:
-            raise ModelError(f"input_size {self.input_size}: expected at most {LARGEST_SIDE} px each way")
-
-
 class KeypointModel:
     """Any DeepLabCut network exported to ONNX, with its `pytorch_config.yaml`; not for several threads at once.
 
@@ -269,7 +235,6 @@ class KeypointModel:
     def __init__(
         self,
         path: str | Path,
-        overrides: ModelOverrides | None = None,
         threads: int = 2,
         providers: Sequence[str] = (CPU,),
     ) -> None:
@@ -277,17 +242,15 @@ class KeypointModel:
 
         Args:
             path: the folder with one .onnx file and its metadata, or that .onnx file.
-            overrides: of the metadata.
             threads: that one picture is computed with.
             providers: onnxruntime's execution providers, best first.
 
         Raises:
-            ModelError: files are missing, or network, metadata and overrides do not agree.
+            ModelError: files are missing, or network and metadata do not agree.
             MissingDependencyError: onnxruntime is not installed.
         """
         self.path = find_network(path)
         self.metadata: ModelMetadata = read_metadata(self.path.parent / METADATA_FILE)
-        self._overrides = overrides or ModelOverrides()
         self._network = Network(self.path, threads, providers)
         self._scale, self._shift = self._build_normalization()
         self._buffer = np.empty(0)
@@ -310,13 +273,13 @@ class KeypointModel:
 
     @property
     def training_size(self) -> tuple[int, int] | None:
-        """Height and width of the images to be given [px]: overridden, frozen, or kept in the metadata; else None."""
+        """Height and width of the images to be given [px]: frozen, or kept in the metadata; else None."""
         frozen = self.frozen_size if None not in self.frozen_size else None
-        return self._overrides.input_size or frozen or self.metadata.training_size
+        return frozen or self.metadata.training_size
 
     def accepts(self, size: tuple[int, int]) -> bool:
         """Tell whether pictures of some height and width [px] are such as the network was trained on."""
-        trained = self._overrides.input_size or self.metadata.training_size
+        trained = self.metadata.training_size
         return tuple(size) == tuple(trained) if trained else self._fits(self._pad_size(size))
 
     @cached_property
@@ -386,7 +349,7 @@ class KeypointModel:
         """Return how maps of some height and width are decoded, for an input of some height and width [px].
 
         Raises:
-            ModelError: the stride of the metadata, or the override, is not that of the network.
+            ModelError: the stride of the metadata is not that of the network.
         """
         key = (*pixels, *cells)
         if key not in self._rules:
@@ -394,21 +357,20 @@ class KeypointModel:
         return self._rules[key]
 
     def _build_rule(self, pixels: tuple[int, int], cells: tuple[int, int]) -> DecodingRule:
-        chosen, metadata = self._overrides, self.metadata
-        stride = _first(chosen.stride, metadata.stride, stride_from_shapes(cells[0], pixels[0]))
+        metadata = self.metadata
+        stride = metadata.stride or stride_from_shapes(cells[0], pixels[0])
         off = np.log2(np.divide(pixels, cells) / stride)
         if np.abs(off).max() > _STRIDE_TOLERANCE:
             raise ModelError(
                 f"stride {stride:g}: the network makes {cells[0]}x{cells[1]} cells of {pixels[0]}x{pixels[1]} px; "
-                f"expected about {stride_from_shapes(cells[0], pixels[0]):g}, from the metadata or the override"
+                f"expected about {stride_from_shapes(cells[0], pixels[0]):g}, as output_stride in the metadata"
             )
         return DecodingRule(
             stride=float(stride),
-            locref_std=_first(chosen.locref_std, metadata.locref_std),
-            apply_sigmoid=_first(chosen.apply_sigmoid, metadata.apply_sigmoid),
-            sub_cell=_first(chosen.sub_cell, True),
-            pooled=_first(chosen.pooled, metadata.pooled),
-            likelihood_stddev=_first(metadata.likelihood_stddev, DEFAULT_STDDEV),
+            locref_std=metadata.locref_std,
+            apply_sigmoid=metadata.apply_sigmoid,
+            pooled=metadata.pooled,
+            likelihood_stddev=DEFAULT_STDDEV if metadata.likelihood_stddev is None else metadata.likelihood_stddev,
         )
 
     def _probe(self) -> OutputLayout:
@@ -435,13 +397,13 @@ class KeypointModel:
 
     def _check_sizes(self) -> None:
         """Refuse a training size that the network is not frozen to."""
-        wanted = self._overrides.input_size or self.metadata.training_size
+        wanted = self.metadata.training_size
         if wanted is None:
             return
         if not self._fits(self._pad_size(wanted)):
             raise ModelError(
-                f"{self.path.name}: the network is frozen to {self.frozen_size} (height, width); got an input_size of "
-                f"{tuple(wanted)} from the metadata or the override"
+                f"{self.path.name}: the network is frozen to {self.frozen_size} (height, width); expected "
+                f"that for its training_size of {tuple(wanted)}"
             )
 
     def _fits(self, padded: tuple[int, int]) -> bool:
@@ -470,11 +432,6 @@ class KeypointModel:
         """Return factor and shift per colour, in the axes of the network's input."""
         axes = (COLOURS, 1, 1) if self._network.input.channel_axis == 1 else (COLOURS,)
         scale, shift = np.full(COLOURS, 1.0 / 255.0, np.float32), np.zeros(COLOURS, np.float32)
-        if _first(self._overrides.normalize, self.metadata.normalize):
+        if self.metadata.normalize:
             scale, shift = scale / _STD, -_MEAN / _STD
         return scale.reshape(axes), shift.reshape(axes)
-
-
-def _first(*values):
-    """Return the first value that is not None."""
-    return next((value for value in values if value is not None), None)

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import one_line
 from finforce.optional import import_onnxruntime
-from finforce.processors import places_of_helpers
+from finforce.processors import bind_helper, places_of_helpers
 from finforce_keypoints.errors import DetectionError, ModelError
-from finforce_keypoints.networks.helpers import Helpers
 from finforce_keypoints.networks.trial import try_network
 
 if TYPE_CHECKING:
@@ -142,6 +142,35 @@ def find_network(path: str | Path) -> Path:
         names = ", ".join(file.name for file in found) or "none"
         raise ModelError(f"{path}: expected a folder with one .onnx file and its metadata, found {names}")
     return found[0]
+
+
+class Helpers:
+    """Threads in addition to the caller's own that share the pictures of a batch, a picture at a time.
+
+    Two threads that compute one picture wait for each other at every layer of a small network; two pictures do not.
+
+    Args:
+        threads: all of them, the caller's included.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+        self._pool = ThreadPoolExecutor(max(threads - 1, 1), "pictures", bind_helper, (threads,))
+
+    def share(self, work: Callable[[int], Any], count: int) -> list[Any]:
+        """Return what the work gives for the numbers from 0 to a count; the first error in one of them is raised."""
+        found: list[Any] = [None] * count
+        waiting = iter(range(count))
+
+        def run() -> None:
+            for number in waiting:
+                found[number] = work(number)
+
+        others = [self._pool.submit(run) for _ in range(min(self._threads, count) - 1)]
+        run()
+        for other in others:
+            other.result()
+        return found
 
 
 class Network:

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from finforce.errors import one_line
 from finforce.optional import import_cv2
 from finforce_keypoints.errors import DetectionError, ModelError
-from finforce_keypoints.geometry.shapes import fit_motion, trust
-from finforce_keypoints.networks.helpers import Helpers
-from finforce_keypoints.networks.network import CPU, open_session
+from finforce_keypoints.geometry.template import fit_motion, trust
+from finforce_keypoints.networks.network import CPU, Helpers, open_session
 
 METADATA = "finforce"  # key of the files' own metadata
 KIND = "side plane"
@@ -96,7 +95,7 @@ class SideNetwork:
         if missing:
             raise ModelError(
                 f"{path}: there is no {' and no '.join(missing)}; expected the folder of a network for side planes; a "
-                "DeepLabCut network is used with finder frame"
+                "DeepLabCut network is used with detection_method frame"
             )
         self._coarse, self._fine = (open_session(self.path / name, 1, providers) for name in (COARSE, FINE))
         self._helpers = Helpers(threads)

@@ -27,8 +27,7 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.parameters import load_jaws
-from finforce_keypoints.settings import RULES
+from finforce_keypoints.parameters import RULES, load_jaws
 from lab.bench.scenes import DIM, GRASP, BenchScene, find_scene
 from lab.harness import Figures, Tradeoff, percentiles
 
@@ -60,7 +59,7 @@ WAYS = (
     Way(name="network, 1 thread", parameters={"threads": 1}),
     Way(name="network, searching", searches=True),
     Way(name="network, resting", rests=True),
-    Way(name="dots", parameters={"finder": "dots"}, dots=True),
+    Way(name="dots", parameters={"detection_method": "dots"}, dots=True),
 )
 
 

@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("recordings", nargs="+", help="recordings with images")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the network in bytes")
     parser.add_argument("--jaw", default="bench", help="jaw file, or the name of a shipped jaw")
-    parser.add_argument("--finder", choices=("network", "frame"), default="network", help="what shows it pictures")
+    parser.add_argument("--method", choices=("network", "frame"), default="network", help="what shows it pictures")
     options = parser.parse_args(arguments)
     with one_line_errors():
         run(options)
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
         DatasetError: the recordings showed the network too little.
     """
     before = KeypointModel(options.network)
-    parameters = {"model": str(options.network), "finder": options.finder}
+    parameters = {"model": str(options.network), "detection_method": options.method}
     with watch_batches() as batches:
         for path in options.recordings:
             recording = read_recording(path)

@@ -26,8 +26,7 @@ from finforce_eval.replay.node import PlayerParameters
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.detectors.dots import DotSettings
-from finforce_keypoints.parameters import DetectorParameters
-from finforce_keypoints.settings import DetectorSettings
+from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
 from finforce_sim.parameters import TwinParameters
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -90,7 +89,7 @@ def test_every_parameter_of_the_graph_is_one_of_the_node():
         "pose_source": "tracker",
         "pose_origin": "middle",
         "images": True,
-        "finder": "frame",
+        "detection_method": "frame",
         "model": "d",
         "depth": "auto",
         "T_gripper_camera": "0 0 0.1, 0 0 0 1",
@@ -145,17 +144,22 @@ def test_solver_and_contact_estimator_have_the_same_mesh_of_the_jaw(solver, mesh
 
 def test_images_start_one_detector_for_all_jaws():
     options = ReplayOptions(
-        composed=False, jaws="both", images=True, finder="dots", jaw_file="j", T_gripper_camera="0 0 0.1 0 0 0 1"
+        composed=False,
+        jaws="both",
+        images=True,
+        detection_method="dots",
+        jaw_file="j",
+        T_gripper_camera="0 0 0.1 0 0 0 1",
     )
     detector = by_name(replay_processes(options, ROOT))["keypoint_detector"]
     assert detector.parameters["jaws"] == "both" and detector.parameters["use_sim_time"] is True
-    assert detector.parameters["finder"] == "dots" and detector.parameters["jaw_file"] == "j"
+    assert detector.parameters["detection_method"] == "dots" and detector.parameters["jaw_file"] == "j"
     assert detector.parameters["T_gripper_camera"] == [0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0]
     assert "keypoint_detector" in by_name(bench_processes(BenchOptions(composed=False, images=True), ROOT))
 
 
 def test_without_images_key_points_come_by_topic():
-    processes = replay_processes(ReplayOptions(composed=False, jaws="both", finder="dots", model="m"), ROOT)
+    processes = replay_processes(ReplayOptions(composed=False, jaws="both", detection_method="dots", model="m"), ROOT)
     assert "keypoint_detector" not in by_name(processes)
 
 

@@ -107,12 +107,12 @@ def test_an_object_mesh_starts_the_contact_estimator(recorded_launch):
 
 
 def test_images_start_the_detector_with_the_configuration(recorded_launch):
-    nodes = start(ROOT / "launch" / "bench.launch.py", images="true", finder="dots", jaw="right")
+    nodes = start(ROOT / "launch" / "bench.launch.py", images="true", detection_method="dots", jaw="right")
     detector = nodes["keypoint_detector"]
     configuration, parameters = detector["parameters"]
     assert (detector["package"], detector["executable"]) == ("finforce", "keypoint_detector")
     assert Path(configuration).name == "bench.yaml"
-    assert (parameters["jaws"], parameters["finder"]) == ("right", "dots")
+    assert (parameters["jaws"], parameters["detection_method"]) == ("right", "dots")
 
 
 def test_the_end_of_the_player_ends_the_launch(recorded_launch):
@@ -139,8 +139,8 @@ def test_the_declared_arguments_are_the_options_with_their_defaults(recorded_lau
 
 
 def test_none_is_an_empty_value(recorded_launch):
-    detector = start(ROBOT, camera="false", camera_name="none", finder="none")["keypoint_detector"]
-    assert not {"camera_frame", "finder"} & set(detector["parameters"][1])
+    detector = start(ROBOT, camera="false", camera_name="none", detection_method="none")["keypoint_detector"]
+    assert not {"camera_frame", "detection_method"} & set(detector["parameters"][1])
     with pytest.raises(ValueError, match="camera_name:=none: camera:=true needs a name"):
         act(ROBOT, camera_name="none")
     with pytest.raises(ValueError, match="dof:=none: expected a int"):

@@ -34,8 +34,7 @@ from finforce_eval.replay.node import PlayerParameters
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.detectors.dots import DotSettings
-from finforce_keypoints.parameters import DetectorParameters
-from finforce_keypoints.settings import DetectorSettings
+from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
 
 RECORDS = (
     NodeParameters,

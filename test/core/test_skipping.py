@@ -17,7 +17,7 @@ from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.observation import Contact, ObjectOutline
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.influence import AWAY, is_out_of_reach
-from finforce_keypoints.settings import RULES as DETECTOR
+from finforce_keypoints.parameters import RULES as DETECTOR
 
 RADIUS, HEIGHT = 0.0125, 0.040
 DEPTHS = ramp(2, 0)

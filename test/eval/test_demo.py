@@ -19,7 +19,6 @@ from finforce_eval.evaluation.scoring import score_grasp
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
 from finforce_eval.replay.replay import Replay
-from finforce_keypoints.images import ImageWatch
 
 
 @pytest.fixture
@@ -81,7 +80,7 @@ def played(tmp_path_factory):
     """A recording from images; the force rises by 0.1 N an image from image 20 on."""
     path = write_footage(make_footage(FakeGripper(count=40, onset=20)), tmp_path_factory.mktemp("bags") / "twin")
     recording = read_recording(path)
-    return detect_keypoints(recording, FakeDetector(recording), watch=ImageWatch())
+    return detect_keypoints(recording, FakeDetector(recording))
 
 
 def grasp_of(recording, error):

@@ -16,7 +16,7 @@ from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
 from finforce_eval.recordings.writer import write_recording
-from finforce_keypoints.images import ImageWatch, check_image
+from finforce_keypoints.images import check_image
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def recording(tmp_path_factory):
 
 def detect(recording, **options):
     detector = FakeDetector(recording, **options)
-    return detect_keypoints(recording, detector, watch=ImageWatch()), detector
+    return detect_keypoints(recording, detector), detector
 
 
 def test_every_image_is_seen_once_in_order_and_its_key_points_take_their_place(recording):
@@ -57,7 +57,7 @@ def test_an_image_without_the_jaw_has_no_key_points_and_no_pose(recording):
 
 def test_what_a_detector_refuses_is_counted_and_the_rest_goes_on(recording):
     found, _ = detect(recording, refused=(2, 3))
-    assert found.notes[-1] == "2 images refused: no picture for this finder"
+    assert found.notes[-1] == "2 images refused: no picture for this detector"
     assert found.jaws["left"].detection.found.sum() == 10
 
 
@@ -80,7 +80,7 @@ class WithoutDepth(FakeDetector):
 
 
 def test_images_without_depth_are_a_note(recording):
-    found = detect_keypoints(recording, WithoutDepth(recording), watch=ImageWatch())
+    found = detect_keypoints(recording, WithoutDepth(recording))
     assert found.notes[-1].startswith("2 images refused: the depth image is empty")
     assert found.jaws["left"].detection.found.tolist() == [False, False] + [True] * 10
 
@@ -93,7 +93,7 @@ def test_a_black_picture_gives_no_key_points(tmp_path):
 
 
 def test_a_recording_in_which_nothing_is_found_is_refused(recording):
-    with pytest.raises(RecordingError, match="no key points in 12 images: no picture for this finder"):
+    with pytest.raises(RecordingError, match="no key points in 12 images: no picture for this detector"):
         detect(recording, refused=range(12))
     with pytest.raises(RecordingError, match="no key points in 12 images: no jaw"):
         detect(recording, lost=range(12))
@@ -255,7 +255,7 @@ def test_what_needs_a_clock_is_refused_offline_and_reaches_the_node_of_a_replay(
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ("finder=foo", "finder: got 'foo', expected one of network, frame, dots"),
+        ("detection_method=foo", "detection_method: got 'foo', expected one of network, frame, dots"),
         ("apply_sigmoid=maybe", "apply_sigmoid: got 'maybe', expected one of auto, yes, no"),
         ("threads=0", "threads: got 0, expected 1 to 64"),
         ("detector.gate=9", "gate: got 9.0, expected"),

@@ -17,7 +17,6 @@ from finforce_eval.recordings.images import ImageTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
 from finforce_keypoints.diagnostics import COLORS
-from finforce_keypoints.images import ImageWatch
 
 pytest.importorskip("matplotlib")
 
@@ -41,7 +40,7 @@ LOST = (3,)
 def recording(tmp_path_factory):
     """Twelve images: two key points used, two refused, one of them hidden; the jaw is lost in the fourth."""
     read = read_recording(write_footage(make_footage(FakeGripper()), tmp_path_factory.mktemp("bags") / "twin"))
-    return detect_keypoints(read, FakeDetector(read, lost=LOST), watch=ImageWatch())
+    return detect_keypoints(read, FakeDetector(read, lost=LOST))
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +144,7 @@ def test_error_and_counts_over_time_are_those_of_the_images(recording):
 
 def test_the_curves_of_the_error_are_median_and_95th_percentile_of_what_was_visible(recording):
     shift = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 5.0], [99.0, 0.0]])  # the last is hidden
-    found = detect_keypoints(recording, FakeDetector(recording, pixel_shift=shift), watch=ImageWatch())
+    found = detect_keypoints(recording, FakeDetector(recording, pixel_shift=shift))
     drawn = {line.get_label(): line.get_ydata() for line in draw_detection(found).axes[0].get_lines()}
     np.testing.assert_allclose(drawn["median of the visible"], 1.0, atol=1e-3)
     np.testing.assert_allclose(drawn["95th percentile"], 1.0 + 0.9 * 4.0, atol=1e-3)

@@ -16,7 +16,6 @@ from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.tables import evaluation_json, format_sight, format_table, markdown_sight
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
-from finforce_keypoints.images import ImageWatch
 from finforce_sim.scenes.scenarios import SCENARIOS
 
 
@@ -118,7 +117,7 @@ def evaluation(tmp_path_factory):
     """A run from images whose estimate follows the truth one image late."""
     gripper = FakeGripper(count=40, onset=20)
     recording = read_recording(write_footage(make_footage(gripper), tmp_path_factory.mktemp("bags") / "twin"))
-    found = detect_keypoints(recording, FakeDetector(recording), watch=ImageWatch())
+    found = detect_keypoints(recording, FakeDetector(recording))
     late = np.vstack((np.zeros((1, 3)), recording.truth("left").force[:-1]))
     jaw = FakeJaw(keypoints=np.zeros((4, 3)))
     result = evaluate_recording(found, jaw, GivenContact(None), factory=lambda: FakeEstimator(late))
@@ -148,7 +147,7 @@ def test_the_table_shows_them_and_says_what_they_are(evaluation):
 def test_the_detector_of_two_jaws_is_timed_once(tmp_path):
     gripper = FakeGripper(sides=("left", "right"))
     recording = read_recording(write_footage(make_footage(gripper), tmp_path / "both"))
-    found = detect_keypoints(recording, FakeDetector(recording), watch=ImageWatch())
+    found = detect_keypoints(recording, FakeDetector(recording))
     results = [
         evaluate_recording(
             found,

@@ -13,7 +13,7 @@ from std_msgs.msg import Header
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.ros import node as ros
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.build import BuiltDetector, FinderCard
+from finforce_keypoints.images import ImageWatch, check_image
 from finforce_keypoints.node import KeypointDetectorNode
 from finforce_keypoints.parameters import DetectorParameters
 
@@ -46,21 +46,18 @@ class FakeDetector:
     def __init__(self, sides):
         self.answer = {side: FakeKeypoints() for side in sides}
         self.images, self.resets, self.error, self.delay = [], 0, None, 0.0
-        self.warnings, self.warmed, self.is_still = {}, False, False
-        self.begun = []
-
-    def begin(self, stamp, color, camera):
-        self.begun.append(color)
+        self.warnings, self.warmed, self.was_still = {}, False, False
+        self.name, self.sha256 = "fake", "ab12"
+        self.watch = ImageWatch()
 
     def detect(self, image):
+        check_image(image)
+        self.watch.check(image)
         self.images.append(image)
         sleep(self.delay)
         if self.error is not None:
             raise self.error
         return self.answer
-
-    def confirm(self, stamp, color, camera):
-        return self.answer if self.is_still else None
 
     def reset(self):
         self.resets += 1
@@ -75,7 +72,7 @@ def start_detector(probe, **parameters):
     overrides = [Parameter(name, value=value) for name, value in given.items()]
 
     def build(jaws, *_):
-        return BuiltDetector(FakeDetector(tuple(jaws)), FinderCard(name="fake", sha256="ab12"))
+        return FakeDetector(tuple(jaws))
 
     node = KeypointDetectorNode(build, context=probe.context, parameter_overrides=overrides)
     probe.spinner.add_node(node)

@@ -15,11 +15,11 @@ from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detector import KeypointDetector
+from finforce_keypoints.detectors import PixelDetection
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.geometry.side_picture import find_side, intersect_plane
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.pixel_finder import PixelFinding
-from finforce_keypoints.settings import DetectorSettings
+from finforce_keypoints.parameters import DetectorSettings
 from finforce_sim.rendering.depth_camera import D405_DISTORTION, DepthNoise, disturb_depth
 
 STRIDE = 8
@@ -406,7 +406,7 @@ def bare_image(stamp, depth, rng=None):
     return RgbdImage(stamp=stamp, color=color, depth=depth, camera=CAMERA)
 
 
-class FakeFinder:
+class FakePixelDetector:
     """Returns given pixels with noise, and keeps what was expected of it."""
 
     def __init__(self, pixels, rng=None, stddev=0.4):
@@ -414,15 +414,15 @@ class FakeFinder:
         self.likelihood = {side: np.full(len(rows), 0.95) for side, rows in pixels.items()}
         self.expected = []
 
-    def find(self, image, expected):
+    def detect(self, image, expected):
         self.expected.append(dict(expected))
-        findings = {}
+        detections = {}
         for side, rows in self.pixels.items():
             noise = 0.0 if self.rng is None else self.stddev * self.rng.standard_normal(rows.shape)
-            findings[side] = PixelFinding(
+            detections[side] = PixelDetection(
                 pixels=rows + noise, likelihood=self.likelihood[side], stddev=np.full(len(rows), self.stddev)
             )
-        return findings
+        return detections
 
 
 @lru_cache(maxsize=16)
@@ -433,8 +433,8 @@ def scene_of(view, bend=None):
 
 
 def build(view="robot", bend=None, rng=None, **settings):
-    """A scene, its true depths, a finder that knows its pixels, and a detector around that."""
+    """A scene, its true depths, a pixel_detector that knows its pixels, and a detector around that."""
     scene, depth = scene_of(view, bend)
-    finder = FakeFinder(scene.pixels(), rng)
-    detector = KeypointDetector(finder, scene.jaws, scene.T_gripper_camera, DetectorSettings(**settings))
-    return scene, depth, finder, detector
+    pixel_detector = FakePixelDetector(scene.pixels(), rng)
+    detector = KeypointDetector(pixel_detector, scene.jaws, scene.T_gripper_camera, DetectorSettings(**settings))
+    return scene, depth, pixel_detector, detector

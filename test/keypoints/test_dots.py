@@ -10,7 +10,7 @@ from finforce.camera import CameraIntrinsics
 from finforce.errors import MissingDependencyError
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.detectors.dots import DotFinder, DotSettings, find_dots
+from finforce_keypoints.detectors.dots import DotDetector, DotSettings, find_dots
 from finforce_keypoints.errors import DetectorSettingsError
 from finforce_keypoints.images import RgbdImage
 
@@ -47,15 +47,15 @@ def picture_of(poses, tip=(0.0, 0.0), look="colored", hidden=None, noise=4.0, br
     return image, truth
 
 
-def errors_of(finding, truth):
-    return np.hypot(*(finding.pixels - truth).T)
+def errors_of(detection, truth):
+    return np.hypot(*(detection.pixels - truth).T)
 
 
 @pytest.mark.parametrize("look", LOOKS)
 def test_dots_of_every_look_are_found_to_a_third_of_a_pixel(look):
     poses = poses_at(ORIGINS)
     image, truth = picture_of(poses, (0.004, 0.0), look)
-    found = DotFinder(JAWS, LOOKS[look][2]).find(image, poses)
+    found = DotDetector(JAWS, LOOKS[look][2]).detect(image, poses)
     for side in JAWS:
         assert errors_of(found[side], truth[side]).max() < CLOSE
         assert found[side].likelihood.min() > 0.6 and found[side].stddev.max() < 1.5
@@ -65,7 +65,7 @@ def test_dots_of_every_look_are_found_to_a_third_of_a_pixel(look):
 def test_a_bent_jaw_is_followed_from_the_base_in_the_first_image(tip):
     poses = poses_at(ORIGINS)
     image, truth = picture_of(poses, tip)
-    found = DotFinder(JAWS).find(image, poses)
+    found = DotDetector(JAWS).detect(image, poses)
     assert max(errors_of(found[side], truth[side]).max() for side in JAWS) < CLOSE
 
 
@@ -75,7 +75,7 @@ def test_hidden_dots_are_missing_and_their_neighbours_keep_their_names(seed):
     hidden = {side: rng.choice(15, 5, replace=False) for side in JAWS}
     poses = poses_at(ORIGINS)
     image, truth = picture_of(poses, (-0.012, 0.0), hidden=hidden)
-    found = DotFinder(JAWS).find(image, poses)
+    found = DotDetector(JAWS).detect(image, poses)
     for side in JAWS:
         gone = np.isin(np.arange(16), hidden[side])
         assert np.isnan(found[side].pixels[gone]).all() and not found[side].likelihood[gone].any()
@@ -86,16 +86,16 @@ def test_hidden_dots_are_missing_and_their_neighbours_keep_their_names(seed):
 @pytest.mark.parametrize("origin", [0.022, 0.0415, 0.061])
 def test_lost_jaws_are_found_along_the_closing_axis(origin):
     image, truth = picture_of(poses_at({"left": -origin, "right": origin}), (-0.004, 0.0))
-    found = DotFinder(JAWS).find(image, {"left": None, "right": None})
+    found = DotDetector(JAWS).detect(image, {"left": None, "right": None})
     assert max(errors_of(found[side], truth[side]).max() for side in JAWS) < CLOSE
 
 
 def test_a_sequence_is_followed_while_the_jaw_bends_and_the_gripper_closes():
-    finder, expected = DotFinder(JAWS), {"left": None, "right": None}
+    pixel_detector, expected = DotDetector(JAWS), {"left": None, "right": None}
     for step in range(8):
         poses = poses_at({"left": -0.05 + 0.001 * step, "right": 0.05 - 0.001 * step})
         image, truth = picture_of(poses, (-0.0025 * step, 0.0), hidden={"left": [2, 3]} if step > 4 else None)
-        found = finder.find(image, expected)
+        found = pixel_detector.detect(image, expected)
         assert np.nanmax([errors_of(found[side], truth[side]) for side in JAWS]) < CLOSE
         expected = poses
 
@@ -105,7 +105,7 @@ def test_a_dot_that_is_half_hidden_is_unlikely():
     image, truth = picture_of(poses)
     x, y = np.round(truth["left"][14]).astype(int)
     image.color[y - 10 : y + 10, x : x + 10] = LOOKS["colored"][1]
-    found = DotFinder(JAWS).find(image, poses)["left"]
+    found = DotDetector(JAWS).detect(image, poses)["left"]
     assert found.likelihood[14] < 0.6 < found.likelihood[:14].min()
     assert found.stddev[14] > 2.0 * found.stddev[:14].max()
 
@@ -113,7 +113,7 @@ def test_a_dot_that_is_half_hidden_is_unlikely():
 def test_dim_light_does_not_hide_coloured_dots():
     poses = poses_at(ORIGINS)
     image, truth = picture_of(poses, bright=0.2, noise=2.0)
-    found = DotFinder(JAWS).find(image, poses)
+    found = DotDetector(JAWS).detect(image, poses)
     assert max(errors_of(found[side], truth[side]).max() for side in JAWS) < 2.0 * CLOSE
 
 
@@ -122,7 +122,7 @@ def test_other_things_of_the_dots_colour_are_not_dots():
     image, truth = picture_of(poses, hidden={"left": [5]})
     image.color[420:470, 20:120] = LOOKS["colored"][0]  # a large one
     image.color[int(truth["left"][5, 1]) - 40 :, 318:321] = LOOKS["colored"][0]  # a long one
-    found = DotFinder(JAWS).find(image, poses)
+    found = DotDetector(JAWS).detect(image, poses)
     assert np.nanmax([errors_of(found[side], truth[side]) for side in JAWS]) < CLOSE
     assert np.isnan(found["left"].pixels[5]).all()
 
@@ -130,10 +130,10 @@ def test_other_things_of_the_dots_colour_are_not_dots():
 def test_a_side_without_dots_is_absent():
     poses = poses_at(ORIGINS)
     image, _ = picture_of({"left": poses["left"]})
-    assert set(DotFinder(JAWS).find(image, poses)) == {"left"}
-    assert set(DotFinder(JAWS).find(image, {"left": None, "right": None})) == {"left"}
+    assert set(DotDetector(JAWS).detect(image, poses)) == {"left"}
+    assert set(DotDetector(JAWS).detect(image, {"left": None, "right": None})) == {"left"}
     black = replace(image, color=np.zeros_like(image.color))
-    assert DotFinder(JAWS).find(black, poses) == {}
+    assert DotDetector(JAWS).detect(black, poses) == {}
 
 
 def test_a_jaw_outside_the_image_or_behind_the_camera_is_absent():
@@ -141,13 +141,13 @@ def test_a_jaw_outside_the_image_or_behind_the_camera_is_absent():
     for place in ((0.0, 0.0, -1.0), (3.0, 0.0, 0.2)):
         pose = np.eye(4)
         pose[:3, 3] = place
-        assert DotFinder(JAWS).find(image, {"left": pose, "right": pose}) == {}
+        assert DotDetector(JAWS).detect(image, {"left": pose, "right": pose}) == {}
 
 
 def test_a_dot_belongs_to_one_jaw_only():
     poses = poses_at({"left": -0.014, "right": 0.014})  # the inner faces are 1.6 mm apart
     image, truth = picture_of(poses, hidden={"left": range(7)})
-    found = DotFinder(JAWS).find(image, poses)
+    found = DotDetector(JAWS).detect(image, poses)
     assert np.isnan(found["left"].pixels[:7]).all()
     assert errors_of(found["right"], truth["right"]).max() < CLOSE
 
@@ -183,4 +183,4 @@ def test_settings_out_of_bounds_and_a_missing_library_are_named(monkeypatch):
 
     monkeypatch.setattr("finforce.optional.import_module", refuse)
     with pytest.raises(MissingDependencyError, match="opencv-contrib-python-headless"):
-        DotFinder(JAWS)
+        DotDetector(JAWS)

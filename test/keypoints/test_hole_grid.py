@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, compute_rays, project
 from finforce_keypoints.errors import GeometryError
-from finforce_keypoints.geometry.hole_grid import find_grid_camera, fit_grid_camera
+from finforce_keypoints.geometry.extrinsics import find_grid_camera, fit_grid_camera
 
 PITCH, RADIUS = 0.025, 0.003
 SIZE = {"width": 960, "height": 540}

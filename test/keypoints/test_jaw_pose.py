@@ -4,8 +4,8 @@ from keypoint_scene_fakes import CAMERA, FakeScene
 
 from finforce.camera import project, rays_from_pixels
 from finforce.gripper_frames import jaw_in_camera
-from finforce_keypoints.geometry.jaw_pose import Origin, OriginFinder, OriginTrack
-from finforce_keypoints.settings import DetectorSettings
+from finforce_keypoints.geometry.jaw_pose import Origin, OriginEstimator, OriginTrack
+from finforce_keypoints.parameters import DetectorSettings
 
 SETTINGS = DetectorSettings()
 STDDEV = np.full(16, 0.4 / 430.6)
@@ -14,7 +14,7 @@ RATE = 30.0
 
 @pytest.fixture(scope="module", params=["left", "right"])
 def seen(request):
-    """A finder of one jaw's origin, and the pixels of its points for an origin."""
+    """A estimator of one jaw's origin, and the pixels of its points for an origin."""
     scene, side = FakeScene("robot"), request.param
 
     def look(x):
@@ -22,11 +22,11 @@ def seen(request):
         return project(scene.keypoints(side) @ T[:3, :3].T + T[:3, 3], CAMERA)
 
     sign = -1.0 if side == "left" else 1.0
-    return OriginFinder(scene.jaws[side], scene.T_gripper_camera, SETTINGS), look, sign
+    return OriginEstimator(scene.jaws[side], scene.T_gripper_camera, SETTINGS), look, sign
 
 
-def measure(finder, pixels):
-    return finder.measure(rays_from_pixels(pixels, CAMERA), STDDEV)
+def measure(estimator, pixels):
+    return estimator.measure(rays_from_pixels(pixels, CAMERA), STDDEV)
 
 
 def only(rows, pixels):
@@ -37,39 +37,39 @@ def only(rows, pixels):
 
 @pytest.mark.parametrize("opening", [0.012, 0.04, 0.075])
 def test_the_reference_point_alone_gives_the_origin(seen, opening):
-    finder, look, sign = seen
-    origin = measure(finder, only([15], look(sign * opening)))
+    estimator, look, sign = seen
+    origin = measure(estimator, only([15], look(sign * opening)))
     assert origin.x == pytest.approx(sign * opening, abs=1e-9)
 
 
 def test_its_standard_deviation_is_that_of_the_errors(seen):
-    finder, look, sign = seen
+    estimator, look, sign = seen
     rng, pixels = np.random.default_rng(0), only([15], look(sign * 0.04))
-    found = [measure(finder, pixels + 0.4 * rng.standard_normal((16, 2))) for _ in range(400)]
+    found = [measure(estimator, pixels + 0.4 * rng.standard_normal((16, 2))) for _ in range(400)]
     assert np.std([origin.x for origin in found]) == pytest.approx(found[0].stddev, rel=0.12)  # 400 samples: 3.5 %
 
 
 def test_without_the_reference_point_the_base_says_less_exactly_where_the_jaw_is(seen):
-    finder, look, sign = seen
+    estimator, look, sign = seen
     pixels = look(sign * 0.04)
     pixels[:14] += 1.0  # bent by some 0.2 mm
-    origin = measure(finder, only(range(15), pixels))
+    origin = measure(estimator, only(range(15), pixels))
     assert abs(origin.x - sign * 0.04) < 3.0 * origin.stddev
-    assert origin.stddev > 0.24e-3 > measure(finder, look(sign * 0.04)).stddev  # what the lowest point may bend
+    assert origin.stddev > 0.24e-3 > measure(estimator, look(sign * 0.04)).stddev  # what the lowest point may bend
 
 
 def test_the_tip_alone_says_nothing(seen):
-    finder, look, sign = seen
-    assert measure(finder, only([6, 13, 14], look(sign * 0.04))) is None
-    assert measure(finder, np.full((16, 2), np.nan)) is None
+    estimator, look, sign = seen
+    assert measure(estimator, only([6, 13, 14], look(sign * 0.04))) is None
+    assert measure(estimator, np.full((16, 2), np.nan)) is None
 
 
 def test_a_reference_point_out_of_the_opening_range_or_off_its_line_is_refused(seen):
-    finder, look, sign = seen
-    assert measure(finder, only([15], look(sign * 0.09))) is None
+    estimator, look, sign = seen
+    assert measure(estimator, only([15], look(sign * 0.09))) is None
     aside = look(sign * 0.04) + [0.0, 40.0]
-    assert measure(finder, only([15], aside)) is None
-    assert measure(finder, only([15], aside - [0.0, 35.0])) is not None
+    assert measure(estimator, only([15], aside)) is None
+    assert measure(estimator, only([15], aside - [0.0, 35.0])) is not None
 
 
 def follow(speeds, seed=0, noise=0.08e-3):

@@ -9,6 +9,7 @@ from sensor_msgs.msg import Image
 
 import finforce_keypoints.camera_feed as camera_feed
 from finforce.health import Level
+from finforce_keypoints.images import FROZEN_AFTER
 
 PERIOD = 33 * MILLISECOND
 
@@ -160,9 +161,9 @@ def test_a_frozen_camera_is_noticed_and_silent(probe):
     for _ in range(5):
         bench.shoot(color=still)
     bench.diagnosis(level=Level.ERROR, word="frozen camera")
-    assert len(bench.clouds()) == bench.node.parameters.frozen_after
+    assert len(bench.clouds()) == FROZEN_AFTER
     bench.shoot()
-    bench.wait_for_clouds(bench.node.parameters.frozen_after + 1)
+    bench.wait_for_clouds(FROZEN_AFTER + 1)
 
 
 def test_a_stamp_that_stands_still_is_refused(probe):

@@ -4,7 +4,7 @@ from keypoint_scene_fakes import CAMERA, FakeScene
 
 from finforce_ifea.jaw.jaw import list_shipped_jaws, load_jaw
 from finforce_keypoints.geometry.depth import build_side_samples, sample_depths, weigh_depths
-from finforce_keypoints.settings import DetectorSettings
+from finforce_keypoints.geometry.jaw_localizer import LEAST_DEPTHS
 
 JAW = load_jaw("bench")
 SAMPLES = build_side_samples(JAW, 3e-3, 0.4e-3)
@@ -33,9 +33,7 @@ def test_a_jaw_without_a_flat_side_is_sampled_next_to_its_key_points():
 
 @pytest.mark.parametrize("name", list_shipped_jaws())
 def test_thin_bands_have_samples_enough_to_be_believed_with_holes_in_the_depth(name):
-    settings = DetectorSettings()
-    samples = build_side_samples(load_jaw(name), settings.window, settings.edge)
-    assert (samples.used.sum(axis=1) >= 4 * settings.least_depths).all()
+    assert (build_side_samples(load_jaw(name)).used.sum(axis=1) >= 4 * LEAST_DEPTHS).all()
 
 
 def test_the_right_jaw_is_sampled_like_the_left():

@@ -11,7 +11,7 @@ from finforce_keypoints.build import BENCH
 from finforce_keypoints.errors import DetectionError, ModelError
 from finforce_keypoints.networks import network as network_module
 from finforce_keypoints.networks.metadata import parse_metadata
-from finforce_keypoints.networks.model import KeypointModel, ModelOverrides, decode
+from finforce_keypoints.networks.model import KeypointModel, decode
 
 # The squares of 12 px lie on the middles of cells: one cell is pure, its neighbours hold a quarter.
 SQUARES = {"red": (100, 68), "green": (340, 204), "blue": (628, 12), "yellow": (20, 460)}
@@ -79,12 +79,12 @@ def test_input_is_normalised_as_the_metadata_say(tmp_path):
     batch[0, 3, 5] = (255, 128, 10)
     expected = (np.array([255, 128, 10]) / 255.0 - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)
     assert np.abs(model.preprocess(batch)[0, :, 3, 5] - expected).max() < 1e-5  # float32
-    plain = KeypointModel(tmp_path, ModelOverrides(normalize=False), threads=1)
+    plain = KeypointModel(write_model(tmp_path, data__inference__normalize_images=False), threads=1)
     assert np.abs(plain.preprocess(batch)[0, :, 3, 5] - np.array([1.0, 128 / 255, 10 / 255])).max() < 1e-6
 
 
 def test_a_network_without_normalisation_given_the_trained_one_loses_its_likelihood(tmp_path):
-    model = KeypointModel(write_model(tmp_path), ModelOverrides(normalize=False), threads=1)
+    model = KeypointModel(write_model(tmp_path, data__inference__normalize_images=False), threads=1)
     assert model.locate(paint(SQUARES)[None]).likelihood.min() < 0.6
 
 
@@ -209,30 +209,25 @@ def test_pictures_that_the_network_cannot_take_are_refused(tmp_path):
             model.run(wrong)
 
 
-def test_overrides_hold_instead_of_the_metadata(tmp_path):
-    write_model(tmp_path, Fake(offset=(3.64005, 0.0)), model__backbone__output_stride=32)
-    model = KeypointModel(tmp_path, ModelOverrides(stride=8, locref_std=2 * 7.2801), threads=1)
+def test_the_metadata_say_how_maps_are_decoded(tmp_path):
+    head = "model__heads__bodypart__predictor"
+    changes = {"model__backbone__output_stride": 16, f"{head}__locref_std": 2 * 7.2801}
+    model = KeypointModel(write_model(tmp_path, Fake(offset=(3.64005, 0.0)), **changes), threads=1)
     rule = model.find_rule((480, 640), (61, 81))
     assert rule.stride == 8.0 and rule.locref_std == 2 * 7.2801
     places = model.locate(paint(SQUARES)[None]).pixels
     assert np.abs(places[0, :2, 0] - PLACES[:2, 0] - 7.2801).max() <= HALF_CELL
-    assert (
-        KeypointModel(tmp_path, ModelOverrides(stride=8, apply_sigmoid=True))
-        .find_rule((480, 640), (61, 81))
-        .apply_sigmoid
-    )
+    logits = KeypointModel(write_model(tmp_path / "logits", **{f"{head}__apply_sigmoid": True}), threads=1)
+    assert logits.find_rule((480, 640), (61, 81)).apply_sigmoid
     with pytest.raises(ModelError, match="stride 2"):
-        KeypointModel(tmp_path, ModelOverrides(stride=2.0))
-    with pytest.raises(ModelError, match="positive"):
-        ModelOverrides(locref_std=0.0)
+        KeypointModel(write_model(tmp_path / "fine", model__backbone__output_stride=4))
 
 
-def test_the_training_size_comes_from_override_network_or_metadata(tmp_path):
+def test_the_training_size_comes_from_network_or_metadata(tmp_path):
     kept = {"finforce__training_size": {"height": 480, "width": 640}}
     write_model(tmp_path / "kept", **kept)
     kept = KeypointModel(tmp_path / "kept")
     assert kept.training_size == (480, 640) and kept.accepts((480, 640)) and not kept.accepts((240, 320))
-    assert KeypointModel(tmp_path / "kept", ModelOverrides(input_size=(240, 320))).training_size == (240, 320)
     assert KeypointModel(write_model(tmp_path / "frozen", Fake(size=(96, 64)))).training_size == (96, 64)
     assert KeypointModel(write_model(tmp_path / "free")).training_size is None
 

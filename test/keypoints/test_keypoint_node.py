@@ -33,7 +33,6 @@ from std_msgs.msg import String
 from finforce.health import Level
 from finforce.messages import decode_cloud, pose_from_message, stamp_of
 from finforce.ros import node as ros
-from finforce_keypoints.camera_feed import PROMPT
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.node import KeypointDetectorNode
 from finforce_keypoints.parameters import INFO_TOPIC
@@ -98,28 +97,6 @@ def test_the_order_of_colour_and_depth_does_not_matter(probe, first):
     bench.wait_for_clouds()
 
 
-def test_a_colour_image_is_looked_at_before_its_depth_has_come_where_that_always_came(probe):
-    bench = CameraBench(probe)
-    begun = bench.node.detector.begun
-    for count in range(1, PROMPT + 2):
-        bench.shoot()
-        bench.wait_for_clouds(count)
-    assert len(begun) == 1  # the first ones only show that depth comes
-    late = time_ns()
-    bench.color(late)
-    assert len(begun) == 2 and len(bench.node.detector.images) == PROMPT + 1
-    bench.depth(late)
-    bench.wait_for_clouds(PROMPT + 2)
-    assert bench.node.detector.images[-1].color is begun[-1]
-    bench.color(time_ns())  # its depth never comes
-    bench.shoot()
-    bench.wait_for_clouds(PROMPT + 3)
-    unused = len(begun)
-    bench.shoot()
-    bench.wait_for_clouds(PROMPT + 4)
-    assert len(begun) == unused
-
-
 def test_stamps_within_the_tolerance_belong_together_and_others_do_not(probe):
     bench = CameraBench(probe, sync_tolerance=0.005)
     stamp = time_ns()
@@ -152,17 +129,6 @@ def test_a_newer_whole_image_passes_over_those_that_wait(probe):
     assert bench.node.feed.passed == 1
     values = {entry.key: entry.value for entry in bench.diagnosis(level=Level.OK).values}
     assert values["overtaken while waiting for depth"] == "1" and values["refused"] == "none"
-
-
-def test_of_a_queue_only_the_newest_image_is_looked_at_and_the_others_are_counted(probe):
-    bench = CameraBench(probe)
-    stamps = [time_ns() + k * MILLISECOND for k in range(4)]
-    bench.burst(stamps)
-    bench.wait_for_clouds()
-    assert [stamp_of(cloud) for cloud in bench.clouds()] == stamps[-1:]
-    assert len(bench.node.detector.images) == 1
-    values = {entry.key: entry.value for entry in bench.diagnosis(level=Level.OK).values}
-    assert values["refused"] == "3 superseded" and values["arrived"] == "4"
 
 
 def test_the_old_name_of_the_colour_topic_is_heard_too(probe):
@@ -327,7 +293,7 @@ def test_dots_on_the_jaws_become_key_points_in_the_jaw_frame(probe, side):
     for jaw, T in scene.poses().items():
         draw_dots(color, scene.keypoints(jaw), T, CAMERA, (30, 220, 60))
     depth = np.rint(np.nan_to_num(1000.0 * scene.image(0.0, rng).depth)).astype(np.uint16)
-    bench = CameraBench(probe, start=start_real_detector, info=False, finder="dots", max_age=5.0)
+    bench = CameraBench(probe, start=start_real_detector, info=False, detection_method="dots", max_age=5.0)
     bench.info_out.publish(info_of(CAMERA))
     probe.spin(0.05)
     for _ in range(3):

@@ -1,12 +1,12 @@
 """Claims about what is drawn of key points and said of them."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 from keypoint_node_fakes import COUNT, JAW, FakeKeypoints
 
 from finforce.health import Level
-from finforce_keypoints.build import FinderCard
 from finforce_keypoints.diagnostics import (
     COLORS,
     LINE,
@@ -75,7 +75,7 @@ def test_a_skeleton_joins_each_key_point_to_its_neighbours():
 
 
 def test_names_without_numbers_have_no_skeleton():
-    said = json.loads(describe_names(["a", "b"], FinderCard(name="dots")))
+    said = json.loads(describe_names(["a", "b"], SimpleNamespace(name="dots", sha256="")))
     assert said == {"names": ["a", "b"], "skeleton": [], "model": "dots", "sha256": ""}
 
 

@@ -10,7 +10,7 @@ from node_fakes import START_PATIENCE, command_of, run_node, stop_when_ready
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_node_cleanly(number):
-    status, text = stop_when_ready(command_of("keypoint_detector", "finder:=dots", "modell:=x"), number)
+    status, text = stop_when_ready(command_of("keypoint_detector", "detection_method:=dots", "modell:=x"), number)
     assert status == 0, text
     assert "Traceback" not in text
     assert "there is no parameter 'modell'" in text
@@ -21,14 +21,13 @@ def test_a_signal_ends_the_node_cleanly(number):
     [
         ("jaws:=middle", "jaws: got 'middle'"),
         ("jaw_file:=no_such_jaw", "no_such_jaw"),
-        ("finder:=guess", "finder: got 'guess'"),
+        ("detection_method:=guess", "detection_method: got 'guess'"),
         ("model:=no_such_folder", "no_such_folder"),
         ("T_gripper_camera:=[0.0, 0.0, 0.1]", "quaternion of shape"),
         ("T_gripper_camera:=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0]", "norm"),
         ("detector.likelihood:=2.0", "detector.likelihood"),
         ("skip_off:=[nonsense]", "there is no rule 'nonsense'"),
         ("color_topics:=[]", "color_topics: got (), expected at least one topic"),
-        ("input_size:=[]", "input_size: got (), expected height and width"),
         ("T_gripper_camera:=[]", "quaternion of shape"),
         ("threads:=[]", "parameter threads is empty; expected a value such as 2"),
         ("depth_topic:=''", "parameter depth_topic is ''; expected the name of a topic: topic name must not be empty"),

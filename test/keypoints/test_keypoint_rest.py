@@ -5,13 +5,12 @@ from time import time_ns
 
 import numpy as np
 import pytest
-from keypoint_node_fakes import HEIGHT, JAW, MILLISECOND, WIDTH, CameraBench, FakeKeypoints, image_of
+from keypoint_node_fakes import JAW, MILLISECOND, CameraBench, FakeKeypoints
 from sensor_msgs.msg import PointCloud2
 
 from finforce.health import Level
 from finforce.messages import stamp_of
-from finforce.skipping import IDLE, LATE, UNHEARD
-from finforce_keypoints.settings import ANNOTATED
+from finforce.skipping import IDLE, STILL, UNHEARD
 
 PERIOD = 100 * MILLISECOND  # of the answers while nothing moves
 
@@ -27,7 +26,7 @@ def next_period():
 
 
 def test_without_a_listener_images_are_not_looked_at_and_with_the_first_they_are(probe):
-    bench = CameraBench(probe, heard=False, skip_off=[LATE])
+    bench = CameraBench(probe, heard=False)
     for _ in range(3):
         bench.shoot()
     probe.wait_for(lambda: counted(bench, UNHEARD) == "3")
@@ -55,91 +54,59 @@ def test_a_resting_node_that_hears_no_images_any_more_is_stale(probe):
     bench.diagnosis(level=Level.STALE, word="nothing has arrived")
 
 
-def test_an_image_in_which_nothing_moved_is_answered_with_its_own_stamp_and_without_its_depth(probe):
-    bench = CameraBench(probe, max_age=2.0, skip_off=[LATE])
-    bench.node.detector.is_still = True
+def test_an_image_in_which_nothing_moved_is_answered_with_its_own_stamp_and_counted(probe):
+    bench = CameraBench(probe, max_age=2.0)
+    bench.node.detector.was_still = True
     stamps = [next_period() + number * PERIOD for number in (-1, 0)]
     for stamp in stamps:
-        bench.color(stamp)
+        bench.shoot(stamp)
     bench.wait_for_clouds(2)
     assert [stamp_of(cloud) for cloud in bench.clouds()] == stamps
     assert [stamp_of(pose) for pose in bench.poses("right")] == stamps
     first, second = (np.frombuffer(cloud.data, dtype=np.uint8) for cloud in bench.clouds())
-    assert np.array_equal(first, second) and not bench.node.detector.images
+    assert np.array_equal(first, second) and counted(bench, STILL) == "2"
 
 
 def test_other_key_points_are_sent_at_once(probe):
-    bench = CameraBench(probe, max_age=2.0, skip_off=[LATE, IDLE])
-    bench.node.detector.is_still = True
-    bench.color(next_period())
+    bench = CameraBench(probe, max_age=2.0, skip_off=[IDLE])
+    bench.node.detector.was_still = True
+    bench.shoot(next_period())
     bench.wait_for_clouds()
     bench.node.detector.answer["left"] = replace(FakeKeypoints(), points=JAW.keypoints + 1e-3)
-    bench.color(next_period() + 1)
+    bench.shoot(next_period() + 1)
     bench.wait_for_clouds(2)
     first, second = (np.frombuffer(cloud.data, dtype=np.uint8) for cloud in bench.clouds())
     assert not np.array_equal(first, second)
 
 
-@pytest.mark.parametrize(("off", "answered"), [([LATE], 1), ([LATE, IDLE], 3)])
+@pytest.mark.parametrize(("off", "answered"), [([""], 1), ([IDLE], 3)])
 def test_while_nothing_moves_one_image_of_a_period_is_answered_unless_told(probe, off, answered):
     bench = CameraBench(probe, max_age=2.0, skip_off=off)
-    bench.node.detector.is_still = True
+    bench.node.detector.was_still = True
     begin = next_period() - PERIOD
     for number in range(3):
-        bench.color(begin + number * 33 * MILLISECOND)
-    bench.color(begin + PERIOD)
+        bench.shoot(begin + number * 33 * MILLISECOND)
+    bench.shoot(begin + PERIOD)
     bench.wait_for_clouds(answered + 1)
     assert len(bench.clouds()) == answered + 1
 
 
-def test_the_image_that_shows_a_motion_is_answered_though_its_depth_came_first(probe):
+def test_the_image_that_shows_a_motion_is_answered_at_once(probe):
     bench = CameraBench(probe, max_age=2.0)
-    bench.node.detector.is_still = True
+    bench.node.detector.was_still = True
     begin = next_period() - 2 * PERIOD
-    for number in range(8):  # more depth images than the node's middleware keeps
-        bench.color(begin + number)
-        bench.depth(begin + number)
-    assert not bench.node.detector.images
-    bench.node.detector.is_still = False
-    stamp = begin + PERIOD + 1
-    bench.depth(stamp)
-    bench.color(stamp)
-    probe.wait_for(lambda: bench.node.detector.images)
-    probe.wait_for(lambda: stamp_of(bench.clouds()[-1]) == stamp)
-
-
-def test_a_depth_image_that_comes_after_the_motion_is_taken_too(probe):
-    bench = CameraBench(probe, max_age=2.0)
-    bench.node.detector.is_still = True
-    stamp = next_period() - PERIOD
-    bench.shoot(stamp)
-    bench.node.detector.is_still = False
-    bench.shoot(stamp + 1)
-    probe.wait_for(lambda: bench.node.detector.images)
-    bench.wait_for_clouds(2)
-
-
-@pytest.mark.parametrize(("off", "answered"), [([""], 1), ([LATE], 3)])
-def test_an_image_that_came_late_is_passed_over_unless_told(probe, off, answered):
-    bench = CameraBench(probe, max_age=5.0, skip_off=off)
-    now = time_ns()
     for number in range(3):
-        bench.depth(now + number * 40 * MILLISECOND)
-    for number in range(3):
-        picture = bench.rng.integers(90, 160, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-        bench.color_out.publish(image_of(now + number * 40 * MILLISECOND, picture, "rgb8"))
-    probe.spin(0.3)
-    bench.wait_for_clouds(answered)
-    assert (len(bench.clouds()) == answered) or (not off[0] and len(bench.clouds()) < 3)
-    assert counted(bench, LATE) == ("off" if off[0] else str(3 - len(bench.clouds())))
+        bench.shoot(begin + number)
+    assert len(bench.clouds()) == 1
+    bench.node.detector.was_still = False
+    bench.shoot(begin + 3)
+    probe.wait_for(lambda: stamp_of(bench.clouds()[-1]) == begin + 3)
 
 
-@pytest.mark.parametrize("off", [[""], [ANNOTATED]])
-def test_the_annotated_image_that_nobody_wants_is_counted_or_drawn(probe, off, monkeypatch):
-    drawn = []
-    monkeypatch.setattr("finforce_keypoints.publishers.draw_keypoints", lambda color, *_: drawn.append(1) or color)
-    bench = CameraBench(probe, skip_off=off)
-    bench.shoot()
+def test_of_images_that_came_together_the_newest_is_answered(probe):
+    bench = CameraBench(probe, max_age=5.0)
+    stamps = [time_ns() + number * MILLISECOND for number in range(4)]
+    bench.burst(stamps)
     bench.wait_for_clouds()
-    probe.spin(0.1)
-    assert (counted(bench, ANNOTATED), len(drawn)) == (("off", 1) if off[0] else ("1", 0))
+    probe.spin(0.3)
+    assert [stamp_of(cloud) for cloud in bench.clouds()] == stamps[-1:]

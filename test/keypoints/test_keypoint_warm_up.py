@@ -11,11 +11,11 @@ from finforce_keypoints.geometry.jaw_localizer import ReferencePatch
 
 
 def test_a_detector_that_was_warmed_up_has_done_everything_once_and_knows_nothing():
-    scene, depth, finder, detector = build()
+    scene, depth, pixel_detector, detector = build()
     image = bare_image(5.0, depth.astype(np.float32))
     before = detector.detect(image)
     detector.warm_up()
-    lost, known = finder.expected[-2:]
+    lost, known = pixel_detector.expected[-2:]
     assert lost == {"left": None, "right": None}
     assert np.allclose(known["left"], jaw_in_camera(scene.T_gripper_camera, "left", -0.045))  # of 10 to 80 mm
     assert detector.lost_sides == ("left", "right") and not detector.counts and not detector.warnings
@@ -40,10 +40,10 @@ def test_warming_up_comes_as_far_as_registering_and_as_depth(monkeypatch):
 
 
 def test_a_finder_that_wants_other_images_is_not_in_the_way_of_warming_up():
-    scene, _, finder, detector = build()
+    scene, _, pixel_detector, detector = build()
 
     def refuse(image, expected):
         raise DetectionError("640x480 is not what the network was trained on")
 
-    finder.find = refuse
+    pixel_detector.find = refuse
     detector.warm_up()

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.build import build_detector
+from finforce_keypoints.build import build_pixel_detector
+from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.parameters import DetectorParameters
+from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
 from finforce_sim.gripper.footage import build_footage
 from finforce_sim.scenes.scenarios import build_scenario
 
@@ -25,7 +26,9 @@ def footage():
 
 def build(jaw):
     jaws = {side: load_jaw(jaw, side) for side in ("left", "right")}
-    return build_detector(jaws, DetectorParameters(jaw_file=jaw)).detector
+    parameters, settings = DetectorParameters(jaw_file=jaw), DetectorSettings()
+    pixel_detector = build_pixel_detector(jaws, parameters, settings)
+    return KeypointDetector(pixel_detector, jaws, parameters.camera_pose, settings)  # covered parts look frozen
 
 
 @pytest.fixture(scope="module")

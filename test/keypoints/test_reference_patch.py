@@ -4,9 +4,8 @@ from scipy.ndimage import gaussian_filter
 
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.geometry import jaw_localizer as reference_patch
-from finforce_keypoints.geometry.jaw_localizer import TEMPLATE_IMAGES, ReferencePatch, build_matcher
-from finforce_keypoints.geometry.jaw_pose import Origin
+from finforce_keypoints.geometry import jaw_pose as reference_patch
+from finforce_keypoints.geometry.jaw_pose import TEMPLATE_IMAGES, Origin, ReferencePatch, build_matcher
 from finforce_keypoints.geometry.side_picture import find_side, intersect_plane
 from finforce_sim.rendering.depth_camera import build_d405_vga
 

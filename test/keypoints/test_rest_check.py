@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from keypoint_scene_fakes import Bend, FakeFinder, scene_of
+from keypoint_scene_fakes import Bend, FakePixelDetector, scene_of
 from scipy.spatial.transform import Rotation
 
 from finforce_keypoints.detector import KeypointDetector
@@ -26,8 +26,8 @@ def warn(shift=(0, 0, 0), turn=(0, 0, 0), view="robot", bend=None, count=15):
     T = scene.T_gripper_camera.copy()
     T[:3, 3] += 1e-3 * np.array(shift)
     T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(np.radians(turn)).as_matrix()
-    finder = FakeFinder(scene.pixels(), np.random.default_rng(0), stddev=0.4)
-    detector = KeypointDetector(finder, scene.jaws, T)
+    pixel_detector = FakePixelDetector(scene.pixels(), np.random.default_rng(0), stddev=0.4)
+    detector = KeypointDetector(pixel_detector, scene.jaws, T)
     for n in range(count):
         detector.detect(replace(noisy_images(view, bend)[n % 2], stamp=n / RATE))
     return detector.warnings

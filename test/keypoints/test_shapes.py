@@ -7,8 +7,15 @@ from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.detectors.side_plane import find_rest
-from finforce_keypoints.geometry.shapes import COUNT, find_motions, fit_motion, span_shapes, trust
-from finforce_keypoints.geometry.template import find_shape, fit_grid
+from finforce_keypoints.geometry.template import (
+    COUNT,
+    find_motions,
+    find_shape,
+    fit_grid,
+    fit_motion,
+    span_shapes,
+    trust,
+)
 
 NAMES = ("bench", "xlerobot", "ssg48_fin_ray_1")
 RNG = np.random.default_rng(5)

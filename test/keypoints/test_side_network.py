@@ -94,7 +94,7 @@ def test_pictures_of_another_size_are_refused(network):
 
 
 def test_both_files_are_needed(tmp_path):
-    with pytest.raises(ModelError, match=r"no coarse\.onnx and no fine\.onnx.*finder frame"):
+    with pytest.raises(ModelError, match=r"no coarse\.onnx and no fine\.onnx.*detection_method frame"):
         SideNetwork(tmp_path)
     shutil.copy(ANY_FINGER / COARSE, tmp_path)
     with pytest.raises(ModelError, match=r"no fine\.onnx"):

@@ -8,7 +8,7 @@ from rgbd_fakes import FakeDetector, FakePhotographer, make_footage
 
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
-from finforce_keypoints.settings import RULES
+from finforce_keypoints.parameters import RULES
 from lab.bench import detection as bench
 from lab.bench.detection import Way, measure_ways
 

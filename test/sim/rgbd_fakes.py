@@ -128,7 +128,7 @@ class FakeDetector:
         index = int(np.argmin(np.abs(self.recording.images.stamps * 1e-9 - image.stamp)))
         self.stamps.append(image.stamp)
         if index in self.refused:
-            raise DetectionError("no picture for this finder")
+            raise DetectionError("no picture for this detector")
         return {} if index in self.lost else {side: self._find(side, index) for side in self.recording.jaws}
 
     def _find(self, side, index):

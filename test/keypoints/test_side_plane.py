@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,8 +9,7 @@ from finforce.camera import project
 from finforce.gripper_frames import HALF_TURN, ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import pose_from_quaternion
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_keypoints.detectors.locators import SHIFTS, AnyFinger, OneFinger, grid_from_metadata
-from finforce_keypoints.detectors.side_plane import PlaneFinder
+from finforce_keypoints.detectors.side_plane import SHIFTS, AnyFinger, OneFinger, SidePlaneDetector, grid_from_metadata
 from finforce_keypoints.errors import GeometryError, ModelError
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.images import RgbdImage
@@ -28,6 +28,7 @@ class ShadeNetwork:
     """Sees each point by the grey level of its disc; its templates hold nothing but the points."""
 
     height, width = 224, 176
+    path, sha256 = Path("shades"), ""
 
     def __init__(self, hidden=()):
         self.batches, self.hidden = [], hidden
@@ -72,9 +73,9 @@ def paint(jaws, places, radius=4.5):
 @pytest.mark.parametrize("off", [0.0, 4e-3, -4e-3])
 def test_pixels_are_those_of_the_image_wherever_the_jaw_was_expected(off):
     jaws, network, places = load_jaws("bench"), ShadeNetwork(), {"left": -0.035, "right": 0.037}
-    finder = PlaneFinder(AnyFinger(network, jaws), jaws, ROBOT_CAMERA)
+    pixel_detector = SidePlaneDetector(AnyFinger(network, jaws), jaws, ROBOT_CAMERA)
     expected = {side: jaw_in_camera(ROBOT_CAMERA, side, x + off) for side, x in places.items()}
-    found = finder.find(paint(jaws, places), expected)
+    found = pixel_detector.detect(paint(jaws, places), expected)
     for side, x in places.items():
         error = np.linalg.norm(found[side].pixels - true_pixels(jaws[side], side, x), axis=1)
         assert error.max() < 0.6  # of a disc's interior, resampled
@@ -88,7 +89,7 @@ def test_successive_pictures_are_shifted_and_what_is_found_in_them_is_not():
     jaws, network = load_jaws("bench"), ShadeNetwork()
     locator, locate, seen = AnyFinger(network, jaws), network.locate, []
     locator.shifts = SHIFTS
-    finder = PlaneFinder(locator, jaws, ROBOT_CAMERA)
+    pixel_detector = SidePlaneDetector(locator, jaws, ROBOT_CAMERA)
 
     def watch(pictures, templates, starts=()):
         places = locate(pictures, templates, starts)
@@ -99,7 +100,7 @@ def test_successive_pictures_are_shifted_and_what_is_found_in_them_is_not():
     network.locate = watch
     image, expected = paint(jaws, {"left": -0.035}), {"left": jaw_in_camera(ROBOT_CAMERA, "left", -0.035)}
     errors = [
-        finder.find(image, expected)["left"].pixels - true_pixels(jaws["left"], "left", -0.035)
+        pixel_detector.detect(image, expected)["left"].pixels - true_pixels(jaws["left"], "left", -0.035)
         for _ in range(len(SHIFTS) + 1)
     ]
     assert np.linalg.norm(errors, axis=2).max() < 0.6
@@ -114,7 +115,7 @@ def test_successive_pictures_are_shifted_and_what_is_found_in_them_is_not():
 def test_another_finger_is_looked_at_on_a_grid_of_its_own():
     jaws, places = load_jaws("ssg48_fin_ray_1"), {"left": -0.035, "right": 0.035}
     expected = {side: jaw_in_camera(ROBOT_CAMERA, side, x) for side, x in places.items()}
-    found = PlaneFinder(AnyFinger(ShadeNetwork(), jaws), jaws, ROBOT_CAMERA).find(paint(jaws, places), expected)
+    found = SidePlaneDetector(AnyFinger(ShadeNetwork(), jaws), jaws, ROBOT_CAMERA).detect(paint(jaws, places), expected)
     for side, x in places.items():
         assert found[side].pixels.shape == (len(jaws[side].keypoints) + 1, 2)
         assert np.linalg.norm(found[side].pixels - true_pixels(jaws[side], side, x), axis=1).max() < 0.6
@@ -123,7 +124,7 @@ def test_another_finger_is_looked_at_on_a_grid_of_its_own():
 @pytest.mark.parametrize("x", [-0.020, -0.031, -0.044])
 def test_a_lost_jaw_is_found_along_the_closing_axis(x):
     jaws = load_jaws("bench")
-    found = PlaneFinder(AnyFinger(ShadeNetwork(), jaws), jaws, ROBOT_CAMERA).find(
+    found = SidePlaneDetector(AnyFinger(ShadeNetwork(), jaws), jaws, ROBOT_CAMERA).detect(
         paint(jaws, {"left": x}), {"left": None}
     )
     error = np.linalg.norm(found["left"].pixels - true_pixels(jaws["left"], "left", x), axis=1)
@@ -133,13 +134,13 @@ def test_a_lost_jaw_is_found_along_the_closing_axis(x):
 
 def test_a_lost_jaw_that_is_nowhere_is_absent():
     jaws = load_jaws("bench")
-    finder = PlaneFinder(AnyFinger(ShadeNetwork(), jaws), jaws, ROBOT_CAMERA)
-    assert not finder.find(paint(jaws, {}), {"left": None, "right": None})
+    pixel_detector = SidePlaneDetector(AnyFinger(ShadeNetwork(), jaws), jaws, ROBOT_CAMERA)
+    assert not pixel_detector.detect(paint(jaws, {}), {"left": None, "right": None})
 
 
 def test_what_is_not_seen_has_no_pixel_and_no_likelihood():
     jaws = load_jaws("bench")
-    found = PlaneFinder(AnyFinger(ShadeNetwork(hidden=(3,)), jaws), jaws, ROBOT_CAMERA).find(
+    found = SidePlaneDetector(AnyFinger(ShadeNetwork(hidden=(3,)), jaws), jaws, ROBOT_CAMERA).detect(
         paint(jaws, {"left": -0.035}), {"left": jaw_in_camera(ROBOT_CAMERA, "left", -0.035)}
     )["left"]
     assert np.isnan(found.pixels[3]).all() and found.likelihood[3] == 0.0 and found.stddev[3] == np.inf
@@ -154,7 +155,7 @@ class ShadeModel:
     """The same as a network of one finger, whose body parts have an order of their own."""
 
     def __init__(self, names=NAMES, plane=PLANE):
-        self.names, self.path = tuple(names), SimpleNamespace(name="shades.onnx")
+        self.names, self.path, self.sha256 = tuple(names), Path("shades/shades.onnx"), ""
         self.metadata = SimpleNamespace(extra={"plane": plane})
 
     def locate(self, pictures):
@@ -166,8 +167,8 @@ class ShadeModel:
 
 def test_the_order_of_the_body_parts_does_not_matter():
     jaws = load_jaws("bench")
-    finder = PlaneFinder(OneFinger(ShadeModel(tuple(reversed(NAMES))), jaws), jaws, ROBOT_CAMERA)
-    found = finder.find(paint(jaws, {"left": -0.035}), {"left": jaw_in_camera(ROBOT_CAMERA, "left", -0.035)})
+    pixel_detector = SidePlaneDetector(OneFinger(ShadeModel(tuple(reversed(NAMES))), jaws), jaws, ROBOT_CAMERA)
+    found = pixel_detector.detect(paint(jaws, {"left": -0.035}), {"left": jaw_in_camera(ROBOT_CAMERA, "left", -0.035)})
     assert np.linalg.norm(found["left"].pixels - true_pixels(jaws["left"], "left", -0.035), axis=1).max() < 0.6
 
 
@@ -191,7 +192,7 @@ def test_a_camera_that_does_not_see_the_sides_is_refused_with_what_to_give():
     jaws = load_jaws("bench")
     other = HALF_TURN @ ROBOT_CAMERA
     with pytest.raises(GeometryError, match=r"y = -0\.0.*other side of the gripper") as found:
-        PlaneFinder(AnyFinger(ShadeNetwork(), jaws), jaws, other)
+        SidePlaneDetector(AnyFinger(ShadeNetwork(), jaws), jaws, other)
     numbers = str(found.value).split("T_gripper_camera is [")[1].rstrip("]").split(",")
     turned = pose_from_quaternion([float(n) for n in numbers[:3]], [float(n) for n in numbers[3:]])
     np.testing.assert_allclose(turned, ROBOT_CAMERA, atol=1e-3)

@@ -6,7 +6,7 @@ from keypoint_scene_fakes import COLOURS, Fake, paint, small_jaws, write_model
 
 from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
-from finforce_keypoints.detectors.whole_image import FrameFinder, check_offsets
+from finforce_keypoints.detectors.whole_image import WholeImageDetector, check_offsets
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.networks.metadata import build_name_map
@@ -36,10 +36,10 @@ def image_of(squares, size=(480, 640)):
     return RgbdImage(stamp=0.0, color=paint(squares, size), depth=None, camera=camera)
 
 
-def finder_of(folder, fake, sides=("left", "right"), changes=None, **options):
+def detector_of(folder, fake, sides=("left", "right"), changes=None, **options):
     jaws = small_jaws(sides)
     model = KeypointModel(write_model(folder, fake, **(changes or {})), threads=1)
-    return FrameFinder(model, build_name_map(model.names, jaws), jaws, **options)
+    return WholeImageDetector(model, build_name_map(model.names, jaws), jaws, **options)
 
 
 def expected_poses(origin_x=0.045):
@@ -49,17 +49,17 @@ def expected_poses(origin_x=0.045):
 LOST = {"left": None, "right": None}
 
 
-def shown_shapes(finder, monkeypatch):
+def shown_shapes(pixel_detector, monkeypatch):
     """The shapes of the batches that the network is given."""
-    shapes, locate = [], finder._model.locate
-    monkeypatch.setattr(finder._model, "locate", lambda batch: (shapes.append(batch.shape), locate(batch))[1])
+    shapes, locate = [], pixel_detector._model.locate
+    monkeypatch.setattr(pixel_detector._model, "locate", lambda batch: (shapes.append(batch.shape), locate(batch))[1])
     return shapes
 
 
 def test_both_jaws_are_found_in_one_pass_in_the_order_of_the_jaw_file(tmp_path, monkeypatch):
-    finder = finder_of(tmp_path, both_jaws())
-    shapes = shown_shapes(finder, monkeypatch)
-    found = finder.find(image_of(SQUARES | OTHERS), LOST)
+    pixel_detector = detector_of(tmp_path, both_jaws())
+    shapes = shown_shapes(pixel_detector, monkeypatch)
+    found = pixel_detector.detect(image_of(SQUARES | OTHERS), LOST)
     assert shapes == [(1, 480, 640, 3)]
     for side, squares in (("left", SQUARES), ("right", OTHERS)):
         assert np.abs(found[side].pixels - list(squares.values())).max() <= CELL
@@ -67,58 +67,58 @@ def test_both_jaws_are_found_in_one_pass_in_the_order_of_the_jaw_file(tmp_path, 
 
 
 def test_while_tracked_only_the_jaws_are_cut_out(tmp_path, monkeypatch):
-    finder = finder_of(tmp_path, both_jaws())
-    shapes = shown_shapes(finder, monkeypatch)
+    pixel_detector = detector_of(tmp_path, both_jaws())
+    shapes = shown_shapes(pixel_detector, monkeypatch)
     image = image_of(SQUARES | OTHERS)
-    found = finder.find(image, expected_poses())
+    found = pixel_detector.detect(image, expected_poses())
     assert shapes[0][1] < 480 and shapes[0][1] % 64 == 0 and shapes[0][2] % 64 == 0
     for side, squares in (("left", SQUARES), ("right", OTHERS)):
         assert np.abs(found[side].pixels - list(squares.values())).max() <= CELL
-    finder.find(image, expected_poses() | {"left": None})
+    pixel_detector.detect(image, expected_poses() | {"left": None})
     assert shapes[1] == (1, 480, 640, 3)
 
 
 def test_a_pose_behind_the_camera_or_beside_the_image_counts_as_lost(tmp_path, monkeypatch):
-    finder = finder_of(tmp_path, both_jaws())
-    shapes = shown_shapes(finder, monkeypatch)
+    pixel_detector = detector_of(tmp_path, both_jaws())
+    shapes = shown_shapes(pixel_detector, monkeypatch)
     for place in ((0.0, 0.0, -1.0), (5.0, 0.0, 0.1)):
         pose = np.eye(4)
         pose[:3, 3] = place
-        finder.find(image_of(SQUARES | OTHERS), {"left": pose, "right": pose})
+        pixel_detector.detect(image_of(SQUARES | OTHERS), {"left": pose, "right": pose})
     assert shapes == [(1, 480, 640, 3)] * 2
 
 
 def test_without_cropping_the_network_sees_the_whole_image(tmp_path, monkeypatch):
-    finder = finder_of(tmp_path, both_jaws(), crop=False)
-    shapes = shown_shapes(finder, monkeypatch)
-    finder.find(image_of(SQUARES), expected_poses())
+    pixel_detector = detector_of(tmp_path, both_jaws(), crop=False)
+    shapes = shown_shapes(pixel_detector, monkeypatch)
+    pixel_detector.detect(image_of(SQUARES), expected_poses())
     assert shapes == [(1, 480, 640, 3)]
 
 
 @pytest.mark.parametrize("size", [(None, None), (480, 640)])
 @pytest.mark.parametrize("poses", [LOST, expected_poses()])
 def test_a_network_of_one_jaw_finds_each_jaw_on_its_side(tmp_path, size, poses):
-    finder = finder_of(tmp_path, one_jaw(size=size))
+    pixel_detector = detector_of(tmp_path, one_jaw(size=size))
     right = {colour: (639 - x, y) for colour, (x, y) in SQUARES.items()}
     image = image_of(SQUARES)
     image.color[:] = np.maximum(image.color, paint(right))
-    found = finder.find(image, poses)
+    found = pixel_detector.detect(image, poses)
     assert np.abs(found["left"].pixels - list(SQUARES.values())).max() <= CELL
     assert np.abs(found["right"].pixels - list(right.values())).max() <= CELL
 
 
 def test_a_network_of_one_jaw_with_one_jaw_sees_the_whole_image(tmp_path, monkeypatch):
-    finder = finder_of(tmp_path, one_jaw(), sides=("left",))
-    shapes = shown_shapes(finder, monkeypatch)
+    pixel_detector = detector_of(tmp_path, one_jaw(), sides=("left",))
+    shapes = shown_shapes(pixel_detector, monkeypatch)
     far = {"red": (600, 204)}
-    found = finder.find(image_of(far), {"left": None})
+    found = pixel_detector.detect(image_of(far), {"left": None})
     assert shapes == [(1, 480, 640, 3)] and np.abs(found["left"].pixels[0] - far["red"]).max() <= CELL
 
 
 def test_jaws_that_are_not_in_the_image_are_unlikely(tmp_path):
-    finder = finder_of(tmp_path, both_jaws())
-    finding = finder.find(image_of({}), LOST)
-    assert all(found.likelihood.max() < 1e-3 for found in finding.values())
+    pixel_detector = detector_of(tmp_path, both_jaws())
+    detection = pixel_detector.detect(image_of({}), LOST)
+    assert all(found.likelihood.max() < 1e-3 for found in detection.values())
 
 
 @pytest.mark.parametrize("size", [(480, 640), (None, None)])
@@ -129,43 +129,43 @@ def test_another_size_than_the_trainings_is_refused_or_letterboxed(tmp_path, siz
     image.color[:] = paint(squares, (800, 1280), half=12)
     fake = both_jaws(size=size)
     with pytest.raises(DetectionError, match="trained on"):
-        finder_of(tmp_path / "a", fake, changes=kept).find(image, LOST)
-    finder = finder_of(tmp_path / "b", fake, changes=kept, allow_resize=True)
-    found = finder.find(image, LOST)
+        detector_of(tmp_path / "a", fake, changes=kept).detect(image, LOST)
+    pixel_detector = detector_of(tmp_path / "b", fake, changes=kept, allow_resize=True)
+    found = pixel_detector.detect(image, LOST)
     places = np.array([squares[colour] for colour in SQUARES])
     assert np.abs(found["left"].pixels - places).max() <= 2 * CELL
     half = image.color[::2, ::2][:400]  # 12 px squares on the same places as INTER_AREA gives
     framed = np.full((480, 640, 3) if size[0] else half.shape, (124, 116, 104), np.uint8)
     framed[:400] = half
-    small = finder._model.locate(framed[None])
+    small = pixel_detector._model.locate(framed[None])
     assert found["left"].stddev == pytest.approx(2.0 * small.stddev[0, :3], rel=1e-3)
 
 
 def test_nothing_is_found_in_the_border_of_a_letterbox(tmp_path, monkeypatch):
     kept = {"finforce__training_size": {"height": 480, "width": 640}}
-    finder = finder_of(tmp_path, both_jaws(size=(480, 640)), changes=kept, allow_resize=True)
+    pixel_detector = detector_of(tmp_path, both_jaws(size=(480, 640)), changes=kept, allow_resize=True)
     monkeypatch.setattr(
         "finforce_keypoints.detectors.whole_image._BLANK", COLOURS["green"]
     )  # as if a point were seen there
-    found = finder.find(image_of({"red": (100, 100)}, (320, 640)), LOST)["left"]
+    found = pixel_detector.detect(image_of({"red": (100, 100)}, (320, 640)), LOST)["left"]
     assert np.abs(found.pixels[0] - (100, 100)).max() <= CELL
     assert np.isnan(found.pixels[1]).all() and found.likelihood[1] == 0.0 and np.isinf(found.stddev[1])
 
 
 @pytest.mark.parametrize("size", [(None, None), (480, 640)])
 def test_a_network_of_one_jaw_does_not_take_the_other_jaw_for_it(tmp_path, size):
-    finder = finder_of(tmp_path, one_jaw(size=size))
+    pixel_detector = detector_of(tmp_path, one_jaw(size=size))
     right = {colour: (639 - x, y) for colour, (x, y) in SQUARES.items()}
     for poses in (LOST, expected_poses()):
-        found = finder.find(image_of(right), poses)
+        found = pixel_detector.detect(image_of(right), poses)
         assert found["right"].likelihood.min() > 0.5
         assert "left" not in found or found["left"].likelihood.max() < 1e-3
 
 
 def test_offsets_that_no_training_gives_are_refused(tmp_path):
-    finder = finder_of(tmp_path, both_jaws(offset=(30.0, 0.0)))
+    pixel_detector = detector_of(tmp_path, both_jaws(offset=(30.0, 0.0)))
     with pytest.raises(DetectionError, match="locref_std"):
-        finder.find(image_of(SQUARES | OTHERS), LOST)
+        pixel_detector.detect(image_of(SQUARES | OTHERS), LOST)
     score = np.array([[0.9, 0.0, 0.0]])
     peaks = Peaks(
         pixels=np.zeros((1, 3, 2)), likelihood=np.array([[0.0, 0.9, 0.9]]), spread=score, stddev=score, astray=score
