@@ -17,7 +17,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.camera import ImageError, project
-from finforce.skipping import ALL, Skips
 from finforce.transforms import pose_from_quaternion
 from finforce_eval.evaluation.keypoint_source import Detector, KeypointSource, SideLog, build_records, with_detections
 from finforce_eval.evaluation.results import DetectionErrors, compare_detection, detection_stats
@@ -27,7 +26,7 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_keypoints.build import build_detector
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.parameters import RULES, load_jaws
+from finforce_keypoints.parameters import load_jaws
 from lab.bench.scenes import DIM, GRASP, BenchScene, find_scene
 from lab.harness import Figures, Tradeoff, percentiles
 
@@ -43,7 +42,7 @@ class Way:
         name: for tables.
         parameters: of the detector node, where they differ from the defaults.
         searches: whether the jaws are looked for anew in every image, not where they were before.
-        rests: whether it leaves out what an image does not need, by the detector's rules.
+        rests: whether it leaves out pixels and depth where nothing has moved.
         dots: whether it looks at images with printed dots.
     """
 
@@ -182,8 +181,7 @@ def _look_at(recording: Recording, ways: Sequence[Way], yardstick: list[float]) 
 def _begin(way: Way, recording: Recording) -> _DetectionRun:
     """Return a way that is ready to look at a recording."""
     records = build_records(KeypointSource(parameters=way.parameters).node_parameters(recording))
-    skips = Skips(RULES, () if way.rests else (ALL,))
-    detector = build_detector(load_jaws(records.parameters), *records, skips).detector
+    detector = build_detector(load_jaws(records.parameters), *records, rests=way.rests)
     detector.warm_up()
     return _DetectionRun(way=way, detector=detector, logs={side: SideLog() for side in recording.jaws})
 

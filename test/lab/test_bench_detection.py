@@ -8,7 +8,6 @@ from rgbd_fakes import FakeDetector, FakePhotographer, make_footage
 
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
-from finforce_keypoints.parameters import RULES
 from lab.bench import detection as bench
 from lab.bench.detection import Way, measure_ways
 
@@ -76,12 +75,12 @@ def test_dots_are_shown_to_their_own_way_only(detectors, bag):
     assert not any(np.array_equal(*pair) for pair in zip(detectors["dots"].seen, recorded, strict=True))
 
 
-def test_rules_are_applied_by_the_resting_way_only(monkeypatch):
+def test_the_resting_way_alone_rests(monkeypatch):
     asked = {}
 
-    def build(jaws, parameters, settings, dots, skips):
-        asked[parameters.threads] = skips.allows(RULES[0])
-        return SimpleNamespace(detector=SimpleNamespace(warm_up=lambda: None))
+    def build(jaws, parameters, settings, dots, rests):
+        asked[parameters.threads] = rests
+        return SimpleNamespace(warm_up=lambda: None)
 
     monkeypatch.setattr(bench, "build_detector", build)
     recording = SimpleNamespace(images=SimpleNamespace(frame_id="camera"), case={}, jaws={"left": None})
