@@ -33,8 +33,7 @@ from finforce_keypoints.build import build_detector
 from finforce_keypoints.detectors.dots import DotSettings
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.images import RgbdImage
-from finforce_keypoints.parameters import DetectorParameters, load_jaws
-from finforce_keypoints.settings import DetectorSettings
+from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, load_jaws
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.faults import FaultyAdapter, PlannedFault
 from finforce_sim.emulator.firmware import EmulatedGripper
@@ -356,7 +355,7 @@ class ImageSensor(EstimatorSensor):
         self._photographer = Photographer(set_stage(pressed.assembly, self._camera, depth_step), seed)
         parameters = DetectorParameters()
         settings = DetectorSettings(quantum=depth_step)
-        self._detector = build_detector(load_jaws(parameters), parameters, settings, DotSettings()).detector
+        self._detector = build_detector(load_jaws(parameters), parameters, settings, DotSettings())
 
     def _look(self, state: TwinState) -> Mapping[str, Observation]:
         shot = self._photographer.shoot(state)
