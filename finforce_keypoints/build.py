@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw
     from finforce_keypoints.detector import KeypointDetector
-    from finforce_keypoints.detectors import PixelDetector
     from finforce_keypoints.detectors.dots import DotSettings
     from finforce_keypoints.detectors.side_plane import SideLocator
+    from finforce_keypoints.images import PixelDetector
     from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
 
 MODELS = Path(__file__).parent / "models"

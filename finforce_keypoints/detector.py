@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics
 from finforce.transforms import check_pose
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.detectors import PixelDetection, PixelDetector
 from finforce_keypoints.errors import DetectionError, GeometryError, ImageOrderError, KeypointError
 from finforce_keypoints.geometry.depth import DepthScale
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints, JawLocalizer
 from finforce_keypoints.geometry.side_picture import find_side
 from finforce_keypoints.geometry.stillness import StillWatch
-from finforce_keypoints.images import ImageWatch, RgbdImage, check_image
+from finforce_keypoints.images import ImageWatch, PixelDetection, PixelDetector, RgbdImage, check_image
 from finforce_keypoints.parameters import DetectorSettings
 
 __all__ = ["JawKeypoints", "KeypointDetector"]

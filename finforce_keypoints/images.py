@@ -1,9 +1,10 @@
-"""Colour images with aligned depth: decoded, checked and watched for a camera that fails."""
+"""Colour images with aligned depth, what is found in them, and a camera that fails."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics, ImageError
 from finforce_keypoints.errors import BlackImageError, EmptyDepthError, FrozenImageError
 
+REFERENCE = "reference"  # the name of the reference point, the last row of every detection
 FROZEN_AFTER = 2  # repetitions of a picture, to the bit, after which a camera counts as frozen
 _WATCHED_STEP = 8  # every so many rows and columns are looked at
 _DARKEST = 10  # of 255: a picture whose brightest hundredth is below this shows nothing
@@ -43,6 +45,49 @@ class ImagePair(NamedTuple):
     stamp: int
     color: Any
     depth: Any
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PixelDetection:
+    """Where one jaw's key points are in an image; the K points of the jaw file first, the reference point last.
+
+    Attributes:
+        pixels: (K + 1, 2) column and row in the full raw, distorted image [px]; NaN where nothing was found.
+        likelihood: (K + 1,) from 0 to 1, 0 where nothing was found.
+        stddev: (K + 1,) one standard deviation of a point along a row or a column [px]; inf where nothing was found.
+    """
+
+    pixels: NDArray
+    likelihood: NDArray
+    stddev: NDArray
+
+
+class PixelDetector(Protocol):
+    """Anything that finds the key points of all jaws in one image, in one pass.
+
+    Attributes:
+        name: of the method and its network.
+        sha256: of the network's files, empty without one.
+    """
+
+    name: str
+    sha256: str
+
+    def detect(self, image: RgbdImage, expected: Mapping[str, NDArray | None]) -> Mapping[str, PixelDetection]:
+        """Return one detection per side.
+
+        Args:
+            image: colour, depth and camera.
+            expected: side -> T_camera_jaw (4, 4) where the jaw should be; None where it was lost: look everywhere; a
+                side that is absent is not looked for.
+
+        Returns:
+            side -> detection; a side that cannot be seen at all is absent.
+
+        Raises:
+            KeypointError: the image cannot be used with this method.
+        """
+        ...
 
 
 def check_image(image: RgbdImage) -> None:

@@ -13,8 +13,8 @@ from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import ROBOT_CAMERA, OpeningRange
 from finforce.optional import import_cv2
 from finforce.settings import check_bounds, setting
-from finforce_keypoints.detectors import PixelDetection
 from finforce_keypoints.errors import DetectorSettingsError
+from finforce_keypoints.images import PixelDetection
 
 _LARGEST_ELONGATION = 4.0  # a disc that is seen at 75 degrees off its normal
 _DIMMEST = 8  # of 255: darker pixels have no colour

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import HALF_TURN, OpeningRange
 from finforce.transforms import pose_numbers
-from finforce_keypoints.detectors import REFERENCE, PixelDetection
 from finforce_keypoints.errors import GeometryError, ModelError
 from finforce_keypoints.geometry.side_picture import PlaneGrid, find_side, map_picture, project_plane, take_picture
 from finforce_keypoints.geometry.template import draw_template, find_motions, find_shape, fit_grid, span_shapes
+from finforce_keypoints.images import REFERENCE, PixelDetection
 from finforce_keypoints.networks.side_network import Places
 
 if TYPE_CHECKING:

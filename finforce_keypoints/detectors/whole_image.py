@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.optional import import_cv2
-from finforce_keypoints.detectors import PixelDetection
 from finforce_keypoints.errors import DetectionError
+from finforce_keypoints.images import PixelDetection
 
 if TYPE_CHECKING:
     from finforce_ifea.jaw.jaw import Jaw

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, project, rays_from_pixels
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.detectors import PixelDetection
 from finforce_keypoints.geometry.depth import (
     DepthEvidence,
     DepthScale,
@@ -29,7 +28,7 @@ from finforce_keypoints.geometry.depth import (
     weigh_depths,
 )
 from finforce_keypoints.geometry.jaw_pose import Origin, OriginEstimator, OriginTrack, ReferencePatch
-from finforce_keypoints.images import RgbdImage, lie_inside
+from finforce_keypoints.images import PixelDetection, RgbdImage, lie_inside
 from finforce_keypoints.parameters import DetectorSettings
 
 GATES = (5e-3, 2e-3)  # [m] off the known side plane, then off the one found, beyond which depth is not the finger's

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from finforce.files import FileError, read_yaml
 from finforce_ifea.jaw.jaw import Jaw
-from finforce_keypoints.detectors import REFERENCE
 from finforce_keypoints.errors import ModelError, NamingError
+from finforce_keypoints.images import REFERENCE
 
 METADATA_FILE = "pytorch_config.yaml"
 LOCREF_STD = 7.2801  # DeepLabCut's default scale of its offset channels [px]

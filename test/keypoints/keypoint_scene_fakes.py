@@ -15,10 +15,9 @@ from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detector import KeypointDetector
-from finforce_keypoints.detectors import PixelDetection
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.geometry.side_picture import find_side, intersect_plane
-from finforce_keypoints.images import RgbdImage
+from finforce_keypoints.images import PixelDetection, RgbdImage
 from finforce_keypoints.parameters import DetectorSettings
 from finforce_sim.rendering.depth_camera import D405_DISTORTION, DepthNoise, disturb_depth
 

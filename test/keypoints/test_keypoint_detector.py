@@ -7,8 +7,8 @@ from keypoint_scene_fakes import CAMERA, Bend, FakePixelDetector, bare_image, bu
 from finforce.camera import ImageError, compute_rays
 from finforce.gripper_frames import jaw_in_camera
 from finforce_keypoints.detector import KeypointDetector, check_reference
-from finforce_keypoints.detectors import PixelDetection
 from finforce_keypoints.errors import DetectionError, EmptyDepthError, GeometryError, ImageOrderError
+from finforce_keypoints.images import PixelDetection
 
 RATE = 30.0
 PUSHED = Bend(push=0.012, lean=0.0015)
