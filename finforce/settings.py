@@ -33,7 +33,7 @@ def setting(
         low: least value.
         high: largest value.
         flags: `choices` (one of several words), `topic` (names one, or several), `settable` (while a node runs),
-            `alias` (former name of the ROS parameter, still read).
+            `alias` (former name of the ROS parameter, still read), `parameter` (False: no ROS parameter).
     """
     bounds = {"min": low, "max": high}
     return field(default=default, metadata={"description": description, "unit": unit, **bounds, **flags})
@@ -46,6 +46,11 @@ class TimeParameters:
     max_age: float = setting(0.2, "greatest age of data at the time of publishing", "s", 0.001, 60.0)
     restart_gap: float = setting(1.0, "stamps that go back by more than this begin a new recording", "s", 0.001, 3600.0)
     diagnostics_period: float = setting(1.0, "time between diagnostics", "s", 0.05, 60.0)
+
+
+def is_parameter(entry: Field) -> bool:
+    """Return whether a field is a setting that a node declares as a parameter."""
+    return bool(entry.metadata) and entry.metadata.get("parameter", True)
 
 
 def describe(entry: Field) -> str:

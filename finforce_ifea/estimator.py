@@ -255,7 +255,7 @@ class JawEstimator:
             self._contact, self._at_rest = None, True
         response, used = self._tracked.response, np.isfinite(points[:, 0])
         deviations = points - self.jaw.keypoints - self._taring.tare.offsets
-        stddev = response.bound_force(deviations, self.settings.offset_stddev)
+        stddev = response.bound_force(deviations)
         return blank_solution(self._stamp, "unloaded", message, used)._replace(
             converged=True,
             force_stddev=stddev * np.array([1.0, 0.0, UNSEEN_ALONG]),
@@ -367,6 +367,8 @@ def _imagine_image(
 
 _PRESENCE_GAIN = 0.1
 _LEAST_PRESENCE = 0.5
+# A key point farther than this from its place at rest is refused [m].
+_FARTHEST = 0.03
 
 
 class KeypointGate:
@@ -384,7 +386,6 @@ class KeypointGate:
         """
         self._rest = jaw.keypoints
         self._threshold = settings.likelihood_threshold
-        self._margin = settings.workspace_margin
         self._allowed = np.ones(len(jaw.keypoints), bool)
         for name in filter(None, (part.strip() for part in settings.ignored_keypoints.split(","))):
             if name not in jaw.keypoint_names:
@@ -402,19 +403,19 @@ class KeypointGate:
         likelihood = np.asarray(observation.likelihood, float)
         if self._presence is None:
             self._presence = (likelihood >= self._threshold).astype(float)
-        _close(points, likelihood, self._rest, self._allowed, self._presence, self._threshold, self._margin)
+        _close(points, likelihood, self._rest, self._allowed, self._presence, self._threshold)
         return points
 
 
 @njit(cache=True)
-def _close(points, likelihood, rest, allowed, presence, threshold, margin):
+def _close(points, likelihood, rest, allowed, presence, threshold):
     """Updates the presence (K,) and makes the points (K, 3) [m] that must not be used NaN."""
     for k in range(len(points)):
         visible = likelihood[k] >= threshold
         presence[k] += _PRESENCE_GAIN * ((1.0 if visible else 0.0) - presence[k])
         near = True
         for a in range(3):
-            near = near and abs(points[k, a] - rest[k, a]) <= margin
+            near = near and abs(points[k, a] - rest[k, a]) <= _FARTHEST
         if not (visible and presence[k] >= _LEAST_PRESENCE and allowed[k] and near):
             for a in range(3):
                 points[k, a] = np.nan

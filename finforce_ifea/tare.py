@@ -13,6 +13,11 @@ from numpy.typing import NDArray
 from finforce_ifea.errors import NotEnoughDataError, UnderLoadError
 from finforce_ifea.settings import EstimatorSettings
 
+# Of a key point that no tare has seen: noise along one axis, and constant offset [m].
+_NOISE, OFFSET_STDDEV = 0.35e-3, 0.4e-3
+# Unloaded images over which offsets are averaged.
+_LONGEST_TARE = 300
+
 
 class StatedNoise(NamedTuple):
     """What a tare found of key points that came with standard deviations.
@@ -152,8 +157,8 @@ class Tare:
         """Whether any key point has an offset."""
         return bool(self.counts.any())
 
-    def offset_variance(self, unseen: float) -> NDArray:
-        """Returns the variance (K,) [m^2] of each offset; `unseen` is the standard deviation without a tare [m]."""
+    def offset_variance(self, unseen: float = OFFSET_STDDEV) -> NDArray:
+        """Return the variance (K,) [m^2] of each offset; `unseen` is the standard deviation without a tare [m]."""
         if unseen not in self._variances:
             self._variances[unseen] = np.where(self.counts > 0, self._seen_variance, unseen**2)
         return self._variances[unseen]
@@ -283,8 +288,8 @@ class TareKeeper:
 
     def reset(self) -> None:
         """Forgets offsets and frames."""
-        self.tare = blank_tare(len(self._keypoints), self._settings.noise)
-        self._frames: deque[NDArray] = deque(maxlen=self._settings.tare_memory + _DELAY_FRAMES)
+        self.tare = blank_tare(len(self._keypoints), _NOISE)
+        self._frames: deque[NDArray] = deque(maxlen=_LONGEST_TARE + _DELAY_FRAMES)
         self._stddevs: deque[NDArray | None] = deque(maxlen=self._frames.maxlen)
         self._open = self._settings.automatic_tare
         self._quiet = 0
@@ -330,7 +335,7 @@ class TareKeeper:
         self._quiet = self._quiet + 1 if quiet else 0
         if not (self._open and self.tared):
             return
-        if loaded or len(self._frames) > self._settings.tare_memory:
+        if loaded or len(self._frames) > _LONGEST_TARE:
             self._open = False
         elif self._quiet >= 2 * _DELAY_FRAMES and self._quiet % _DELAY_FRAMES == 0:
             # the newest half second is left out: a load may just have begun
@@ -345,7 +350,7 @@ class TareKeeper:
             NotEnoughDataError: Too few unloaded frames or visible key points.
             UnderLoadError: The jaw is, or looks, loaded.
         """
-        count = min(self._settings.tare_memory, self._quiet if self.tared else len(self._frames))
+        count = min(_LONGEST_TARE, self._quiet if self.tared else len(self._frames))
         if self.tared and self._quiet == 0:
             raise UnderLoadError("cannot tare: something presses on the jaw")
         if count < _FEWEST_FRAMES:
@@ -369,7 +374,7 @@ class TareKeeper:
         )
 
     def _check_unloaded(self, tare: Tare) -> None:
-        sigma = self._significance(tare, self._settings.offset_stddev)
+        sigma = self._significance(tare, OFFSET_STDDEV)
         if sigma > _LOADED_SIGMA:
             raise UnderLoadError(f"cannot tare: the key points look loaded ({sigma:.1f} standard deviations)")
 
@@ -398,7 +403,7 @@ class TareKeeper:
         if _measure_bend(points - rest) > _REST_REACH or _measure_bend(mean) > _REST_REACH_MEAN:
             return False
         tare = compute_tare([points, points], rest)
-        return tare is not None and self._significance(tare, self._settings.offset_stddev) < _LOADED_SIGMA
+        return tare is not None and self._significance(tare, OFFSET_STDDEV) < _LOADED_SIGMA
 
 
 def _measure_bend(deviations: NDArray) -> float:

@@ -62,7 +62,7 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
 from finforce.ros.pipeline import Outlet, Port, Stage, Unread
 from finforce.ros.tracing import note, write_trace
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
-from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe
+from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe, is_parameter
 from finforce.skipping import UNHEARD, Skips
 from finforce.stamps import NANOSECONDS  # noqa: F401 - for those with stamps
 
@@ -92,7 +92,7 @@ def declare_record(node: Node, record: type[RecordT], prefix: str = "") -> Recor
         ParameterError: a value has the wrong type or is out of bounds, or a topic's name cannot be one.
     """
     values = {}
-    for entry in filter(lambda entry: entry.metadata, fields(record)):
+    for entry in filter(is_parameter, fields(record)):
         name = f"{prefix}.{entry.name}" if prefix else entry.name
         value = _read_value(node, name, entry, prefix)
         check_value(entry, value, name=name)

@@ -30,6 +30,8 @@ from finforce_ifea.settings import EstimatorSettings
 
 DEPTH, SHAPE, HEIGHT = 0, 1, 2
 _OTHER_SIZE = 3.0
+# Uncertainty of a known outline's tilt in addition to that of its pose [rad].
+_TILT_STDDEV = 0.02
 # What leads by more [m] is beside the heights.
 _BESIDE = 1.0
 
@@ -318,6 +320,6 @@ def expect_object(contact: Contact, settings: EstimatorSettings, known: Indenter
         return ExpectedObject(indenter=RoundIndenter(), mean=mean, variance=own**2)
     same = isinstance(known, OutlineIndenter) and known.describes(outline)
     indenter = known if same else _build_outline(_Shape(outline.polygons))
-    own = np.array([settings.tilt_stddev, settings.height_stddev])
+    own = np.array([_TILT_STDDEV, settings.height_stddev])
     mean = np.array([outline.tilt, outline.origin[1]])
     return ExpectedObject(indenter=indenter, mean=mean, variance=outline.stddev[[2, 1]] ** 2 + own**2)

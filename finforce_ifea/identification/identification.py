@@ -26,7 +26,7 @@ from finforce_ifea.mechanics import build_mechanics, choose_full
 from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation, invert_relaxation
 from finforce_ifea.settings import EstimatorSettings
-from finforce_ifea.tare import compute_tare
+from finforce_ifea.tare import OFFSET_STDDEV, compute_tare
 
 BRANCH_PRIOR = np.array([0.1, np.log(1.0), 0.1, np.log(10.0)])
 BRANCH_STDDEV = np.array([0.3, 1.5, 0.3, 1.5])
@@ -415,7 +415,7 @@ def _plateaus_of_case(number: int, case: CalibrationCase, jaw: Jaw, settings: Es
     if (
         tare is None
     ):  # stills: key points are taken to be where the jaw file has them, within the offset of untared ones
-        rest, noise, rest_variance = jaw.keypoints, _STILL_NOISE**2, settings.offset_stddev**2
+        rest, noise, rest_variance = jaw.keypoints, _STILL_NOISE**2, OFFSET_STDDEV**2
     else:
         rest = np.where(tare.counts[:, None] > 0, jaw.keypoints + tare.offsets, np.nan)
         noise = np.trace(tare.noise) / 3.0

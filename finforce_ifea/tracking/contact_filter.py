@@ -22,9 +22,6 @@ EXPECTATION = np.dtype(
         ("largest_change", float),  # of the shape at once
         ("settled_change", float),  # of the shape that no longer matters
         ("farthest", float),  # of the height from its mean [m]
-        ("acceleration", float),  # standard deviation [m/s^2]
-        ("memory", float),  # longest average [images]
-        ("model_error", float),  # of the mechanics, as a share of a key point's displacement
         ("gate", float),  # residual that keeps a quarter of its weight, in standard deviations
         ("stiffness", float),  # of the jaw at first touch [N/m], 0 where unknown
         ("has_corners", bool),  # whether the object may rock
@@ -44,6 +41,10 @@ FORECAST = np.dtype(
 
 # Change of the height that is allowed at once [m].
 LARGEST_SHIFT = 0.3e-3
+# Images over which residuals are averaged while the contact holds still.
+LONGEST_AVERAGE = 45.0
+# Expected acceleration of the object into the jaw, one standard deviation [m/s^2].
+_ACCELERATION = 0.02
 # Standard deviation of the depth per image in addition to its acceleration [m].
 _DEPTH_DRIFT = 0.01e-3
 # No speed is believed for longer than this [s].
@@ -62,7 +63,7 @@ def forecast_state(state, dt, is_sudden, expectation, forecast):
         forecast: see `FORECAST`.
     """
     state, expectation, forecast = state[()], expectation[()], forecast[()]
-    spread, power = state.spread, expectation.acceleration**2
+    spread, power = state.spread, _ACCELERATION**2
     a, b, c = spread[0, 0], spread[0, 1], spread[1, 1]
     mixed = b + dt * c + power * dt**3 / 2.0
     forecast.spread[0, 0] = a + 2.0 * dt * b + dt**2 * c + power * dt**4 / 4.0 + _DEPTH_DRIFT**2
@@ -76,7 +77,8 @@ def forecast_state(state, dt, is_sudden, expectation, forecast):
     forecast.unsure = dt if is_sudden else 0.0
 
 
-_MODEL_FLOOR = 0.02e-3
+# Error of the mechanics, as a share of a key point's displacement, and at least [m].
+_MODEL_ERROR, _MODEL_FLOOR = 0.01, 0.02e-3
 _LEAST_WEIGHT = 0.02
 # Median of a squared distance in three axes; what more is chance; and fewer points do not tell the noise.
 MEDIAN_SQUARE, _CHANCE, _FEWEST = 2.37, 1.5, 5
@@ -147,7 +149,7 @@ def _measure_residuals(points, positions, motions, below, expectation):
         point = points[k]
         point.bias = point.offset_variance + _MODEL_FLOOR**2
         for a in range(3):
-            point.bias += expectation.model_error**2 * (positions[k, a] - point.rest[a]) ** 2
+            point.bias += _MODEL_ERROR**2 * (positions[k, a] - point.rest[a]) ** 2
         for i in range(4):
             point.modes[0, i], point.modes[1, i] = motions[k, 0, i], motions[k, 2, i]
         least = min(least, point.tare_noise[0, 0] + point.tare_noise[1, 1])
@@ -252,7 +254,7 @@ def update_state(points, average, extended, forecast, expectation, state):
     gain_depth, gain_speed = spread[0, 0] / expected, spread[0, 1] / expected
     depth = forecast.x[0] + gain_depth * innovation
     deeper = depth - forecast.x[0]
-    _extend_average(average, points, deeper, expectation.memory, extended)
+    _extend_average(average, points, deeper, LONGEST_AVERAGE, extended)
     offset = (forecast.x[1] - expectation.mean[0], forecast.x[2] - expectation.mean[1])
     hessian, gradient = _compute_posterior(points, extended, offset, expectation.variance, information)
     covariance = _invert_symmetric(hessian)

@@ -62,8 +62,7 @@ class ContactSearch:
         self._forecast = np.zeros((), FORECAST)
         self._average, self._extended = np.zeros(count, AVERAGE), np.zeros(count, AVERAGE)
         self.expectation = np.zeros((), EXPECTATION)
-        for name in ("acceleration", "memory", "model_error", "gate"):
-            self.expectation[name] = getattr(settings, name)
+        self.expectation["gate"] = settings.gate
 
     def begin(self, contact: RollingContact, mean: NDArray) -> None:
         """Begin with the undeformed jaw and an object of expected shape and height (2,) that just touches."""

@@ -233,7 +233,7 @@ class ContactTracker:
         points["measured"], points["rest"] = measured, self._rest
         points["tare_noise"], points["gain"] = noise.plane, noise.gain
         points["width_variance"], points["trust"] = noise.width_variance, noise.trust
-        points["offset_variance"] = tare.offset_variance(self.settings.offset_stddev) + noise.bias
+        points["offset_variance"] = tare.offset_variance() + noise.bias
 
     def significance(self, tare: Tare, stddev: float) -> float:
         """Return by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.errors import ObservationError
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.errors import NotEnoughDataError, UnobservableError
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
@@ -14,7 +13,7 @@ from finforce_ifea.observation import Contact
 from finforce_ifea.paper_inverse import InverseResult, Problem, solve_inverse
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import Tare
-from finforce_ifea.tracking.contact_filter import question_location
+from finforce_ifea.tracking.contact_filter import LONGEST_AVERAGE, question_location
 from finforce_ifea.tracking.contact_state import (
     MIDDLE_STDDEV,
     UNSEEN_TRACTION,
@@ -51,7 +50,6 @@ class GivenContactTracker:
         self._watch = LocationWatch(response, settings)
         self.jaw, self.mechanics, self.settings = jaw, mechanics, settings
         self.paper = settings.solver == "paper"
-        self._energy_weights = parse_energy_weights(settings, len(jaw.candidates))
         self._known: dict[tuple[float, ...], tuple[Any, Any]] = {}
         self._load = lru_cache(maxsize=256)(self._build_load)
         self.reset()
@@ -132,7 +130,7 @@ class GivenContactTracker:
             weights=shares,
             axes="three" if self.settings.force_axes == "three" else "normal",
             precision=precision,
-            energy_weight=self._energy_weights[self._candidate] if self.paper else 0.0,
+            energy_weight=self.settings.energy_weight if self.paper else 0.0,
             energy_form=self.settings.energy_form,
         )
 
@@ -165,7 +163,7 @@ class GivenContactTracker:
         known = np.isfinite(targets[:, 0])
         noise = tare.point_noise(stddev)
         scatter = np.trace(noise.plane, axis1=1, axis2=2) / 2.0 / noise.trust
-        variance = scatter + noise.bias + tare.offset_variance(self.settings.offset_stddev)
+        variance = scatter + noise.bias + tare.offset_variance()
         try:
             if self.paper:
                 result, weights = self._solve(targets, None), known.astype(float)
@@ -236,23 +234,6 @@ class GivenContactTracker:
         return explain_offsets(modes, tare, stddev)
 
 
-def parse_energy_weights(settings: EstimatorSettings, count: int) -> NDArray:
-    """Returns the energy weight of each of `count` candidates (count,).
-
-    Raises:
-        ObservationError: `energy_weights` is not empty and does not hold one number, zero or above, per candidate.
-    """
-    if not settings.energy_weights.strip():
-        return np.full(count, settings.energy_weight)
-    try:
-        weights = np.array([float(part) for part in settings.energy_weights.split(",")])
-    except ValueError as error:
-        raise ObservationError(f"energy_weights: {error}, expected {count} numbers") from error
-    if len(weights) != count or not (np.isfinite(weights).all() and (weights >= 0).all()):
-        raise ObservationError(f"energy_weights: got {len(weights)} numbers, expected {count} of zero or above")
-    return weights
-
-
 # A pressed object travels along the finger by this share of its depth, one standard deviation: 20 mm becomes 13.8 mm at
 # 10 mm of a cylinder of 35 mm, less with smaller ones and higher up.
 _TRAVEL = 0.3
@@ -275,7 +256,7 @@ class LocationWatch:
         """Keeps the answers of the unloaded jaw and how well heights are known."""
         self._response = response
         self._prior_variance = settings.height_stddev**2
-        self._memory = float(settings.memory)
+        self._memory = LONGEST_AVERAGE
         self._height, self._spread = float(np.median(response.heights)), 0.0
         self.reset()
 

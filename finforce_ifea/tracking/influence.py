@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from finforce_ifea.contact_mechanics.indenter import DEPTH
 from finforce_ifea.contact_mechanics.pressed_jaw import RollingContact
 from finforce_ifea.observation import Contact
-from finforce_ifea.tare import Tare
+from finforce_ifea.tare import OFFSET_STDDEV, Tare
 
 _HEIGHTS = 13
 _TOUCH = 3e-5
@@ -57,7 +57,7 @@ class InfluenceCoefficients:
         share = np.clip((height - low) / (high - low), 0.0, 1.0)
         return (1.0 - share) * values[upper - 1] + share * values[upper]
 
-    def bound_force(self, deviations: NDArray, offset_stddev: float) -> float:
+    def bound_force(self, deviations: NDArray) -> float:
         """Returns the standard deviation [N] of a force that key points seen at rest leave room for, at any height.
 
         At each height, the force that explains the deviations best and its own standard deviation are taken together;
@@ -65,23 +65,22 @@ class InfluenceCoefficients:
 
         Args:
             deviations: of the key points from their places at rest (K, 3) [m], NaN where unseen.
-            offset_stddev: by which each is off by chance [m].
         """
         seen = np.isfinite(deviations[:, 0])
-        fit = self._fit(seen.tobytes(), offset_stddev)
+        fit = self._fit(seen.tobytes())
         loads = fit.gains @ deviations[seen][:, ::2].ravel()
         return float(np.sqrt((np.maximum(loads, 0.0) ** 2 + fit.stddevs**2).mean()))
 
-    def _fit(self, seen: bytes, offset_stddev: float) -> "_PointFit":
+    def _fit(self, seen: bytes) -> "_PointFit":
         """Returns the fits for the key points that are seen, (K,) bool as bytes; kept, for they are mostly the same."""
-        if (seen, offset_stddev) not in self.fits:
+        if seen not in self.fits:
             rows = np.frombuffer(seen, bool)
-            fits = [fit_load(motions[rows], np.full(int(rows.sum()), offset_stddev)) for motions in self.motions]
+            fits = [fit_load(motions[rows], np.full(int(rows.sum()), OFFSET_STDDEV)) for motions in self.motions]
             self.fits.clear()
-            self.fits[seen, offset_stddev] = _PointFit(
+            self.fits[seen] = _PointFit(
                 gains=np.stack([fit.gain for fit in fits]), stddevs=np.array([fit.stddev for fit in fits])
             )
-        return self.fits[seen, offset_stddev]
+        return self.fits[seen]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from finforce.gripper_frames import BENCH_CAMERA
-from finforce.settings import TimeParameters
+from finforce.settings import TimeParameters, is_parameter
 from finforce.systems.launch import options_from_texts
 from finforce.systems.live import bench_processes
 from finforce.systems.processes import BenchOptions, Process, ReplayOptions, RobotOptions, replay_processes
@@ -31,7 +31,9 @@ from finforce_sim.parameters import TwinParameters
 
 ROOT = Path(__file__).resolve().parents[2]
 SOLVER_PARAMETERS = {entry.name for entry in fields(NodeParameters)}
-SOLVER_PARAMETERS |= {f"estimator.{entry.name}" for entry in fields(EstimatorSettings)} | {"use_sim_time"}
+SOLVER_PARAMETERS |= {f"estimator.{entry.name}" for entry in fields(EstimatorSettings) if is_parameter(entry)} | {
+    "use_sim_time"
+}
 CONTACT_PARAMETERS = {entry.name for entry in fields(ContactParameters)} | {"use_sim_time"}
 CONTACT_PARAMETERS |= {f"contact.{entry.name}" for entry in fields(ContactSettings)}
 DETECTOR_PARAMETERS = {entry.name for entry in fields(DetectorParameters)} | {"use_sim_time"}
