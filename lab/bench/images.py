@@ -18,10 +18,28 @@ import pandas as pd
 
 from finforce.errors import FinforceError
 from finforce_eval.cli.main import main as finforce
+from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
+from finforce_sim.gripper.footage import parse_size
+from finforce_sim.scenes.scenarios import build_scenario
 from lab.bench.detection import sight_columns, time_product
-from lab.bench.scenes import BENCH, FIRST_SEED, UNSEEN, record_unseen, scene_folder
+from lab.bench.scenes import SIZE, scene_folder
 from lab.harness import Figures
 
+# Name of a case: scene, and what is changed in it; no object is one of the shapes trained on.
+UNSEEN: dict[str, tuple[str, dict[str, Any]]] = {
+    "cylinder": ("grasp_cylinder", {}),
+    "cube": ("grasp_cube", {}),
+    "asymmetric": ("grasp_asymmetric", {}),
+    "bottle": ("grasp_cylinder", {"object": "bottle", "scale": 0.45, "turn_x": 1.5708}),
+    "shifting": ("shifting", {}),
+    "fast close": ("fast_close", {}),
+    "bench middle": ("bench_cylinder", {}),
+    "bench lower": ("bench_cylinder_lower", {}),
+    "weight": ("weight_turn", {}),
+    "weight, dim": ("weight_turn_dim", {}),
+}
+FIRST_SEED = 101
+BENCH = "bench"  # the jaw that the scenes are made for
 QUICK_SCENE = "cylinder"
 
 
@@ -101,3 +119,24 @@ def calibrate(bag: Path, jaw: str) -> str:
     if not file.exists() and finforce(["calibrate", str(bag), "--jaw", jaw, "--from", "truth", "-o", str(file)]) != 0:
         raise FinforceError(f"{bag.name}: {jaw} cannot be calibrated there")
     return str(file)
+
+
+def record_unseen(name: str, seed: int, folder: Path, jaw: str = BENCH) -> Path:
+    """Record a case of `UNSEEN` with a seed into a folder, unless that was done before; return where.
+
+    Args:
+        name: of the case.
+        seed: of textures, light and noise.
+        folder: of the recordings.
+        jaw: shipped jaw or jaw file.
+
+    Raises:
+        FinforceError: the scene cannot be recorded.
+    """
+    scene, changes = UNSEEN[name]
+    label = name.replace(",", "").replace(" ", "_")
+    bag = folder / (f"{label}_{seed}" if jaw == BENCH else f"{label}_{Path(jaw).stem}_{seed}")
+    if not bag.exists():
+        scenario = build_scenario(scene, **changes, jaw=jaw)
+        record_scene(scenario, seed, bag, camera=parse_size(SIZE), form=RecordingForm())
+    return bag

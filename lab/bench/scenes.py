@@ -1,7 +1,6 @@
 """Rendered scenes with truth for benchmarks, none of whose seeds a network was trained on; kept once they are made.
 
-A scene is rendered as a camera of 180 Hz would see it, without what no camera of 30, 60 or 90 Hz sees, and cut into
-sections that are played on end.
+A scene is rendered as a camera of 180 Hz would see it, without what no camera of 30, 60 or 90 Hz sees.
 """
 
 from __future__ import annotations
@@ -9,21 +8,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from itertools import groupby
-from operator import attrgetter
 from pathlib import Path
 from shutil import rmtree
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
-
-from finforce.stamps import NANOSECONDS
-from finforce_eval.errors import RecordingError
-from finforce_eval.recordings.images import CAMERA_INFO, IMAGE
-from finforce_eval.recordings.recording import POSE
-from finforce_eval.replay.playback import Playback, RawMessage
-from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
 if TYPE_CHECKING:
     from finforce_sim.gripper.gripper import TwinState
@@ -67,23 +57,6 @@ _SHORT = {"settle": 0.3, "record": 0.8}
 GRASP = BenchScene(scenario="grasp_cylinder", seed=101, changes=_SHORT)
 GRASP_FAST = replace(GRASP, slots=EVERY_RATE)
 DIM = BenchScene(scenario="grasp_asymmetric", seed=102, changes={**_SHORT, "light": "dim"})
-CALIBRATION = BenchScene(scenario="shifting", seed=103, changes={"shift_time": 0.4, "settle": 0.1, "record": 0.1})
-
-# Name of a case: scene, and what is changed in it; no object is one of the shapes trained on.
-UNSEEN: dict[str, tuple[str, dict[str, Any]]] = {
-    "cylinder": ("grasp_cylinder", {}),
-    "cube": ("grasp_cube", {}),
-    "asymmetric": ("grasp_asymmetric", {}),
-    "bottle": ("grasp_cylinder", {"object": "bottle", "scale": 0.45, "turn_x": 1.5708}),
-    "shifting": ("shifting", {}),
-    "fast close": ("fast_close", {}),
-    "bench middle": ("bench_cylinder", {}),
-    "bench lower": ("bench_cylinder_lower", {}),
-    "weight": ("weight_turn", {}),
-    "weight, dim": ("weight_turn_dim", {}),
-}
-FIRST_SEED = 101
-BENCH = "bench"  # the jaw that the scenes are made for
 
 
 class SmoothGripper:
@@ -170,141 +143,3 @@ def _render(scene: BenchScene, path: Path) -> None:
     case = {"scene": scene.scenario, "seed": scene.seed, "finger": FINGER, "object": {"kind": scene.build().object}}
     with tqdm(total=len(footage), unit="image", desc=scene.scenario, disable=None, leave=False) as bar:
         write_footage(footage, path, form=RecordingForm(farthest=FARTHEST), case=case, seen=lambda _: bar.update())
-
-
-def record_unseen(name: str, seed: int, folder: Path, jaw: str = BENCH) -> Path:
-    """Record a case of `UNSEEN` with a seed into a folder, unless that was done before; return where.
-
-    Args:
-        name: of the case.
-        seed: of textures, light and noise.
-        folder: of the recordings.
-        jaw: shipped jaw or jaw file.
-
-    Raises:
-        FinforceError: the scene cannot be recorded.
-    """
-    from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
-    from finforce_sim.gripper.footage import parse_size
-    from finforce_sim.scenes.scenarios import build_scenario
-
-    scene, changes = UNSEEN[name]
-    label = name.replace(",", "").replace(" ", "_")
-    bag = folder / (f"{label}_{seed}" if jaw == BENCH else f"{label}_{Path(jaw).stem}_{seed}")
-    if not bag.exists():
-        scenario = build_scenario(scene, **changes, jaw=jaw)
-        record_scene(scenario, seed, bag, camera=parse_size(SIZE), form=RecordingForm())
-    return bag
-
-
-PHASE_TOPIC, OBJECT_TOPIC, MASK_TOPIC = "/bench/phase", "/object_pose", "/object_mask"
-PLAYED = {COLOR_TOPIC: IMAGE, DEPTH_TOPIC: IMAGE, INFO_TOPIC: CAMERA_INFO, OBJECT_TOPIC: POSE, MASK_TOPIC: IMAGE}
-RATE = 30.0  # Hz
-
-
-@dataclass(frozen=True, kw_only=True)
-class StreamPart:
-    """A stretch of time in which the images of one section are played, over and over where they do not suffice.
-
-    Attributes:
-        section: of the recording.
-        seconds: how long.
-        name: under which it is measured; empty: it is not.
-    """
-
-    section: str
-    seconds: float
-    name: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Span:
-    """When a part is played, from the beginning of all [s]."""
-
-    part: StreamPart
-    begin: float
-    end: float
-
-
-class SceneStream:
-    """The messages of the sections of a recording, in the order and as long as the parts have them.
-
-    It is played as a `Playback` is; every iteration gives the same.
-
-    Attributes:
-        begin: time of the first message [ns].
-        types: of the topics.
-        spans: of the parts.
-
-    Args:
-        sections: images by section: each a list of the messages that belong to one image.
-        parts: what is played.
-        rate: of the images [Hz].
-
-    Raises:
-        RecordingError: a part asks for a section that has no images.
-    """
-
-    def __init__(
-        self, sections: Mapping[str, Sequence[Sequence[RawMessage]]], parts: Sequence[StreamPart], rate: float = RATE
-    ) -> None:
-        for part in parts:
-            if not sections.get(part.section):
-                raise RecordingError(f"the recording has no images of the section {part.section!r}")
-        self._sections, self._parts, self._rate = sections, tuple(parts), rate
-        self.begin = NANOSECONDS
-        kinds = {
-            message.topic: message.msgtype for images in sections.values() for image in images for message in image
-        }
-        self.types = kinds
-        self.spans = tuple(self._lay_out())
-
-    def _lay_out(self) -> Iterator[Span]:
-        """Yield when each part is played."""
-        begin = 0.0
-        for part in self._parts:
-            end = begin + round(part.seconds * self._rate) / self._rate
-            yield Span(part=part, begin=begin, end=end)
-            begin = end
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self._images())
-
-    def _images(self) -> Iterator[Sequence[RawMessage]]:
-        for part in self._parts:
-            images = self._sections[part.section]
-            for index in range(round(part.seconds * self._rate)):
-                yield images[index % len(images)]
-
-    def __iter__(self) -> Iterator[RawMessage]:
-        for index, image in enumerate(self._images()):
-            time = self.begin + round(index * NANOSECONDS / self._rate)
-            for message in image:
-                yield message._replace(time=time, data=message.restamped(time))
-
-
-def cut_sections(messages: Playback, names: Mapping[str, str]) -> dict[str, list[list[RawMessage]]]:
-    """Return the images of a recording by section, each with all that has its stamp.
-
-    Args:
-        messages: camera images, poses of the object, and the words of `/bench/phase`.
-        names: section by the beginning of such a word; images of other phases are left out.
-    """
-    sections: dict[str, list[list[RawMessage]]] = {}
-    section = ""
-    for _, group in groupby(messages, key=attrgetter("time")):
-        image = list(group)
-        for message in image:
-            if message.topic == PHASE_TOPIC:
-                word = read_word(message.data)
-                section = next((name for start, name in names.items() if word.startswith(start)), "")
-        kept = [message for message in image if message.topic in PLAYED]
-        if section and any(message.topic == COLOR_TOPIC for message in kept):
-            sections.setdefault(section, []).append(kept)
-    return sections
-
-
-def read_word(data: bytes) -> str:
-    """Return the text of a std_msgs/String in CDR: four bytes of encapsulation, four of length, text and a zero."""
-    size = int.from_bytes(data[4:8], "little")
-    return data[8 : 8 + size].rstrip(b"\0").decode()

@@ -1,62 +1,54 @@
-"""Claims about the benchmark of skipped work: what is played when, and what its figures say."""
+"""Claims about the benchmark of skipped work: which images belong to a scene, and what is counted of it."""
 
 import pandas as pd
 import pytest
 
-from finforce_eval.errors import RecordingError
+from finforce.stamps import NANOSECONDS
+from finforce_eval.recordings.tracks import parse_phases
 from finforce_eval.replay.playback import RawMessage
-from finforce_keypoints.parameters import COLOR_TOPIC
-from lab.bench.scenes import SceneStream, StreamPart, cut_sections, read_word
-from lab.bench.skipping import arrange
-
-SECOND = 1_000_000_000
+from lab.bench import skipping
+from lab.bench.skipping import SCENE, SETTLED, WARM_UP, SceneMeter, arrange, find_spans
 
 
-def message(time, topic=COLOR_TOPIC, text="", has_header=True):
-    """A message with its stamp; or a std_msgs/String."""
-    if text:
-        word = text.encode() + b"\0"
-        return RawMessage(
-            time, topic, "std_msgs/msg/String", b"\0\1\0\0" + len(word).to_bytes(4, "little") + word, False
-        )
-    stamp = (time // SECOND).to_bytes(4, "little") + (time % SECOND).to_bytes(4, "little")
-    return RawMessage(time, topic, "sensor_msgs/msg/Image", b"\0\1\0\0" + stamp + b"rest", has_header)
+def test_idling_approach_and_holding_are_measured_once_they_have_begun():
+    from finforce_sim.scenes.scenarios import write_script
+
+    script = write_script(SCENE.build())
+    begins = [n for n, word in enumerate(script.phases) if n == 0 or word != script.phases[n - 1]]
+    stamps = [round(NANOSECONDS * script.stamps[n]) for n in begins]
+    spans = find_spans(parse_phases(stamps, [script.phases[n] for n in begins], "scene"))
+    seconds = {name: (end - begin) / NANOSECONDS for name, (begin, end) in spans.items()}
+    assert seconds["idle"] == pytest.approx(SCENE.changes["tare"] - WARM_UP, abs=0.04)
+    assert seconds["approach"] == pytest.approx(3.0, abs=0.04)  # 15 mm at 5 mm/s
+    assert seconds["grasp"] == pytest.approx(SCENE.changes["record"] + SCENE.changes["settle"] - SETTLED, abs=0.04)
+    assert spans["approach"][1] < spans["grasp"][0]
 
 
-def recording():
-    """Four images: two of one phase, one of a phase that nobody asked for, one of another."""
-    for number, phase in enumerate(("a:1", "a:2", "b:1", "c:1")):
-        time = (number + 1) * SECOND
-        yield message(time, "/bench/phase", phase)
-        yield message(time)
-        yield message(time, "/left/ground_truth_wrench")
+def test_cpu_time_is_read_where_a_scene_begins_and_ends(monkeypatch):
+    made = []
 
+    class Meter:
+        def __init__(self, pids):
+            made.append(self)
+            self.samples = 0
 
-def test_sections_hold_the_images_of_their_phases_and_nothing_but_what_is_played():
-    sections = cut_sections(recording(), {"a:": "first", "c:": "last"})
-    assert {name: len(images) for name, images in sections.items()} == {"first": 2, "last": 1}
-    assert {part.topic for images in sections.values() for image in images for part in image} == {COLOR_TOPIC}
-    assert read_word(message(0, "/bench/phase", "0:load:7:ramp").data) == "0:load:7:ramp"
+        def sample(self):
+            self.samples += 1
 
+        def shares(self):
+            return {"node": 10.0 * len(made)}
 
-def test_a_reel_repeats_a_section_with_rising_stamps_at_its_rate():
-    sections = cut_sections(recording(), {"a:": "first", "c:": "last"})
-    parts = [StreamPart(section="first", seconds=0.5, name="shown"), StreamPart(section="last", seconds=0.1)]
-    stream = SceneStream(sections, parts, rate=10.0)
-    played = list(stream)
-    assert len(played) == len(stream) == 6
-    assert [entry.time - stream.begin for entry in played] == [round(0.1 * k * SECOND) for k in range(6)]
-    assert [entry.stamp for entry in played] == [entry.time for entry in played]
-    assert [(span.begin, span.end) for span in stream.spans] == [(0.0, 0.5), (0.5, pytest.approx(0.6))]
-
-
-def test_a_section_without_images_is_refused():
-    with pytest.raises(RecordingError, match="no images of the section 'press'"):
-        SceneStream({}, [StreamPart(section="press", seconds=1.0)])
+    monkeypatch.setattr(skipping, "CpuMeter", Meter)
+    meter = SceneMeter(spans={"idle": (10, 20), "grasp": (30, 40)})
+    for time in (0, 12, 15, 22, 31, 39, 45):
+        meter.note({"node": 1}, RawMessage(time, "/camera", "Image", b"", False))
+    assert list(meter.shares) == ["idle", "grasp"]
+    # a meter for what is before, in each scene, between and after them
+    assert [one.samples for one in made] == [2, 1, 2, 1]
 
 
 def test_the_table_sets_a_node_with_the_rules_beside_the_same_without():
-    common = {"node": "solver", "grasp forces/Hz": 30.0, "other load/%": 12.0, "memory/MB": 250.0}
+    common = {"node": "solver", "grasp forces/Hz": 30.0, "memory/MB": 250.0}
     rows = [
         {**common, "rules": rules, "scene": scene, "CPU/% of a core": cpu}
         for rules, scene, cpu in (
