@@ -1,4 +1,4 @@
-"""Fills the tables of the pages in docs/ from the JSON of benchmarks: `tools/fill_pages.py report/*.json`.
+"""Fill the tables of the pages in docs/ from the JSON of benchmarks: `tools/fill_pages.py report/*.json`.
 
 A table stands between `<!-- begin NAME -->` and `<!-- end NAME -->`; NAME is its place in the figures, as
 `solvers.tables.tiers`, or `machine.NAME` for what the part NAME was measured on. What no file holds stays as it was.
@@ -36,11 +36,9 @@ def describe_machine(machine: Mapping[str, Any]) -> str:
 
 
 def read_texts(path: Path) -> dict[str, str]:
-    """Return the texts of one file; a file whose figures are of one thing is that thing's, by the file's name."""
+    """Return the texts of one file, with a sentence on its machine for each part."""
     figures = json.loads(path.read_text(encoding="utf-8"))
     machine = figures.pop("machine", None)
-    if "tables" in figures:
-        figures = {path.stem: figures}
     sentence = {f"machine.{name}": describe_machine(machine) for name in figures} if machine else {}
     return list_texts(figures) | sentence
 

@@ -88,9 +88,9 @@ def press_model(model: Model, cases: Sequence[BenchCase]) -> list[dict[str, Any]
             {
                 "case": case.name,
                 "force, worst/%": float(force[np.abs(force).argmax()]),
-                **{f"at {depth} mm/%": float(force[at[depth]]) if depth in at else np.nan for depth in SHOWN},
+                **{f"force at {depth} mm/%": float(force[at[depth]]) if depth in at else np.nan for depth in SHOWN},
                 "key points, worst/mm": float(points.max()),
-                "at 5 mm/mm": float(points[at[5]]) if 5 in at else np.nan,
+                "key points at 5 mm/mm": float(points[at[5]]) if 5 in at else np.nan,
                 "turn/mrad": measure_turn(jaw, case, moved[-1]),
                 "true turn/mrad": measure_turn(jaw, case, case.moved[count - 1]),
             }

@@ -189,8 +189,3 @@ def test_page_takes_its_tables_from_the_figures_and_keeps_what_they_do_not_hold(
     filled = fill_pages.fill(page, texts)
     assert filled == page.replace("old", "| t |", 1)
     assert fill_pages.fill(filled, texts) == filled
-
-
-def test_a_file_of_one_benchmark_is_named_after_it(fill_pages, tmp_path):
-    (tmp_path / "verification.json").write_text(json.dumps({"tables": {"summary": "| s |"}}))
-    assert fill_pages.read_texts(tmp_path / "verification.json") == {"verification.tables.summary": "| s |"}
