@@ -90,7 +90,7 @@ def _find_versions() -> Iterator[tuple[str, str]]:
             yield name, installed(name)
 
 
-LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh", "small_gicp")
+LIBRARIES = ("numpy", "scipy", "numba", "open3d", "manifold3d", "trimesh")
 
 
 def write_json(path: str, content: Mapping[str, Any]) -> None:

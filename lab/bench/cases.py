@@ -81,12 +81,12 @@ class ReplayedPress:
     ends: NDArray
 
     def contacts(self, kind: str) -> Sequence[Contact]:
-        """Returns the contacts of a kind, "height" or "outline", image by image."""
+        """Return the contacts of a kind, "height" or "outline", image by image."""
         return self.outlines if kind == "outline" else self.heights
 
 
 def load_cases(path: Path | str = TRUTH) -> tuple[BenchCase, ...]:
-    """Returns the nine cases."""
+    """Return the nine cases."""
     data = np.load(path)
     cases = []
     for key in sorted(name.removesuffix("_depth") for name in data if name.endswith("_depth")):
@@ -106,13 +106,13 @@ def load_cases(path: Path | str = TRUTH) -> tuple[BenchCase, ...]:
 
 
 def bench_finger() -> Jaw:
-    """Returns the bench jaw with the material of the truth."""
+    """Return the bench jaw with the material of the truth."""
     jaw = load_jaw("bench")
     return replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
 
 
 def press_cases(jaw: Jaw, diameters: Sequence[float] = DIAMETERS) -> tuple[BenchCase, ...]:
-    """Returns presses of any finger by its own solid model, of a section on the coarse mesh.
+    """Return presses of any finger by its own solid model, of a section on the coarse mesh.
 
     The cylinders of the bench meet the same shares of the finger's candidates as there, and a shorter finger is
     pressed as much less, a stiff one to about twelve newtons, and one that buckles before as deep as it bears.
@@ -162,7 +162,7 @@ def press_cases(jaw: Jaw, diameters: Sequence[float] = DIAMETERS) -> tuple[Bench
 
 
 def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, seed: int = 0) -> ReplayedPress:
-    """Returns a press to all levels at 2 mm/s, each held for 1.5 s, after two seconds at rest.
+    """Return a press to all levels at 2 mm/s, each held for 1.5 s, after two seconds at rest.
 
     Between the depths of the truth key points and forces are interpolated without overshoot.
 
@@ -207,7 +207,7 @@ class _PressMotion:
 
 
 def _build_motion(depths: NDArray) -> _PressMotion:
-    """Returns rest, then ramps to those of the levels that were pressed, to the last depths of others, and holds."""
+    """Return rest, then ramps to those of the levels that were pressed, to the last depths of others, and holds."""
     known = np.isin(np.round(LEVELS, 9), np.round(depths, 9))
     levels = np.array(LEVELS)[known] if known.all() else depths[-len(LEVELS) :]
     parts, ends = [np.zeros(REST_FRAMES)], []
@@ -230,7 +230,7 @@ def _observe(sight: MeasuredKeypoints) -> list[Observation]:
 
 
 def _outlines(contact: Contact, axes: NDArray, radius: float, error: NDArray | float) -> list[Contact]:
-    """Returns the contact with a round outline at axes (n, 2) [m], its pose off by `error` standard deviations (3,)."""
+    """Return the contact with a round outline at axes (n, 2) [m], its pose off by `error` standard deviations (3,)."""
     angles = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
     polygons = (radius * np.stack([np.cos(angles), np.sin(angles)], axis=1),)
     wrong = _POSE_ERROR * error
@@ -284,7 +284,7 @@ class NoisyCamera:
     hidden_trusted: float = 0.05
 
     def look(self, points: NDArray, axes: NDArray, radius: float, random: np.random.Generator) -> MeasuredKeypoints:
-        """Returns what the camera sees of key points (n, K, 3) [m] beside a cylinder along y.
+        """Return what the camera sees of key points (n, K, 3) [m] beside a cylinder along y.
 
         Args:
             points: true key points, jaw frame.
@@ -313,7 +313,7 @@ class NoisyCamera:
         return MeasuredKeypoints(points=seen, likelihood=likelihood)
 
     def _find_cover(self, points: NDArray, axes: NDArray, radius: float) -> NDArray:
-        """Returns which share of the way to each point (n, K) a cylinder lets the sight go; NaN when all of it."""
+        """Return which share of the way to each point (n, K) a cylinder lets the sight go; NaN when all of it."""
         ray = points - self.place
         start = np.array(self.place)[[0, 2]] - axes[:, None]
         a = (ray[..., [0, 2]] ** 2).sum(-1)

@@ -229,14 +229,14 @@ class MethodSetup:
 
 
 def by_outline(setup: MethodSetup, *, with_wrench: bool) -> Method:
-    """Returns the way of mode "estimate"."""
+    """Return the way of mode "estimate"."""
     settings = ContactSettings()
     face = build_inner_face(setup.jaw, settings.mesh)
     return _by_localizer(setup, OutlineLocalizer(face, settings), with_wrench=with_wrench)
 
 
 def by_closest(setup: MethodSetup) -> Method:
-    """Returns the way of mode "closest"."""
+    """Return the way of mode "closest"."""
     face = build_inner_face(setup.jaw, ContactSettings().mesh)
     return _by_localizer(setup, ClosestLocalizer(setup.jaw, face), with_wrench=False)
 
@@ -261,7 +261,7 @@ def _by_localizer(setup: MethodSetup, localizer: Localizer, *, with_wrench: bool
 
 
 def by_intersection(setup: MethodSetup, *, cut_down: bool) -> Method:
-    """Returns the centre of the intersection with the whole object, or with what of it is near the jaw."""
+    """Return the centre of the intersection with the whole object, or with what of it is near the jaw."""
     settings = ContactSettings()
     jaw = setup.jaw.build_mesh(settings.mesh)
     solid = NearSolid(setup.mesh, settings.margin)
@@ -275,7 +275,7 @@ def by_intersection(setup: MethodSetup, *, cut_down: bool) -> Method:
 
 
 def _height_of(centre: NDArray, surface: NDArray, nodes: NDArray) -> float:
-    """Returns the undeformed height [m] of the deformed vertex nearest to a centre (3,) [m], as the paper does."""
+    """Return the undeformed height [m] of the deformed vertex nearest to a centre (3,) [m], as the paper does."""
     return float(nodes[((surface - centre) ** 2).sum(axis=1).argmin(), 2])
 
 
