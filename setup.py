@@ -35,7 +35,6 @@ setup(
     install_requires=[
         "numpy",  # arrays
         "scipy",  # sparse matrices, factorisations, least squares
-        "daqp",  # small quadratic programs in microseconds
         "numba",  # compiles the element loops: a step in milliseconds
         "pyyaml",  # jaw files, calibrations
         "meshio",  # volume mesh files of jaws

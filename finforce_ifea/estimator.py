@@ -62,7 +62,7 @@ class JawEstimator:
         settings: EstimatorSettings | None = None,
         calibration: Calibration | None = None,
     ) -> None:
-        """Builds the mechanics of the jaw as the calibration describes it.
+        """Build the mechanics of the jaw as the calibration describes it.
 
         Args:
             jaw: as its file has it.
@@ -94,7 +94,7 @@ class JawEstimator:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets everything but the jaw: offsets, place, relaxation, stamps."""
+        """Forget everything but the jaw: offsets, place, relaxation, stamps."""
         self._stamp: float | None = None
         self._contact: Contact | None = None
         self._at_rest = self.is_idle = False
@@ -107,7 +107,7 @@ class JawEstimator:
         self._given.reset()
 
     def forget(self) -> None:
-        """Forgets the object, too: what was learnt of its friction."""
+        """Forget the object, too: what was learnt of its friction."""
         self.reset()
         self._tracked.forget()
 
@@ -127,7 +127,7 @@ class JawEstimator:
         return self._tracked.slips.mobilised
 
     def warm_up(self) -> None:
-        """Compiles what is compiled on first use, and leaves no trace."""
+        """Compile what is compiled on first use, and leave no trace."""
         warm_up(self.jaw, self.settings.tare_frames, self.update, self.forget)
 
     @property
@@ -141,15 +141,15 @@ class JawEstimator:
         return self.mechanics.mesh.surface
 
     def surface(self) -> NDArray:
-        """Returns the deformed mesh vertices (n, 3) [m], in mesh order."""
+        """Return the deformed mesh vertices (n, 3) [m], in mesh order."""
         return self._tracker.vertices()
 
     def keypoints_model(self) -> NDArray:
-        """Returns the key points (K, 3) [m] of the deformed model."""
+        """Return the key points (K, 3) [m] of the deformed model."""
         return self._tracker.positions()
 
     def update(self, observation: Observation, contact: Contact | None) -> Solution:
-        """Takes one image's key points and returns what they say.
+        """Take one image's key points and return what they say.
 
         Args:
             observation: stamp [s], points (K, 3) [m] in the jaw frame, likelihood (K,), stddev (K, 3) [m] and
@@ -192,11 +192,11 @@ class JawEstimator:
         return self._conclude(state, used)
 
     def learn(self) -> None:
-        """Learns what the last image says beside its force; the next image does it where nobody had time before."""
+        """Learn what the last image says beside its force; the next image does it where nobody had time before."""
         self._tracked.learn()
 
     def tare(self) -> TareReport:
-        """Takes the last frames as unloaded and learns each key point's offset.
+        """Take the last frames as unloaded and learn each key point's offset.
 
         Raises:
             NotEnoughDataError: Too few unloaded frames or visible key points.
@@ -205,7 +205,7 @@ class JawEstimator:
         return self._taring.take()
 
     def _await_tare(self) -> str:
-        """Returns what is missing for the first tare, empty when it is done or not due."""
+        """Return what is missing for the first tare, empty when it is done or not due."""
         if self._taring.tared:
             return ""
         if self._taring.missing:
@@ -218,7 +218,7 @@ class JawEstimator:
         return ""
 
     def _follow(self, contact: Contact) -> None:
-        """Hands a contact to the tracker that it is for."""
+        """Hand a contact to the tracker that it is for."""
         if not len(contact.points):
             return
         self._check_on_surface(contact)
@@ -230,7 +230,7 @@ class JawEstimator:
         chosen.follow(contact)
 
     def _check_on_surface(self, contact: Contact) -> None:
-        """Refuses contacts beside the inner surface."""
+        """Refuse contacts beside the inner surface."""
         surface = self.mechanics.contact.surface
         low, high = surface.low - _BESIDE, surface.high + _BESIDE
         places = contact.points[:, 1:]
@@ -241,13 +241,13 @@ class JawEstimator:
             )
 
     def _without_contact(self, points: NDArray, used: NDArray) -> Solution:
-        """Says what can be said without an object: nothing presses, or it cannot be known where."""
+        """Tell what can be said without an object: nothing presses, or it cannot be known where."""
         if self._taring.is_at_rest(points):
             return self._rest("no object, the jaw is at rest", points)
         return self._fail("no_contact", "the jaw is bent but no contact is known", used)
 
     def _rest(self, message: str, points: NDArray) -> Solution:
-        """Says that nothing presses, as far as the key points (K, 3) [m] tell it."""
+        """Tell that nothing presses, as far as the key points (K, 3) [m] tell it."""
         self._taring.note(quiet=True, loaded=False)
         self._relax()
         if not self._at_rest:  # the shape of a load that has gone
@@ -264,7 +264,7 @@ class JawEstimator:
         )
 
     def _fail(self, status: str, message: str, used: NDArray, iterations: int = 0) -> Solution:
-        """Returns a solution without force."""
+        """Return a solution without force."""
         return blank_solution(self._stamp, status, message, used, iterations)
 
     def _conclude(self, state: ContactState | None, used: NDArray) -> Solution:
@@ -284,11 +284,11 @@ class JawEstimator:
         return self._solution(state, used)
 
     def _relax(self) -> None:
-        """Lets the material relax without a load."""
+        """Let the material relax without a load."""
         self._relaxation.update(np.zeros(3), self._pass_time())
 
     def _pass_time(self) -> float:
-        """Returns the time since the material's last force [s]."""
+        """Return the time since the material's last force [s]."""
         dt = 0.0 if self._relaxed is None else self._stamp - self._relaxed
         self._relaxed = self._stamp
         return dt
@@ -330,7 +330,7 @@ Update = Callable[[Observation, Contact], object]
 
 
 def warm_up(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None]) -> None:
-    """Gives an estimator images with each kind of contact, with stated standard deviations and without.
+    """Give an estimator images with each kind of contact, with stated standard deviations and without.
 
     Args:
         jaw: the jaw.
@@ -351,7 +351,7 @@ def warm_up(jaw: Jaw, tare_frames: int, update: Update, reset: Callable[[], None
 
 
 def _imagine_contacts(jaw: Jaw) -> Iterator[Contact]:
-    """Yields a contact by its height, one by its points, and one by an outline."""
+    """Yield a contact by its height, one by its points, and one by an outline."""
     fixed = Contact.fixed(jaw, float(np.median(jaw.candidates[:, 2])))
     yield from (fixed, replace(fixed, free=False), sketch_contact(jaw))
 
@@ -359,7 +359,7 @@ def _imagine_contacts(jaw: Jaw) -> Iterator[Contact]:
 def _imagine_image(
     jaw: Jaw, stamp: float, bend: float, stddev: NDArray | None, random: np.random.Generator
 ) -> Observation:
-    """Returns the key points of a jaw whose tip is bent by so much [m]."""
+    """Return the key points of a jaw whose tip is bent by so much [m]."""
     points = jaw.keypoints + _NOISE * random.standard_normal(jaw.keypoints.shape)
     points[:, 0] -= bend * (points[:, 2] / jaw.keypoints[:, 2].max()) ** 2
     return Observation(stamp=stamp, points=points, likelihood=np.ones(len(points)), stddev=stddev)
@@ -379,7 +379,7 @@ class KeypointGate:
     """
 
     def __init__(self, jaw: Jaw, settings: EstimatorSettings) -> None:
-        """Keeps the key points at rest and the thresholds.
+        """Keep the key points at rest and the thresholds.
 
         Raises:
             ObservationError: A name to be ignored is no key point of the jaw.
@@ -394,11 +394,11 @@ class KeypointGate:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets which points were seen."""
+        """Forget which points were seen."""
         self._presence: NDArray | None = None
 
     def accept(self, observation: Observation) -> NDArray:
-        """Returns the points (K, 3) [m] with NaN in the rows that must not be used."""
+        """Return the points (K, 3) [m] with NaN in the rows that must not be used."""
         points = np.array(observation.points, float)
         likelihood = np.asarray(observation.likelihood, float)
         if self._presence is None:
@@ -409,7 +409,7 @@ class KeypointGate:
 
 @njit(cache=True)
 def _close(points, likelihood, rest, allowed, presence, threshold):
-    """Updates the presence (K,) and makes the points (K, 3) [m] that must not be used NaN."""
+    """Update the presence (K,) and make the points (K, 3) [m] that must not be used NaN."""
     for k in range(len(points)):
         visible = likelihood[k] >= threshold
         presence[k] += _PRESENCE_GAIN * ((1.0 if visible else 0.0) - presence[k])

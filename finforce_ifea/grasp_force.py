@@ -71,7 +71,7 @@ class JawDistance:
     """How far the jaws' origins are from each other, by their poses in the camera's frame."""
 
     def __init__(self, max_age: float) -> None:
-        """Keeps the greatest distance in time of a pose from what it is used for [s]."""
+        """Keep the greatest distance in time of a pose from what it is used for [s]."""
         self._max_age = round(max_age / SECOND)
         self._poses: dict[str, tuple[int, NDArray]] = {}
 

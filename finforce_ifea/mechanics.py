@@ -24,7 +24,7 @@ _WIDTH_SHARES: dict[tuple, float] = {}
 
 
 def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
-    """Builds the mechanics that the settings name; "default" is the full one that the jaw file recommends.
+    """Build the mechanics that the settings name; "default" is the full one that the jaw file recommends.
 
     Raises:
         JawFileError: The jaw cannot be described by that model.
@@ -56,7 +56,7 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
 
 
 def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) -> JawModel:
-    """Returns the plane model of a jaw's section, as stiff as the solid finger.
+    """Return the plane model of a jaw's section, as stiff as the solid finger.
 
     Plane strain holds the width, which is free at both sides: the modulus is lowered by what the solid is softer at
     rest, both with the coarse mesh, 2 to 4 % for fingers ten and more times as wide as their walls are thick.
@@ -84,14 +84,14 @@ def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) ->
 
 
 def choose_solver(settings: EstimatorSettings) -> EstimatorSettings:
-    """Returns settings in which "default" has become "reduced", unless forces in three axes are asked for."""
+    """Return settings in which "default" has become "reduced", unless forces in three axes are asked for."""
     if settings.solver == "default" and settings.force_axes == "normal":
         return replace(settings, solver="reduced")
     return settings
 
 
 def build_chosen(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
-    """Builds the mechanics of an estimator; a jaw of which no equilibria can be stored is described in full by default.
+    """Build the mechanics of an estimator; a jaw of which no equilibria can be stored is described in full by default.
 
     Raises:
         JawFileError: The jaw cannot be described by the model that is named.
@@ -109,12 +109,12 @@ def build_chosen(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
 
 
 def choose_full(settings: EstimatorSettings) -> EstimatorSettings:
-    """Returns settings with the full mechanics behind the solver that they name."""
+    """Return settings with the full mechanics behind the solver that they name."""
     return replace(settings, solver="default") if settings.solver in _REDUCED else settings
 
 
 def _reduce(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
-    """Builds stored equilibria of what the jaw file recommends."""
+    """Build stored equilibria of what the jaw file recommends."""
     from finforce_ifea.reduced.cache import reduce_mechanics
 
     if settings.force_axes != "normal":

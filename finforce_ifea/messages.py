@@ -1,4 +1,4 @@
-"""Messages into observations and contacts; outlines to and from the columns of a point cloud."""
+"""Messages into observations and contacts; outlines to and from the columns of a point cloud; the look of markers."""
 
 from __future__ import annotations
 
@@ -12,6 +12,13 @@ from numpy.typing import NDArray
 from finforce.messages import check_cloud, decode_columns, decode_keypoints
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, are_same_polygons
+
+# How contact and force look in RViz and Foxglove, live and in recordings.
+CONTACT = (1.0, 0.8, 0.0, 1.0)
+FORCE = (0.9, 0.1, 0.6, 1.0)
+NEWTONS_PER_METRE = 200.0  # 5 N are drawn 25 mm long, a third of a bench finger
+CONTACT_DIAMETER = 0.005
+ARROW = (0.002, 0.004, 0.005)  # shaft, head, head length
 
 
 def observation_from_cloud(cloud: Any, frame: str, gravity: NDArray | None = None) -> Observation:

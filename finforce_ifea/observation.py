@@ -60,7 +60,7 @@ class Contact:
 
     @classmethod
     def fixed(cls, jaw: Jaw, z: float) -> Contact:
-        """Returns the contact of an object that first touches at height z [m].
+        """Return the contact of an object that first touches at height z [m].
 
         Raises:
             ContactError: The height is not on the jaw's inner surface.
@@ -121,7 +121,7 @@ class Solution(NamedTuple):
 
 
 def blank_solution(stamp: float, status: str, message: str, used: NDArray, iterations: int = 0) -> Solution:
-    """Returns a solution without force, for whatever is not a contact."""
+    """Return a solution without force, for whatever is not a contact."""
     zero, unknown = np.zeros(3), np.full(3, np.nan)
     return Solution(
         stamp=stamp,
@@ -144,7 +144,7 @@ def blank_solution(stamp: float, status: str, message: str, used: NDArray, itera
 
 
 def check_observation(observation: Observation, count: int, last_stamp: float | None) -> None:
-    """Refuses what cannot be an image's key points.
+    """Refuse what cannot be an image's key points.
 
     Raises:
         ObservationError: Wrong shapes, infinite values, a likelihood outside [0, 1], a standard deviation that is none,
@@ -189,7 +189,7 @@ def _are_possible(points, likelihood):
 
 
 def check_contact(contact: Contact, jaw: Jaw) -> None:
-    """Refuses what cannot be a contact.
+    """Refuse what cannot be a contact.
 
     Raises:
         ContactError: Wrong shapes, points off the inner face, weights that are negative or all zero.
@@ -204,7 +204,7 @@ def check_contact(contact: Contact, jaw: Jaw) -> None:
 
 
 def sketch_contact(jaw: Jaw) -> Contact:
-    """Returns a contact with the outline of a square that just touches the middle of a jaw, for a first try."""
+    """Return a contact with the outline of a square that just touches the middle of a jaw, for a first try."""
     height = float(np.median(jaw.candidates[:, 2]))
     middle = np.array([[jaw.face.read(height), 0.0, height]])
     square = 0.01 * np.array([[0.0, -1.0], [2.0, -1.0], [2.0, 1.0], [0.0, 1.0]])
@@ -235,7 +235,7 @@ class ObjectOutline:
     across: NDArray | None = None
 
     def __post_init__(self) -> None:
-        """Refuses what is no outline.
+        """Refuse what is no outline.
 
         Raises:
             ContactError: No polygon, fewer than three corners, numbers that are not finite or not metres.
@@ -258,12 +258,12 @@ class ObjectOutline:
             )
 
     def placed(self) -> tuple[NDArray, ...]:
-        """Returns the polygons (n, 2) [m] in x and z of the jaw frame."""
+        """Return the polygons (n, 2) [m] in x and z of the jaw frame."""
         c, s = np.cos(self.tilt), np.sin(self.tilt)
         turn = np.array([[c, s], [-s, c]])
         return tuple(p @ turn + self.origin for p in self.polygons)
 
 
 def are_same_polygons(first: tuple[NDArray, ...], second: tuple[NDArray, ...]) -> bool:
-    """Returns whether two sets of polygons (n, 2) are equal, so that what was computed from one holds for the other."""
+    """Return whether two sets of polygons (n, 2) are equal, so that what was computed from one holds for the other."""
     return first is second or (len(first) == len(second) and all(map(np.array_equal, first, second)))

@@ -87,7 +87,7 @@ class InverseResult:
 def solve_inverse(
     model: JawModel, problem: Problem, q: NDArray, *, iterations: int = 20, tolerance: float = 2e-7
 ) -> InverseResult:
-    """Solves an inverse problem, starting from the state q (size,).
+    """Solve an inverse problem, starting from the state q (size,).
 
     Raises:
         NotEnoughDataError: No key point is active.
@@ -184,7 +184,7 @@ def _linear_step(model: JawModel, problem: Problem, q: NDArray, active: NDArray)
 
 
 def scale_energy(Q: NDArray, W_aa: NDArray, form: EnergyForm) -> NDArray:
-    """Returns the matrix that eps multiplies: W_aa as printed, or scaled to the size of Q as SOFA does."""
+    """Return the matrix that eps multiplies: W_aa as printed, or scaled to the size of Q as SOFA does."""
     if form == "paper":
         return W_aa
     norm = lambda matrix: np.abs(matrix).sum(1).max()  # noqa: E731
@@ -192,7 +192,7 @@ def scale_energy(Q: NDArray, W_aa: NDArray, form: EnergyForm) -> NDArray:
 
 
 def _force_directions(model: JawModel, problem: Problem, q: NDArray) -> tuple[NDArray, NDArray]:
-    """Returns the forces (n, 3, m) per unit multiplier and the multipliers' lower bounds (m,)."""
+    """Return the forces (n, 3, m) per unit multiplier and the multipliers' lower bounds (m,)."""
     normals = -surface_normals(model, problem.neighbours, q)
     count = len(normals)
     if problem.axes == "normal":
@@ -211,7 +211,7 @@ def _force_directions(model: JawModel, problem: Problem, q: NDArray) -> tuple[ND
 
 
 def surface_normals(model: JawModel, neighbours: Any, q: NDArray) -> NDArray:
-    """Returns the outward normals (n, 3) of the deformed inner surface, from points below and above each contact."""
+    """Return the outward normals (n, 3) of the deformed inner surface, from points below and above each contact."""
     points = model.positions(neighbours, q)
     along = points[1::2] - points[::2]
     normal = np.stack([along[:, 2], np.zeros(len(along)), -along[:, 0]], axis=1)

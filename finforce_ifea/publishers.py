@@ -12,7 +12,7 @@ from finforce.ros import node as ros
 from finforce.ros.messages import points_marker
 from finforce.skipping import Skips
 from finforce_ifea.grasp_force import Grasp
-from finforce_ifea.marker_style import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
+from finforce_ifea.messages import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
 from finforce_ifea.parameters import NodeParameters
 
 if TYPE_CHECKING:

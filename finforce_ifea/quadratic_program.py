@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import daqp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
@@ -10,8 +9,8 @@ from scipy.linalg.lapack import dposv
 from finforce_ifea.errors import UnobservableError
 
 UNBOUNDED = 1e30
-# Largest KKT residual of a returned solution, and from where one is solved again by its active set.
-KKT_LIMIT, _KKT_POLISH = 1e-8, 1e-12
+# Largest KKT residual of a returned solution, and the pull of a bound that is let go.
+KKT_LIMIT, _LEAST_PULL = 1e-8, 1e-12
 _SINGULAR = 1e-12
 _REFINEMENTS = 2
 
@@ -25,7 +24,7 @@ class ProgramSolution:
 
 
 def solve_program(hessian: NDArray, gradient: NDArray, lower: NDArray) -> ProgramSolution:
-    """Minimises x^T H x / 2 + g^T x over x >= lower; the KKT residual of what is returned is below `KKT_LIMIT`.
+    """Minimise x^T H x / 2 + g^T x over x >= lower; the KKT residual of what is returned is below `KKT_LIMIT`.
 
     Args:
         hessian: H (m, m), symmetric.
@@ -50,12 +49,8 @@ def solve_program(hessian: NDArray, gradient: NDArray, lower: NDArray) -> Progra
     bounded = lower > -UNBOUNDED
     bound = np.full(len(g), -UNBOUNDED)
     bound[bounded] = np.maximum(lower[bounded] * scale[bounded] / size, -UNBOUNDED)
-    x = _solve_by_daqp(H, g, bound)
+    x = solve_by_active_set(H, g, bound, np.zeros(len(g)))
     kkt = compute_kkt_residual(H, g, bound, x)
-    if not kkt <= _KKT_POLISH:
-        polished = solve_by_active_set(H, g, bound, x)
-        again = compute_kkt_residual(H, g, bound, polished)
-        x, kkt = (x, kkt) if kkt < again else (polished, again)
     if not kkt <= KKT_LIMIT:
         raise UnobservableError(
             f"the quadratic program is too badly conditioned: its optimality is missed by {kkt:.1g}, expected at most "
@@ -65,7 +60,7 @@ def solve_program(hessian: NDArray, gradient: NDArray, lower: NDArray) -> Progra
 
 
 def _check_program(hessian: NDArray, gradient: NDArray) -> None:
-    """Refuses a program that is not finite, or with a force that moves nothing."""
+    """Refuse a program that is not finite, or with a force that moves nothing."""
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
         raise UnobservableError("the quadratic program holds numbers that are not finite")
     if not (np.diag(hessian) > 0.0).all():
@@ -74,16 +69,8 @@ def _check_program(hessian: NDArray, gradient: NDArray) -> None:
         )
 
 
-def _solve_by_daqp(H: NDArray, g: NDArray, bound: NDArray) -> NDArray:
-    """Returns what daqp finds, feasible; zero where it finds nothing."""
-    m = len(g)
-    x, _, flag, _ = daqp.solve(H, g, np.zeros((0, m)), np.full(m, UNBOUNDED), bound, np.zeros(m, np.int32))
-    x = np.asarray(x) if flag >= 1 else np.zeros(m)
-    return np.maximum(np.where(np.isfinite(x), x, 0.0), bound)
-
-
 def solve_by_active_set(H: NDArray, g: NDArray, bound: NDArray, x: NDArray) -> NDArray:
-    """Minimises x^T H x / 2 + g^T x over x >= bound from a feasible x by adding and dropping one bound at a time.
+    """Minimise x^T H x / 2 + g^T x over x >= bound from a feasible x by adding and dropping one bound at a time.
 
     Bounds that x sits on are held at first. The free variables solve H_ff x_f = -g_f - H_fh x_h; where that leaves the
     bounds, the step is cut at the first one, which is then held; otherwise the bound that pulls most is let go.
@@ -111,14 +98,14 @@ def solve_by_active_set(H: NDArray, g: NDArray, bound: NDArray, x: NDArray) -> N
         x = aim
         pull = np.where(free, 0.0, H @ x + g)
         worst = int(pull.argmin())
-        if pull[worst] >= -_KKT_POLISH:
+        if pull[worst] >= -_LEAST_PULL:
             break
         free[worst] = True
     return x
 
 
 def _minimise_free(H: NDArray, g: NDArray, x: NDArray, free: NDArray) -> NDArray:
-    """Returns x (m,) with its free variables at their minimum, refined against rounding."""
+    """Return x (m,) with its free variables at their minimum, refined against rounding."""
     x = x.copy()
     rows = np.flatnonzero(free)
     block = np.asfortranarray(H[np.ix_(rows, rows)])
@@ -129,7 +116,7 @@ def _minimise_free(H: NDArray, g: NDArray, x: NDArray, free: NDArray) -> NDArray
 
 
 def compute_kkt_residual(H: NDArray, g: NDArray, lower: NDArray, x: NDArray) -> float:
-    """Returns the largest violation, over |g|, of the optimality conditions of min x^T H x / 2 + g^T x, x >= lower."""
+    """Return the largest violation, over |g|, of the optimality conditions of min x^T H x / 2 + g^T x, x >= lower."""
     slope = H @ x + g
     bounded = lower > -UNBOUNDED
     violation = np.where(bounded, np.minimum(x - lower, slope), slope)

@@ -24,18 +24,18 @@ class Relaxation:
     """The state of all branches for a force of three components."""
 
     def __init__(self, terms: Sequence[RelaxationTerm]) -> None:
-        """Starts relaxed."""
+        """Start relaxed."""
         self._share = np.array([term.share for term in terms], float)
         self._tau = np.array([term.time_constant for term in terms], float)
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the past."""
+        """Forget the past."""
         self._over = np.zeros((len(self._share), 3))
         self._elastic = np.zeros(3)
 
     def update(self, elastic: NDArray, dt: float) -> NDArray:
-        """Returns the measured force (3,) [N] for the elastic force (3,) [N] after dt [s], exact for a ramp between."""
+        """Return the measured force (3,) [N] for the elastic force (3,) [N] after dt [s], exact for a ramp between."""
         out = np.empty(3)
         relax_force(np.asarray(elastic, float), self.packed, dt, out)
         return out
@@ -52,14 +52,14 @@ class Relaxation:
 
 
 def invert_relaxation(measured: NDArray, stamps: NDArray, terms: Sequence[RelaxationTerm]) -> NDArray:
-    """Returns the elastic forces (n,) [N] that relax into measured ones (n,) [N] at stamps (n,) [s]."""
+    """Return the elastic forces (n,) [N] that relax into measured ones (n,) [N] at stamps (n,) [s]."""
     share = np.array([term.share for term in terms])
     tau = np.array([term.time_constant for term in terms])
     return _invert(np.asarray(measured, float), np.asarray(stamps, float), share, tau)
 
 
 def apply_relaxation(elastic: NDArray, stamps: NDArray, terms: Sequence[RelaxationTerm]) -> NDArray:
-    """Returns the measured forces (n,) [N] for elastic ones (n,) [N] at stamps (n,) [s]; see `Relaxation.update`."""
+    """Return the measured forces (n,) [N] for elastic ones (n,) [N] at stamps (n,) [s]; see `Relaxation.update`."""
     share = np.array([term.share for term in terms])
     tau = np.array([term.time_constant for term in terms])
     return _relax(np.asarray(elastic, float), np.asarray(stamps, float), share, tau)
@@ -92,7 +92,7 @@ def _invert(measured, stamps, share, tau):
 
 @njit(cache=True)
 def relax_force(elastic, relaxation, dt, out):
-    """Writes to out the force (3,) [N] for an elastic one (3,) [N] after dt [s]; see `Relaxation.packed`."""
+    """Write to out the force (3,) [N] for an elastic one (3,) [N] after dt [s]; see `Relaxation.packed`."""
     before, over, share, tau = relaxation
     for a in range(3):
         out[a] = elastic[a]

@@ -64,7 +64,7 @@ class EstimatorSettings:
     )
 
     def __post_init__(self) -> None:
-        """Refuses values out of bounds.
+        """Refuse values out of bounds.
 
         Raises:
             ObservationError: A setting is not among its choices or outside its bounds.

@@ -50,7 +50,7 @@ class PointNoise(NamedTuple):
 
 
 def match_stated(scatter: NDArray, stddev: NDArray, floor: float) -> StatedNoise:
-    """Returns the noise of key points: relative sizes as stated, the common scale as the tare measured it.
+    """Return the noise of key points: relative sizes as stated, the common scale as the tare measured it.
 
     With e_ki = scatter / stddev of key point k in image i, its own level l_k and the common shape C,
 
@@ -82,7 +82,7 @@ def match_stated(scatter: NDArray, stddev: NDArray, floor: float) -> StatedNoise
 
 
 def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNoise:
-    """Returns the noise of one image's key points: N_k, enlarged for what states more than it did in the tare.
+    """Return the noise of one image's key points: N_k, enlarged for what states more than it did in the tare.
 
         N_ki = R N_k R,    R = diag(max(1, s_ki / s_k)),    trust_ki = tr N_k / tr N_ki (in the plane).
 
@@ -109,7 +109,7 @@ def compute_point_noise(usual: StatedNoise, stddev: NDArray | None) -> PointNois
 
 @njit(cache=True)
 def _enlarge_noise(covariance, usual, stddev):
-    """Returns what `PointNoise` holds, where an image states `stddev` (K, 3) [m] and usual ones are (K, 3)."""
+    """Return what `PointNoise` holds, where an image states `stddev` (K, 3) [m] and usual ones are (K, 3)."""
     count = len(covariance)
     plane, gain = np.empty((count, 2, 2)), np.empty((count, 2))
     along, trust, bias = np.empty(count), np.empty(count), np.empty(count)
@@ -174,7 +174,7 @@ class Tare:
         return np.trace(noise, axis1=-2, axis2=-1) / 3.0 / np.maximum(self.counts, 1)
 
     def point_noise(self, stddev: NDArray | None) -> PointNoise:
-        """Returns the noise of the key points of an image that states `stddev` (K, 3) [m], or nothing.
+        """Return the noise of the key points of an image that states `stddev` (K, 3) [m], or nothing.
 
         A tare without stated deviations stands for key points that all state its pooled noise.
         """
@@ -193,14 +193,14 @@ class Tare:
 
 
 def blank_tare(count: int, noise: float) -> Tare:
-    """Returns the tare of key points of which nothing is known but their noise [m]."""
+    """Return the tare of key points of which nothing is known but their noise [m]."""
     return Tare(offsets=np.zeros((count, 3)), counts=np.zeros(count), noise=noise**2 * np.eye(3))
 
 
 def compute_tare(
     frames: Sequence[NDArray], keypoints: NDArray, stddevs: Sequence[NDArray | None] = (None,)
 ) -> Tare | None:
-    """Averages unloaded frames.
+    """Average unloaded frames.
 
     Points farther than 3 mm from the drawing, or 1.8 mm from their own median, are gross errors. A point seen in less
     than half of the frames has no offset: what shows it now and then is its cover.
@@ -268,7 +268,7 @@ class TareReport:
     noise: float
 
     def __str__(self) -> str:
-        """Returns the report as one sentence."""
+        """Return the report as one sentence."""
         return (
             f"tared {self.keypoints} key points over {self.frames} frames: largest offset "
             f"{1e3 * self.largest_offset:.2f} mm, noise {1e3 * self.noise:.2f} mm"
@@ -279,7 +279,7 @@ class TareKeeper:
     """Collects unloaded frames, tares once there are enough, and goes on averaging until the first load."""
 
     def __init__(self, keypoints: NDArray, settings: EstimatorSettings, significance: Significance) -> None:
-        """Keeps the drawn key points (K, 3) [m] and `significance`.
+        """Keep the drawn key points (K, 3) [m] and `significance`.
 
         It says by how many standard deviations a force explains a tare whose points are off by chance by so much [m].
         """
@@ -287,7 +287,7 @@ class TareKeeper:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets offsets and frames."""
+        """Forget offsets and frames."""
         self.tare = blank_tare(len(self._keypoints), _NOISE)
         self._frames: deque[NDArray] = deque(maxlen=_LONGEST_TARE + _DELAY_FRAMES)
         self._stddevs: deque[NDArray | None] = deque(maxlen=self._frames.maxlen)
@@ -306,7 +306,7 @@ class TareKeeper:
         return max(0, self._settings.tare_frames - len(self._frames)) if due else 0
 
     def add(self, points: NDArray, stddev: NDArray | None = None, *, apart: bool) -> None:
-        """Takes the accepted key points (K, 3) [m] of a frame and their stated standard deviations (K, 3) [m].
+        """Take the accepted key points (K, 3) [m] of a frame and their stated standard deviations (K, 3) [m].
 
         `apart` when the object is known not to touch.
         """
@@ -318,7 +318,7 @@ class TareKeeper:
             self._open = True
 
     def begin(self) -> None:
-        """Tares for the first time if that is due; a jaw that looks loaded goes on without.
+        """Tare for the first time if that is due; a jaw that looks loaded goes on without.
 
         Raises:
             NotEnoughDataError: Too few key points are seen.
@@ -331,7 +331,7 @@ class TareKeeper:
             self._open = False
 
     def note(self, *, quiet: bool, loaded: bool) -> None:
-        """Takes note of whether anything presses; averages more frames until something surely does."""
+        """Take note of whether anything presses; averages more frames until something surely does."""
         self._quiet = self._quiet + 1 if quiet else 0
         if not (self._open and self.tared):
             return
@@ -344,7 +344,7 @@ class TareKeeper:
             self.tare = compute_tare(frames, self._keypoints, stddevs) or self.tare
 
     def take(self) -> TareReport:
-        """Takes the last frames as unloaded and learns each key point's offset.
+        """Take the last frames as unloaded and learn each key point's offset.
 
         Raises:
             NotEnoughDataError: Too few unloaded frames or visible key points.
@@ -407,7 +407,7 @@ class TareKeeper:
 
 
 def _measure_bend(deviations: NDArray) -> float:
-    """Returns the root mean square [m] of the nearer deviations (K, 3) [m], infinite when there are too few."""
+    """Return the root mean square [m] of the nearer deviations (K, 3) [m], infinite when there are too few."""
     ways = np.sort(np.linalg.norm(deviations[np.isfinite(deviations[:, 0])], axis=1))
     nearer = ways[: int(np.ceil(_NEARER * len(ways)))]
     return float(np.sqrt(np.mean(nearer**2))) if len(nearer) >= 3 else np.inf

@@ -11,8 +11,7 @@ from finforce_eval.evaluation.contact_source import ContactChoice, first_touch
 from finforce_eval.evaluation.evaluate import check_keypoint_count
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.tracks import Recording
-from finforce_ifea.identification.friction import identify_friction
-from finforce_ifea.identification.identification import CalibrationCase, CalibrationFit, fit_calibration
+from finforce_ifea.identification import CalibrationCase, CalibrationFit, fit_calibration, identify_friction
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.settings import EstimatorSettings
 

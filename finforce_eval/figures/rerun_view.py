@@ -13,7 +13,7 @@ from finforce.optional import import_cv2, import_library
 from finforce.stamps import NANOSECONDS
 from finforce_eval.annotation.forces import GraspForces, JawForces, Shape
 from finforce_eval.recordings.tracks import JawTrack, Recording
-from finforce_ifea.marker_style import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
+from finforce_ifea.messages import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
 
 TIMELINE = "recording"
 _QUALITY = 80  # of the pictures, JPEG

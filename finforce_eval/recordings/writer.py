@@ -15,7 +15,7 @@ from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, WRENCH
 from finforce_eval.recordings.tracks import KeypointTrack, PhaseTrack, PoseTrack, Recording, WrenchTrack
-from finforce_ifea.marker_style import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
+from finforce_ifea.messages import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 

@@ -26,7 +26,7 @@ class RigidObject(Protocol):
     """A rigid object, endless along y; its nearest point to the jaw comes first into the jaw."""
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
-        """Returns the contact with points (p, 3) [m] of an object sunk by depth [m] below x = face_x at height [m]."""
+        """Return the contact with points (p, 3) [m] of an object sunk by depth [m] below x = face_x at height [m]."""
         ...
 
 
@@ -50,7 +50,7 @@ class RigidBox:
     edge_radius: float
 
     def __post_init__(self) -> None:
-        """Refuses sizes that are no box.
+        """Refuse sizes that are no box.
 
         Raises:
             ContactError: A size is not positive, or the edges are rounder than the box is wide.
@@ -97,7 +97,7 @@ def press_jaw(
     height: float,
     depths: Sequence[float],
 ) -> list[PressState]:
-    """Presses a rigid object into the inner surface, displacement driven, frictionless.
+    """Press a rigid object into the inner surface, displacement driven, frictionless.
 
     Args:
         model: the jaw's mechanics.
@@ -140,7 +140,7 @@ class _Setting:
     height: float
 
     def press(self, points: NDArray, depth: float) -> PenaltyContact:
-        """Returns the contact with the surface's points (p, 3) [m] at a depth [m]."""
+        """Return the contact with the surface's points (p, 3) [m] at a depth [m]."""
         return self.rigid.press(points, self.surface.stiffness, self.face_x, depth, self.height)
 
 
@@ -155,7 +155,7 @@ class _State:
 
 
 def _find_equilibrium(setting: _Setting, q: NDArray, depth: float) -> _State | None:
-    """Returns the stable equilibrium at `depth` by Newton's method, or None when it finds none."""
+    """Return the stable equilibrium at `depth` by Newton's method, or None when it finds none."""
     model, surface, tolerance = setting.model, setting.surface, min(_TOLERANCE, _FINE * depth)
     for iteration in range(1, _ITERATIONS + 1):
         contact = setting.press(model.positions(surface.probe, q), depth)

@@ -136,7 +136,7 @@ def _add_ratio(ratio, touch, out):
 
 @njit(**_OPTIONS)
 def add_traction(traction, touch, p, x, z, stiffness, out):
-    """Writes point p, at x and z [m], with what acts along the surface to out (2, 7); see `POINT_SHAPE`.
+    """Write point p, at x and z [m], with what acts along the surface to out (2, 7); see `POINT_SHAPE`.
 
     Returns:
         Its shear, and the most that the cone allows; zero where friction is not followed [N].
@@ -175,7 +175,7 @@ def add_traction(traction, touch, p, x, z, stiffness, out):
 
 @njit(**_OPTIONS)
 def _apply(contact, points, stiffness, traction):
-    """Returns the contact (forces, springs, by_shape) at all points with what acts along the surface."""
+    """Return the contact (forces, springs, by_shape) at all points with what acts along the surface."""
     forces, springs, by_shape = contact
     count = len(points)
     pushed, stiff, changes = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3, 4))

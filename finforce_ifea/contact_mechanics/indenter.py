@@ -91,7 +91,7 @@ class ObjectPose(NamedTuple):
 
 @njit(**_OPTIONS)
 def pose_object(pressed, face_x, place):
-    """Returns the `ObjectPose` at a place (3,)."""
+    """Return the `ObjectPose` at a place (3,)."""
     if pressed.is_round:
         radius = np.exp(place[1])
         return ObjectPose(face_x + radius - place[0], place[2], radius, 1.0, 0.0)
@@ -112,7 +112,7 @@ def is_clear_of(pressed, pose, x, z):
 
 @njit(**_OPTIONS)
 def touch_object(pressed, pose, x, z, stiffness, weights):
-    """Returns the `Touch` of one point at x and z [m], derivatives by the place's shape; `weights` is (6, 4)."""
+    """Return the `Touch` of one point at x and z [m], derivatives by the place's shape; `weights` is (6, 4)."""
     if pressed.is_round:
         touch = touch_cylinder(x, z, stiffness, pose.x, pose.z, pose.radius)
         bx, bz = pose.radius * (touch.bx + touch.kxx), pose.radius * (touch.bz + touch.kxz)
@@ -123,7 +123,7 @@ def touch_object(pressed, pose, x, z, stiffness, weights):
 
 @njit(**_OPTIONS)
 def measure_gap(pressed, pose, points):
-    """Returns the least distance [m] of points (p, 3) [m] from an object, negative inside."""
+    """Return the least distance [m] of points (p, 3) [m] from an object, negative inside."""
     least, weights = np.inf, np.zeros((6, 4))
     for p in range(len(points)):
         dx, dz = points[p, 0] - pose.x, points[p, 2] - pose.z
@@ -138,7 +138,7 @@ def measure_gap(pressed, pose, points):
 
 @njit(**_OPTIONS)
 def find_first_touch(pressed, face, place):
-    """Returns the depth [m] at which an object of a place (3,) first touches an undeformed `FaceProfile`."""
+    """Return the depth [m] at which an object of a place (3,) first touches an undeformed `FaceProfile`."""
     points = face.points
     if pressed.is_round:
         radius = np.exp(place[1])
@@ -163,7 +163,7 @@ def find_first_touch(pressed, face, place):
 
 
 def flat_profile(low: float, high: float, x: float = 0.0) -> FaceProfile:
-    """Returns a plane inner surface x = const between two heights [m]."""
+    """Return a plane inner surface x = const between two heights [m]."""
     return FaceProfile(np.array([[x, low], [x, high]]), True, x)
 
 
@@ -185,15 +185,15 @@ class Indenter(Protocol):
     has_corners: bool
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, place: NDArray) -> PenaltyContact:
-        """Returns the contact with points (p, 3) [m] at a place (3,); `by_shape` is the derivative by place[SHAPE]."""
+        """Return the contact with points (p, 3) [m] at a place (3,); `by_shape` is the derivative by place[SHAPE]."""
         ...
 
     def find_gap(self, points: NDArray, face_x: float, place: NDArray) -> float:
-        """Returns the least distance [m] of points (p, 3) [m] from the object, negative inside."""
+        """Return the least distance [m] of points (p, 3) [m] from the object, negative inside."""
         ...
 
     def find_touch(self, place: NDArray, face: FaceProfile) -> float:
-        """Returns the depth [m] of first touch with an undeformed surface."""
+        """Return the depth [m] of first touch with an undeformed surface."""
         ...
 
 
@@ -230,7 +230,7 @@ class OutlineIndenter:
     has_corners = True
 
     def __init__(self, polygons: tuple[NDArray, ...]) -> None:
-        """Builds the distance field of the polygons (n, 2) [m]; raises ContactError for one that is too small."""
+        """Build the distance field of the polygons (n, 2) [m]; raises ContactError for one that is too small."""
         self.polygons = polygons
         self._size = np.ptp(np.concatenate(polygons), axis=0)
         self.field: DistanceField = build_distance_field(polygons)
@@ -262,7 +262,7 @@ class OutlineIndenter:
 
 
 def _find_gap(pressed: PressedObject, points: NDArray, face_x: float, place: NDArray) -> float:
-    """Returns the gap of points (p, 3) [m]; see `measure_gap`."""
+    """Return the gap of points (p, 3) [m]; see `measure_gap`."""
     return float(measure_gap(pressed, pose_object(pressed, face_x, place), np.ascontiguousarray(points)))
 
 
@@ -297,12 +297,12 @@ class _Shape:
 
 @lru_cache(maxsize=8)
 def _build_outline(shape: _Shape) -> OutlineIndenter:
-    """Returns the object of some polygons, the same one as before if they came lately."""
+    """Return the object of some polygons, the same one as before if they came lately."""
     return OutlineIndenter(shape.polygons)
 
 
 def expect_object(contact: Contact, settings: EstimatorSettings, known: Indenter | None = None) -> ExpectedObject:
-    """Returns the object of a contact: its outline, or a cylinder about the height of the points.
+    """Return the object of a contact: its outline, or a cylinder about the height of the points.
 
     Args:
         contact: where the object touches.

@@ -43,7 +43,7 @@ class DistanceField:
 
 
 def build_distance_field(polygons: tuple[NDArray, ...]) -> DistanceField:
-    """Returns the field of an outline's polygons, (n, 2) [m] each, about its origin.
+    """Return the field of an outline's polygons, (n, 2) [m] each, about its origin.
 
     Raises:
         ContactError: The polygons span less than a cell of the grid.
@@ -67,7 +67,7 @@ def build_distance_field(polygons: tuple[NDArray, ...]) -> DistanceField:
 
 @njit(**_OPTIONS)
 def _measure_depth(segments, low, cell, rows, columns, faces_away):
-    """Returns the depth (rows, columns) below the segments that an object turns to the jaw; negative outside."""
+    """Return the depth (rows, columns) below the segments that an object turns to the jaw; negative outside."""
     count = len(segments)
     nearest = np.empty((rows, columns))
     for i in range(rows):
@@ -95,7 +95,7 @@ def _measure_depth(segments, low, cell, rows, columns, faces_away):
 
 @njit(**_OPTIONS)
 def _weigh(t, value, slope, bend):
-    """Fills the four weights of a uniform cubic B-spline and of its derivatives by t in [0, 1)."""
+    """Fill the four weights of a uniform cubic B-spline and of its derivatives by t in [0, 1)."""
     s = 1.0 - t
     value[0], value[3] = s * s * s / 6.0, t * t * t / 6.0
     value[1], value[2] = 2.0 / 3.0 - t * t + 0.5 * t * t * t, 2.0 / 3.0 - s * s + 0.5 * s * s * s
@@ -107,7 +107,7 @@ def _weigh(t, value, slope, bend):
 
 @njit(**_OPTIONS)
 def read_value(coefficients, low, cell, x, z, weights):
-    """Returns the depth [m] at one point, -1 mm beyond the grid, and fills in weights (6, 4) of x and z there."""
+    """Return the depth [m] at one point, -1 mm beyond the grid, and fill in weights (6, 4) of x and z there."""
     rows, columns = coefficients.shape
     a, b = (x - low[0]) / cell, (z - low[1]) / cell
     i, j = int(np.floor(a)), int(np.floor(b))
@@ -124,7 +124,7 @@ def read_value(coefficients, low, cell, x, z, weights):
 
 @njit(**_OPTIONS)
 def _read_slopes(coefficients, cell, i, j, weights):
-    """Returns gradient (x, z) and second derivatives (xx, xz, zz) where `read_value` has read the depth."""
+    """Return gradient (x, z) and second derivatives (xx, xz, zz) where `read_value` has read the depth."""
     gx, gz, gxx, gxz, gzz = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(4):
         for m in range(4):
@@ -139,7 +139,7 @@ def _read_slopes(coefficients, cell, i, j, weights):
 
 @njit(**_OPTIONS)
 def read_depth(coefficients, low, cell, points):
-    """Returns depth, gradient (x, z) and second derivatives (xx, xz, zz) at points (p, 2) [m] as (p, 6).
+    """Return depth, gradient (x, z) and second derivatives (xx, xz, zz) at points (p, 2) [m] as (p, 6).
 
     Beyond the grid the depth is that of a point a millimetre outside.
     """
@@ -153,7 +153,7 @@ def read_depth(coefficients, low, cell, points):
 
 @njit(**_OPTIONS)
 def _trace_front(coefficients, low, cell, steps):
-    """Returns the first x [m] of depth zero at each height (n, 2) [m]; NaN where the object is not met."""
+    """Return the first x [m] of depth zero at each height (n, 2) [m]; NaN where the object is not met."""
     rows, columns = coefficients.shape
     weights = np.zeros((6, 4))
     count = (columns - 4) * steps
@@ -179,7 +179,7 @@ def _trace_front(coefficients, low, cell, steps):
 
 @njit(**_OPTIONS)
 def find_leading(segments, c, s, low, high):
-    """Returns the least x [m] of segments (s, 4) turned by (cos, sin) of the tilt, between two heights, else 1e9."""
+    """Return the least x [m] of segments (s, 4) turned by (cos, sin) of the tilt, between two heights, else 1e9."""
     least = 1e9
     for k in range(len(segments)):
         ax, az = c * segments[k, 0] - s * segments[k, 1], s * segments[k, 0] + c * segments[k, 1]
@@ -215,7 +215,7 @@ class PenaltyContact:
 
 @njit(**_OPTIONS)
 def _resist(depth, stiffness):
-    """Returns force [N] and its derivative [N/m] at a depth above zero [m]."""
+    """Return force [N] and its derivative [N/m] at a depth above zero [m]."""
     if depth < _SMOOTH_DEPTH:
         return 0.5 * stiffness * depth * depth / _SMOOTH_DEPTH, stiffness * depth / _SMOOTH_DEPTH
     return stiffness * (depth - 0.5 * _SMOOTH_DEPTH), stiffness
@@ -245,7 +245,7 @@ class Touch(NamedTuple):
 
 @njit(**_OPTIONS)
 def touch_cylinder(x, z, stiffness, centre_x, centre_z, radius):
-    """Returns the `Touch` of a cylinder on a point at x and z [m]; see `press_cylinder`."""
+    """Return the `Touch` of a cylinder on a point at x and z [m]; see `press_cylinder`."""
     dx, dz = x - centre_x, z - centre_z
     square = dx * dx + dz * dz
     if square >= radius * radius or square < 1e-24:
@@ -271,13 +271,13 @@ def _press_cylinder(points, stiffness, centre_x, centre_z, radius):
 
 @njit(**_OPTIONS)
 def _write_touch(touch, force, spring, by_shape):
-    """Writes the touch of one point to its force (3,), springs (3, 3) and derivatives (3,)."""
+    """Write the touch of one point to its force (3,), springs (3, 3) and derivatives (3,)."""
     force[0], force[2], by_shape[0], by_shape[2] = touch.fx, touch.fz, touch.bx, touch.bz
     spring[0, 0], spring[2, 2], spring[0, 2], spring[2, 0] = touch.kxx, touch.kzz, touch.kxz, touch.kxz
 
 
 def measure_penalty_energy(forces: NDArray, stiffness: NDArray) -> float:
-    """Returns the energy [J] that the penalty stores where it pushes with forces (p, 3) [N].
+    """Return the energy [J] that the penalty stores where it pushes with forces (p, 3) [N].
 
     With k = stiffness (p,) [N/m], s = 20 um and d the depth that belongs to a force it is k d^3 / (6 s) up to s, and
     k (d^2 - s^2) / 2 - k s (d - s) / 2 more beyond.
@@ -292,7 +292,7 @@ def measure_penalty_energy(forces: NDArray, stiffness: NDArray) -> float:
 def press_cylinder(
     points: NDArray, stiffness: NDArray, centre_x: float, centre_z: float, radius: float
 ) -> PenaltyContact:
-    """Presses a rigid cylinder, axis along y, on surface points.
+    """Press a rigid cylinder, axis along y, on surface points.
 
     With the penetration d = radius - r the force is stiffness d n (quadratic below 20 um), n from the axis outwards.
 
@@ -337,7 +337,7 @@ def _press_box(points, stiffness, centre_x, centre_z, half_x, half_z, edge):
 def press_box(
     points: NDArray, stiffness: NDArray, centre: tuple[float, float], half: tuple[float, float], edge: float
 ) -> PenaltyContact:
-    """Presses a rigid box, endless along y, with rounded edges on surface points; see `press_cylinder`.
+    """Press a rigid box, endless along y, with rounded edges on surface points; see `press_cylinder`.
 
     Args:
         points: deformed positions (p, 3) [m].
@@ -352,7 +352,7 @@ def press_box(
 
 @njit(**_OPTIONS)
 def touch_field(x, z, stiffness, coefficients, low, cell, origin_x, origin_z, c, s, weights):
-    """Returns the `Touch` of an outline turned by (cos, sin) of its tilt; see `press_field`. `weights` is (6, 4)."""
+    """Return the `Touch` of an outline turned by (cos, sin) of its tilt; see `press_field`. `weights` is (6, 4)."""
     rx, rz = x - origin_x, z - origin_z
     depth, i, j = read_value(coefficients, low, cell, c * rx + s * rz, c * rz - s * rx, weights)
     if depth <= 0.0:
@@ -383,7 +383,7 @@ def _press_field(points, stiffness, coefficients, low, cell, origin, c, s):
 def press_field(
     points: NDArray, stiffness: NDArray, field: DistanceField, origin: NDArray, tilt: float
 ) -> PenaltyContact:
-    """Presses a rigid outline, endless along y, on surface points; see `press_cylinder`.
+    """Press a rigid outline, endless along y, on surface points; see `press_cylinder`.
 
     With the depth d(p) below the outline the force is -stiffness d grad d, and its springs follow from d's second
     derivatives; `by_shape` is the derivative by the tilt [N/rad].

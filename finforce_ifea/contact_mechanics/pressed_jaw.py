@@ -34,7 +34,7 @@ _HEIGHTS = (0.25, 0.5, 0.75)
 
 
 def measure_stiffness(model: JawModel, surface: ContactSurface) -> float:
-    """Returns one over the mean compliance against line loads along -x, one at a time [N/m].
+    """Return one over the mean compliance against line loads along -x, one at a time [N/m].
 
     The loads stand at a quarter, half and three quarters of the surface.
     """
@@ -96,7 +96,7 @@ class RollingContact:
     bearable = np.inf
 
     def __init__(self, model: JawModel, surface: ContactSurface, face: FaceLine) -> None:
-        """Keeps the model, its contact surface and the undeformed inner face.
+        """Keep the model, its contact surface and the undeformed inner face.
 
         The penalty goes with the jaw's own stiffness, so that forces scale with Young's modulus: a stiff jaw does not
         vanish in the object, and a soft one does not meet a wall.
@@ -110,7 +110,7 @@ class RollingContact:
         self.traction_ratio, self._friction = 0.0, None
 
     def set_indenter(self, indenter: Indenter) -> None:
-        """Takes another object, which is pressed in from now on."""
+        """Take another object, which is pressed in from now on."""
         self.indenter = indenter
 
     def set_traction_ratio(self, ratio: float) -> None:
@@ -118,11 +118,11 @@ class RollingContact:
         self.traction_ratio = ratio
 
     def begin(self, height: float) -> NDArray:
-        """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
+        """Return the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
         return np.zeros(self.model.size)
 
     def find_touch(self, place: NDArray) -> float:
-        """Returns the depth [m] at which the object at a place (3,) first touches the undeformed jaw."""
+        """Return the depth [m] at which the object at a place (3,) first touches the undeformed jaw."""
         return self.indenter.find_touch(place, self.profile)
 
     @cached_property
@@ -155,11 +155,11 @@ class RollingContact:
         return self._friction.settle(contact, points, stiffness, _find_origin(place))
 
     def place_points(self, q: NDArray) -> NDArray:
-        """Returns the surface points (p, 3) [m] of the deformed jaw."""
+        """Return the surface points (p, 3) [m] of the deformed jaw."""
         return self.model.positions(self.surface.probe, q)
 
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
-        """Linearises the equilibrium f_int(q) = J^T p(J q, place) at unknowns q and place (depth, shape, height).
+        """Linearise the equilibrium f_int(q) = J^T p(J q, place) at unknowns q and place (depth, shape, height).
 
         The springs of tangential forces are not symmetric; the tangent takes their symmetric part, which Newton's
         method forgives.
@@ -191,7 +191,7 @@ class RollingContact:
         )
 
     def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
-        """Returns the step of a jaw that has lost contact, cut where its surface meets the object again."""
+        """Return the step of a jaw that has lost contact, cut where its surface meets the object again."""
 
         def find_gap(share: float) -> float:
             return self.indenter.find_gap(self.place_points(q + share * step), self.face_x, place)
@@ -205,7 +205,7 @@ def _find_origin(place: NDArray) -> NDArray:
 
 
 def find_share_that_meets(find_gap: Callable[[float], float]) -> float:
-    """Returns the share from 0 to 1 of a step at which the gap [m] to an object closes, by bisection."""
+    """Return the share from 0 to 1 of a step at which the gap [m] to an object closes, by bisection."""
     low, high = 0.0, 1.0
     for _ in range(BISECTIONS):
         share = 0.5 * (low + high)
@@ -217,12 +217,12 @@ def find_share_that_meets(find_gap: Callable[[float], float]) -> float:
 
 
 def measure_step(model: JawModel, step: NDArray) -> float:
-    """Returns the largest change in a step of the unknowns (size,), as a share of the model's reach."""
+    """Return the largest change in a step of the unknowns (size,), as a share of the model's reach."""
     return float((np.abs(step) / model.reach).max(initial=0.0))
 
 
 def limit_step(model: JawModel, step: NDArray) -> NDArray:
-    """Returns a step of the unknowns shortened so that none exceeds the model's reach."""
+    """Return a step of the unknowns shortened so that none exceeds the model's reach."""
     largest = measure_step(model, step)
     return step if largest <= 1.0 else step / largest
 
@@ -274,12 +274,12 @@ class ContactSurface:
 
 
 def profile_surface(surface: ContactSurface, face: FaceLine) -> FaceProfile:
-    """Returns the undeformed surface of a face, for objects to touch."""
+    """Return the undeformed surface of a face, for objects to touch."""
     return FaceProfile(np.ascontiguousarray(surface.points[:: surface.across, [0, 2]]), face.is_flat, face.plane)
 
 
 def build_contact_surface(jaw: Jaw, mesh: VolumeMesh, model: JawModel, *, across: Across) -> ContactSurface:
-    """Returns contact points every quarter millimetre along the inner surface.
+    """Return contact points every quarter millimetre along the inner surface.
 
     Args:
         jaw: the jaw.

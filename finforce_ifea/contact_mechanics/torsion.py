@@ -39,13 +39,13 @@ class Torsion:
     roll: NDArray
 
     def at(self, height: float) -> tuple[NDArray, NDArray, float]:
-        """Returns the motions by moment and by force (K, 3) each and the roll at a height [m]."""
+        """Return the motions by moment and by force (K, 3) each and the roll at a height [m]."""
         return _interpolate(self.heights, (self.by_moment, self.by_force), self.roll, height)
 
 
 @njit(cache=True, error_model="numpy")
 def _interpolate(heights, motions, roll, height):
-    """Returns both motions (m, K, 3) and the roll (m,) between rising heights (m,) [m], those at the ends beyond."""
+    """Return both motions (m, K, 3) and the roll (m,) between rising heights (m,) [m], those at the ends beyond."""
     low = 0
     while low < len(heights) - 2 and height >= heights[low + 1]:
         low += 1
@@ -57,7 +57,7 @@ def _interpolate(heights, motions, roll, height):
 
 
 def _find_narrowest(jaw: Jaw, heights: NDArray, half: float) -> float:
-    """Returns the least half width [m] of the inner face at heights (n,) [m], `half` where it is the same all along."""
+    """Return the least half width [m] of the inner face at heights (n,) [m], `half` where it is the same all along."""
     if jaw.section is None or not jaw.section.taper.any():
         return half
     places = np.stack([[jaw.face.read(z), z] for z in heights])
@@ -65,7 +65,7 @@ def _find_narrowest(jaw: Jaw, heights: NDArray, half: float) -> float:
 
 
 def measure_torsion(jaw: Jaw, mesh: VolumeMesh) -> Torsion | None:
-    """Returns how a jaw twists and gives way sideways; None where it is no solid, or its mesh too large.
+    """Return how a jaw twists and gives way sideways; None where it is no solid, or its mesh too large.
 
     Args:
         jaw: with its material and key points.

@@ -7,7 +7,7 @@ from finforce_ifea.jaw.mesh import shape_gradients
 
 
 def elasticity_matrix(young_modulus: float, poisson_ratio: float) -> NDArray:
-    """Returns the isotropic elasticity matrix D, shape (6, 6) [Pa], for strains (xx, yy, zz, 2xy, 2yz, 2zx)."""
+    """Return the isotropic elasticity matrix D, shape (6, 6) [Pa], for strains (xx, yy, zz, 2xy, 2yz, 2zx)."""
     lame = young_modulus * poisson_ratio / ((1 + poisson_ratio) * (1 - 2 * poisson_ratio))
     shear = young_modulus / (2 * (1 + poisson_ratio))
     D = np.diag([2 * shear] * 3 + [shear] * 3)
@@ -16,7 +16,7 @@ def elasticity_matrix(young_modulus: float, poisson_ratio: float) -> NDArray:
 
 
 def strain_displacement(gradient: NDArray) -> NDArray:
-    """Returns B, shape (..., 6, 3 n), from shape function gradients (..., n, 3) [1/m]."""
+    """Return B, shape (..., 6, 3 n), from shape function gradients (..., n, 3) [1/m]."""
     n = gradient.shape[-2]
     B = np.zeros((*gradient.shape[:-2], 6, n, 3))
     x, y, z = gradient[..., 0], gradient[..., 1], gradient[..., 2]
@@ -32,7 +32,7 @@ def _physical_gradient(corners: NDArray, local: NDArray) -> tuple[NDArray, NDArr
 
 
 def hex_stiffness(corners: NDArray, D: NDArray) -> NDArray:
-    """Returns the stiffness of 8-node hexahedra with incompatible modes.
+    """Return the stiffness of 8-node hexahedra with incompatible modes.
 
     The three quadratic modes 1 - xi_k^2 of each displacement component are condensed; their gradients use the
     Jacobian at the centre, so that the constant-strain patch test holds on distorted elements.
@@ -60,7 +60,7 @@ def hex_stiffness(corners: NDArray, D: NDArray) -> NDArray:
 
 
 def tet_stiffness(corners: NDArray, D: NDArray) -> NDArray:
-    """Returns the stiffness (m, 3 n, 3 n) [N/m] of tetrahedra with n = 4 or 10 nodes (m, n, 3) [m], meshio order.
+    """Return the stiffness (m, 3 n, 3 n) [N/m] of tetrahedra with n = 4 or 10 nodes (m, n, 3) [m], meshio order.
 
     The 10-node element is integrated with four points, exact for its stiffness when its edges are straight.
     """
@@ -78,7 +78,7 @@ def tet_stiffness(corners: NDArray, D: NDArray) -> NDArray:
 
 
 def centre_gradient(corners: NDArray) -> NDArray:
-    """Returns the shape function gradients at the element centres, shape (m, n, 3) [1/m], that define rotation."""
+    """Return the shape function gradients at the element centres, shape (m, n, 3) [1/m], that define rotation."""
     count = corners.shape[1]
     centre = np.zeros((1, 3)) if count == 8 else np.full((1, 3), 0.25)
     local = shape_gradients(count, centre)

@@ -22,7 +22,7 @@ class Factor(Protocol):
         ...
 
     def solve(self, b: NDArray) -> NDArray:
-        """Returns K^-1 b for b of shape (n,) or (n, k)."""
+        """Return K^-1 b for b of shape (n,) or (n, k)."""
         ...
 
 
@@ -35,7 +35,7 @@ class BandedFactor:
         self._factor = factor
 
     def solve(self, b: NDArray) -> NDArray:
-        """Returns K^-1 b for b of shape (n,) or (n, k)."""
+        """Return K^-1 b for b of shape (n,) or (n, k)."""
         return dpbtrs(self._factor, b, lower=1)[0].reshape(b.shape)
 
 
@@ -58,19 +58,19 @@ class SparseFactor:
         return bool((plain.perm_r == plain.perm_c).all() and (plain.U.diagonal() > 0.0).all())
 
     def solve(self, b: NDArray) -> NDArray:
-        """Returns K^-1 b for b of shape (n,) or (n, k)."""
+        """Return K^-1 b for b of shape (n,) or (n, k)."""
         return self._lu.solve(np.asarray(b))
 
 
 def _factorise_sparse(matrix: sparse.csc_matrix, pivoting: float, ordered: bool) -> SuperLU:
-    """Returns the LU factors; above zero, `pivoting` is the share of a column's largest entry that a pivot needs."""
+    """Return the LU factors; above zero, `pivoting` is the share of a column's largest entry that a pivot needs."""
     # the fill is small and so are supernodes: panels of more than one column only cost
     order = {"permc_spec": "NATURAL", "panel_size": 1} if ordered else {"permc_spec": "MMD_AT_PLUS_A"}
     return splu(matrix, diag_pivot_thresh=pivoting, options={"SymmetricMode": True}, **order)
 
 
 def order_unknowns(row: NDArray, col: NDArray, size: int) -> NDArray:
-    """Returns the place of each unknown (size,) in the order of minimum degree, in which factors have little fill.
+    """Return the place of each unknown (size,) in the order of minimum degree, in which factors have little fill.
 
     To find it takes as long as a factorisation, and depends on the matrix' pattern alone.
 
@@ -86,13 +86,13 @@ def order_unknowns(row: NDArray, col: NDArray, size: int) -> NDArray:
 
 
 def factorise_banded(storage: NDArray) -> BandedFactor | None:
-    """Factorises lower banded storage (width + 1, n); returns None when the matrix is not positive definite."""
+    """Factorise lower banded storage (width + 1, n); return None when the matrix is not positive definite."""
     factor, info = dpbtrf(storage, lower=1, overwrite_ab=0)
     return BandedFactor(factor) if info == 0 else None
 
 
 def sparse_from_banded(storage: NDArray) -> sparse.csc_matrix:
-    """Returns the full symmetric matrix of lower banded storage (width + 1, n)."""
+    """Return the full symmetric matrix of lower banded storage (width + 1, n)."""
     width, n = storage.shape[0] - 1, storage.shape[1]
     lower = sparse.diags([storage[k, : n - k] for k in range(width + 1)], [-k for k in range(width + 1)], format="csc")
     full = lower + sparse.tril(lower, -1).T

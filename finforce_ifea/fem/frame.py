@@ -65,7 +65,7 @@ class BeamPoints(NamedTuple):
 
 @njit(**_OPTIONS)
 def _with_held(q):
-    """Returns q with one more entry, the zero of everything that is held."""
+    """Return q with one more entry, the zero of everything that is held."""
     full = np.zeros(len(q) + 1)
     full[: len(q)] = q
     return full
@@ -73,7 +73,7 @@ def _with_held(q):
 
 @njit(**_OPTIONS)
 def _place_ends(beams, e, q, ends):
-    """Fills ends (2, 6) of beam e: position, tangent, derivative of the position by the arm's rotation."""
+    """Fill ends (2, 6) of beam e: position, tangent, derivative of the position by the arm's rotation."""
     tx, tz = beams.direction[e, 0], beams.direction[e, 1]
     for k in range(2):
         dof = beams.dof[e, k]
@@ -90,7 +90,7 @@ def _place_ends(beams, e, q, ends):
 
 @njit(**_OPTIONS)
 def _measure(beams, e, ends, strain):
-    """Fills strain = (d, s, a) of `add_beams`; returns chord and smallest stretch along an end's tangent."""
+    """Fill strain = (d, s, a) of `add_beams`; return chord and smallest stretch along an end's tangent."""
     ex, ez = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
     chord = np.sqrt(ex * ex + ez * ez)
     ex, ez = ex / chord, ez / chord
@@ -106,7 +106,7 @@ def _measure(beams, e, ends, strain):
 
 @njit(**_OPTIONS)
 def _fill_forms(ends, chord, bend_s, bend_a, forms):
-    """Fills the derivatives (4, 8) by the unknowns of chord length, motion across the chord, a, and d."""
+    """Fill the derivatives (4, 8) by the unknowns of chord length, motion across the chord, a, and d."""
     ex, ez = (ends[1, 0] - ends[0, 0]) / chord, (ends[1, 1] - ends[0, 1]) / chord
     for k in range(2):
         sign, i = 2.0 * k - 1.0, 4 * k
@@ -123,7 +123,7 @@ def _fill_forms(ends, chord, bend_s, bend_a, forms):
 
 @njit(**_OPTIONS)
 def add_beams(beams: Beams, q: NDArray, with_tangent: bool, force: NDArray, storage: NDArray) -> tuple[float, float]:
-    """Adds internal forces to force (n + 1,) and tangents to lower banded storage.
+    """Add internal forces to force (n + 1,) and tangents to lower banded storage.
 
     With the chord's length l, the rotations p_1 and p_2 of the ends from the chord, s = (p_1 - p_2) / 2 and
     a = (p_1 + p_2) / 2 (Argyris's natural modes), the energy is (k_n d^2 + k_s s^2 + k_a a^2) / 2 with
@@ -171,7 +171,7 @@ def add_beams(beams: Beams, q: NDArray, with_tangent: bool, force: NDArray, stor
 
 @njit(**_OPTIONS)
 def _fill_tangent(forms, weights, f, ends, H):
-    """Fills the second derivatives H (8, 8) of a beam's energy; f (8,) are its first derivatives."""
+    """Fill the second derivatives H (8, 8) of a beam's energy; f (8,) are its first derivatives."""
     k_n, K_s, K_a, along, twist = weights
     for i in range(8):
         for j in range(i + 1):
@@ -192,7 +192,7 @@ def _fill_tangent(forms, weights, f, ends, H):
 
 @njit(**_OPTIONS)
 def _add_block(dof, H, storage):
-    """Adds a symmetric H (8, 8) at unknowns dof (2, 4), which may occur twice, to lower banded storage."""
+    """Add a symmetric H (8, 8) at unknowns dof (2, 4), which may occur twice, to lower banded storage."""
     n = storage.shape[1]
     for i in range(8):
         row = dof[i // 4, i % 4]
@@ -206,7 +206,7 @@ def _add_block(dof, H, storage):
 
 @njit(**_OPTIONS)
 def _map_point(points, p, ends, J):
-    """Fills the derivatives J (2, 8) of a point's place by its beam's unknowns; returns the place (x, z).
+    """Fill the derivatives J (2, 8) of a point's place by its beam's unknowns; return the place (x, z).
 
     The centre line c = shape . (P_1, t_1, P_2, t_2) is Hermite's cubic through the ends with their tangents:
     it runs on from beam to beam with the same derivative. The offset turns with the direction of c'.
@@ -236,7 +236,7 @@ def _map_point(points, p, ends, J):
 
 @njit(**_OPTIONS)
 def point_positions(beams, points, q):
-    """Returns the deformed positions (p, 3) [m]; y stays."""
+    """Return the deformed positions (p, 3) [m]; y stays."""
     full, ends, J = _with_held(q), np.empty((2, 6)), np.empty((2, 8))
     out = points.points.copy()
     for p in range(len(out)):
@@ -248,7 +248,7 @@ def point_positions(beams, points, q):
 
 @njit(**_OPTIONS)
 def point_motions(beams, points, q, modes):
-    """Returns the motions (p, 3, k) [m] of the points for changes modes (n, k) of the unknowns."""
+    """Return the motions (p, 3, k) [m] of the points for changes modes (n, k) of the unknowns."""
     n, count = modes.shape
     full, ends, J = _with_held(q), np.empty((2, 6)), np.empty((2, 8))
     out = np.zeros((len(points.beam), 3, count))
@@ -267,7 +267,7 @@ def point_motions(beams, points, q, modes):
 
 @njit(**_OPTIONS)
 def point_loads(beams, points, q, forces):
-    """Returns the generalised load (n,) of forces (p, 3) [N]; what acts along y is held."""
+    """Return the generalised load (n,) of forces (p, 3) [N]; what acts along y is held."""
     full, ends, J = _with_held(q), np.empty((2, 6)), np.empty((2, 8))
     out = np.zeros(len(full))
     for p in range(len(forces)):
@@ -282,7 +282,7 @@ def point_loads(beams, points, q, forces):
 
 @njit(**_OPTIONS)
 def add_point_springs(beams, points, q, blocks, storage):
-    """Adds sum_p J_p^T D_p J_p, D_p = blocks (p, 3, 3) [N/m], symmetric, to lower banded storage."""
+    """Add sum_p J_p^T D_p J_p, D_p = blocks (p, 3, 3) [N/m], symmetric, to lower banded storage."""
     full, ends, J, H = _with_held(q), np.empty((2, 6)), np.empty((2, 8)), np.empty((8, 8))
     for p in range(len(blocks)):
         xx, xz, zz = blocks[p, 0, 0], blocks[p, 0, 2], blocks[p, 2, 2]
@@ -298,7 +298,7 @@ def add_point_springs(beams, points, q, blocks, storage):
 
 
 def shape_weights(xi: NDArray, length: NDArray, bends: NDArray) -> NDArray:
-    """Returns the weights (p, 2, 4) of ends and tangents at xi (p,): Hermite's cubics, linear in bars."""
+    """Return the weights (p, 2, 4) of ends and tangents at xi (p,): Hermite's cubics, linear in bars."""
     step, slope, one, none = xi**2 * (3 - 2 * xi), 6 * xi * (1 - xi), np.ones_like(xi), np.zeros_like(xi)
     cubic = [
         [1 - step, length * xi * (1 - xi) ** 2, step, length * xi**2 * (xi - 1)],
@@ -328,7 +328,7 @@ class FrameDivisions:
     along_rib: int = 3
 
     def __post_init__(self) -> None:
-        """Refuses less than one beam; raises MeshError."""
+        """Refuse less than one beam; raises MeshError."""
         if min(self.between_ribs, self.along_rib) < 1:
             raise MeshError(f"frame divisions: got {self}, expected whole numbers from 1 on")
 
@@ -354,7 +354,7 @@ class FrameModel:
         mesh: VolumeMesh | None = None,
         divisions: FrameDivisions | None = None,
     ) -> None:
-        """Divides the drawing into beams.
+        """Divide the drawing into beams.
 
         Args:
             drawing: the finger [m], jaw frame.
@@ -372,18 +372,18 @@ class FrameModel:
         self._vertices = None if mesh is None else self.attach(mesh.nodes)
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
-        """Evaluates internal force, energy and, unless `tangent` is False, the tangent stiffness at q."""
+        """Evaluate internal force, energy and, unless `tangent` is False, the tangent stiffness at q."""
         force, storage = np.zeros(self.size + 1), np.zeros((self.bandwidth + 1, self.size), order="F")
         energy, smallest = add_beams(self.beams, q, tangent, force, storage)
         storage = storage if tangent else None
         return Linearization(force=force[:-1], energy=energy, smallest_det=smallest, tangent=storage)
 
     def factorise(self, tangent: NDArray) -> Factor:
-        """Factorises a stored tangent; Cholesky, or LU where the state is not stable."""
+        """Factorise a stored tangent; Cholesky, or LU where the state is not stable."""
         return factorise_banded(tangent) or SparseFactor(sparse_from_banded(tangent))
 
     def attach(self, points: NDArray, max_distance: float = 1e-3) -> BeamPoints:
-        """Returns a probe of undeformed points (p, 3) [m]; raises MeshError when one is off the finger."""
+        """Return a probe of undeformed points (p, 3) [m]; raises MeshError when one is off the finger."""
         points = np.array(points, float)
         distances = self.drawing.distance_to(points)
         away = np.flatnonzero(~(distances <= max_distance))
@@ -396,19 +396,19 @@ class FrameModel:
         return _attach_to_beams(self.beams, self._parts, points)
 
     def positions(self, probe: BeamPoints, q: NDArray) -> NDArray:
-        """Returns the deformed positions (p, 3) [m] of a probe."""
+        """Return the deformed positions (p, 3) [m] of a probe."""
         return point_positions(self.beams, probe, q)
 
     def project(self, probe: BeamPoints, q: NDArray, modes: NDArray) -> NDArray:
-        """Returns the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the unknowns."""
+        """Return the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the unknowns."""
         return point_motions(self.beams, probe, q, np.ascontiguousarray(modes))
 
     def load(self, probe: BeamPoints, q: NDArray, forces: NDArray) -> NDArray:
-        """Returns the generalised load (size,) of forces (p, 3) [N] at a probe's points."""
+        """Return the generalised load (size,) of forces (p, 3) [N] at a probe's points."""
         return point_loads(self.beams, probe, q, np.ascontiguousarray(forces))
 
     def stiffen(self, tangent: NDArray, probe: BeamPoints, q: NDArray, blocks: NDArray) -> None:
-        """Adds springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place.
+        """Add springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place.
 
         J^T D J alone: that a force's lever changes as the beam below it turns, f . d2x/dq2, is left out. For
         10 N half a band's thickness off its centre line that is some percent of a beam's bending stiffness.
@@ -416,7 +416,7 @@ class FrameModel:
         add_point_springs(self.beams, probe, q, np.ascontiguousarray(blocks), tangent)
 
     def vertices(self, q: NDArray) -> NDArray:
-        """Returns the deformed mesh vertices (v, 3) [m], in mesh order; raises MeshError without a mesh."""
+        """Return the deformed mesh vertices (v, 3) [m], in mesh order; raises MeshError without a mesh."""
         if self._vertices is None:
             raise MeshError("the frame has no vertices, since it was built without a mesh: give mesh=...")
         return point_positions(self.beams, self._vertices, q)
@@ -467,7 +467,7 @@ class _Sketch:
     def _add_chain(
         self, joints: tuple, ends: NDArray, thickness: float, count: int, turns: tuple = (None, None)
     ) -> NDArray:
-        """Adds `count` beams between two ends (2, 2) on two joints; returns their numbers.
+        """Add `count` beams between two ends (2, 2) on two joints; return their numbers.
 
         An end turns with its joint, or by the unknown in `turns` that is not None. A bar's thickness is 0.
         """
@@ -484,7 +484,7 @@ class _Sketch:
         return np.arange(len(self._dof) - count, len(self._dof))
 
     def _add_band(self, side: int, joints: list[_Joint]) -> None:
-        """Adds a band from the clamped height over its junctions to the tip."""
+        """Add a band from the clamped height over its junctions to the tip."""
         drawing, band = self.drawing, self._bands[side]
         thickness, count = band.normal_thickness, self.divisions.between_ribs
         top = drawing.length if drawing.tip_z is None else drawing.tip_z
@@ -499,12 +499,12 @@ class _Sketch:
         self.parts.append(_Part(np.stack([start, end]), thickness, np.concatenate(beams)))
 
     def _rigid_half(self, rib: Rib, side: int) -> float:
-        """Returns how far from a junction a band does not bend [m]; the foot of a rigid bar clamps it."""
+        """Return how far from a junction a band does not bend [m]; the foot of a rigid bar clamps it."""
         share = 1.0 if self.drawing.bars == "rigid" else _OVERLAP * (self.drawing.joints == "stiff")
         return 0.5 * share * float(np.linalg.norm(np.ptp(self.drawing.rib_edges(rib)[:, side], axis=0)))
 
     def _add_rib(self, number: int, joints: tuple[_Joint, _Joint]) -> None:
-        """Adds a rib from back to back of the bands, or the bar that stands for it."""
+        """Add a rib from back to back of the bands, or the bar that stands for it."""
         rib, hinged = self.drawing.ribs[number], self.drawing.joints == "hinged"
         axis = self.drawing.junctions[:, number]
         if self._welded:
@@ -524,7 +524,7 @@ class _Sketch:
         self.parts.append(_Part(axis, rib.thickness, beams))
 
     def number_beams(self, material: Material) -> Beams:
-        """Returns the beams with their unknowns in reverse Cuthill-McKee order."""
+        """Return the beams with their unknowns in reverse Cuthill-McKee order."""
         dof = np.array(self._dof)
         rows = dof.reshape(len(dof), -1)
         row, col = (index.ravel() for index in np.broadcast_arrays(rows[:, :, None], rows[:, None, :]))
@@ -540,7 +540,7 @@ class _Sketch:
 
 
 def _beam_stiffness(length: NDArray, thickness: NDArray, width: float, material: Material) -> NDArray:
-    """Returns the stiffness (m, 5) of Timoshenko beams that bend in plane strain; see `add_beams`.
+    """Return the stiffness (m, 5) of Timoshenko beams that bend in plane strain; see `add_beams`.
 
     A beam without thickness is a bar, made as stiff as the thickest band is along itself, so that no larger
     number enters: the steel finger's stretch by 0.5 um under 10 N; its strips bend 10,000 times as easily.
@@ -556,7 +556,7 @@ def _beam_stiffness(length: NDArray, thickness: NDArray, width: float, material:
 
 
 def _attach_to_beams(beams: Beams, parts: list[_Part], points: NDArray) -> BeamPoints:
-    """Returns what carries points (p, 3): the nearest place on the centre line of the part they lie in."""
+    """Return what carries points (p, 3): the nearest place on the centre line of the part they lie in."""
     xz = points[:, [0, 2]]
     # rounded, so that a point where two parts meet belongs to the first of them, the band, on every machine
     nearest = np.argmin([_distance_to_part(part, xz).round(12) for part in parts], axis=0)
@@ -577,7 +577,7 @@ def _attach_to_beams(beams: Beams, parts: list[_Part], points: NDArray) -> BeamP
 
 
 def _distance_to_part(part: _Part, xz: NDArray) -> NDArray:
-    """Returns how far points (p, 2) lie outside the rectangle around a part's centre line (p,) [m]."""
+    """Return how far points (p, 2) lie outside the rectangle around a part's centre line (p,) [m]."""
     length = np.linalg.norm(part.axis[1] - part.axis[0])
     along, rest = (part.axis[1] - part.axis[0]) / length, xz - part.axis[0]
     place, side = rest @ along, np.abs(rest[:, 0] * along[1] - rest[:, 1] * along[0])

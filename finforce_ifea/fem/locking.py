@@ -25,7 +25,7 @@ class LockingWarning(UserWarning):
 
 
 def measure_locking(jaw: Jaw, mesh: VolumeMesh) -> float:
-    """Returns the stiffness k of a mesh over what 10-node tetrahedra on the same nodes say that it should be.
+    """Return the stiffness k of a mesh over what 10-node tetrahedra on the same nodes say that it should be.
 
     With nu_0 = min(nu, 0.3), where these do not lock, that is k_10(nu_0) (1 - nu_0^2) / (1 - nu^2): bands bend in plane
     strain. The load acts along -x at the middle contact candidate.
@@ -37,7 +37,7 @@ def measure_locking(jaw: Jaw, mesh: VolumeMesh) -> float:
 
 
 def _measure_stiffness(jaw: Jaw, mesh: VolumeMesh, material: Material) -> float:
-    """Returns force over motion [N/m] at the middle contact candidate."""
+    """Return force over motion [N/m] at the middle contact candidate."""
     model = SolidModel(mesh, material)
     probe, rest = model.attach(jaw.candidates[[len(jaw.candidates) // 2]], 1e-3), np.zeros(model.size)
     load = model.load(probe, rest, np.array([[-1.0, 0.0, 0.0]]))
@@ -45,14 +45,14 @@ def _measure_stiffness(jaw: Jaw, mesh: VolumeMesh, material: Material) -> float:
 
 
 def measure_shape(mesh: VolumeMesh) -> float:
-    """Returns the least scaled Jacobian of a mesh of hexahedra: det J over the lengths of its columns, 1 in a box."""
+    """Return the least scaled Jacobian of a mesh of hexahedra: det J over the lengths of its columns, 1 in a box."""
     gradients = shape_gradients(8, _CORNERS)
     jacobians = np.einsum("mni,pnj->mpij", mesh.nodes[mesh.hexes], gradients)
     return float((np.linalg.det(jacobians) / np.linalg.norm(jacobians, axis=2).prod(axis=2)).min())
 
 
 def warn_of_locking(jaw: Jaw, mesh: VolumeMesh) -> None:
-    """Warns when a jaw's elements are too stiff, and says by how much and what would do.
+    """Warn when a jaw's elements are too stiff, and say by how much and what would do.
 
     What cannot lock is not measured: hexahedra of a drawing or of good shape, and 10-node tetrahedra of a material that
     changes its volume.

@@ -45,33 +45,33 @@ class JawModel(Protocol):
     reach: NDArray | float
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
-        """Evaluates internal force, energy and, unless `tangent` is False, the tangent stiffness at q."""
+        """Evaluate internal force, energy and, unless `tangent` is False, the tangent stiffness at q."""
         ...
 
     def attach(self, points: NDArray, max_distance: float) -> Any:
-        """Returns a probe of material points (p, 3) [m, undeformed, jaw frame]; raises MeshError when off the jaw."""
+        """Return a probe of material points (p, 3) [m, undeformed, jaw frame]; raises MeshError when off the jaw."""
         ...
 
     def positions(self, probe: Any, q: NDArray) -> NDArray:
-        """Returns the deformed positions (p, 3) [m] of a probe."""
+        """Return the deformed positions (p, 3) [m] of a probe."""
         ...
 
     def project(self, probe: Any, q: NDArray, modes: NDArray) -> NDArray:
-        """Returns the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the unknowns."""
+        """Return the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the unknowns."""
         ...
 
     def load(self, probe: Any, q: NDArray, forces: NDArray) -> NDArray:
-        """Returns the generalised load (size,) of forces (p, 3) [N] at a probe's points."""
+        """Return the generalised load (size,) of forces (p, 3) [N] at a probe's points."""
         ...
 
     def stiffen(self, tangent: Any, probe: Any, q: NDArray, blocks: NDArray) -> None:
-        """Adds springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""
+        """Add springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""
         ...
 
     def factorise(self, tangent: Any) -> Factor:
-        """Factorises a stored tangent."""
+        """Factorise a stored tangent."""
         ...
 
     def vertices(self, q: NDArray) -> NDArray:
-        """Returns the deformed mesh vertices (v, 3) [m], in mesh order."""
+        """Return the deformed mesh vertices (v, 3) [m], in mesh order."""
         ...

@@ -35,7 +35,7 @@ class PlaneModel(SolidModel):
     across: Across = "middle"
 
     def __init__(self, mesh: VolumeMesh, plane: PlaneMesh, section: Section, material: Material) -> None:
-        """Numbers the unknowns and prepares the triangles.
+        """Number the unknowns and prepare the triangles.
 
         Args:
             mesh: the extruded section, jaw frame [m].
@@ -67,7 +67,7 @@ class PlaneModel(SolidModel):
         self._plan_assembly()
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
-        """Evaluates internal force, energy and, unless `tangent` is False, the tangent stiffness at q (size,) [m]."""
+        """Evaluate internal force, energy and, unless `tangent` is False, the tangent stiffness at q (size,) [m]."""
         f = np.zeros_like(self.mesh.nodes)
         energy, smallest = _add_triangles(
             self.expand(q),
@@ -87,13 +87,13 @@ class PlaneModel(SolidModel):
 
 
 def _place_points(corners: NDArray) -> NDArray:
-    """Returns the three points (t, 3, 2) [m] of triangles (t, 6, 2) with straight sides."""
+    """Return the three points (t, 3, 2) [m] of triangles (t, 6, 2) with straight sides."""
     shares = np.column_stack([1.0 - _POINTS.sum(axis=1), _POINTS])
     return np.einsum("pn,tni->tpi", shares, corners[:, :3])
 
 
 def _differentiate(corners: NDArray) -> tuple[NDArray, NDArray]:
-    """Returns shape function gradients (t, 3, 6, 2) [1/m] and areas (t, 3) [m^2] at three points of triangles."""
+    """Return shape function gradients (t, 3, 6, 2) [1/m] and areas (t, 3) [m^2] at three points of triangles."""
     r, s = _POINTS.T
     t = 1.0 - r - s
     zero = np.zeros(3)
@@ -107,7 +107,7 @@ def _differentiate(corners: NDArray) -> tuple[NDArray, NDArray]:
 
 @njit(cache=True, error_model="numpy")
 def _add_triangles(u, elements, gradients, volumes, lame, shear, with_tangent, force, K):
-    """Adds nodal forces (n, 3) and fills stiffnesses K (t, 18, 18); returns energy [J] and the smallest det F."""
+    """Add nodal forces (n, 3) and fill stiffnesses K (t, 18, 18); return energy [J] and the smallest det F."""
     energy, smallest = 0.0, 1e300
     a = np.empty((6, 2))
     for e in range(len(elements)):

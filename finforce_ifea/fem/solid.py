@@ -60,7 +60,7 @@ class SolidModel:
         return "half" if self.symmetric else "both"
 
     def __init__(self, mesh: VolumeMesh, material: Material, *, symmetric: bool = True) -> None:
-        """Builds element stiffnesses and the plan of assembly.
+        """Build element stiffnesses and the plan of assembly.
 
         Args:
             mesh: nodes [m] in the jaw frame, elements, clamped nodes.
@@ -87,7 +87,7 @@ class SolidModel:
         self._plan_assembly()
 
     def _mirror_unknowns(self, mirror: NDArray | None) -> None:
-        """Numbers the free unknowns; mirrored nodes share theirs."""
+        """Number the free unknowns; mirrored nodes share theirs."""
         y = self.mesh.nodes[:, 1]
         master, free = np.arange(len(y)), np.ones((len(y), 3), bool)
         if mirror is not None:
@@ -98,7 +98,7 @@ class SolidModel:
         self._number_unknowns(master, free)
 
     def _number_unknowns(self, master: NDArray, free: NDArray) -> None:
-        """Numbers the free (n, 3) of the unclamped nodes, of small bandwidth; others go with their master."""
+        """Number the free (n, 3) of the unclamped nodes, of small bandwidth; others go with their master."""
         free[self.mesh.clamped] = False
         ordered = _order_nodes(self._elements)
         number = np.full(free.shape, -1)
@@ -107,7 +107,7 @@ class SolidModel:
         self.dof = np.where(number[master] >= 0, number[master], self.size)
 
     def _plan_assembly(self) -> None:
-        """Prepares where each lower entry of each element matrix goes in the stored tangent."""
+        """Prepare where each lower entry of each element matrix goes in the stored tangent."""
         source, high, low = self._find_entries()
         self.bandwidth = int((high - low).max())
         self.banded = self.size * self.bandwidth**2 < self._banded_limit
@@ -124,7 +124,7 @@ class SolidModel:
         self._index = self._keys % self.size
 
     def _find_entries(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Returns the lower entries of all element matrices: where they are stored there, and their two unknowns."""
+        """Return the lower entries of all element matrices: where they are stored there, and their two unknowns."""
         dof = self.dof[self._elements].reshape(len(self._elements), -1)
         i, j = np.nonzero(np.arange(dof.shape[1])[:, None] // 3 >= np.arange(dof.shape[1]) // 3)
         row, col = dof[:, i], dof[:, j]
@@ -134,19 +134,19 @@ class SolidModel:
         return source, np.maximum(row, col)[keep], np.minimum(row, col)[keep]
 
     def expand(self, q: NDArray) -> NDArray:
-        """Returns the displacements (nodes, 3) [m] of all mesh nodes for unknowns q (size,)."""
+        """Return the displacements (nodes, 3) [m] of all mesh nodes for unknowns q (size,)."""
         return self.sign * np.append(q, 0.0)[self.dof]
 
     def gather(self, forces: NDArray) -> NDArray:
-        """Returns the generalised load (size,) [N] of nodal forces (nodes, 3) [N]."""
+        """Return the generalised load (size,) [N] of nodal forces (nodes, 3) [N]."""
         return np.bincount(self.dof.ravel(), (self.sign * forces).ravel(), self.size + 1)[: self.size]
 
     def vertices(self, q: NDArray) -> NDArray:
-        """Returns the deformed mesh vertices (v, 3) [m], in mesh order."""
+        """Return the deformed mesh vertices (v, 3) [m], in mesh order."""
         return self.mesh.nodes + self.expand(q)
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
-        """Evaluates internal force, energy and, unless `tangent` is False, the tangent stiffness at q (size,) [m]."""
+        """Evaluate internal force, energy and, unless `tangent` is False, the tangent stiffness at q (size,) [m]."""
         f = np.zeros_like(self.mesh.nodes)
         energy, smallest = corotational_elements(
             self.expand(q), self._elements, self._X, self._K0, self._g, tangent, f, self._Ke
@@ -164,17 +164,17 @@ class SolidModel:
         return storage
 
     def factorise(self, tangent: NDArray | sparse.csc_matrix) -> Factor:
-        """Factorises a stored tangent; Cholesky, or LU where the state is not stable or the band is wide."""
+        """Factorise a stored tangent; Cholesky, or LU where the state is not stable or the band is wide."""
         if not self.banded:
             return SparseFactor(tangent, ordered=True)
         return factorise_banded(tangent) or SparseFactor(sparse_from_banded(tangent))
 
     def sparse_tangent(self, tangent: NDArray | sparse.csc_matrix) -> sparse.csc_matrix:
-        """Returns a stored tangent as the full symmetric matrix (size, size) [N/m]."""
+        """Return a stored tangent as the full symmetric matrix (size, size) [N/m]."""
         return sparse_from_banded(tangent) if self.banded else tangent
 
     def attach(self, points: NDArray, max_distance: float = 1e-3) -> SolidProbe:
-        """Returns a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
+        """Return a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
         attachment = attach_points(self.mesh, points, max_distance)
         return SolidProbe(
             points=np.array(points, float),
@@ -183,19 +183,19 @@ class SolidModel:
         )
 
     def positions(self, probe: SolidProbe, q: NDArray) -> NDArray:
-        """Returns the deformed positions (p, 3) [m] of a probe."""
+        """Return the deformed positions (p, 3) [m] of a probe."""
         return probe_positions(probe.points, probe.dof, probe.weights, q)
 
     def project(self, probe: SolidProbe, q: NDArray, modes: NDArray) -> NDArray:
-        """Returns the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the unknowns."""
+        """Return the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the unknowns."""
         return probe_motions(probe.dof, probe.weights, np.ascontiguousarray(modes))
 
     def load(self, probe: SolidProbe, q: NDArray, forces: NDArray) -> NDArray:
-        """Returns the generalised load (size,) [N] of forces (p, 3) [N] at a probe's points."""
+        """Return the generalised load (size,) [N] of forces (p, 3) [N] at a probe's points."""
         return probe_loads(probe.dof, probe.weights, forces, self.size)
 
     def stiffen(self, tangent: NDArray | sparse.csc_matrix, probe: SolidProbe, q: NDArray, blocks: NDArray) -> None:
-        """Adds springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""
+        """Add springs blocks (p, 3, 3) [N/m] at a probe's points to a stored tangent, in place."""
         if self.banded:
             _add_banded_springs(probe.dof, probe.weights, blocks, self.size, tangent)
             return
@@ -210,7 +210,7 @@ class SolidModel:
 
 
 def _order_nodes(elements: NDArray) -> NDArray:
-    """Returns the nodes of elements (m, k) in reverse Cuthill-McKee order."""
+    """Return the nodes of elements (m, k) in reverse Cuthill-McKee order."""
     used, local = np.unique(elements, return_inverse=True)
     local = local.reshape(elements.shape)
     pairs = np.broadcast_to(local[:, :, None], (*local.shape, local.shape[1]))
@@ -220,7 +220,7 @@ def _order_nodes(elements: NDArray) -> NDArray:
 
 
 def find_mirror_nodes(mesh: VolumeMesh) -> NDArray | None:
-    """Returns each node's mirror image in y = 0 (n,), or None when the mesh cannot be halved there."""
+    """Return each node's mirror image in y = 0 (n,), or None when the mesh cannot be halved there."""
     index = {tuple(point): i for i, point in enumerate(np.rint(mesh.nodes * 1e9).astype(np.int64))}
     images = np.rint(mesh.nodes * [1e9, -1e9, 1e9]).astype(np.int64)
     mirror = np.array([index.get(tuple(point), -1) for point in images])
@@ -240,7 +240,7 @@ _POLAR_TOLERANCE = 1e-14
 
 @njit(**_OPTIONS)
 def _invert(A, out):
-    """Writes the inverse of a 3 x 3 matrix; returns its determinant."""
+    """Write the inverse of a 3 x 3 matrix; return its determinant."""
     a = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
     b = A[1, 2] * A[2, 0] - A[1, 0] * A[2, 2]
     c = A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0]
@@ -258,7 +258,7 @@ def _invert(A, out):
 
 @njit(**_OPTIONS)
 def _rotate(F, R, inverse):
-    """Writes the rotation R of F = R U by Newton's iteration R <- (R + R^-T) / 2; returns det F."""
+    """Write the rotation R of F = R U by Newton's iteration R <- (R + R^-T) / 2; return det F."""
     for i in range(3):
         for j in range(3):
             R[i, j] = F[i, j]
@@ -280,7 +280,7 @@ def _rotate(F, R, inverse):
 
 @njit(**_OPTIONS)
 def _shape(u, nodes, X, g, F, R, scratch, x, d):
-    """Writes F, R, the turned-back coordinates x (k, 3) and the deformation d (3 k); returns det F."""
+    """Write F, R, the turned-back coordinates x (k, 3) and the deformation d (3 k); return det F."""
     k = len(nodes)
     F[:] = 0.0
     F[0, 0] = F[1, 1] = F[2, 2] = 1.0
@@ -304,7 +304,7 @@ def _shape(u, nodes, X, g, F, R, scratch, x, d):
 
 @njit(**_OPTIONS)
 def _spin_matrix(F, R, U, H):
-    """Writes H = (tr(U) I - U)^-1 with U = R^T F."""
+    """Write H = (tr(U) I - U)^-1 with U = R^T F."""
     for a in range(3):
         for b in range(3):
             U[a, b] = -(R[0, a] * F[0, b] + R[1, a] * F[1, b] + R[2, a] * F[2, b])
@@ -316,7 +316,7 @@ def _spin_matrix(F, R, U, H):
 
 @njit(**_OPTIONS)
 def _forces(K0, x, d, g, H, fl, p):
-    """Writes f' = K0 d and p = f' - G^T m, both (3 k); returns the energy."""
+    """Write f' = K0 d and p = f' - G^T m, both (3 k); return the energy."""
     k, energy = len(x), 0.0
     for i in range(3 * k):
         s = 0.0
@@ -342,7 +342,7 @@ def _forces(K0, x, d, g, H, fl, p):
 
 @njit(**_OPTIONS)
 def _spins(g, H, G):
-    """Writes G = H [g_i], (3, 3 k)."""
+    """Write G = H [g_i], (3, 3 k)."""
     for i in range(len(g)):
         for a in range(3):
             G[a, 3 * i] = H[a, 1] * g[i, 2] - H[a, 2] * g[i, 1]
@@ -352,7 +352,7 @@ def _spins(g, H, G):
 
 @njit(**_OPTIONS)
 def _couplings(K0, x, d, fl, p, L, B):
-    """Writes L = K0 S + ([p] + [f']) / 2, (3 k, 3), and B = S^T K0 S + (sum x f'^T symmetrised) - (sum x.f') I."""
+    """Write L = K0 S + ([p] + [f']) / 2, (3 k, 3), and B = S^T K0 S + (sum x f'^T symmetrised) - (sum x.f') I."""
     k = len(x)
     B[:] = 0.0
     for i in range(3 * k):
@@ -384,7 +384,7 @@ def _couplings(K0, x, d, fl, p, L, B):
 
 @njit(**_OPTIONS)
 def _tangent(K0, G, L, B, R, T, scratch, Ke):
-    """Writes R (K0 + (G^T B - L) G - G^T L^T) R^T, lower 3 x 3 blocks only."""
+    """Write R (K0 + (G^T B - L) G - G^T L^T) R^T, lower 3 x 3 blocks only."""
     n = len(K0)
     for i in range(n):
         l0, l1, l2 = G[0, i], G[1, i], G[2, i]
@@ -408,7 +408,7 @@ def _tangent(K0, G, L, B, R, T, scratch, Ke):
 def corotational_elements(
     u: NDArray, conn: NDArray, X: NDArray, K0: NDArray, g: NDArray, with_tangent: bool, f: NDArray, Ke: NDArray
 ) -> tuple[float, float]:
-    """Adds internal forces to f and writes element tangents.
+    """Add internal forces to f and write element tangents.
 
     Args:
         u: displacements (n, 3) [m].
@@ -449,14 +449,14 @@ _EXACT = {"cache": True, "error_model": "numpy"}
 
 @njit(**_EXACT)
 def scatter_lower(values, source, row, col, storage):
-    """Adds values[source[i]] to storage[row[i], col[i]] for all i."""
+    """Add values[source[i]] to storage[row[i], col[i]] for all i."""
     for i in range(len(source)):
         storage[row[i], col[i]] += values[source[i]]
 
 
 @njit(**_EXACT)
 def probe_positions(points, dof, weights, q):
-    """Returns points (p, 3) moved by sum_m weights (p, m, 3) q[dof (p, m, 3)], shape (p, 3)."""
+    """Return points (p, 3) moved by sum_m weights (p, m, 3) q[dof (p, m, 3)], shape (p, 3)."""
     out = points.copy()
     n = len(q)
     for p in range(dof.shape[0]):
@@ -469,7 +469,7 @@ def probe_positions(points, dof, weights, q):
 
 @njit(**_EXACT)
 def probe_motions(dof, weights, modes):
-    """Returns the motions (p, 3, k) of the points for changes modes (n, k) of the unknowns."""
+    """Return the motions (p, 3, k) of the points for changes modes (n, k) of the unknowns."""
     n, k = modes.shape
     out = np.zeros((dof.shape[0], 3, k))
     for p in range(dof.shape[0]):
@@ -484,7 +484,7 @@ def probe_motions(dof, weights, modes):
 
 @njit(**_EXACT)
 def probe_loads(dof, weights, forces, n):
-    """Returns the generalised load (n,) of forces (p, 3)."""
+    """Return the generalised load (n,) of forces (p, 3)."""
     out = np.zeros(n)
     for p in range(dof.shape[0]):
         if forces[p, 0] == 0.0 and forces[p, 1] == 0.0 and forces[p, 2] == 0.0:

@@ -54,7 +54,7 @@ class Face:
     """
 
     def __init__(self, mechanics: Mechanics, heights: NDArray) -> None:
-        """Keeps the rows at heights (n,) [m]."""
+        """Keep the rows at heights (n,) [m]."""
         surface, face, self._model = mechanics.contact.surface, mechanics.contact.face, mechanics.model
         columns = surface.points[:, 1].reshape(-1, surface.across).T
         sides = np.stack([np.interp(heights, surface.heights, y) for y in columns], axis=1)
@@ -64,7 +64,7 @@ class Face:
         self.basis = np.zeros((self._model.size, 0))
 
     def _share_nodes(self, mechanics: Mechanics, heights: NDArray) -> sparse.csr_matrix:
-        """Returns what each unknown's force is on the rows (2 n, size): rows and nodes of the face stand apart.
+        """Return what each unknown's force is on the rows (2 n, size): rows and nodes of the face stand apart.
 
         A force between two rows is shared by both as by the ends of a beam; one below the first row goes to the clamp,
         too.
@@ -85,7 +85,7 @@ class Face:
         return table.tocsr()
 
     def describe(self, q: NDArray) -> FaceTangent:
-        """Returns the equilibrium of unknowns q (size,) and what unit loads at the rows do to it."""
+        """Return the equilibrium of unknowns q (size,) and what unit loads at the rows do to it."""
         model, count = self._model, 2 * self._count
         responses, state = self._respond(q), model.linearize(q, tangent=False)
         moves = self._average(model.project(self._probe, q, responses)).reshape(count, count)
@@ -99,11 +99,11 @@ class Face:
         )
 
     def describe_all(self, states: NDArray) -> list[FaceTangent]:
-        """Returns the equilibria of unknowns (n, size); see `describe`."""
+        """Return the equilibria of unknowns (n, size); see `describe`."""
         return [self.describe(q) for q in states]
 
     def find_basis(self, states: NDArray, count: int) -> None:
-        """Sets the basis to the `count` shapes that say most of equilibria (m, size) and of what loads do to them."""
+        """Set the basis to the `count` shapes that say most of equilibria (m, size) and of what loads do to them."""
         parts, largest = [], 0.0
         for q in states[:: _EVERY**2]:
             responses = self._respond(q)[:, ::_EVERY]
@@ -114,12 +114,12 @@ class Face:
         self.basis = np.linalg.qr(_condense(samples, min(count, *samples.shape)))[0]
 
     def _respond(self, q: NDArray) -> NDArray:
-        """Returns the changes (size, 2 n) of the unknowns by unit loads at the rows."""
+        """Return the changes (size, 2 n) of the unknowns by unit loads at the rows."""
         model = self._model
         return model.factorise(model.linearize(q).tangent).solve(self._unit_loads(q))
 
     def _find_load(self, q: NDArray, force: NDArray) -> NDArray:
-        """Returns the load on the rows (2 n,) [N] that balances an internal force (size,), as far as it can."""
+        """Return the load on the rows (2 n,) [N] that balances an internal force (size,), as far as it can."""
         if self._share is not None:
             return self._share @ force
         loads = sparse.csc_matrix(self._unit_loads(q))
@@ -130,11 +130,11 @@ class Face:
         return load
 
     def _average(self, moves: NDArray) -> NDArray:
-        """Returns x and z motions (n, 2, k) of the rows, the mean across the face, of those of points (p, 3, k)."""
+        """Return x and z motions (n, 2, k) of the rows, the mean across the face, of those of points (p, 3, k)."""
         return moves.reshape(self._count, self._across, 3, -1).mean(1)[:, [0, 2]]
 
     def _unit_loads(self, q: NDArray) -> NDArray:
-        """Returns the loads (size, 2 n) of unit forces along x and z at each row."""
+        """Return the loads (size, 2 n) of unit forces along x and z at each row."""
         columns = np.zeros((len(q), 2 * self._count))
         for row in range(self._count):
             for number, axis in enumerate((0, 2)):
@@ -145,7 +145,7 @@ class Face:
 
 
 def _condense(samples: NDArray, count: int) -> NDArray:
-    """Returns the `count` orthogonal combinations (size, count) that say most of samples (size, m).
+    """Return the `count` orthogonal combinations (size, count) that say most of samples (size, m).
 
     Their scalar products (m, m) take the place of the unknowns' (size, size), which a large mesh could not store.
     """
@@ -187,7 +187,7 @@ Share = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 def build_manifold(
     mechanics: Mechanics, young_modulus: float, progress: Callable[[float], None], share: Share = map
 ) -> Manifold:
-    """Presses a rod into the jaw at every height and stores equilibria and compliances.
+    """Press a rod into the jaw at every height and store equilibria and compliances.
 
     Args:
         mechanics: of the jaw.
@@ -209,7 +209,7 @@ def build_manifold(
 
 
 def build_rest(mechanics: Mechanics, young_modulus: float) -> Manifold:
-    """Stores the unloaded jaw alone, at all grid points; see `build_manifold`."""
+    """Store the unloaded jaw alone, at all grid points; see `build_manifold`."""
     heights, rest = _choose_rows(mechanics), np.zeros(mechanics.model.size)
     face = Face(mechanics, heights[1:])
     face.find_basis(rest[None], SHAPES)
@@ -227,7 +227,7 @@ class _Grid:
 
 
 def _press_everywhere(contact: RollingContact, progress: Callable[[float], None], share: Share) -> _Grid:
-    """Returns the equilibria under rods at all heights."""
+    """Return the equilibria under rods at all heights."""
     low, high = contact.surface.heights[[0, -1]]
     place = np.linspace(0.0, 1.0, HEIGHTS)
     place = place - _DENSER * np.sin(2.0 * np.pi * place) / (2.0 * np.pi)
@@ -243,12 +243,12 @@ def _press_everywhere(contact: RollingContact, progress: Callable[[float], None]
 
 
 def _press_fully(contact: RollingContact, height: float) -> _Equilibrium:
-    """Returns the deepest equilibrium under a rod at a height [m]."""
+    """Return the deepest equilibrium under a rod at a height [m]."""
     return _Rod(contact, height).press(np.inf)[-1]
 
 
 def _press_rod(contact: RollingContact, hardest: float, height: float) -> tuple[float, list[NDArray]]:
-    """Returns the largest depth [m] of a rod at one height [m], and the equilibria (T, size) that divide its path.
+    """Return the largest depth [m] of a rod at one height [m], and the equilibria (T, size) that divide its path.
 
     Raises:
         ContactError: the jaw cannot be pressed there.
@@ -265,7 +265,7 @@ def _press_rod(contact: RollingContact, hardest: float, height: float) -> tuple[
 
 
 def _find_depth(path: list[_Equilibrium], hardest: float) -> float:
-    """Returns the depth [m] at which a path ends or, found between its steps, needs the largest force [N].
+    """Return the depth [m] at which a path ends or, found between its steps, needs the largest force [N].
 
     Depths that change smoothly with height make equilibria that do.
     """
@@ -276,7 +276,7 @@ def _find_depth(path: list[_Equilibrium], hardest: float) -> float:
 
 
 def _choose_rows(mechanics: Mechanics) -> NDArray:
-    """Returns the heights (n + 1,) [m] of the rows, the clamp's first.
+    """Return the heights (n + 1,) [m] of the rows, the clamp's first.
 
     A solid moves linearly between its nodes: their own heights are best, divided where they are few. Where they are too
     many or too close together, as in unstructured meshes, and of frames the rows divide the face evenly.
@@ -293,7 +293,7 @@ def _choose_rows(mechanics: Mechanics) -> NDArray:
 
 
 def _find_own_rows(mechanics: Mechanics) -> tuple[NDArray, float]:
-    """Returns the heights of the face's free nodes (n,) [m], and the highest of its clamped ones, -inf without any."""
+    """Return the heights of the face's free nodes (n,) [m], and the highest of its clamped ones, -inf without any."""
     mesh, on_face = mechanics.mesh, mechanics.contact.face.holds(mechanics.mesh.nodes)
     held = np.isin(np.arange(len(mesh.nodes)), mesh.clamped)
     own = np.unique(np.round(mesh.nodes[on_face & ~held, 2], 7))
@@ -320,7 +320,7 @@ class _Rod:
         self._touch = contact.find_touch(np.array([0.0, np.log(self._radius), height]))
 
     def press(self, hardest: float) -> list[_Equilibrium]:
-        """Returns equilibria at rising depths below first touch, up to where the jaw gives way or resists."""
+        """Return equilibria at rising depths below first touch, up to where the jaw gives way or resists."""
         path, step = [], _LONGEST
         while not path or path[-1].depth < self._deepest - 1e-9:
             before = path[-1] if path else None
@@ -339,7 +339,7 @@ class _Rod:
         return path
 
     def divide(self, path: list[_Equilibrium], largest: float, count: int) -> list[NDArray] | None:
-        """Returns the unknowns of equilibria that divide a path up to a depth [m], denser at its beginning.
+        """Return the unknowns of equilibria that divide a path up to a depth [m], denser at its beginning.
 
         The unloaded one comes first. None where one is not found: the jaw goes over to another shape there.
         """
@@ -355,7 +355,7 @@ class _Rod:
         return states
 
     def _settle(self, start: _Equilibrium | None, depth: float, tolerance: float) -> _Equilibrium | None:
-        """Returns the equilibrium at a depth [m] of the rod, to a tolerance of the unknowns; or None."""
+        """Return the equilibrium at a depth [m] of the rod, to a tolerance of the unknowns; or None."""
         contact, model = self._contact, self._contact.model
         place = np.array([self._touch + depth, np.log(self._radius), self._height])
         q = np.zeros(model.size)
@@ -376,7 +376,7 @@ class _Rod:
 
 
 def _store(young_modulus: float, grid: _Grid, heights: NDArray, parts: list[list[FaceTangent]], face: Face) -> Manifold:
-    """Returns the manifold of a grid of equilibria and their tangents (T, Z)."""
+    """Return the manifold of a grid of equilibria and their tangents (T, Z)."""
 
     def collect(name: str, kind: type = np.float64) -> NDArray:
         return np.array([[getattr(part, name) for part in row] for row in parts], kind)

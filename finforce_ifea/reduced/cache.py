@@ -42,7 +42,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def hash_parts(*parts: NDArray | str | float) -> str:
-    """Returns a name (32 hexadecimal digits) for arrays, texts and numbers, to the last bit."""
+    """Return a name (32 hexadecimal digits) for arrays, texts and numbers, to the last bit."""
     digest = hashlib.sha256(f"manifold {VERSION}".encode())
     for part in parts:
         array = np.ascontiguousarray(part) if isinstance(part, np.ndarray) else None
@@ -53,7 +53,7 @@ def hash_parts(*parts: NDArray | str | float) -> str:
 
 
 def fetch_manifold(key: str, build: Callable[[], Manifold]) -> Manifold:
-    """Returns the stored manifold of a key, or builds and stores it; of two processes one builds.
+    """Return the stored manifold of a key, or build and store it; of two processes one builds.
 
     A folder that cannot be written costs a warning and the time to build anew.
     """
@@ -70,7 +70,7 @@ def fetch_manifold(key: str, build: Callable[[], Manifold]) -> Manifold:
 
 
 def _read(path: Path) -> Manifold | None:
-    """Returns a stored manifold, None when there is none that can be read."""
+    """Return a stored manifold, None when there is none that can be read."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             values = {field.name: stored[field.name] for field in fields(Manifold)}
@@ -84,7 +84,7 @@ def _read(path: Path) -> Manifold | None:
 
 
 def _write(path: Path, manifold: Manifold) -> None:
-    """Stores a manifold, whole or not at all; what a killed process has left of it is removed."""
+    """Store a manifold, whole or not at all; what a killed process has left of it is removed."""
     part = path.with_suffix(f".{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -100,7 +100,7 @@ def _write(path: Path, manifold: Manifold) -> None:
 
 
 def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mechanics:
-    """Returns the mechanics by stored equilibria.
+    """Return the mechanics by stored equilibria.
 
     Args:
         full: the mechanics that is to be reduced.
@@ -127,7 +127,7 @@ def reduce_mechanics(full: Mechanics, jaw: Jaw, *, linear: bool = False) -> Mech
 
 
 def _share_manifold(full: Mechanics, jaw: Jaw) -> Manifold:
-    """Returns the manifold of a jaw with its modulus, the same one for all jaws of this process that are alike."""
+    """Return the manifold of a jaw with its modulus, the same one for all jaws of this process that are alike."""
     modulus = jaw.material.young_modulus
     key = (name_manifold(full, jaw), modulus)
     found = _SHARED.get(key)
@@ -138,7 +138,7 @@ def _share_manifold(full: Mechanics, jaw: Jaw) -> Manifold:
 
 
 def name_manifold(full: Mechanics, jaw: Jaw) -> str:
-    """Returns the hash of all that the equilibria of a jaw depend on; its modulus is none of it."""
+    """Return the hash of all that the equilibria of a jaw depend on; its modulus is none of it."""
     mesh, model = full.mesh, full.model
     parts = [mesh.nodes, mesh.elements, mesh.clamped, jaw.material.poisson_ratio, full.contact.face_x]
     if not full.contact.face.is_flat:
@@ -156,7 +156,7 @@ def name_manifold(full: Mechanics, jaw: Jaw) -> str:
 
 
 def store_manifold(full: Mechanics, jaw: Jaw, share: Share) -> None:
-    """Builds and stores the manifold of a jaw, unless it is stored, its work shared among processes.
+    """Build and store the manifold of a jaw, unless it is stored, its work shared among processes.
 
     Raises:
         ContactError: The jaw cannot be pressed.
@@ -165,6 +165,6 @@ def store_manifold(full: Mechanics, jaw: Jaw, share: Share) -> None:
 
 
 def _build_watched(full: Mechanics, jaw: Jaw, share: Share = map) -> Manifold:
-    """Builds the manifold under a progress bar."""
+    """Build the manifold under a progress bar."""
     with tqdm(total=100, desc=f"equilibria of {jaw.name}, once", unit="%", disable=None, leave=False) as bar:
         return build_manifold(full, jaw.material.young_modulus, lambda done: bar.update(int(100 * done) - bar.n), share)

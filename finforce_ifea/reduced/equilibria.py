@@ -54,7 +54,7 @@ class Manifold:
 
 @njit(**_OPTIONS)
 def weigh_cubic(x: float, count: int, weights: NDArray, slopes: NDArray) -> int:
-    """Writes the four weights of cubic Lagrange interpolation at x on 0 ... count - 1 and their derivatives.
+    """Write the four weights of cubic Lagrange interpolation at x on 0 ... count - 1 and their derivatives.
 
     Returns:
         The first of the four nodes.
@@ -77,7 +77,7 @@ def weigh_cubic(x: float, count: int, weights: NDArray, slopes: NDArray) -> int:
 
 @njit(**_OPTIONS)
 def interpolate(table, m, out):
-    """Writes the values out (k,) of a table (T, Z, k) at grid coordinates m (2,)."""
+    """Write the values out (k,) of a table (T, Z, k) at grid coordinates m (2,)."""
     wt, wz, slope = np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL)
     t, z = weigh_cubic(m[0], table.shape[0], wt, slope), weigh_cubic(m[1], table.shape[1], wz, slope)
     out[:] = 0.0
@@ -90,7 +90,7 @@ def interpolate(table, m, out):
 
 @njit(**_OPTIONS)
 def interpolate_slopes(table, m, step, out):
-    """Writes every `step`-th pair of a table (T, Z, 2 n) at grid coordinates m (2,), and derivatives, out (3, k)."""
+    """Write every `step`-th pair of a table (T, Z, 2 n) at grid coordinates m (2,), and derivatives, out (3, k)."""
     wt, wz, dt, dz = np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL), np.empty(STENCIL)
     t, z = weigh_cubic(m[0], table.shape[0], wt, dt), weigh_cubic(m[1], table.shape[1], wz, dz)
     out[:] = 0.0
@@ -108,7 +108,7 @@ def interpolate_slopes(table, m, step, out):
 
 @njit(**_OPTIONS)
 def find_ends(values):
-    """Returns the first index of values (k,) that is not zero and the one after the last; (0, 0) without any."""
+    """Return the first index of values (k,) that is not zero and the one after the last; (0, 0) without any."""
     first, last = 0, 0
     for k in range(len(values)):
         if values[k] != 0.0:
@@ -123,7 +123,7 @@ def find_ends(values):
 
 @njit(**_OPTIONS)
 def _find_cell(table, m):
-    """Returns the lower grid point of the cell at m (2,) and the weights of its corners 00, 01, 10, 11."""
+    """Return the lower grid point of the cell at m (2,) and the weights of its corners 00, 01, 10, 11."""
     t = min(max(int(np.floor(m[0])), 0), table.shape[0] - 2)
     z = min(max(int(np.floor(m[1])), 0), table.shape[1] - 2)
     a, b = m[0] - t, m[1] - z
@@ -132,7 +132,7 @@ def _find_cell(table, m):
 
 @njit(**_OPTIONS)
 def blend(table, m, low, high, first, last, out):
-    """Writes rows low to high, columns first to last of a table (T, Z, p, q), linear between grid points, to out."""
+    """Write rows low to high, columns first to last of a table (T, Z, p, q), linear between grid points, to out."""
     t, z, w00, w01, w10, w11 = _find_cell(table, m)
     for i in range(high - low):
         c00, c01 = table[t, z, low + i], table[t, z + 1, low + i]
@@ -144,7 +144,7 @@ def blend(table, m, low, high, first, last, out):
 
 @njit(**_OPTIONS)
 def add_product(table, m, vector, first, last, step, out):
-    """Adds the product of a table (T, Z, p, q), linear between grid points, with a vector (q,) to out (p,).
+    """Add the product of a table (T, Z, p, q), linear between grid points, with a vector (q,) to out (p,).
 
     The vector is zero outside first to last; every `step`-th pair of rows is added to.
     """
@@ -171,7 +171,7 @@ _HALVINGS, _SLACK, _SLACK_FLOOR = 4, 1e-2, 1e-8
 
 @njit(**_EXACT)
 def find_grid_step(moves, now, m):
-    """Returns the step from grid coordinates m (2,) towards the stored equilibrium nearest to motions now (2 n,) [m].
+    """Return the step from grid coordinates m (2,) towards the stored equilibrium nearest to motions now (2 n,) [m].
 
     A damped step of Gauss and Newton on the distance of every so manieth row; it does not leave the grid. The third
     number is the root mean square distance at m [m].
@@ -196,7 +196,7 @@ def find_grid_step(moves, now, m):
 
 @njit(**_EXACT)
 def bound_grid_step(step, m, moves):
-    """Returns a step of the grid coordinates that is not too long and does not leave the grid."""
+    """Return a step of the grid coordinates that is not too long and does not leave the grid."""
     for axis in range(2):
         step[axis] = min(max(step[axis], -LARGEST_GRID_STEP), LARGEST_GRID_STEP)
         step[axis] = min(max(m[axis] + step[axis], 0.0), moves.shape[axis] - 1.0) - m[axis]
@@ -205,7 +205,7 @@ def bound_grid_step(step, m, moves):
 
 @njit(**_EXACT)
 def _measure_miss(tables, loads, m):
-    """Returns the root mean square distance [m] of a jaw under loads (2 n,) [N] from the equilibrium stored at m."""
+    """Return the root mean square distance [m] of a jaw under loads (2 n,) [N] from the equilibrium stored at m."""
     count = len(loads)
     extra, miss = np.empty(count), np.zeros(count)
     interpolate(tables[2], m, extra)
@@ -221,7 +221,7 @@ def _measure_miss(tables, loads, m):
 
 @njit(**_EXACT)
 def approach_grid(tables, loads, m, step):
-    """Shortens a step (3,) of grid coordinates m (2,), see `find_grid_step`, until it leads nearer to the stored ones.
+    """Shorten a step (3,) of grid coordinates m (2,), see `find_grid_step`, until it leads nearer to the stored ones.
 
     The step takes the jaw to stay as it is, which it does not where compliances change fast, as at the base.
     """

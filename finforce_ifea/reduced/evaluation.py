@@ -81,7 +81,7 @@ class FacePoints:
     rows: NDArray
 
     def spread(self, moves: NDArray) -> NDArray:
-        """Returns the motions (p, 3) [m] of the points for those of the rows (2 n,) [m]."""
+        """Return the motions (p, 3) [m] of the points for those of the rows (2 n,) [m]."""
         out = np.zeros(self.points.shape)
         out[:, ::2] = self.rows @ moves.reshape(-1, 2)
         return out
@@ -91,7 +91,7 @@ class _Identity:
     """The factor of loads that are unknowns themselves."""
 
     def solve(self, b: NDArray) -> NDArray:
-        """Returns b."""
+        """Return b."""
         return np.asarray(b)
 
 
@@ -107,7 +107,7 @@ class ReducedModel:
     across: Across = "middle"
 
     def __init__(self, manifold: Manifold, full: JawModel, face: FaceLine) -> None:
-        """Keeps the manifold of the jaw that `full` describes, with its inner face."""
+        """Keep the manifold of the jaw that `full` describes, with its inner face."""
         self.manifold, self._full, self._face = manifold, full, face
         self.rows = manifold.loads.shape[2]
         self.size = self.rows + 2
@@ -117,7 +117,7 @@ class ReducedModel:
         self.reach = np.r_[stiffness, LARGEST_GRID_STEP, manifold.loads.shape[1]]
 
     def linearize(self, q: NDArray, *, tangent: bool = True) -> Linearization:
-        """Returns the loads that q (size,) holds, and how far its grid coordinates are from the nearest equilibrium."""
+        """Return the loads that q (size,) holds, and how far its grid coordinates are from the nearest equilibrium."""
         moves = self.moves(q)
         step = find_grid_step(self.manifold.moves, moves, q[-2:])[:2]
         if q[-2] < SHALLOW:
@@ -126,7 +126,7 @@ class ReducedModel:
         return Linearization(force=force, energy=0.5 * float(moves @ q[:-2]), smallest_det=1.0, tangent=None)
 
     def _find_shallow_step(self, q: NDArray, by_depth: float) -> NDArray:
-        """Returns the step (2,) of grid coordinates where the loads tell the height: that first, then the depth."""
+        """Return the step (2,) of grid coordinates where the loads tell the height: that first, then the depth."""
         sizes, rods = np.abs(q[:-2:2]), self.manifold.rods
         if not sizes.any():
             return np.array([by_depth, 0.0])
@@ -135,11 +135,11 @@ class ReducedModel:
         return np.array([by_depth if abs(by_height) < _BESIDE else 0.0, by_height])
 
     def moves(self, q: NDArray) -> NDArray:
-        """Returns the motions of the rows (2 n,) [m], x and z interleaved."""
+        """Return the motions of the rows (2 n,) [m], x and z interleaved."""
         return follow(self.manifold.moves, self.compliance, self.loads, q)
 
     def attach(self, points: NDArray, max_distance: float = 1e-3) -> ReducedProbe | FacePoints:
-        """Returns a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
+        """Return a probe of material points (p, 3) [m, undeformed]; raises MeshError when one is off the jaw."""
         points = np.array(points, float)
         low, high = self.manifold.heights[[0, -1]]
         on_face = self._face.holds(points, _ON_FACE) & (points[:, 2] >= low) & (points[:, 2] <= high)
@@ -155,39 +155,39 @@ class ReducedModel:
         )
 
     def positions(self, probe: ReducedProbe | FacePoints, q: NDArray) -> NDArray:
-        """Returns the deformed positions (p, 3) [m] of a probe."""
+        """Return the deformed positions (p, 3) [m] of a probe."""
         if isinstance(probe, FacePoints):
             return probe.points + probe.spread(self.moves(q))
         return place_points(probe.points, probe.shapes, probe.compliance, self.loads, q)
 
     def project(self, probe: ReducedProbe | FacePoints, q: NDArray, modes: NDArray) -> NDArray:
-        """Returns the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the loads alone."""
+        """Return the motions (p, 3, k) [m] of a probe for changes modes (size, k) of the loads alone."""
         if isinstance(probe, FacePoints):
             now = self.moves(q)
             return np.stack([probe.spread(self.moves(q + mode) - now) for mode in modes.T], axis=2)
         return move_points(probe.compliance, q, np.ascontiguousarray(modes))
 
     def load(self, probe: ReducedProbe | FacePoints, q: NDArray, forces: NDArray) -> NDArray:
-        """Returns the loads (size,) [N] at the rows of forces (p, 3) [N] at points of the inner face."""
+        """Return the loads (size,) [N] at the rows of forces (p, 3) [N] at points of the inner face."""
         return np.r_[(probe.rows.T @ forces[:, [0, 2]]).ravel(), 0.0, 0.0]
 
     def factorise(self, tangent: None) -> Factor:
-        """Returns the factor of the unknowns, which are loads."""
+        """Return the factor of the unknowns, which are loads."""
         return _Identity()
 
     def vertices(self, q: NDArray) -> NDArray:
-        """Returns the deformed mesh vertices (v, 3) [m], in mesh order."""
+        """Return the deformed mesh vertices (v, 3) [m], in mesh order."""
         return self._full.vertices(self.expand(q))
 
     def expand(self, q: NDArray) -> NDArray:
-        """Returns the unknowns of the full model (m,) at this one's (size,), as far as its basis goes."""
+        """Return the unknowns of the full model (m,) at this one's (size,), as far as its basis goes."""
         still = np.zeros((self.manifold.basis.shape[1], 1))
         shape = place_points(still, self.manifold.shapes, self.shape_compliance, self.loads, q)
         return self.manifold.basis @ shape.ravel()
 
 
 def scale_manifold(manifold: Manifold, young_modulus: float) -> Manifold:
-    """Returns the manifold of a jaw with another modulus [Pa]."""
+    """Return the manifold of a jaw with another modulus [Pa]."""
     if young_modulus == manifold.young_modulus:
         return manifold
     factor = young_modulus / manifold.young_modulus
@@ -202,7 +202,7 @@ def scale_manifold(manifold: Manifold, young_modulus: float) -> Manifold:
 
 
 def share_rows(heights: NDArray, places: NDArray) -> NDArray:
-    """Returns what share each row has in points at `places` (p,) [m] along the face, (p, n), linear between rows.
+    """Return what share each row has in points at `places` (p,) [m] along the face, (p, n), linear between rows.
 
     Args:
         heights: of the clamp, where the jaw is held, and of the rows (n + 1,) [m].
@@ -232,7 +232,7 @@ class ReducedContact(RollingContact):
     """
 
     def __init__(self, model: ReducedModel, surface: ContactSurface, face: FaceLine) -> None:
-        """Keeps the model, its contact surface, one point per height, and the undeformed inner face."""
+        """Keep the model, its contact surface, one point per height, and the undeformed inner face."""
         self.model, self.surface, self.face, self.face_x = model, surface, face, face.plane
         self.indenter: Indenter = RoundIndenter()
         self.traction_ratio, self._friction = 0.0, None
@@ -266,13 +266,13 @@ class ReducedContact(RollingContact):
         return place_contact(self._jaw.points, self._jaw.low, self._jaw.share, self.model.moves(q))
 
     def begin(self, height: float) -> NDArray:
-        """Returns the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
+        """Return the unknowns (size,) of the unloaded jaw that is to be touched at a height [m]."""
         q, rods = np.zeros(self.model.size), self.model.manifold.rods
         q[-1] = np.interp(height, rods, np.arange(len(rods)))
         return q
 
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
-        """Linearises the equilibrium with the object at a place (depth, shape, height); see `RollingContact`."""
+        """Linearise the equilibrium with the object at a place (depth, shape, height); see `RollingContact`."""
         traction = self._describe_traction(place)
         return linearize_reduced(self.packed, tuple(self.indenter.pressed), tuple(traction), q, place)
 
@@ -347,7 +347,7 @@ class _Gathered(NamedTuple):
 
 @njit(**_OPTIONS)
 def follow(moves, compliance, loads, q):
-    """Returns motions (k,) [m] of a table moves (T, Z, k) with its compliance (T, Z, k, 2 n) for unknowns q."""
+    """Return motions (k,) [m] of a table moves (T, Z, k) with its compliance (T, Z, k, 2 n) for unknowns q."""
     count = loads.shape[2]
     m, extra, out = q[count:], np.empty(count), np.empty(moves.shape[2])
     interpolate(loads, m, extra)
@@ -361,7 +361,7 @@ def follow(moves, compliance, loads, q):
 
 @njit(**_OPTIONS)
 def place_points(points, shapes, compliance, loads, q):
-    """Returns points (p, c) [m] moved as the table shapes (T, Z, p c) [m] and its compliance say."""
+    """Return points (p, c) [m] moved as the table shapes (T, Z, p c) [m] and its compliance say."""
     placed = follow(shapes, compliance, loads, q).reshape(points.shape)
     for k in range(len(points)):
         for a in range(points.shape[1]):
@@ -371,7 +371,7 @@ def place_points(points, shapes, compliance, loads, q):
 
 @njit(**_OPTIONS)
 def move_points(compliance, q, modes):
-    """Returns the motions (p, 3, k) [m] of points whose compliance is (T, Z, 3 p, 2 n), for modes (2 n + 2, k)."""
+    """Return the motions (p, 3, k) [m] of points whose compliance is (T, Z, 3 p, 2 n), for modes (2 n + 2, k)."""
     count, k = compliance.shape[3], modes.shape[1]
     first, last = count, 0
     for c in range(k):
@@ -392,7 +392,7 @@ def move_points(compliance, q, modes):
 
 @njit(**_OPTIONS)
 def place_contact(points, low, share, moves):
-    """Returns contact points (p, 3) [m], moved by the rows beside them, whose motions are (2 n,) [m]."""
+    """Return contact points (p, 3) [m], moved by the rows beside them, whose motions are (2 n,) [m]."""
     placed = points.copy()
     for p in range(len(points)):
         for a in range(2):
@@ -405,7 +405,7 @@ def place_contact(points, low, share, moves):
 
 @njit(**_OPTIONS)
 def _add_springs(out, weight, row, low, share, stiffness):
-    """Adds a point's springs, see `add_traction`, seen from a row with a weight, to the band stiffness (2 n, 7)."""
+    """Add a point's springs, see `add_traction`, seen from a row with a weight, to the band stiffness (2 n, 7)."""
     for j in range(2):
         other = low + j
         if other < 0:
@@ -418,7 +418,7 @@ def _add_springs(out, weight, row, low, share, stiffness):
 
 @njit(**_OPTIONS)
 def _add_to_clamp(out, weight, share, held, grip):
-    """Adds what the clamp takes of a point, see `add_traction`, to held (2, 5), and its springs to grip (2, 2)."""
+    """Add what the clamp takes of a point, see `add_traction`, to held (2, 5), and its springs to grip (2, 2)."""
     for a in range(2):
         held[a, 0] += weight * out[a, 0]
         for c in range(4):
@@ -429,7 +429,7 @@ def _add_to_clamp(out, weight, share, held, grip):
 
 @njit(**_OPTIONS)
 def _gather(jaw, pressed, pose, traction, points):
-    """Returns the contact of an object with contact points (p, 3) [m] at the rows."""
+    """Return the contact of an object with contact points (p, 3) [m] at the rows."""
     count = jaw.loads.shape[2]
     loads, stiffness, held, grip = np.zeros((count, 5)), np.zeros((count, 7)), np.zeros((2, 5)), np.zeros((2, 2))
     total, point, place = 0.0, np.zeros(3), np.zeros(3)
@@ -466,7 +466,7 @@ def _gather(jaw, pressed, pose, traction, points):
 
 @njit(**_OPTIONS)
 def _solve_rows(q, compliance, loads, stiffness):
-    """Returns (2 n, 5): the step of the loads to equilibrium, and their derivatives by the place; and its motion [m].
+    """Return (2 n, 5): the step of the loads to equilibrium, and their derivatives by the place; and its motion [m].
 
     With loads p(u) of the object at the rows, springs S = -dp/du and compliance C, one step of Newton's method on
     lambda = p(u(lambda)) solves
@@ -504,7 +504,7 @@ def _solve_rows(q, compliance, loads, stiffness):
 
 @njit(**_OPTIONS)
 def _change_energy(jaw, pressed, pose, traction, points, motion, share, work):
-    """Returns by how much the energy changes along a step of which a share has been made; see `_find_share`."""
+    """Return by how much the energy changes along a step of which a share has been made; see `_find_share`."""
     out, weights, change = np.zeros(POINT_SHAPE), np.zeros((6, 4)), work[0] + share * work[1]
     for p in range(len(points)):
         x, z = points[p, 0] + share * motion[p, 0], points[p, 2] + share * motion[p, 2]
@@ -519,7 +519,7 @@ def _change_energy(jaw, pressed, pose, traction, points, motion, share, work):
 
 @njit(**_OPTIONS)
 def _find_share(jaw, pressed, pose, traction, points, moves, q, step):
-    """Returns the share of a step up to which the energy of jaw and object falls; corners make it rise again.
+    """Return the share of a step up to which the energy of jaw and object falls; corners make it rise again.
 
     Along a step of the loads that moves the rows by du and contact points (p, 3) by dx, it changes by
     (lambda - p)^T du, all as far as the step has gone.
@@ -545,7 +545,7 @@ def _find_share(jaw, pressed, pose, traction, points, moves, q, step):
 
 @njit(**_OPTIONS)
 def _step_grid(jaw, q, moves, steps, size, contact):
-    """Returns the step (2,) of the grid coordinates after a step of the loads, and the distance from the grid [m].
+    """Return the step (2,) of the grid coordinates after a step of the loads, and the distance from the grid [m].
 
     Args:
         jaw: see `ReducedJaw`.
@@ -572,7 +572,7 @@ def _step_grid(jaw, q, moves, steps, size, contact):
 
 @njit(**_OPTIONS)
 def read_grid(rods, height):
-    """Returns the grid coordinate of a height [m] among rising ones (Z,) [m]."""
+    """Return the grid coordinate of a height [m] among rising ones (Z,) [m]."""
     last = len(rods) - 1
     if not height > rods[0]:
         return 0.0
@@ -584,7 +584,7 @@ def read_grid(rods, height):
 
 @njit(**_OPTIONS)
 def linearize_reduced(jaw, pressed, traction, q, place):
-    """Returns one linearised equilibrium as `PressedState`.
+    """Return one linearised equilibrium as `PressedState`.
 
     Plain tuples are handed over from Python several times as fast as named ones.
 
@@ -633,7 +633,7 @@ def linearize_reduced(jaw, pressed, traction, q, place):
 
 @njit(**_OPTIONS)
 def _hold_base(jaw, q, contact, steps, force, force_modes):
-    """Adds what of the contact force the clamp holds below the first row to force (3,) and derivatives (3, 4) [N]."""
+    """Add what of the contact force the clamp holds below the first row to force (3,) and derivatives (3, 4) [N]."""
     if not (contact.grip[0, 0] + contact.grip[1, 1] > 0.0):
         return
     count = len(steps)
@@ -654,7 +654,7 @@ def _hold_base(jaw, q, contact, steps, force, force_modes):
 
 @njit(**_OPTIONS)
 def approach_reduced(jaw, pressed, q, step, place):
-    """Returns the step of a jaw that has lost contact, cut where it meets the object again; see `linearize_reduced`."""
+    """Return the step of a jaw that has lost contact, cut where it meets the object again; see `linearize_reduced`."""
     jaw, pressed = ReducedJaw(*jaw), PressedObject(*pressed)
     low, high, pose = 0.0, 1.0, pose_object(pressed, jaw.face_x, place)
     for _ in range(BISECTIONS):

@@ -64,13 +64,13 @@ class FrictionEstimate:
     """
 
     def __init__(self, settings: EstimatorSettings, smooth: Coefficient = SMOOTH) -> None:
-        """Keeps what is expected of objects, that of those of the calibration included."""
+        """Keep what is expected of objects, that of those of the calibration included."""
         self._rough = Coefficient(settings.friction, settings.friction_stddev)
         self._smooth, self._share = smooth, settings.smooth_share
         self.reset()
 
     def reset(self) -> None:
-        """Starts with an object of which nothing is known."""
+        """Start with an object of which nothing is known."""
         self._information, self._vector = np.zeros((5, 5)), np.zeros(5)
         self._means = np.zeros(0, _MEANS)
         self._prior = np.ones(2)
@@ -104,14 +104,14 @@ class FrictionEstimate:
         return Coefficient(mean, float(np.sqrt(variance)))
 
     def _judge(self, variance: float, mean: float) -> Coefficient:
-        """Returns the coefficient for what the key points alone say of it."""
+        """Return the coefficient for what the key points alone say of it."""
         smooth, rough = (*self._smooth, self._share), (*self._rough, 1.0 - self._share)
         return Coefficient(*_judge(variance, mean, smooth, rough))
 
 
 @njit(**_OPTIONS)
 def _judge(variance, mean, smooth, rough):
-    """Returns mean and standard deviation for two hypotheses (mean, standard deviation, probability)."""
+    """Return mean and standard deviation for two hypotheses (mean, standard deviation, probability)."""
     total, first, second = 0.0, 0.0, 0.0
     for expected, deviation, share in (smooth, rough):
         own = max(deviation, 1e-6) ** 2
@@ -188,7 +188,7 @@ def _remember(mean, weight, m, left, row, noise):
 
 @njit(**_OPTIONS)
 def _solve(information, vector, prior):
-    """Returns variance and mean of mu by the key points alone, infinite where they say nothing, and all unknowns."""
+    """Return variance and mean of mu by the key points alone, infinite where they say nothing, and all unknowns."""
     A = information.copy()
     A[0, 0] += 1.0 / prior[0]
     A[1, 1] += 1.0 / prior[1]
@@ -215,7 +215,7 @@ def _solve(information, vector, prior):
 
 @njit(**_OPTIONS)
 def _find_excess(means, found):
-    """Returns how much larger what goes with m is than chance would leave it, squared, at least 1.
+    """Return how much larger what goes with m is than chance would leave it, squared, at least 1.
 
     They are those that the unknowns (5,) and one common depth leave, over their standard deviations.
     """
@@ -279,17 +279,17 @@ class SlipHistory:
         self._friction.reset()
 
     def set_indenter(self, indenter: Indenter) -> None:
-        """Takes the object as it is pressed in from now on."""
+        """Take the object as it is pressed in from now on."""
         self._contact.set_indenter(indenter)
 
     def shift(self, change: float) -> None:
-        """Counts the depth `change` [m] more, as of an object that was cut anew."""
+        """Count the depth `change` [m] more, as of an object that was cut anew."""
         if self._x is not None:
             self._x[DEPTH] += change
             self._friction.shift(-change)
 
     def follow(self, q: NDArray, x: NDArray, stddev: float, coefficient: float) -> float:
-        """Returns how far friction is mobilised in a state of the contact.
+        """Return how far friction is mobilised in a state of the contact.
 
         Args:
             q: shape of the jaw there, for a beginning (size,).
@@ -317,7 +317,7 @@ class SlipHistory:
         return self.mobilised
 
     def _press(self, q: NDArray, x: NDArray) -> bool:
-        """Presses the jaw of unknowns q (size,) in the next state; return False, all as it was, where that fails."""
+        """Press the jaw of unknowns q (size,) in the next state; return False, all as it was, where that fails."""
         contact, calm = self._contact, 1.0
         corrected = np.zeros(contact.model.size)
         for _ in range(_ITERATIONS):
@@ -341,7 +341,7 @@ def leave_play(change: float, play: float) -> float:
 
 
 def calm_down(correction: NDArray, before: NDArray, calm: float) -> float:
-    """Returns the share of a correction (size,) to be made after another one of which a share `calm` was made."""
+    """Return the share of a correction (size,) to be made after another one of which a share `calm` was made."""
     size = np.sqrt((correction @ correction) * (before @ before))
     if size > 0.0 and correction @ before < _TURNED * size:
         return max(_LEAST_CORRECTION, 0.5 * calm)

@@ -46,7 +46,7 @@ class GivenContactTracker:
     def __init__(
         self, jaw: Jaw, mechanics: Mechanics, settings: EstimatorSettings, response: InfluenceCoefficients
     ) -> None:
-        """Keeps the jaw, whose key points lie on it; `response` is that of the unloaded one."""
+        """Keep the jaw, whose key points lie on it; `response` is that of the unloaded one."""
         self._watch = LocationWatch(response, settings)
         self.jaw, self.mechanics, self.settings = jaw, mechanics, settings
         self.paper = settings.solver == "paper"
@@ -64,7 +64,7 @@ class GivenContactTracker:
         return self.mechanics.model.positions(self.probe, np.zeros(self.mechanics.model.size))
 
     def reset(self) -> None:
-        """Starts anew, unloaded, with the middle candidate."""
+        """Start anew, unloaded, with the middle candidate."""
         self.q = np.zeros(self.mechanics.model.size)
         self._misfit = 1.0
         self._watch.reset()
@@ -73,24 +73,24 @@ class GivenContactTracker:
         self._weights: NDArray | None = np.ones(1)
 
     def resume(self, q: NDArray) -> None:
-        """Starts anew from the shape (size,) that another tracker has found."""
+        """Start anew from the shape (size,) that another tracker has found."""
         self.reset()
         self.q = q.copy()
 
     def vertices(self) -> NDArray:
-        """Returns the deformed mesh vertices (n, 3) [m], in mesh order."""
+        """Return the deformed mesh vertices (n, 3) [m], in mesh order."""
         return self.mechanics.model.vertices(self.q)
 
     def positions(self) -> NDArray:
-        """Returns the key points (K, 3) [m] of the deformed jaw."""
+        """Return the key points (K, 3) [m] of the deformed jaw."""
         return self.mechanics.model.positions(self.probe, self.q)
 
     def give_shape(self) -> NDArray:
-        """Returns the shape (size,) for another tracker to begin with."""
+        """Return the shape (size,) for another tracker to begin with."""
         return self.q
 
     def follow(self, contact: Contact) -> None:
-        """Takes a contact over: its heights and weights."""
+        """Take a contact over: its heights and weights."""
         heights = contact.points[:, 2]
         if self.paper:
             middle = np.average(heights, weights=contact.weights)
@@ -102,7 +102,7 @@ class GivenContactTracker:
         self._weights = np.asarray(contact.weights, float)
 
     def _build_load(self, height: float) -> tuple[NDArray, NDArray]:
-        """Returns the points of a load at one height and their neighbours along the finger."""
+        """Return the points of a load at one height and their neighbours along the finger."""
         surface = self.mechanics.contact.surface
         if self.paper:
             points = np.array([[self.jaw.face.read(height), 0.0, height]])
@@ -135,7 +135,7 @@ class GivenContactTracker:
         )
 
     def _probes(self, key: tuple[float, ...], points: NDArray, neighbours: NDArray) -> tuple[Any, Any]:
-        """Returns the probes of a load's points and neighbours; those of the last loads are kept."""
+        """Return the probes of a load's points and neighbours; those of the last loads are kept."""
         if key not in self._known:
             if len(self._known) >= _KNOWN_LOADS:
                 del self._known[next(iter(self._known))]
@@ -184,7 +184,7 @@ class GivenContactTracker:
         return solve_inverse(self.mechanics.model, problem, self.q, iterations=steps, tolerance=_SETTLED)
 
     def _reweigh(self, targets: NDArray, q: NDArray, variance: NDArray, known: NDArray) -> NDArray:
-        """Returns weights (K,) that fall with the distance from the shape found; the median sets their scale."""
+        """Return weights (K,) that fall with the distance from the shape found; the median sets their scale."""
         miss = np.where(known[:, None], self.mechanics.model.positions(self.probe, q) - targets, 0.0)
         distance = (miss**2).sum(1) / variance
         scale = max(1.0, float(np.median(distance[known])) / _MEDIAN_SQUARE)
@@ -225,7 +225,7 @@ class GivenContactTracker:
         return state
 
     def significance(self, tare: Tare, stddev: float) -> float:
-        """Returns by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
+        """Return by how many standard deviations a force explains the offsets of a tare; see `explain_offsets`."""
         model, q = self.mechanics.model, np.zeros(self.mechanics.model.size)
         problem = self._problem(np.array(self._rest), None)
         load = model.load(problem.contacts, q, np.tile([-1.0, 0.0, 0.0], (len(problem.weights), 1)))
@@ -253,7 +253,7 @@ class LocationWatch:
     """
 
     def __init__(self, response: InfluenceCoefficients, settings: EstimatorSettings) -> None:
-        """Keeps the answers of the unloaded jaw and how well heights are known."""
+        """Keep the answers of the unloaded jaw and how well heights are known."""
         self._response = response
         self._prior_variance = settings.height_stddev**2
         self._memory = LONGEST_AVERAGE
@@ -261,11 +261,11 @@ class LocationWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets where the key points had the load."""
+        """Forget where the key points had the load."""
         self._offset, self._information = 0.0, 0.0
 
     def follow(self, heights: NDArray, weights: NDArray) -> None:
-        """Takes a load's heights (n,) [m] and their weights (n,) over; another mean height is another load.
+        """Take a load's heights (n,) [m] and their weights (n,) over; another mean height is another load.
 
         Shares of a spread load are hardly better known than that it is somewhere there.
         """
@@ -301,7 +301,7 @@ class LocationWatch:
         state["height_stddev"], state["location_error"] = stddev, abs(sensitivity) * stddev
 
     def _average(self, asked: float, information: float) -> None:
-        """Takes what a frame asks for [m] with its information [1/m^2] into the average."""
+        """Take what a frame asks for [m] with its information [1/m^2] into the average."""
         kept = self._information * (1.0 - 1.0 / self._memory)
         if information > 0.0:
             self._offset = (kept * self._offset + information * asked) / (kept + information)

@@ -39,26 +39,26 @@ class InfluenceCoefficients:
     fits: dict = field(default_factory=dict, repr=False)
 
     def at(self, height: float) -> NDArray:
-        """Returns the motions per force (K, 2) [m/N] at a height [m]."""
+        """Return the motions per force (K, 2) [m/N] at a height [m]."""
         return self._interpolate(self.motions, height)
 
     def slope_at(self, height: float) -> NDArray:
-        """Returns the derivative of the motions by the height (K, 2) [1/N]."""
+        """Return the derivative of the motions by the height (K, 2) [1/N]."""
         return self._interpolate(np.gradient(self.motions, self.heights, axis=0), height)
 
     def stiffness_at(self, height: float) -> float:
-        """Returns force over depth [N/m] at a height [m]; below and above, that of the nearest one."""
+        """Return force over depth [N/m] at a height [m]; below and above, that of the nearest one."""
         return float(np.interp(height, self.heights, self.stiffness))
 
     def _interpolate(self, values: NDArray, height: float) -> NDArray:
-        """Returns values (m, ...) between their heights."""
+        """Return values (m, ...) between their heights."""
         upper = int(np.clip(np.searchsorted(self.heights, height), 1, len(self.heights) - 1))
         low, high = self.heights[upper - 1], self.heights[upper]
         share = np.clip((height - low) / (high - low), 0.0, 1.0)
         return (1.0 - share) * values[upper - 1] + share * values[upper]
 
     def bound_force(self, deviations: NDArray) -> float:
-        """Returns the standard deviation [N] of a force that key points seen at rest leave room for, at any height.
+        """Return the standard deviation [N] of a force that key points seen at rest leave room for, at any height.
 
         At each height, the force that explains the deviations best and its own standard deviation are taken together;
         all heights are alike.
@@ -72,7 +72,7 @@ class InfluenceCoefficients:
         return float(np.sqrt((np.maximum(loads, 0.0) ** 2 + fit.stddevs**2).mean()))
 
     def _fit(self, seen: bytes) -> "_PointFit":
-        """Returns the fits for the key points that are seen, (K,) bool as bytes; kept, for they are mostly the same."""
+        """Return the fits for the key points that are seen, (K,) bool as bytes; kept, for they are mostly the same."""
         if seen not in self.fits:
             rows = np.frombuffer(seen, bool)
             fits = [fit_load(motions[rows], np.full(int(rows.sum()), OFFSET_STDDEV)) for motions in self.motions]
@@ -92,7 +92,7 @@ class _PointFit:
 
 
 def measure_influence(contact: RollingContact, probe: Any, keypoints: int) -> InfluenceCoefficients:
-    """Returns the answers of a contact's model, whose `probe` is that of the key points.
+    """Return the answers of a contact's model, whose `probe` is that of the key points.
 
     Args:
         contact: model and contact surface, see `RollingContact`.
@@ -128,7 +128,7 @@ class LoadFit:
 
 
 def fit_load(modes: NDArray, deviation: NDArray) -> LoadFit:
-    """Returns the fit of one mode (n, 2) to offsets of n key points, each off by chance by its deviation (n,) [m].
+    """Return the fit of one mode (n, 2) to offsets of n key points, each off by chance by its deviation (n,) [m].
 
     All together are off by chance, too, as a wrong depth scale moves them alike.
     """
@@ -141,7 +141,7 @@ def fit_load(modes: NDArray, deviation: NDArray) -> LoadFit:
 
 
 def explain_offsets(modes: NDArray, tare: Tare, offset_stddev: float) -> float:
-    """Returns by how many standard deviations one mode (K, 2) explains the offsets of a tare; see `fit_load`."""
+    """Return by how many standard deviations one mode (K, 2) explains the offsets of a tare; see `fit_load`."""
     seen = tare.counts > 0
     fit = fit_load(modes[seen], np.sqrt(offset_stddev**2 + tare.offset_variance(0.0)[seen]))
     return float(fit.gain @ tare.offsets[seen][:, [0, 2]].ravel() / fit.stddev)
@@ -174,7 +174,7 @@ class ReachWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets what was seen."""
+        """Forget what was seen."""
         self._contact: Contact | None = None
         self._is_away = False
         self._modes: NDArray | None = None

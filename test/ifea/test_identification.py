@@ -8,7 +8,7 @@ from estimator_fakes import magnitudes, make_estimator, ramp, record, run
 from mechanics_fakes import BENCH, MODULUS
 
 from finforce_ifea.errors import CalibrationError
-from finforce_ifea.identification.identification import CalibrationCase, find_plateaus, fit_calibration
+from finforce_ifea.identification import CalibrationCase, find_plateaus, fit_calibration
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation

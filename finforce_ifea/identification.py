@@ -8,7 +8,7 @@ history of the recordings, ramps included.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,6 +27,7 @@ from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation, invert_relaxation
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tare import OFFSET_STDDEV, compute_tare
+from finforce_ifea.tracking.friction import Coefficient
 
 BRANCH_PRIOR = np.array([0.1, np.log(1.0), 0.1, np.log(10.0)])
 BRANCH_STDDEV = np.array([0.3, 1.5, 0.3, 1.5])
@@ -89,7 +90,7 @@ def fit_calibration(
     settings: EstimatorSettings | None = None,
     progress: Callable[[float], None] = lambda cost: None,
 ) -> CalibrationFit:
-    """Identifies a finger.
+    """Identify a finger.
 
     Args:
         jaw: as drawn.
@@ -169,7 +170,7 @@ class _Fit:
         self._shapes: dict[bytes, tuple[NDArray, NDArray]] = {}
 
     def calibration(self, x: NDArray) -> Calibration:
-        """Returns the parameters as a calibration."""
+        """Return the parameters as a calibration."""
         return Calibration(
             young_modulus=float(self.jaw.material.young_modulus * np.exp(x[0])),
             inner_thickness_factor=float(x[1]),
@@ -182,7 +183,7 @@ class _Fit:
         )
 
     def residuals(self, x: NDArray) -> NDArray:
-        """Returns shape, force and prior residuals, each over its standard deviation."""
+        """Return shape, force and prior residuals, each over its standard deviation."""
         shapes, forces = self._solve_shapes(x)
         elastic = self._elastic_forces(x)
         model = np.exp(x[0]) * forces
@@ -195,7 +196,7 @@ class _Fit:
         return np.sqrt(INSTANTS) * (_FORCE_ERROR * force + _FORCE_FLOOR)
 
     def _elastic_forces(self, x: NDArray) -> list[NDArray]:
-        """Returns the elastic forces [N] behind the true ones at the instants of each plateau."""
+        """Return the elastic forces [N] behind the true ones at the instants of each plateau."""
         terms = self.calibration(x).relaxation
         elastic = [
             invert_relaxation(force, case.stamps_true, terms)
@@ -204,7 +205,7 @@ class _Fit:
         return [elastic[plateau.case][plateau.instants] for plateau in self.plateaus]
 
     def _solve_shapes(self, x: NDArray) -> tuple[NDArray, NDArray]:
-        """Returns the shape residuals and the magnitudes [N] at the drawn modulus; remembers them per geometry."""
+        """Return the shape residuals and the magnitudes [N] at the drawn modulus; remembers them per geometry."""
         key = np.r_[x[_GEOMETRY], x[len(_NAMES) :]].tobytes()
         if key not in self._shapes:
             mechanics = self._build_finger(x)
@@ -220,7 +221,7 @@ class _Fit:
         return self._shapes[key]
 
     def _build_finger(self, x: NDArray) -> Mechanics:
-        """Returns the mechanics of the finger with parameters x, at the drawn modulus.
+        """Return the mechanics of the finger with parameters x, at the drawn modulus.
 
         Raises:
             CalibrationError: No finger can look like that; the recordings are of another one.
@@ -235,7 +236,7 @@ class _Fit:
             ) from error
 
     def jacobian(self, x: NDArray) -> NDArray:
-        """Returns forward differences, each in the direction that stays within the bounds."""
+        """Return forward differences, each in the direction that stays within the bounds."""
         centre = self.residuals(x)
         columns = []
         for i, step in enumerate(self.difference):
@@ -250,7 +251,7 @@ class _Fit:
         return np.stack(columns, axis=1)
 
     def report(self, x: NDArray, stddev: NDArray) -> CalibrationFit:
-        """Returns the fit with its residuals in units."""
+        """Return the fit with its residuals in units."""
         shapes, forces = self._solve_shapes(x)
         elastic, model = self._elastic_forces(x), np.exp(x[0]) * forces
         errors = np.concatenate([target - value for target, value in zip(elastic, model, strict=True)])
@@ -291,7 +292,7 @@ class _PlateauSolver:
         self._rest = self._model.positions(probe, np.zeros(self._model.size))
 
     def solve(self, plateau: Plateau, item: ExpectedObject, shape: float, start: _PlateauShape | None) -> _PlateauShape:
-        """Returns the closest shape, found by Gauss-Newton from `start` or from the unloaded jaw.
+        """Return the closest shape, found by Gauss-Newton from `start` or from the unloaded jaw.
 
         Raises:
             CalibrationError: No shape of the jaw comes close.
@@ -379,7 +380,7 @@ class Plateau:
 def find_plateaus(
     cases: Sequence[CalibrationCase], jaw: Jaw, settings: EstimatorSettings, *, per_case: int
 ) -> list[Plateau]:
-    """Returns at most `per_case` steady loads of each recording.
+    """Return at most `per_case` steady loads of each recording.
 
     Raises:
         CalibrationError: A recording has no unloaded start or no steady load.
@@ -441,7 +442,7 @@ def _plateaus_of_case(number: int, case: CalibrationCase, jaw: Jaw, settings: Es
 
 
 def _steady_runs(force: NDArray) -> list[tuple[int, int]]:
-    """Returns the ranges of frames over which the force hardly changes."""
+    """Return the ranges of frames over which the force hardly changes."""
     later = np.r_[force[_STEADY_SPAN:], np.full(_STEADY_SPAN, force[-1])]
     steady = (np.abs(later - force) < _STEADY_CHANGE * np.maximum(force, 0.3) + 0.01) & (force > _LEAST_FORCE)
     edges = np.flatnonzero(np.diff(np.r_[0, steady.astype(int), 0]))
@@ -449,7 +450,7 @@ def _steady_runs(force: NDArray) -> list[tuple[int, int]]:
 
 
 def _robust_mean(samples: NDArray) -> tuple[NDArray, NDArray]:
-    """Returns the mean (K, 3) of samples (n, K, 3) without gross errors, and the counts behind it (K,)."""
+    """Return the mean (K, 3) of samples (n, K, 3) without gross errors, and the counts behind it (K,)."""
     samples = samples.copy()
     seen = np.isfinite(samples[..., 0]).any(0)
     middle = np.zeros(samples.shape[1:])
@@ -497,7 +498,7 @@ class _ForceHistory:
 
 
 def branches_from_parameters(x: NDArray) -> tuple[RelaxationTerm, ...]:
-    """Returns the branches of parameters (4,), the faster one first."""
+    """Return the branches of parameters (4,), the faster one first."""
     terms = [RelaxationTerm(share=float(x[k]), time_constant=float(np.exp(x[k + 1]))) for k in (0, 2)]
     return tuple(sorted(terms, key=lambda term: term.time_constant))
 
@@ -509,7 +510,7 @@ def fit_force_history(
     calibration: Calibration,
     progress: Callable[[float], None],
 ) -> HistoryFit:
-    """Fits modulus and relaxation at a given geometry.
+    """Fit modulus and relaxation at a given geometry.
 
     Raises:
         CalibrationError: The estimator trusts hardly a loaded frame of the recordings.
@@ -541,7 +542,7 @@ def fit_force_history(
 def _track_force(
     jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration
 ) -> _ForceHistory:
-    """Estimates the elastic force of every frame."""
+    """Estimate the elastic force of every frame."""
     estimator = JawEstimator(jaw, settings=settings, calibration=replace(calibration, relaxation=()))
     solutions = [estimator.update(observation, case.contact) for observation in case.observations]
     trusted = [solution for solution in solutions if solution.trusted]
@@ -557,6 +558,45 @@ def _model(x: NDArray, history: _ForceHistory) -> NDArray:
 
 
 def _residuals(x: NDArray, histories: Sequence[_ForceHistory]) -> NDArray:
-    """Returns the force residuals of all frames over their standard deviations, and those of the prior."""
+    """Return the force residuals of all frames over their standard deviations, and those of the prior."""
     rows = [(_model(x, c) - c.true) / (_RELATIVE_ERROR * c.true + _ABSOLUTE_ERROR) for c in histories]
     return np.concatenate([np.concatenate(rows) / np.sqrt(_CORRELATED_FRAMES), (x[1:] - BRANCH_PRIOR) / BRANCH_STDDEV])
+
+
+# A coefficient that is known no better than this is none; more loops do not tell the errors of the mechanics apart.
+_VAGUE, _LEAST_STDDEV = 0.15, 0.03
+
+
+def identify_friction(
+    jaw: Jaw, calibration: Calibration, cases: Iterable[CalibrationCase], settings: EstimatorSettings
+) -> Coefficient | None:
+    """Return the coefficient that the key points of all recordings show together; None where they tell too little.
+
+    Recordings without an object's outline tell nothing, nor does the paper's solver.
+
+    Args:
+        jaw: as drawn.
+        calibration: that was found for it.
+        cases: the recordings.
+        settings: of the estimator that the calibration is for.
+
+    Raises:
+        ObservationError: Key points that are none.
+        ContactError: A contact that is not on the jaw.
+    """
+    known = [case for case in cases if case.contact.outline is not None]
+    if not known or settings.solver == "paper":
+        return None
+    estimator = JawEstimator(jaw, calibration=calibration, settings=replace(settings, smooth_share=0.0))
+    information, vector = 0.0, 0.0
+    for case in known:
+        estimator.forget()
+        for observation in case.observations:
+            estimator.update(observation, case.contact)
+        seen = estimator.seen_friction
+        if np.isfinite(seen.stddev):
+            information += seen.stddev**-2
+            vector += seen.mean * seen.stddev**-2
+    if not information > _VAGUE**-2:
+        return None
+    return Coefficient(max(vector / information, 0.0), max(information**-0.5, _LEAST_STDDEV))

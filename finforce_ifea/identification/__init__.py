@@ -1,1 +1,0 @@
-"""Material constants of a finger from recordings with true forces."""
