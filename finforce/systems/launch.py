@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,98 +21,78 @@ SWITCH = ("true", "false", "True", "False")
 
 def solver_arguments(*, images: str = "false", parameter_file: str = NONE, use_sim_time: str = "false") -> list[Any]:
     """Return the launch arguments of every system with solvers; the defaults are those of its launch file."""
-    from launch.actions import DeclareLaunchArgument as Argument
+    from launch.substitutions import LaunchConfiguration
 
-    own = "none: the node's own"
     return [
-        Argument("jaw_file", default_value=NONE, description=f"jaw file, or the name of a shipped jaw; {own}, bench"),
-        Argument("calibration_file", default_value=NONE, description="calibration file, or a shipped name"),
-        Argument(
-            "contact_height",
-            default_value="nan",
-            description="height of first touch above the clamped base [m]; nan: contacts come by topic",
+        _text("jaw_file", "Jaw file or name of a shipped jaw; none: bench"),
+        _text("calibration_file", "Calibration file or name of a shipped calibration; none: material of the jaw file"),
+        _text("contact_height", "Height of first touch above the clamped base [m]; nan: contacts come by topic", "nan"),
+        _text("object_mesh", "Mesh file of the object, from which contacts are estimated"),
+        _text("object_mesh_unit", "Unit of the mesh file: m, cm, mm or inch"),
+        _text("contact", "Contact estimation: estimate, paper (Algorithm 1) or closest"),
+        _text("pose_source", "Source of object poses: topic, detections or tracker"),
+        _text("pose_topic", "Topic of object poses from another program; none: object_pose, object_detections"),
+        _text("pose_origin", "Origin of these poses in the object: mesh, middle or added"),
+        _switch("images", "Detection of key points in camera images; false: key points come by topic", images),
+        _text("finder", "Former name of detection_method, for one release"),
+        _text("detection_method", "network, frame (DeepLabCut) or dots", LaunchConfiguration("finder")),
+        _text("model", "Folder of a network"),
+        _choice(
+            "depth", "Depth images: aligned (every image needs one), auto (where there is one), off", (NONE, *DEPTHS)
         ),
-        Argument("object_mesh", default_value=NONE, description="mesh file of the object; contacts are then estimated"),
-        Argument("object_mesh_unit", default_value=NONE, description="unit of the mesh file: m, cm, mm or inch"),
-        Argument("contact", default_value=NONE, description="contact by: estimate, paper (Algorithm 1) or closest"),
-        Argument("pose_source", default_value=NONE, description="object poses: topic, detections or tracker"),
-        Argument(
-            "pose_topic",
-            default_value=NONE,
-            description="where other programs publish them, as /pose_estimation/output; "
-            "none: object_pose, object_detections",
-        ),
-        Argument("pose_origin", default_value=NONE, description="what those are of: mesh, middle or added"),
-        Argument(
-            "images",
-            default_value=images,
-            choices=SWITCH,
-            description="find the key points in images of a camera; else they come by topic",
-        ),
-        Argument("detection_method", default_value=NONE, description="network, frame (DeepLabCut) or dots"),
-        Argument("model", default_value=NONE, description="folder of a network"),
-        Argument(
-            "depth",
-            default_value=NONE,
-            choices=(NONE, *DEPTHS),
-            description="aligned: every colour image needs its depth; auto: where there is some; off: colour alone",
-        ),
-        Argument(
-            "T_gripper_camera", default_value=NONE, description="camera in the gripper's frame: x y z [m] qx qy qz qw"
-        ),
-        Argument("solver", default_value=NONE, description="mechanics: reduced, solid, frame, linear or paper (Eq. 1)"),
-        Argument("mesh", default_value=NONE, description="mesh density: default, coarse or fine"),
-        Argument("parameter_file", default_value=parameter_file, description="YAML file with parameters of the nodes"),
-        Argument("use_sim_time", default_value=use_sim_time, choices=SWITCH, description="take the time from /clock"),
-        Argument(
-            "composed",
-            default_value="true",
-            choices=SWITCH,
-            description="detector, contact estimator and solvers in one process; false: each in its own",
-        ),
-        Argument("rviz", default_value="false", choices=SWITCH, description="show the markers in RViz"),
+        _text("T_gripper_camera", "Pose of the camera in the gripper frame: x y z [m] qx qy qz qw"),
+        _text("solver", "Mechanics: reduced, solid, frame, linear or paper (Eq. 1)"),
+        _text("mesh", "Mesh density: default, coarse or fine"),
+        _text("parameter_file", "YAML file with node parameters", parameter_file),
+        _switch("use_sim_time", "Time from /clock", use_sim_time),
+        _switch("composed", "Detector, contact estimator and solvers in one process; false: one process each", "true"),
+        _switch("rviz", "RViz with the markers"),
     ]
 
 
 def gripper_arguments() -> list[Any]:
     """Return the launch arguments of every system with a gripper."""
-    from launch.actions import DeclareLaunchArgument as Argument
-
+    port = "Serial port of the CAN adapter, or CAN channel; none: from the parameter file, with sim a temporary one"
     return [
-        Argument(
-            "gripper_port",
-            default_value=NONE,
-            description="port of the gripper's CAN adapter, or the CAN channel; none: that of the parameter file, "
-            "or, with sim:=true, one in the temporary folder",
-        ),
-        Argument(
-            "gripper_interface",
-            default_value=NONE,
-            description="slcan: a serial CAN adapter; else python-can's name of one, as socketcan",
-        ),
-        Argument(
-            "sim",
-            default_value="false",
-            choices=SWITCH,
-            description="no hardware: an emulated gripper bends the twin's jaws, and the twin is their camera",
-        ),
+        _text("gripper_port", port),
+        _text("gripper_interface", "slcan for a serial CAN adapter, or an interface of python-can, such as socketcan"),
+        _switch("sim", "Simulation: an emulated gripper, with the synthetic twin as its camera"),
     ]
 
 
 def stack_arguments() -> list[Any]:
     """Return the launch arguments of the gripper in a manipulation stack."""
-    from launch.actions import DeclareLaunchArgument as Argument
-
     return [
-        Argument("description", default_value=NONE, description="xacro or URDF file of the robot; none: the gripper"),
-        Argument("semantics", default_value=NONE, description="its SRDF file, for MoveIt; none: that of the gripper"),
-        Argument("controllers", default_value=NONE, description="YAML file of controllers; none: the gripper's"),
-        Argument("gripper", default_value="true", choices=SWITCH, description="drive the gripper"),
-        Argument("gripper_port", default_value=NONE, description="port of the CAN adapter, or the CAN channel"),
-        Argument("gripper_interface", default_value=NONE, description="slcan, or python-can's name, as socketcan"),
-        Argument("parameter_file", default_value=NONE, description="YAML file with parameters of the driver"),
-        Argument("sim", default_value="false", choices=SWITCH, description="an emulated gripper, no hardware"),
+        _text("description", "xacro or URDF file of the robot; none: the gripper alone"),
+        _text("semantics", "SRDF file of the robot, for MoveIt; none: that of the gripper"),
+        _text("controllers", "YAML file of the controllers; none: those of the gripper"),
+        _switch("gripper", "Start of the gripper driver", "true"),
+        _text("gripper_port", "Serial port of the CAN adapter, or CAN channel"),
+        _text("gripper_interface", "slcan for a serial CAN adapter, or an interface of python-can, such as socketcan"),
+        _text("parameter_file", "YAML file with driver parameters"),
+        _switch("sim", "Simulation: an emulated gripper in place of hardware"),
     ]
+
+
+def _text(name: str, description: str, default: Any = NONE) -> Any:
+    """Return a launch argument of any text."""
+    from launch.actions import DeclareLaunchArgument
+
+    return DeclareLaunchArgument(name, default_value=default, description=description)
+
+
+def _choice(name: str, description: str, choices: Sequence[str]) -> Any:
+    """Return a launch argument of one of several words, the first by default."""
+    from launch.actions import DeclareLaunchArgument
+
+    return DeclareLaunchArgument(name, default_value=choices[0], choices=choices, description=description)
+
+
+def _switch(name: str, description: str, default: str = "false") -> Any:
+    """Return a launch argument that is true or false."""
+    from launch.actions import DeclareLaunchArgument
+
+    return DeclareLaunchArgument(name, default_value=default, choices=SWITCH, description=description)
 
 
 def options_from_texts(record: type[OptionsT], texts: Mapping[str, str]) -> OptionsT:

@@ -23,6 +23,7 @@ STAND_INS = {
     "launch": (),
     "launch.actions": (*ACTIONS, "SetEnvironmentVariable", "Shutdown"),
     "launch.launch_description_sources": ("PythonLaunchDescriptionSource",),
+    "launch.substitutions": ("LaunchConfiguration",),
     "launch_ros": (),
     "launch_ros.actions": ("Node",),
     "launch_ros.parameter_descriptions": (),
@@ -61,6 +62,7 @@ def act(path, **texts):
     *arguments, opaque = runpy.run_path(str(path))["generate_launch_description"]()
     defaults = {action.args[0]: action.kwargs["default_value"] for action in arguments}
     values = {**defaults, **({"composed": "false"} if "composed" in defaults else {}), **texts}
+    values = {name: values[text.args[0]] if isinstance(text, Recorder) else text for name, text in values.items()}
     return opaque.kwargs["function"](SimpleNamespace(launch_configurations=values))
 
 
@@ -99,6 +101,11 @@ def test_an_argument_reaches_the_node_with_its_type(recorded_launch):
     assert solver["name"] == "right_ifea_solver"
 
 
+def test_an_argument_is_read_under_its_former_name(recorded_launch):
+    nodes = start(ROOT / "launch" / "bench.launch.py", images="true", finder="dots")
+    assert nodes["keypoint_detector"]["parameters"][1]["detection_method"] == "dots"
+
+
 def test_an_object_mesh_starts_the_contact_estimator(recorded_launch):
     nodes = start(ROOT / "launch" / "bench.launch.py", object_mesh="can.stl", contact="paper", jaw="right")
     estimator = nodes["contact_estimator"]
@@ -131,7 +138,10 @@ def test_the_declared_arguments_are_the_options_with_their_defaults(recorded_lau
     *arguments, _ = runpy.run_path(str(path))["generate_launch_description"]()
     record = RECORDS[path.name.split(".")[0]]
     texts = {action.args[0]: action.kwargs["default_value"] for action in arguments}
-    assert set(texts) == {entry.name for entry in fields(record)} and len(texts) == len(arguments)
+    assert len(texts) == len(arguments)
+    aliases = {name: text.args[0] for name, text in texts.items() if isinstance(text, Recorder)}
+    texts |= {name: texts[alias] for name, alias in aliases.items()}
+    assert set(texts) - set(aliases.values()) == {entry.name for entry in fields(record)}
     options = launch_module.options_from_texts(record, texts)
     expected = record(parameter_file=options.parameter_file)
     assert repr(options) == repr(expected)  # nan is not nan
