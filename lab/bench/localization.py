@@ -1,14 +1,13 @@
-"""Time against place error of the ways to find a contact, on a bench recording with ground truth.
+"""Time against error of the methods that locate a contact, on the shipped bench recording with ground truth.
 
-The error is the distance, on the undeformed surface, from the place found to where the line of action of the true force
-cuts the deformed surface. Times and errors are of the same calls.
+The error is the distance, on the undeformed surface, from the contact location found to where the line of action of the
+true force cuts the deformed surface. Times and errors are of the same calls.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -17,6 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce_contact.estimator import ContactEstimator
+from finforce_contact.jaw_contact import ForceLoop
 from finforce_contact.localization.outline_localizer import (
     ClosestLocalizer,
     ContactScene,
@@ -38,14 +38,13 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
-from finforce_ifea.observation import Observation
 from lab.harness import Figures, Tradeoff, percentiles
 
-LEAST_FORCE = 0.1  # [N], below which the line of a measured force says nothing of its place
-EVERY, EVERY_QUICK = 5, 25  # images between two that are looked at
+LEAST_FORCE = 0.1  # [N], below which the line of a measured force tells no location
+EVERY, EVERY_QUICK = 5, 25  # images from one that is used to the next
 GRIDS = ((48, 9), (100, 24), (200, 49))  # triangles around and along a cylinder: 1, 5 and 20 thousand
 RADIUS, LENGTH = 0.0125, 0.06  # [m] of the cylinder of the shipped recording
-WARM = 5  # calls that compile and cut before any is timed
+WARM_UP = 5  # calls that compile and cut before any is timed
 APART = 0.05  # [m] that the object is moved away, to time a scene without contact
 JITTER, SEED = 0.05e-3, 1  # [m], so that no two calls are alike
 
@@ -58,7 +57,7 @@ class LocatedImage:
         T: of the object in the jaw frame (4, 4).
         surface: deformed (n, 3) [m].
         wrench: force (3,) [N] and torque (3,) [N m] of the image before; None when not known.
-        true: height of the true place [m].
+        true: height of the true location [m].
     """
 
     T: NDArray
@@ -68,37 +67,32 @@ class LocatedImage:
 
 
 def measure(quick: bool) -> Figures:
-    """Return times and place errors of every way with 1, 5 and 20 thousand triangles, on the shipped recording.
+    """Return times and location errors of every method with 1, 5 and 20 thousand triangles.
 
     Args:
-        quick: look at fewer images, for a first impression.
+        quick: use fewer images, for a first impression.
     """
     meshes = [build_cylinder(RADIUS, LENGTH, *grid) for grid in GRIDS]
-    return measure_methods([RECORDING], meshes, EVERY_QUICK if quick else EVERY)
+    return measure_methods(meshes, EVERY_QUICK if quick else EVERY)
 
 
-def measure_methods(paths: Sequence[str | Path], meshes: Sequence[ObjectMesh] = (), every: int = EVERY) -> Figures:
-    """Return times and place errors over bench recordings.
+def measure_methods(meshes: Sequence[ObjectMesh], every: int) -> Figures:
+    """Return times and location errors on the shipped recording.
 
     Args:
-        paths: of the recordings.
-        meshes: to be looked at in place of the recordings' own, each for all images.
-        every: images between two that are looked at.
+        meshes: of the object, each for all images.
+        every: images from one that is used to the next.
     """
     from tqdm import tqdm
 
-    calls: dict[tuple[str, int], list[tuple[float, float]]] = {}
-    away: dict[tuple[str, int], list[float]] = {}
-    for path in paths:
-        recording = read_recording(path)
-        own = load_object_mesh(Path(path).parent / recording.case["mesh"])
-        frames = list(follow(recording, own, every))
-        for mesh in tqdm(meshes or [own], desc="contact places", unit="mesh", disable=None, leave=False):
-            for name, method in build_methods(mesh).items():
-                key = name, len(mesh.triangles)
-                calls.setdefault(key, []).extend(_run(method, frames, _stay))
-                away.setdefault(key, []).extend(spent for spent, _ in _run(method, frames, _jittered_apart()))
-    rows = [summarise(*key, np.array(found), away[key]) for key, found in calls.items()]
+    recording = read_recording(RECORDING)
+    images = list(follow(recording, load_object_mesh(RECORDING.parent / recording.case["mesh"]), every))
+    rows = []
+    for mesh in tqdm(meshes, desc="contact locations", unit="mesh", disable=None, leave=False):
+        for name, method in build_methods(mesh).items():
+            found = np.array(list(_run(method, images, lambda T: T)))
+            apart = [spent for spent, _ in _run(method, images, _jittered_apart())]
+            rows.append(summarise(name, len(mesh.triangles), found, apart))
     return Figures(
         tables={"localization": pd.DataFrame(rows)},
         picture=Tradeoff(
@@ -116,42 +110,32 @@ def measure_methods(paths: Sequence[str | Path], meshes: Sequence[ObjectMesh] = 
 
 
 def build_methods(mesh: ObjectMesh) -> dict[str, Method]:
-    """Return the ways to find a place on a mesh by name."""
+    """Return the methods on a mesh by name."""
     jaw = load_calibration("bench").apply(load_jaw("bench"))
     return {name: build(MethodSetup(jaw=jaw, mesh=mesh)) for name, build in METHODS.items()}
 
 
 def follow(recording: Recording, mesh: ObjectMesh, every: int) -> Iterator[LocatedImage]:
     """Yield every so-manieth image in true contact; surface and wrench are the solver's, with the estimated contact."""
-    track = recording.jaw("left")
+    keypoints = recording.jaw("left").keypoints
     solver = JawEstimator(load_jaw("bench"), calibration=load_calibration("bench"))
     estimator = ContactEstimator(solver.jaw, mesh=mesh)
-    lines = true_lines(recording, "left", track.keypoints.stamps, solver.jaw.inner_face_x)
-    force = np.linalg.norm(match_truth(recording.truth("left"), track.keypoints.stamps), axis=1)
-    inner = InnerSurface(solver.surface(), solver.jaw.face)
-    seen_object = track_object(recording, "left")
-    poses = list(zip(seen_object.stamps, seen_object.poses, strict=True))
+    loop = ForceLoop(estimator, solver)
+    lines = true_lines(recording, "left", keypoints.stamps, solver.jaw.inner_face_x)
+    force = np.linalg.norm(match_truth(recording.truth("left"), keypoints.stamps), axis=1)
+    inner, track = InnerSurface(solver.surface(), solver.jaw.face), track_object(recording, "left")
+    poses = list(zip(1e-9 * track.stamps, track.poses, strict=True))
     wrench = None
-    for index, stamp in enumerate(track.keypoints.stamps):
-        while poses and poses[0][0] <= stamp:
-            when, T = poses.pop(0)
-            estimator.take_pose(1e-9 * when, T)
-        surface = solver.surface()
-        estimate = estimator.update(1e-9 * stamp, surface, wrench)
+    for index, stamp in enumerate(keypoints.stamps):
+        surface, due = solver.surface(), [pose for pose in poses if pose[0] <= 1e-9 * stamp]
+        poses = poses[len(due) :]
+        solution = loop.update(keypoints.observation(index), due)
+        estimate = loop.contact.estimate
         if index % every == 0 and force[index] > LEAST_FORCE and estimate.T_jaw_object is not None:
             true = inner.cut(surface, lines.points[index], lines.directions[index])
             if np.isfinite(true):
                 yield LocatedImage(T=estimate.T_jaw_object, surface=surface, wrench=wrench, true=true)
-        points, likelihood = track.keypoints.points[index], track.keypoints.likelihood[index]
-        solution = solver.update(
-            Observation(stamp=1e-9 * stamp, points=points, likelihood=likelihood), estimate.contact
-        )
-        wrench = (solution.force, solution.torque) if solution.status == "ok" else None
-
-
-def _stay(T: NDArray) -> NDArray:
-    """Return a pose as it is."""
-    return T
+        wrench = (solution.force, solution.torque) if solution.trusted else None
 
 
 def _jittered_apart() -> Callable[[NDArray], NDArray]:
@@ -167,23 +151,23 @@ def _jittered_apart() -> Callable[[NDArray], NDArray]:
 
 
 def _run(
-    method: Method, frames: Sequence[LocatedImage], place: Callable[[NDArray], NDArray]
+    method: Method, images: Sequence[LocatedImage], move: Callable[[NDArray], NDArray]
 ) -> Iterator[tuple[float, float]]:
-    """Yield the time [s] and the place error [m] of each image, NaN where no place was found; warm from the first."""
-    for frame in frames[:WARM]:
-        method(place(frame.T), frame.surface, frame.wrench)
-    for frame in frames:
-        T = place(frame.T)
+    """Yield the time [s] and the location error [m] of each image, NaN where nothing was found; after a warm-up."""
+    for image in images[:WARM_UP]:
+        method(move(image.T), image.surface, image.wrench)
+    for image in images:
+        T = move(image.T)
         begin = perf_counter()
-        found = method(T, frame.surface, frame.wrench)
-        yield perf_counter() - begin, np.nan if found is None else abs(found - frame.true)
+        found = method(T, image.surface, image.wrench)
+        yield perf_counter() - begin, np.nan if found is None else abs(found - image.true)
 
 
-def summarise(method: str, triangles: int, calls: NDArray, away: Sequence[float]) -> dict[str, Any]:
+def summarise(method: str, triangles: int, calls: NDArray, apart: Sequence[float]) -> dict[str, Any]:
     """Return the row of calls (n, 2), time [s] and error [m], and of times without contact [s]."""
     errors = 1e3 * calls[np.isfinite(calls[:, 1]), 1]
     median, p95, largest = np.percentile(errors, [50, 95, 100]).tolist() if len(errors) else [float("nan")] * 3
-    contact, apart = percentiles(calls[:, 0], "in contact"), percentiles(away, "50 mm apart")
+    times = percentiles(calls[:, 0], "in contact") | percentiles(apart, "50 mm apart")
     return {
         "method": method,
         "triangles": triangles,
@@ -192,7 +176,7 @@ def summarise(method: str, triangles: int, calls: NDArray, away: Sequence[float]
         "error median/mm": median,
         "error p95/mm": p95,
         "largest/mm": largest,
-        **{name: value for name, value in (contact | apart).items() if "p50" in name or "p99" in name},
+        **{name: value for name, value in times.items() if "p50" in name or "p99" in name},
     }
 
 
@@ -229,14 +213,14 @@ class MethodSetup:
 
 
 def by_outline(setup: MethodSetup, *, with_wrench: bool) -> Method:
-    """Return the way of mode "estimate"."""
+    """Return the method of mode "estimate"."""
     settings = ContactSettings()
     face = build_inner_face(setup.jaw, settings.mesh)
     return _by_localizer(setup, OutlineLocalizer(face, settings), with_wrench=with_wrench)
 
 
 def by_closest(setup: MethodSetup) -> Method:
-    """Return the way of mode "closest"."""
+    """Return the method of mode "closest"."""
     face = build_inner_face(setup.jaw, ContactSettings().mesh)
     return _by_localizer(setup, ClosestLocalizer(setup.jaw, face), with_wrench=False)
 
@@ -254,8 +238,8 @@ def _by_localizer(setup: MethodSetup, localizer: Localizer, *, with_wrench: bool
             line=face.deform(surface),
             wrench=wrench if with_wrench else None,
         )
-        place = localizer.locate(scene)
-        return None if place is None else place.patch.mean
+        found = localizer.locate(scene)
+        return None if found is None else found.patch.mean
 
     return locate
 
@@ -280,7 +264,7 @@ def _height_of(centre: NDArray, surface: NDArray, nodes: NDArray) -> float:
 
 
 def by_whole_estimator(setup: MethodSetup) -> Method:
-    """Return the estimator with its pose filter and its outline as a way to find a place."""
+    """Return the estimator with its pose filter and its outline as a method."""
     estimator, stamps = ContactEstimator(setup.jaw, mesh=setup.mesh, settings=ContactSettings()), iter(range(10**9))
 
     def locate(T: NDArray, surface: NDArray, wrench: Wrench) -> float | None:

@@ -1,4 +1,4 @@
-"""The benchmark of contact places: errors and times of the same calls, what is not installed is said."""
+"""Claims about the benchmark of contact locations: errors and times of the same calls."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from finforce_eval.recordings.recording import read_recording
 from lab.bench import localization as bench
 from lab.bench.localization import METHODS, LocatedImage, build_cylinder, measure_methods, summarise
 
-MESH = build_cylinder(0.0125, 0.06, 16, 2)
+MESH = build_cylinder(0.0125, 0.06, 48, 9)
 
 
 def at_truth(setup):
@@ -32,14 +32,14 @@ def frames(monkeypatch):
     return made
 
 
-def test_error_is_the_distance_to_the_true_place_over_the_images_where_one_was_found(frames):
-    row = measure_methods([RECORDING], [MESH]).tables["localization"].iloc[0]
+def test_error_is_the_distance_to_the_true_location_over_the_images_where_one_was_found(frames):
+    row = measure_methods([MESH], 5).tables["localization"].iloc[0]
     assert (row["method"], row["triangles"], row["n"]) == ("near", len(MESH.triangles), 4)
     assert row["found/%"] == 50.0
     assert row["error median/mm"] == row["largest/mm"] == pytest.approx(2.0)
 
 
-def test_a_way_that_found_nothing_has_no_error():
+def test_a_method_that_found_nothing_has_no_error():
     row = summarise("blind", 10, np.array([[1e-3, np.nan]] * 3), [1e-3])
     assert row["found/%"] == 0.0 and np.isnan(row["error median/mm"])
 
@@ -55,12 +55,12 @@ def test_cylinder_is_closed_of_the_size_asked_for_and_turned_outwards():
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
 
 
-def test_true_place_is_found_on_the_shipped_recording_by_the_default_way(monkeypatch):
+def test_true_location_is_found_on_the_shipped_recording_by_the_default_method(monkeypatch):
     recording = read_recording(RECORDING)
     start = int(recording.jaw("left").keypoints.stamps[0])
     monkeypatch.setattr(bench, "read_recording", lambda path: recording.between(start, start + 15 * NANOSECONDS))
     monkeypatch.setattr(bench, "METHODS", dict(list(METHODS.items())[:1]))
-    row = measure_methods([RECORDING], every=20).tables["localization"].iloc[0]
+    row = measure_methods([MESH], 20).tables["localization"].iloc[0]
     assert row["method"] == "outline and line of action" and row["n"] > 3
     assert row["found/%"] == 100.0
     assert row["error median/mm"] < 1.5  # over all images it is 0.8, the others' mean is 3
