@@ -14,14 +14,11 @@ LATE = "frame late"
 UNHEARD = "nobody subscribes"
 EVERYWHERE = (LATE, UNHEARD)
 # of a solver
-AWAY = "no object near"
 IDLE = "idle image"
 SOLVER = (IDLE,)
-# of a contact estimator, which has AWAY and IDLE, too
+# of a contact estimator, which has IDLE, too
 STILL = "nothing moved"
-RESTING = "grasp rests"
-UNNEEDED = "jaw not needed"
-CONTACT = (AWAY, IDLE, STILL, RESTING, UNNEEDED)
+CONTACT = (IDLE, STILL)
 
 
 class SkippingError(FinforceError):

@@ -86,8 +86,8 @@ class DepthFeed:
         if not same_camera(self._camera, camera):
             self._camera, self._tracker, self._lost = camera, None, True
 
-    def take_depth(self, image: Any, *, rests: bool = False) -> StampedPose | None:
-        """Take a depth image and return the object's pose in it; None while it rests, or waits for a mask.
+    def take_depth(self, image: Any) -> StampedPose | None:
+        """Take a depth image and return the object's pose in it; None while it waits for a mask.
 
         Raises:
             ObservationError: the frame is another one.
@@ -97,7 +97,7 @@ class DepthFeed:
         stamp = stamp_of(image)
         self._images.add(DEPTH, stamp, image)
         mask = self._images.find(MASK, stamp)
-        if rests or self._mesh is None:
+        if self._mesh is None:
             return None
         if self._lost and mask is not None:
             return self._locate(image, mask.value)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import ObservationError, PoseError
-from finforce.skipping import AWAY, CONTACT, STILL, Skips
+from finforce.skipping import CONTACT, STILL, Skips
 from finforce.transforms import check_pose, invert_pose
 from finforce_contact.errors import check_stamp, check_wrench
 from finforce_contact.localization.outline_localizer import (
@@ -94,17 +94,15 @@ __all__ = ["ContactEstimate", "ContactEstimator"]
 
 # A rotation's entries times this are about the way that the object's surface moves [m].
 _LEVER = 0.03
-# Far from contact the place may be off by this [m] before it is looked for anew.
-_FAR_STILL = 0.3e-3
 # A surface that moved by less since its rest [m] is that of a solver that has not begun.
 _AT_REST = 1e-7
 _JAW_SAMPLES = 100
 _SURROUNDED = 0.5
-_STILL_FORCE = 0.01
+# Motion [m] and change of force [N] that are not worth a new search.
+_STILL, _STILL_FORCE = 0.02e-3, 0.01
 # An object with its origin farther off [m] is in nobody's reach.
 _NOWHERE = 1.0
-_RULES = {"apart": AWAY, "still": STILL}
-_REASONS = ("solved", "apart", "still", "no_object", "no_pose", "surrounded", "beside", "late pose", "odd pose")
+_REASONS = ("solved", "still", "no_object", "no_pose", "surrounded", "beside", "late pose", "odd pose")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -272,9 +270,8 @@ class ContactEstimator:
 
     def _follow(self, stamp: float, pose: FilteredPose, scene: ContactScene) -> ContactEstimate:
         """Finds the place in a scene, or keeps the last one, and says whether the object touches."""
-        skipped = self._find_reason_to_skip(scene)
-        if not (skipped and self.skips.allows(_RULES[skipped])):
-            skipped = ""
+        is_still = self.skips.allows(STILL) and self._is_still(scene)
+        if not is_still:
             if self._surrounds_jaw(scene):
                 message = f"this pose puts {self._mesh.name} around the jaw: check its pose, mesh and unit"
                 return self._give_up(stamp, "no_pose", message, "surrounded")
@@ -283,36 +280,24 @@ class ContactEstimator:
                 message = f"{self._mesh.name} does not stand before the inner surface"
                 return self._give_up(stamp, "apart", message, "beside")
             self._rows = _points_of(self._place, self.jaw)
-        self._counts[skipped or "solved"] += 1
-        self.skips.count(_RULES.get(skipped, ""))
-        message = "" if skipped == "apart" else self._judge_touch(pose, scene)
-        if skipped == "apart":
-            self._belief.set(False)
+        self._counts["still" if is_still else "solved"] += 1
+        self.skips.count(STILL, is_still)
+        message = self._judge_touch(pose, scene)
         self._rest.update(stamp, scene.line if self._belief.touching and self._is_live(scene) else None)
-        return self._report(stamp, pose, scene, skipped, message)
+        return self._report(stamp, pose, scene, is_still, message)
 
-    def _find_reason_to_skip(self, scene: ContactScene) -> str:
-        """Returns why the last place still holds, empty when it does not."""
+    def _is_still(self, scene: ContactScene) -> bool:
+        """Return whether neither object, surface nor force moved since the last contact state was found."""
         before = self._solved
         if before is None or self._place is None or not scene.section.polygons:
-            return ""
+            return False
         moved = np.abs(scene.T - before.T)
         moved[:3, :3] *= _LEVER
-        if self._is_far(scene):
-            moved[0, 3] = 0.0
-            return "apart" if self._place.touching is not True and moved.max() < _FAR_STILL else ""
-        still = self.settings.still
-        if moved.max() > still or np.abs(scene.line - before.line).max() > still:
-            return ""
-        same = (scene.wrench is None) == (before.wrench is None)
-        if same and scene.wrench is not None:
-            same = np.abs(scene.wrench[0] - before.wrench[0]).max() < _STILL_FORCE
-        return "still" if same else ""
-
-    def _is_far(self, scene: ContactScene) -> bool:
-        """Whether the boxes around object and jaw are apart along x by more than the margin."""
-        front = scene.T[0, :3] @ self._centre + scene.T[0, 3] - np.abs(scene.T[0, :3]) @ self._half
-        return front - self.settings.margin > max(scene.line[:, 0].max(), self.face.front)
+        if moved.max() > _STILL or np.abs(scene.line - before.line).max() > _STILL:
+            return False
+        if scene.wrench is None or before.wrench is None:
+            return scene.wrench is before.wrench
+        return bool(np.abs(scene.wrench[0] - before.wrench[0]).max() < _STILL_FORCE)
 
     def _is_live(self, scene: ContactScene) -> bool:
         """Whether the surface is that of a solver at work."""
@@ -341,7 +326,7 @@ class ContactEstimator:
         return ""
 
     def _report(
-        self, stamp: float, pose: FilteredPose, scene: ContactScene, skipped: str, message: str
+        self, stamp: float, pose: FilteredPose, scene: ContactScene, is_still: bool, message: str
     ) -> ContactEstimate:
         """Returns the estimate of an image."""
         touching = self._belief.touching
@@ -354,7 +339,7 @@ class ContactEstimator:
             candidates=self._rows.candidates,
             weights=self._rows.weights,
             touching=touching,
-            skipped=skipped,
+            skipped="still" if is_still else "",
             outline=self._outline(pose, scene.section),
             T_jaw_object=pose.T,
             probability=self._belief.probability,

@@ -21,7 +21,6 @@ from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.observation import Contact, Observation, Solution
 from finforce_ifea.tracking.influence import is_out_of_reach
 
-AWAY_FOR = 10  # images in a row, after which the object is taken to stay away: a second, of the ten that are looked at
 ValueT = TypeVar("ValueT")
 
 
@@ -82,6 +81,11 @@ class ContactLoop:
     The contact of an image is found with the object's last pose, on the deformed jaw that the solver found in the image
     before. Offline and live run this same loop; live, its ends are topics.
 
+    Attributes:
+        estimator: of this jaw.
+        last: the newest contact, None before the first.
+        is_out_of_reach: whether the object stood out of the jaw's reach in it.
+
     Args:
         estimator: of this jaw.
         max_age: greatest distance between the stamps of an image and of the surface and wrench used for it [ns].
@@ -99,17 +103,12 @@ class ContactLoop:
         self._surface: tuple[int, NDArray] | None = None
         self._wrench: tuple[int, tuple[NDArray, NDArray]] | None = None
         self._posed: int | None = None
-        self._away = 0
+        self.is_out_of_reach = False
 
     def reset(self) -> None:
         """Forget everything but the object's mesh."""
         self.estimator.reset()
         self._start()
-
-    @property
-    def is_out_of_reach(self) -> bool:
-        """Whether the object stood out of the jaw's reach in the last image."""
-        return self._away > 0
 
     @property
     def is_idle(self) -> bool:
@@ -153,8 +152,7 @@ class ContactLoop:
         surface, wrench = self._fresh(self._surface, stamp), self._fresh(self._wrench, stamp)
         self.last = TimedEstimate(stamp, self.estimator.update(SECOND * stamp, surface, wrench))
         contact = self.last.estimate.contact
-        away = contact is not None and is_out_of_reach(contact, self.estimator.jaw.inner_face_x)
-        self._away = self._away + 1 if away else 0
+        self.is_out_of_reach = contact is not None and is_out_of_reach(contact, self.estimator.jaw.inner_face_x)
         return self.last
 
     def _fresh(self, kept: tuple[int, ValueT] | None, stamp: int) -> ValueT | None:
@@ -263,7 +261,6 @@ class JawContact(ContactLoop):
         self._pairing.reset()
         self._passed: deque[PassedImage] = deque(maxlen=DEPTH)
         self._over: deque[int] = deque(maxlen=DEPTH)
-        self._is_driven = False
         self._jaw: NDArray | None = None
 
     def set_object(self, mesh: ObjectMesh | None) -> None:
@@ -278,11 +275,6 @@ class JawContact(ContactLoop):
         self._pairing.reset()
         self._passed.clear()
         self._posed = None
-
-    @property
-    def needs_surface(self) -> bool:
-        """Whether surface and wrench are of use: unless it was away for a while, or where images are due with them."""
-        return self._is_driven or self._away < AWAY_FOR
 
     def _warm_up(self) -> None:
         """Let what is compiled on first use be compiled before the first image waits for it."""
@@ -302,9 +294,7 @@ class JawContact(ContactLoop):
         """
         self.keep_surface(stamp, surface)
         known = self._posed is not None and not self._pairing.is_waiting(stamp) and stamp not in self._over
-        estimates = self._due(stamp) if known else []
-        self._is_driven |= bool(estimates)
-        return estimates
+        return self._due(stamp) if known else []
 
     def take_jaw_pose(self, stamp: int, T_camera_jaw: NDArray) -> list[TimedEstimate]:
         """Take the jaw's pose (4, 4) in an image [ns]; return the contacts that are known now.

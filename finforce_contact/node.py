@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
@@ -17,15 +17,25 @@ from finforce.health import Health, Outcome, Report
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce.settings import refresh_record
-from finforce.skipping import CONTACT, IDLE, UNNEEDED, Skips
+from finforce.skipping import CONTACT, IDLE, Skips
 from finforce.stamps import Idling, StampGate
 from finforce_contact.camera_feed import StampedPose
 from finforce_contact.diagnostics import describe, object_alarms, outcome_of_estimate
 from finforce_contact.jaw_contact import TimedEstimate
 from finforce_contact.parameters import ContactParameters
 from finforce_contact.publishers import ContactOutputs
-from finforce_contact.session import ContactSession, subscribe
+from finforce_contact.session import ContactSession, detections_type
 from finforce_contact.settings import ContactSettings, TrackerSettings
+
+CAMERA = "/camera/camera"
+WAITING = ros.QoSProfile(depth=20, reliability=ros.ReliabilityPolicy.BEST_EFFORT)  # a tenth of a second, and more
+
+
+class Deferred(NamedTuple):
+    """A message of a jaw's solver that is not read until the next contact is looked for, and what takes it."""
+
+    take: Callable[[str, Any], list[TimedEstimate]]
+    message: ros.Unread
 
 
 class ContactEstimatorNode(Node):
@@ -56,11 +66,9 @@ class ContactEstimatorNode(Node):
         with self._refusals(sides):
             self.get_logger().info(self.session.load_mesh(parameters))
         self._serve()
-        self.camera_group = MutuallyExclusiveCallbackGroup()
         self.idling = {side: Idling() for side in sides}
-        self.unread: dict[str, dict[type, Callable[[], None]]] = {side: {} for side in sides}
-        self.objects: Any = None
-        self.inputs = subscribe(self.qos, parameters, self.session, self)
+        self.deferred: dict[str, dict[str, Deferred]] = {side: {} for side in sides}
+        self._subscribe()
         self.get_logger().info(f"jaws: {parameters.jaws}, ready, object poses by {parameters.pose_source}")
 
     def _serve(self) -> None:
@@ -74,11 +82,47 @@ class ContactEstimatorNode(Node):
             report = partial(self._report, side)
             ros.publish_diagnostics(self, self.qos, f"finforce: {side} contact", period, report)
 
+    def _subscribe(self) -> None:
+        """Subscribe to all that the parameters ask for.
+
+        Raises:
+            MissingDependencyError: a message type is not installed.
+        """
+        qos, session, source = self.qos, self.session, self.parameters.pose_source
+        self.objects = None
+        if self.parameters.tracks:
+            self._subscribe_camera()
+        elif source == "topic":
+            self.objects = qos.subscription(ros.PoseStamped, "object_pose", self._on_object, ros.SENSOR)
+        else:
+            self.objects = qos.subscription(detections_type(), "object_detections", self._on_object, ros.SENSOR)
+        for side in self.parameters.sides:
+            # of an image that is passed over no more than the stamp is read
+            for kind, name, take in (
+                (ros.WrenchStamped, "wrench", session.take_wrench),
+                (ros.PointCloud2, "surface", session.take_surface),
+            ):
+                keep = partial(self._on_solver, side, name, take)
+                qos.subscription(kind, f"{side}/{name}", keep, ros.SENSOR, unread=True)
+            find = partial(self._on_jaw_pose, side)
+            qos.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, WAITING, unread=True, can_wait=True)
+
+    def _subscribe_camera(self) -> None:
+        """Subscribe to the images in which the object is found; they wait for each other."""
+        session, group = self.session, MutuallyExclusiveCallbackGroup()
+        info, take_info = f"{CAMERA}/color/camera_info", partial(self._on_image, session.take_camera)
+        self.qos.subscription(ros.CameraInfo, info, take_info, ros.SENSOR, callback_group=group)
+        for topic, take in (
+            ("object_mask", session.take_mask),
+            (f"{CAMERA}/aligned_depth_to_color/image_raw", session.take_depth),
+        ):
+            ros.LargeSubscription(self.qos, ros.Image, topic, partial(self._on_image, take), callback_group=group)
+
     def _refreshed(self) -> ContactParameters:
         """Return the parameters with the present values of those that may be set at run time."""
         return refresh_record(self.parameters, lambda name: self.get_parameter(name).value)
 
-    def on_jaw_pose(self, side: str, unread: ros.Unread) -> None:
+    def _on_jaw_pose(self, side: str, unread: ros.Unread) -> None:
         """Find the contact of an image, unless it may be passed over."""
         with self._refusals((side,)):
             self._find_contact(side, unread, unread.stamp)
@@ -89,7 +133,7 @@ class ContactEstimatorNode(Node):
         self.health[side].arrive()
         # poses of the object that came while the image was looked at
         for message in ros.take_waiting(self.objects):
-            self.on_object(message)
+            self._on_object(message)
         if self.idling[side].passes(stamp):
             self.skips.count(IDLE)
             self.session.pass_over(side, stamp, unread.read)
@@ -98,28 +142,15 @@ class ContactEstimatorNode(Node):
             self.session.restart(side)
             self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
         message = unread.read()
-        self._read_late(side)
-        self._send(side, began, self.session.take_jaw_pose(side, message))
-        self._rest(side, stamp)
-
-    def _read_late(self, side: str) -> None:
-        """Read what a jaw's solver said while images were passed over."""
         self.idling[side].end()
-        for read in list(self.unread[side].values()):
-            read()
+        for name, deferred in list(self.deferred[side].items()):
+            self._on_solver(side, name, *deferred)
+        self._send(side, began, self.session.take_jaw_pose(side, message))
+        is_idle = self.session.jaws[side].is_idle and self.skips.allows(IDLE)
+        self.idling[side].note(stamp, is_idle)
 
-    def _rest(self, side: str, stamp: int) -> None:
-        """Do less for a jaw out of whose reach the object stood in an image [ns], or that holds it still."""
-        jaw = self.session.jaws[side]
-        self.idling[side].note(stamp, jaw.is_idle and self.skips.allows(IDLE))
-        if jaw.needs_surface or not self.skips.allows(UNNEEDED):
-            self.inputs[side].open()
-            return
-        self.skips.count(UNNEEDED)
-        self.inputs[side].close()
-
-    def on_jaw(
-        self, side: str, kind: type, take: Callable[[str, Any], list[TimedEstimate]], unread: ros.Unread
+    def _on_solver(
+        self, side: str, name: str, take: Callable[[str, Any], list[TimedEstimate]], unread: ros.Unread
     ) -> None:
         """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own.
 
@@ -128,20 +159,20 @@ class ContactEstimatorNode(Node):
         began = perf_counter()
         with self._refusals((side,)):
             if self.idling[side].passes(unread.stamp):
-                self.unread[side][kind] = partial(self.on_jaw, side, kind, take, unread)
+                self.deferred[side][name] = Deferred(take, unread)
                 return
-            self.unread[side].pop(kind, None)
+            self.deferred[side].pop(name, None)
             message = unread.read()
             self._check_ahead(message)
             self._send(side, began, take(side, message))
 
-    def on_object(self, message: Any) -> None:
+    def _on_object(self, message: Any) -> None:
         """Use the object's pose that another node has found."""
         with self._refusals(self.parameters.sides):
             self._check_ahead(message)
             self._hand_on(self.session.read_pose(message))
 
-    async def on_image(self, take: Callable[[Any], StampedPose | None], image: Any) -> None:
+    async def _on_image(self, take: Callable[[Any], StampedPose | None], image: Any) -> None:
         """Use the object's pose, if one is found with an image, while other callbacks go on."""
         with self._refusals(self.parameters.sides):
             self._check_ahead(image)

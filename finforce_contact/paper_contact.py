@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from manifold3d import Manifold
 
 
+MARGIN = 5e-3  # [m] kept around the jaw's box when the object is cut to it
+
+
 class IntersectionLocalizer:
     """Algorithm 1 of the paper.
 
@@ -37,7 +40,7 @@ class IntersectionLocalizer:
         """
         self._candidates = jaw.candidates[:, 1:]
         self._mesh, self._face, self._offset = face.mesh, face, settings.offset
-        self._object = NearSolid(mesh, settings.margin)
+        self._object = NearSolid(mesh, MARGIN)
         self._vertices = np.ascontiguousarray(mesh.vertices)
         self.reset()
 

@@ -1,12 +1,11 @@
-"""The object, where its poses come from, and the jaws that it touches, for several threads; the topics they read."""
+"""The object, where its poses come from, and the jaws that it touches, for several threads."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from importlib import import_module
 from threading import RLock
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +13,7 @@ from numpy.typing import NDArray
 from finforce.camera import ImageError
 from finforce.errors import FinforceError, MissingDependencyError, ObservationError
 from finforce.messages import check_cloud, decode_keypoints, pose_from_message, stamp_of, wrench_from_message
-from finforce.ros import node as ros
-from finforce.skipping import CONTACT, RESTING, Skips
+from finforce.skipping import Skips
 from finforce.stamps import SECOND
 from finforce_contact.camera_feed import DepthFeed, StampedPose
 from finforce_contact.errors import ReconstructionError
@@ -53,12 +51,9 @@ class ContactSession:
         tracker: TrackerSettings,
         skips: Skips | None = None,
     ) -> None:
-        self._skips = skips or Skips(CONTACT)
         tolerance, max_age = round(parameters.pose_tolerance / SECOND), round(parameters.max_age / SECOND)
         self.jaws = {
-            side: JawContact(
-                ContactEstimator(jaw, settings=contact, skips=self._skips), tolerance=tolerance, max_age=max_age
-            )
+            side: JawContact(ContactEstimator(jaw, settings=contact, skips=skips), tolerance=tolerance, max_age=max_age)
             for side, jaw in load_jaws(parameters).items()
         }
         self.mesh: ObjectMesh | None = None
@@ -204,12 +199,9 @@ class ContactSession:
             self._camera.take_camera(info)
 
     def take_depth(self, image: Any) -> StampedPose | None:
-        """Return the object's pose in a depth image, None while every grasp rests; see `DepthFeed`."""
-        rests = self._skips.allows(RESTING) and all(jaw.estimator.still for jaw in self.jaws.values())
-        if rests:
-            self._skips.count(RESTING)
+        """Return the object's pose in a depth image, if it is tracked; see `DepthFeed`."""
         with self._camera_lock:
-            return self._camera.take_depth(image, rests=rests)
+            return self._camera.take_depth(image)
 
     def take_mask(self, image: Any) -> StampedPose | None:
         """Return the object's pose in the image that a mask belongs to, if it is looked for; see `DepthFeed`."""
@@ -228,107 +220,6 @@ def surface_from_cloud(cloud: Any, frame: str) -> NDArray:
     if not np.isfinite(points).all():
         raise ObservationError("the surface has vertices that are not finite")
     return points
-
-
-CAMERA = "/camera/camera"
-WAITING = ros.QoSProfile(depth=20, reliability=ros.ReliabilityPolicy.BEST_EFFORT)  # a tenth of a second, and more
-
-
-class Handlers(Protocol):
-    """What a node does with messages, each time guarded against what may be wrong with them.
-
-    Attributes:
-        camera_group: callback group of the images, which wait for each other.
-        skips: rules of what need not be done.
-        objects: the subscription to the object's poses, where other programs find them.
-    """
-
-    camera_group: Any
-    skips: Skips
-    objects: Any
-
-    def on_object(self, message: Any) -> None:
-        """Use the object's pose that a message holds."""
-
-    async def on_image(self, take: Callable[[Any], Any], image: Any) -> None:
-        """Use the object's pose that `take` finds with an image."""
-
-    def on_jaw_pose(self, side: str, unread: ros.Unread) -> None:
-        """Use the pose of a jaw, a message that was not read yet."""
-
-    def on_jaw(self, side: str, kind: type, take: Callable[[str, Any], list[Any]], unread: ros.Unread) -> None:
-        """Use what `take` makes of a message of a jaw's solver, which was not read yet."""
-
-
-class JawInputs:
-    """The subscriptions to what a jaw's solver says, which come and go.
-
-    Args:
-        qos: makes subscriptions and watches them.
-        side: of the jaw.
-        session: takes the messages.
-        handlers: guards that.
-    """
-
-    def __init__(self, qos: ros.QosWatch, side: str, session: ContactSession, handlers: Handlers) -> None:
-        self._qos = qos
-        self._topics = [
-            (kind, f"{side}/{name}", partial(handlers.on_jaw, side, kind, take))
-            for kind, name, take in (
-                (ros.WrenchStamped, "wrench", session.take_wrench),
-                (ros.PointCloud2, "surface", session.take_surface),
-            )
-        ]
-        self._made: list[Any] = []
-
-    @property
-    def are_open(self) -> bool:
-        """Whether the jaw's solver is listened to."""
-        return bool(self._made)
-
-    def open(self) -> None:
-        """Listen to the jaw's solver from now on."""
-        if not self._made:
-            # of an image that is passed over no more than the stamp is read
-            self._made = [self._qos.subscription(*topic, ros.SENSOR, unread=True) for topic in self._topics]
-
-    def close(self) -> None:
-        """Listen no more."""
-        while self._made:
-            self._qos.drop(self._made.pop())
-
-
-def subscribe(
-    qos: ros.QosWatch, parameters: ContactParameters, session: ContactSession, handlers: Handlers
-) -> dict[str, JawInputs]:
-    """Subscribe to all that the parameters ask for; return what comes of the jaws' solvers, by side.
-
-    Raises:
-        MissingDependencyError: a message type is not installed.
-    """
-    if parameters.tracks:
-        _subscribe_camera(qos, session, handlers)
-    elif parameters.pose_source == "topic":
-        handlers.objects = qos.subscription(ros.PoseStamped, "object_pose", handlers.on_object, ros.SENSOR)
-    else:
-        handlers.objects = qos.subscription(detections_type(), "object_detections", handlers.on_object, ros.SENSOR)
-    jaws = {side: JawInputs(qos, side, session, handlers) for side in parameters.sides}
-    for side, inputs in jaws.items():
-        inputs.open()
-        take = partial(handlers.on_jaw_pose, side)
-        qos.subscription(ros.PoseStamped, f"{side}/jaw_pose", take, WAITING, unread=True, can_wait=True)
-    return jaws
-
-
-def _subscribe_camera(qos: ros.QosWatch, session: ContactSession, handlers: Handlers) -> None:
-    """Subscribe to the images in which the object is found."""
-    take_info, group = partial(handlers.on_image, session.take_camera), handlers.camera_group
-    qos.subscription(ros.CameraInfo, f"{CAMERA}/color/camera_info", take_info, ros.SENSOR, callback_group=group)
-    for topic, take in (
-        ("object_mask", session.take_mask),
-        (f"{CAMERA}/aligned_depth_to_color/image_raw", session.take_depth),
-    ):
-        ros.LargeSubscription(qos, ros.Image, topic, partial(handlers.on_image, take), callback_group=group)
 
 
 def detections_type() -> type:

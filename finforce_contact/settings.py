@@ -64,10 +64,6 @@ class ContactSettings:
     rest_motion: float = setting(
         0.2e-3, "a surface that moves by more than this ends the rest of the grasp", "m", 1e-5, 5e-3
     )
-    still: float = setting(0.02e-3, "motion of object or surface that is not worth a new place", "m", 0.0, 1e-3)
-    margin: float = setting(
-        5e-3, "an object farther off the jaw than this keeps its place while it nears", "m", 1e-4, 0.1
-    )
     recut_angle: float = setting(0.0175, "turn out of the finger's plane that needs a new outline", "rad", 1e-4, 0.5)
     recut_shift: float = setting(1e-3, "shift along the finger's width that needs a new outline", "m", 1e-5, 0.05)
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import partial
 from threading import Timer
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 from geometry_msgs.msg import PoseStamped, Vector3Stamped, WrenchStamped
 from rclpy.node import Node
@@ -43,6 +43,13 @@ from finforce_ifea.settings import EstimatorSettings
 SLOW = 4.0  # s of preparation, after which somebody may wonder
 
 
+class WaitingImage(NamedTuple):
+    """Key points that wait for their contact, and when they came (perf_counter) [s]."""
+
+    cloud: PointCloud2
+    began: float
+
+
 class IfeaSolverNode(Node):
     """Solves one jaw, image by image, and publishes nothing that it does not trust.
 
@@ -74,7 +81,7 @@ class IfeaSolverNode(Node):
         self.health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
         self.pairing = ForcePairing(parameters.jaw_name)
         self.idling = Idling()
-        self.waiting: Callable[[], None] | None = None
+        self.waiting: WaitingImage | None = None
         self.last: Solution | None = None
         self.qos = ros.QosWatch(self, stage)
         self.out = SolverOutputs(self.qos, parameters, self.skips)
@@ -136,7 +143,7 @@ class IfeaSolverNode(Node):
         self.health.arrive(0 if self.idling.is_idle else overtaken)
         if passed:
             return
-        self.waiting = partial(self._solve, unread.read(), began)
+        self.waiting = WaitingImage(unread.read(), began)
         if self.contacts.expect(unread.stamp, began):
             self.overdue.reset()
         else:
@@ -145,9 +152,9 @@ class IfeaSolverNode(Node):
     def _solve_waiting(self) -> None:
         """Solve the image that waits for its contact, if there is one."""
         self.overdue.cancel()
-        solve, self.waiting = self.waiting, None
-        if solve is not None:
-            solve()
+        image, self.waiting = self.waiting, None
+        if image is not None:
+            self._solve(*image)
 
     def _solve(self, cloud: PointCloud2, began: float) -> None:
         """Solve an image and publish its wrench, if it can be trusted."""

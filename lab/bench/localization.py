@@ -27,7 +27,7 @@ from finforce_contact.localization.outline_localizer import (
 from finforce_contact.localization.section import SectionKeeper
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.paper_contact import NearSolid, intersect
+from finforce_contact.paper_contact import MARGIN, NearSolid, intersect
 from finforce_contact.settings import ContactSettings
 from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import match_truth
@@ -248,7 +248,7 @@ def by_intersection(setup: MethodSetup, *, cut_down: bool) -> Method:
     """Return the centre of the intersection with the whole object, or with what of it is near the jaw."""
     settings = ContactSettings()
     jaw = setup.jaw.build_mesh(settings.mesh)
-    solid = NearSolid(setup.mesh, settings.margin)
+    solid = NearSolid(setup.mesh, MARGIN)
 
     def locate(T: NDArray, surface: NDArray, wrench: Wrench) -> float | None:
         part = solid.near(T, surface) if cut_down else solid.whole

@@ -152,33 +152,6 @@ def test_images_before_their_camera_are_named(probe, camera, scene):
     bench.diagnosis(level=Level.ERROR, word="camera_info")
 
 
-def test_the_tracker_rests_while_the_grasp_does(probe, camera, scene):
-    bench = TrackingBench(probe, camera)
-    bench.see(scene, masked=True)
-    probe.wait_for(lambda: bench.poses, MAX_AGE)
-    jaw = bench.node.session.jaws["left"]
-    jaw.estimator = Resting(jaw.estimator)
-    bench.see(scene, masked=False)
-    probe.wait_for(lambda: bench.node.skips.describe()["skipped: grasp rests"] == "1")
-    probe.spin(0.3)
-    assert len(bench.poses) == 1
-    jaw.estimator.still = False
-    bench.see(scene, masked=False)
-    probe.wait_for(lambda: len(bench.poses) == 2)
-
-
-class Resting:
-    """An estimator whose grasp holds still."""
-
-    still = True
-
-    def __init__(self, estimator):
-        self._estimator = estimator
-
-    def __getattr__(self, name):
-        return getattr(self._estimator, name)
-
-
 def test_reconstruct_finds_the_object_in_the_image(probe, camera, scene):
     bench = TrackingBench(probe, camera, object_mesh="")
     answer = call(probe, "contact_estimator/reconstruct")

@@ -28,7 +28,7 @@ from finforce_contact.localization.section import (
     split_turn,
 )
 from finforce_contact.mesh.object_mesh import surrounds
-from finforce_contact.paper_contact import IntersectionLocalizer, NearSolid, centre_of_volume, intersect
+from finforce_contact.paper_contact import MARGIN, IntersectionLocalizer, NearSolid, centre_of_volume, intersect
 from finforce_contact.settings import ContactSettings
 from finforce_ifea.errors import MeshError
 
@@ -343,7 +343,7 @@ class TestIntersection:
 
     def test_object_cut_to_the_jaw_gives_the_same_centre_and_is_cut_once(self):
         pytest.importorskip("manifold3d")
-        near = NearSolid(cylinder(), SETTINGS.margin)
+        near = NearSolid(cylinder(), MARGIN)
         for shift in (0.0, 0.5 * MM, 1 * MM):
             T = pose(FACE + 0.0125 - 1 * MM, 0.04 + shift)
             whole = intersect(near.whole, T, NODES, INNER.mesh.surface)

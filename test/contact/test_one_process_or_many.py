@@ -53,7 +53,7 @@ def solve(probe, composed, mesh, images, shift):
     contact = build(
         ContactEstimatorNode,
         jaws="left",
-        skip_off=["idle image", "jaw not needed"],
+        skip_off=["idle image"],
         calibration_file="bench",
         object_mesh=str(mesh),
     )
