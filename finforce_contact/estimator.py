@@ -96,6 +96,8 @@ __all__ = ["ContactEstimate", "ContactEstimator"]
 _LEVER = 0.03
 # A surface that moved by less since its rest [m] is that of a solver that has not begun.
 _AT_REST = 1e-7
+# A bent jaw farther from the object than this [m], and what the pose may err, is bent by something else.
+_REACH = 4e-3
 _JAW_SAMPLES = 100
 _SURROUNDED = 0.5
 # Motion [m] and change of force [N] that are not worth a new search.
@@ -143,9 +145,9 @@ class ContactEstimator:
         self.face = build_inner_face(jaw, self.settings.mesh)
         self._rest_line = self.face.deform(self.face.mesh.nodes)
         self._samples = np.unique(np.linspace(0, len(self.face.mesh.nodes) - 1, _JAW_SAMPLES).astype(int))
-        self._poses, self._belief = PoseFilter(self.settings), TouchBelief(self.settings)
+        self._poses, self._belief = PoseFilter(self.settings), TouchBelief()
         self._slips = SlipWatch(self.settings)
-        self._rest, self.skips = StillnessWatch(self.settings), skips or Skips(CONTACT)
+        self._rest, self.skips = StillnessWatch(), skips or Skips(CONTACT)
         self._counts: Counter[str] = Counter(dict.fromkeys(_REASONS, 0))
         self.set_object(mesh)
 
@@ -173,7 +175,7 @@ class ContactEstimator:
             low, high = mesh.bounds
             self._centre, self._half = mesh.middle, 0.5 * (high - low)
             span = (float(self.face.heights[0]), float(self.face.heights[-1]))
-            self._sections = SectionKeeper(mesh, self.face.half_width, self.settings, span)
+            self._sections = SectionKeeper(mesh, self.face.half_width, span)
         self._mesh = mesh
         self.reset()
 
@@ -192,10 +194,10 @@ class ContactEstimator:
 
     def _build_localizer(self, mesh: ObjectMesh) -> Localizer:
         if self.settings.mode == "paper":
-            return IntersectionLocalizer(self.jaw, self.face, mesh, self.settings)
+            return IntersectionLocalizer(self.jaw, self.face, mesh)
         if self.settings.mode == "closest":
             return ClosestLocalizer(self.jaw, self.face)
-        return OutlineLocalizer(self.face, self.settings)
+        return OutlineLocalizer(self.face)
 
     def take_pose(
         self,
@@ -318,7 +320,7 @@ class ContactEstimator:
             self._belief.set(place.touching)
             return ""
         stddev = float(np.hypot(pose.stddev[0], settings.pose_bias))
-        slack, live = settings.reach + 3.0 * stddev, self._is_live(scene)
+        slack, live = _REACH + 3.0 * stddev, self._is_live(scene)
         if place.gap > slack or (live and place.gap < -slack and place.bend < SURELY_BENT):
             self._belief.set(False)
             return describe_conflict(self._mesh.name, place.gap, place.bend)

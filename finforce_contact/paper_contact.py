@@ -11,13 +11,13 @@ from finforce.transforms import invert_pose
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.localization.outline_localizer import ContactPatch, ContactScene, InnerFace, Place
 from finforce_contact.mesh.triangles import ObjectMesh, solid_from_triangles, to_manifold, triangles_of_solid
-from finforce_contact.settings import ContactSettings
 from finforce_ifea.jaw.jaw import Jaw
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
 
+OFFSET = 1e-3  # [m] by which the object is pushed into the surface before contact (Eq. 2)
 MARGIN = 5e-3  # [m] kept around the jaw's box when the object is cut to it
 
 
@@ -31,7 +31,7 @@ class IntersectionLocalizer:
     it back to the surface as it was before it bent would part the two for good.
     """
 
-    def __init__(self, jaw: Jaw, face: InnerFace, mesh: ObjectMesh, settings: ContactSettings) -> None:
+    def __init__(self, jaw: Jaw, face: InnerFace, mesh: ObjectMesh) -> None:
         """Builds the object's solid.
 
         Raises:
@@ -39,7 +39,7 @@ class IntersectionLocalizer:
             MissingDependencyError: manifold3d is not installed.
         """
         self._candidates = jaw.candidates[:, 1:]
-        self._mesh, self._face, self._offset = face.mesh, face, settings.offset
+        self._mesh, self._face = face.mesh, face
         self._object = NearSolid(mesh, MARGIN)
         self._vertices = np.ascontiguousarray(mesh.vertices)
         self.reset()
@@ -68,7 +68,7 @@ class IntersectionLocalizer:
         """Returns t_x = l_0 + l_bd / 2 [m] (Eq. 2), corrected for objects whose origin is not in their middle."""
         turned = self._vertices @ T[0, :3]
         low, high = turned.min(), turned.max()
-        return float(self._face.front - self._offset + 0.5 * (high - low) - 0.5 * (high + low))
+        return float(self._face.front - OFFSET + 0.5 * (high - low) - 0.5 * (high + low))
 
     def _candidate_of(self, centre: NDArray, surface: NDArray) -> ContactPatch:
         """Returns the candidate of an intersection's centre (3,) [m]."""

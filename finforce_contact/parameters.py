@@ -18,55 +18,45 @@ IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class ContactParameters(TimeParameters):
-    """What a contact estimator node is told beside the settings of its parts; units stand in the metadata."""
+    """Parameters of a contact estimator node, in addition to the settings of its parts; metadata holds units."""
 
-    jaws: str = setting("left", "the jaws whose contacts are estimated", choices=("left", "right", "both"))
-    jaw_file: str = setting("bench", "jaw file, or the name of a shipped jaw")
-    calibration_file: str = setting(
-        "", "calibration file, or a shipped name, as the solvers have it: it shapes the mesh of the jaw; empty: none"
-    )
-    camera_frame: str = setting("camera_color_optical_frame", "frame of the poses and images")
+    jaws: str = setting("left", "Jaws whose contacts are estimated", choices=("left", "right", "both"))
+    jaw_file: str = setting("bench", "Jaw file, or name of a shipped jaw")
+    calibration_file: str = setting("", "Calibration file or name of a shipped one, as for the solvers; empty for none")
+    camera_frame: str = setting("camera_color_optical_frame", "Frame of poses and images")
     object_mesh: str = setting(
-        "", "mesh file of the object; empty: the object is unknown; read again by load_mesh", settable=True
+        "", "Mesh file of the object, read again by load_mesh; empty when it is unknown", settable=True
     )
-    object_mesh_unit: str = setting(
-        "m", "unit of the object's mesh file", choices=("m", "cm", "mm", "inch"), settable=True
-    )
+    object_mesh_unit: str = setting("m", "Unit of the object mesh", choices=("m", "cm", "mm", "inch"), settable=True)
     pose_source: str = setting(
         "topic",
-        "object poses: PoseStamped on object_pose, Detection3DArray on object_detections, or the built-in tracker",
+        "Source of object poses: PoseStamped on object_pose, Detection3DArray on object_detections, or the built-in "
+        "tracker",
         choices=("topic", "detections", "tracker"),
     )
     pose_origin: str = setting(
         "mesh",
-        "what poses from elsewhere are of: the mesh's own origin; the middle of its box; or its origin with the middle "
-        "added where it ought to be taken off, as isaac_ros_foundationpose does up to release 4.4",
+        "Origin of poses from other programs: that of the mesh, the middle of its box, or the origin with the middle "
+        "added where it should be subtracted, as isaac_ros_foundationpose does up to release 4.4",
         choices=tuple(ORIGINS),
     )
     pose_tolerance: float = setting(
-        0.017, "greatest distance between the stamps of a jaw pose and its object pose", "s", 0.0, 1.0
+        0.017, "Maximum stamp difference between a jaw pose and its object pose", "s", 0.0, 1.0
     )
-    depth_scale: float = setting(0.001, "one step of a 16-bit depth image", "m", 1e-6, 0.01)
+    depth_scale: float = setting(0.001, "Unit of 16-bit depth images", "m", 1e-6, 0.01)
     reconstruct_method: str = setting(
         "",
-        "how reconstruct finds the object; empty: robust with a generated mesh; without, a primitive where that fits, "
-        "else completion",
+        "Method of reconstruct; empty for robust with a generated mesh, else a primitive where it fits, else "
+        "completion",
         choices=("", "robust", "paper", "primitive", "completion"),
         settable=True,
     )
-    generated_mesh: str = setting(
-        "", "mesh file for reconstruct, made by a generator; empty: there is none", settable=True
-    )
+    generated_mesh: str = setting("", "Mesh file from a generator, for reconstruct; empty for none", settable=True)
     generated_pose: tuple[float, ...] = setting(
-        IDENTITY, "x, y, z [m], qx, qy, qz, qw of the generated mesh in the camera frame", settable=True
+        IDENTITY, "Pose of the generated mesh in the camera frame: x, y, z [m], qx, qy, qz, qw", settable=True
     )
-    generated_scale: float = setting(
-        1.0, "metres per unit of the generated mesh, as far as it is known", "m", 1e-6, 1e6, settable=True
-    )
-
-    skip_off: tuple[str, ...] = setting(
-        ("",), "rules that are not applied, by their names in the diagnostics after `skipped:`, or all"
-    )
+    generated_scale: float = setting(1.0, "Length of the generated mesh's unit", "m", 1e-6, 1e6, settable=True)
+    skip_off: tuple[str, ...] = setting(("",), "Skip rules that are not applied, as named in the diagnostics, or all")
 
     @property
     def sides(self) -> tuple[str, ...]:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from finforce_contact.errors import to_floats
 from finforce_contact.localization.section import Section, compute_gaps, distances_to
-from finforce_contact.settings import ContactSettings
 from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh
@@ -336,6 +335,15 @@ class Localizer(Protocol):
         """Returns the place, None when the object does not stand before the inner surface."""
 
 
+_OVERLAP = 0.2e-3  # [m] into which the object is brought with the deformed surface
+_ROW_SPACING = 2.5e-3  # [m], the greatest height of the surface that one row stands for
+_NARROW = 5e-3  # [m], the greatest height of a contact that is one row
+WRENCH_FORCE = 0.2  # [N]; the line of action of a weaker force tells nothing
+WRENCH_GAIN = 0.93  # share of the line of action in the mean; the rest is that of the overlap
+# A line of action counts where it misses the overlap by no more than this [m], or meets an object this near [m].
+_WRENCH_REACH, _WRENCH_SLACK = 3e-3, 1e-3
+
+
 class OutlineLocalizer:
     """Brings the object along x into slight overlap with the deformed surface, whatever its pose errs along x.
 
@@ -343,9 +351,8 @@ class OutlineLocalizer:
     the rows are weighted so that it is their mean when it agrees with the overlap.
     """
 
-    def __init__(self, face: InnerFace, settings: ContactSettings) -> None:
-        """Keeps the inner face and the settings."""
-        self._face, self._settings = face, settings
+    def __init__(self, face: InnerFace) -> None:
+        self._face = face
 
     def reset(self) -> None:
         """Starts anew; nothing is remembered."""
@@ -356,11 +363,11 @@ class OutlineLocalizer:
         nearest = int(gaps.argmin())
         if not np.isfinite(gaps[nearest]):
             return None
-        heights, settings = self._face.heights, self._settings
-        overlap = overlap_of(gaps, settings.overlap)
-        patch = patch_from_overlap(heights, overlap, settings.row_spacing, settings.narrow)
+        heights = self._face.heights
+        overlap = overlap_of(gaps, _OVERLAP)
+        patch = patch_from_overlap(heights, overlap, _ROW_SPACING, _NARROW)
         if scene.wrench is not None:
-            patch = self._follow_wrench(patch, gaps - gaps[nearest] - settings.overlap, scene)
+            patch = self._follow_wrench(patch, gaps - gaps[nearest] - _OVERLAP, scene)
         bend = float(np.interp(patch.mean, heights, self._face.x - scene.line[:, 0]))
         return Place(patch=patch, gap=float(gaps[nearest]), bend=bend)
 
@@ -370,13 +377,13 @@ class OutlineLocalizer:
         A pose that is a little off along z closes the gap at one end of a wrapped surface and opens it at the other.
         """
         force, torque = scene.wrench
-        settings, heights = self._settings, self._face.heights
-        if np.hypot(force[0], force[2]) < settings.wrench_force:
+        heights = self._face.heights
+        if np.hypot(force[0], force[2]) < WRENCH_FORCE:
             return patch
         centre = cross_line_of_action(scene.line, heights, force, torque, patch.mean)
         touched = heights[gaps < 0.0]
-        near = touched[0] - settings.wrench_reach <= centre <= touched[-1] + settings.wrench_reach
-        if not (near or np.interp(centre, heights, gaps) < settings.wrench_slack):
+        near = touched[0] - _WRENCH_REACH <= centre <= touched[-1] + _WRENCH_REACH
+        if not (near or np.interp(centre, heights, gaps) < _WRENCH_SLACK):
             return patch
-        mean = patch.mean + settings.wrench_gain * (centre - patch.mean)
+        mean = patch.mean + WRENCH_GAIN * (centre - patch.mean)
         return tilt_patch(patch, mean)

@@ -14,12 +14,13 @@ from finforce.errors import PoseError
 from finforce.optional import import_manifold3d
 from finforce_contact.mesh.repair import chain_loops
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.settings import ContactSettings
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # A wall whose far side lies no deeper than this in the jaw is still taken for what the jaw touches [m].
 _THROUGH = 2e-3
 _MOST_CROSSINGS = 64
+# A turn out of the finger's plane [rad] and a shift along its width [m] that need a new outline.
+_RECUT_ANGLE, _RECUT_SHIFT = 0.0175, 1e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -349,11 +350,9 @@ def find_across(mesh: ObjectMesh, T: NDArray, half_width: float, span: tuple[flo
 class SectionKeeper:
     """Cuts an object's outline anew when it turned out of the plane or moved across it, and tilts it in between."""
 
-    def __init__(
-        self, mesh: ObjectMesh, half_width: float, settings: ContactSettings, span: tuple[float, float] = (-1.0, 1.0)
-    ) -> None:
+    def __init__(self, mesh: ObjectMesh, half_width: float, span: tuple[float, float] = (-1.0, 1.0)) -> None:
         """Keeps the mesh, half the width of the finger, which the outline is that of, and its lowest and highest z."""
-        self._mesh, self._half_width, self._settings, self._span = mesh, half_width, settings, span
+        self._mesh, self._half_width, self._span = mesh, half_width, span
         self._R: NDArray | None = None
         self.cuts = 0
 
@@ -364,7 +363,7 @@ class SectionKeeper:
             self._cut(T)
         else:
             tilt, swing = split_turn(T[:3, :3] @ self._R.T)
-            if swing > self._settings.recut_angle or abs(T[1, 3] - self._y) > self._settings.recut_shift:
+            if swing > _RECUT_ANGLE or abs(T[1, 3] - self._y) > _RECUT_SHIFT:
                 self._cut(T)
                 tilt = 0.0
         return Section(

@@ -26,6 +26,8 @@ _RESTING = 6
 _CLOSING = 1.5e-3
 # An odd pose that is farther than this [m] from the last one is wrong.
 _FAR = 2e-3
+# A contact that wanders by more than this [m] is followed anew.
+_REACH = 8e-3
 # A gap between samples that begins anew [s].
 _LONGEST_GAP = 0.5
 
@@ -91,7 +93,7 @@ class SlipWatch:
 
     def place(self, height: float) -> float:
         """Returns the material height [m] that is followed: that at which the contact began, near `height`."""
-        if self._height is None or abs(self._height - height) > self._settings.slip_reach:
+        if self._height is None or abs(self._height - height) > _REACH:
             self._height, self._on_object = height, None
         return self._height
 

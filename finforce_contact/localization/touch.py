@@ -5,11 +5,14 @@ from math import erf, exp, pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_contact.settings import ContactSettings
-
 # A surface that gave way by more [m] is surely bent.
 SURELY_BENT = 1e-3
 _NEGLIGIBLE = 1e-300
+# Probability from which contact is believed, below which it is over, and images in a row below it until then.
+_TOUCHES, _RELEASES, RELEASE_IMAGES = 0.93, 0.5, 3
+_NOISE = 0.035e-3  # [m], standard deviation of the solver's surface at rest
+# A surface that moves by no more than this [m] for so long [s] is held still: no new pose is needed.
+_REST_MOTION, _REST_TIME = 0.2e-3, 1.0
 # Images over which the restlessness of the surface before contact is learnt, and how much of it is believed.
 _NOISE_MEMORY = 150.0
 _MOST_NOISE = 3.0
@@ -66,9 +69,7 @@ class TouchBelief:
     It learns how restless the surface is while nothing touches, and the constant error of the pose along x.
     """
 
-    def __init__(self, settings: ContactSettings) -> None:
-        """Keeps the thresholds."""
-        self._settings = settings
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
@@ -76,7 +77,7 @@ class TouchBelief:
         self.touching = False
         self.probability = 0.0
         self._images_apart = 0
-        self._noise = self._settings.deflection_noise
+        self._noise = _NOISE
         self._bias = 0.0
 
     def set(self, touching: bool) -> None:
@@ -91,15 +92,14 @@ class TouchBelief:
             depth_stddev: its standard deviation [m].
             bend: of the surface where the object is nearest [m]; None when nobody knows.
         """
-        rules = self._settings
         if bend is None:
             self.probability = _below(depth / depth_stddev)
         else:
             self.probability = contact_probability(depth - self._bias, depth_stddev, bend, self._noise)
-        if self.probability >= rules.touch_probability:
+        if self.probability >= _TOUCHES:
             self.touching = True
-        self._images_apart = self._images_apart + 1 if self.probability < rules.release_probability else 0
-        if self._images_apart >= rules.release_frames:
+        self._images_apart = self._images_apart + 1 if self.probability < _RELEASES else 0
+        if self._images_apart >= RELEASE_IMAGES:
             self.touching = False
         if bend is not None:
             self._learn(depth, depth_stddev, bend)
@@ -113,9 +113,8 @@ class TouchBelief:
             self._bias += error / _BIAS_MEMORY
         if self.touching:
             return
-        least = self._settings.deflection_noise
         square = self._noise**2 + (bend**2 - self._noise**2) / _NOISE_MEMORY
-        self._noise = min(max(sqrt(square), least), _MOST_NOISE * least)
+        self._noise = min(max(sqrt(square), _NOISE), _MOST_NOISE * _NOISE)
 
 
 def _normal(value: float, stddev: float) -> float:
@@ -131,9 +130,7 @@ def _below(value: float) -> float:
 class StillnessWatch:
     """Watches the deformed inner face while the object touches."""
 
-    def __init__(self, settings: ContactSettings) -> None:
-        """Keeps how long and how still."""
-        self._settings = settings
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
@@ -146,8 +143,8 @@ class StillnessWatch:
     def update(self, stamp: float, line: NDArray | None) -> None:
         """Takes the inner face (h, 2) [m] of an image [s] in contact; None without contact or surface."""
         held = self._line is not None and line is not None
-        if not held or np.abs(line - self._line).max() > self._settings.rest_motion:
+        if not held or np.abs(line - self._line).max() > _REST_MOTION:
             if self.still:
                 self.ended = stamp
             self._line, self._since = line, stamp
-        self.still = line is not None and stamp - self._since >= self._settings.rest_time
+        self.still = line is not None and stamp - self._since >= _REST_TIME

@@ -14,6 +14,10 @@ from finforce_contact.pose.contour import MeshOutline, Outline, compare_outline
 from finforce_contact.pose.depth_image import Comparison, DepthImage, Glance, Samples, Visibility
 from finforce_contact.settings import TrackerSettings
 
+_EDGE_POINTS = 200  # of the outline that are compared per image
+_NOISE_WIDTH = 5.0  # [px] over which the errors of the depth are alike
+# Errors of the normals of the mesh and of its outline [rad]: a motion along its surface up to this is not seen.
+_NORMAL_ERROR, _EDGE_ERROR = 0.035, 0.15
 # A surface seen at less than this cosine tells more about flying pixels than about itself.
 _GRAZING = 0.2
 # The end of an object in a depth image is known to about this [px].
@@ -184,7 +188,7 @@ class MeshAligner:
         glance, back = self.glance(T, effort.points), invert_pose(T)
         outline = None
         if effort.outline:
-            outline = self._outline.find(T, glance, self.camera, self.settings.edge_points).moved(back)
+            outline = self._outline.find(T, glance, self.camera, _EDGE_POINTS).moved(back)
         return _Expected(surface=glance.surface.moved(back), outline=outline, step=glance.step)
 
     def _build(self, T: NDArray, expected: _Expected, image: DepthImage, gate: float) -> _Normal:
@@ -192,14 +196,14 @@ class MeshAligner:
         surface = expected.surface.moved(T)
         depths = image.compare_surface(surface, gate)
         about = _About(middle=middle, radius=self.radius, stddev=_spread(depths, self.settings.noise))
-        normal = _normal_equations(surface, depths, about, self.settings.normal_error)
+        normal = _normal_equations(surface, depths, about, _NORMAL_ERROR)
         if expected.outline is None:
             return normal
         outline = expected.outline.moved(T)
         edges = compare_outline(outline, image, max(gate, _EDGE_REACH))
         edge_noise = max(_EDGE_NOISE * middle[2] / self.camera.fx, about.stddev)
         about = replace(about, stddev=_spread(edges, edge_noise))
-        return normal.plus(_normal_equations(outline.samples, edges, about, self.settings.edge_error))
+        return normal.plus(_normal_equations(outline.samples, edges, about, _EDGE_ERROR))
 
     def _step(self, normal: _Normal) -> NDArray:
         """Returns the step (6,) in the directions that the image tells."""
@@ -220,7 +224,7 @@ class MeshAligner:
         counts = np.bincount(normal.sights, minlength=len(Visibility))
         basis = normal.sure_directions()
         # neighbouring depths err alike: so many pixels count as one
-        alike = max(1.0, self.settings.noise_width / expected.step) ** 2
+        alike = max(1.0, _NOISE_WIDTH / expected.step) ** 2
         known = basis.T @ self._to_middle(T)
         return Alignment(
             T_camera_object=T,

@@ -12,6 +12,11 @@ from finforce_contact.errors import check_stamp, to_floats
 from finforce_contact.settings import ContactSettings
 
 _X = 0
+# Random walks of the object along the jaw [m/s^0.5], of its rotation [rad/s^0.5] and of its closing speed [m/s^1.5];
+# what moves more is noticed and followed.
+_DRIFT, _ROTATION_DRIFT, _ACCELERATION = 0.1e-3, 2e-3, 2e-3
+_GATE = 5.0  # [sigma]; a pose farther off is not believed at once
+_JUMP_POSES = 3  # in a row off the trajectory that agree with each other are believed
 # Samples over which noise is learnt, and how many the assumed noise counts for.
 _NOISE_MEMORY, _NOISE_PRIOR = 60.0, 6.0
 _NOISE_RANGE = (1e-2, 1e2)
@@ -48,11 +53,11 @@ class PoseFilter:
     """
 
     def __init__(self, settings: ContactSettings) -> None:
-        """Keeps noise, drift and gates."""
-        self._settings = settings
+        """Keep what noise is expected."""
+        self._timeout = settings.pose_timeout
         noise = np.repeat([settings.pose_noise, settings.rotation_noise], 3)
         self._assumed = noise**2
-        self._drift = np.repeat([settings.drift, settings.rotation_drift], 3) ** 2
+        self._drift = np.repeat([_DRIFT, _ROTATION_DRIFT], 3) ** 2
         self._drift[_X] = 0.0
         self.reset()
 
@@ -63,7 +68,7 @@ class PoseFilter:
         self.latest: NDArray | None = None
         self._scale = np.ones(6)
         self._learnt, self._slide = _NOISE_PRIOR, np.zeros(2)
-        self._aside: deque[tuple[float, NDArray]] = deque(maxlen=self._settings.jump_samples)
+        self._aside: deque[tuple[float, NDArray]] = deque(maxlen=_JUMP_POSES)
 
     def update(self, stamp: float, T: NDArray, covariance: NDArray | None = None) -> str:
         """Takes a pose and returns what became of it: "used", "late", "aside" or "jump".
@@ -82,13 +87,13 @@ class PoseFilter:
         if self.stamp is not None and stamp <= self.stamp:
             return "late"
         self.latest = T
-        if self.stamp is None or stamp - self.stamp > self._settings.pose_timeout:
+        if self.stamp is None or stamp - self.stamp > self._timeout:
             self._begin(stamp, T, noise)
             return "used"
         self._predict(stamp)
         innovation = step_between(self._T, T)
         spread = self._P + noise
-        if (innovation**2 > self._settings.gate**2 * spread).any():
+        if (innovation**2 > _GATE**2 * spread).any():
             return self._set_aside(stamp, T, noise)
         self._aside.clear()
         self._learn(innovation, None if covariance is None else noise)
@@ -155,7 +160,7 @@ class PoseFilter:
 
     def _predict(self, stamp: float) -> None:
         """Moves the trajectory on to a time [s]: constant speed under white acceleration in x, a random walk else."""
-        dt, power = stamp - self.stamp, self._settings.acceleration**2
+        dt, power = stamp - self.stamp, _ACCELERATION**2
         self._T[:3, 3] += dt * np.array([self._speed, *self._slide])
         self._P = self._P + self._drift * dt
         self._P[_X] += 2.0 * dt * self._cross + dt**2 * self._speed_variance + power * dt**3 / 3.0
@@ -194,7 +199,7 @@ class PoseFilter:
     def _set_aside(self, stamp: float, T: NDArray, noise: NDArray) -> str:
         """Keeps a pose off the trajectory; once enough in a row agree, the trajectory starts anew from them."""
         self._aside.append((stamp, T))
-        if len(self._aside) < self._settings.jump_samples or not self._agree(noise):
+        if len(self._aside) < _JUMP_POSES or not self._agree(noise):
             return "aside"
         (first, T_first), (last, T_last) = self._aside[0], self._aside[-1]
         self._begin(stamp, T_last, noise, speed=float((T_last - T_first)[_X, 3] / (last - first)))
@@ -205,4 +210,4 @@ class PoseFilter:
         stamps = np.array([stamp for stamp, _ in self._aside])
         steps = np.array([step_between(self._aside[0][1], T) for _, T in self._aside])
         line = np.outer((stamps - stamps[0]) / (stamps[-1] - stamps[0]), steps[-1])
-        return bool(((steps - line) ** 2 <= self._settings.gate**2 * 2.0 * noise).all())
+        return bool(((steps - line) ** 2 <= _GATE**2 * 2.0 * noise).all())

@@ -18,6 +18,9 @@ from finforce_contact.pose.depth_image import LEAST_PIXELS, DepthImage
 from finforce_contact.pose.source import ObjectPose, check_camera_outside
 from finforce_contact.settings import TrackerSettings
 
+# Depth farther off than this [m] is not the object, at first and in the end.
+_WIDE_GATE, _GATE = 0.006, 0.003
+_LEAST_VISIBLE = 0.1  # share of the object in view that nothing hides
 # Depths farther apart than this [m] disagree altogether.
 _WORST = 0.01
 _COARSE = Effort(gates=(0.03, 0.015), steps=3, points=150, outline=False)
@@ -222,7 +225,7 @@ class PoseTracker:
         return self._accept(stamp, alignment, self.latest.covariance + np.diag(moved**2))
 
     def _near_effort(self) -> Effort:
-        gates = (self._settings.wide_gate, self._settings.gate, self._settings.gate)
+        gates = (_WIDE_GATE, _GATE, _GATE)
         return Effort(gates=gates, steps=3, points=self._settings.points)
 
     def _recover(self, stamp: float, image: DepthImage) -> Alignment | None:
@@ -264,7 +267,7 @@ class PoseTracker:
             return False
         return (
             alignment.seen >= LEAST_PIXELS
-            and alignment.visible >= self._settings.least_visible
+            and alignment.visible >= _LEAST_VISIBLE
             and alignment.fitness >= self._settings.least_fitness
         )
 
@@ -273,7 +276,7 @@ class PoseTracker:
         before, after = self.latest.T_camera_object, alignment.T_camera_object
         way = np.linalg.norm(self._aligner.middle_of(after) - self._aligner.middle_of(before))
         way = max(way, self._aligner.radius * rotation_between(before, after))
-        return way < self._settings.wide_gate + self._settings.speed * min(elapsed, _LONGEST_GAP)
+        return way < _WIDE_GATE + self._settings.speed * min(elapsed, _LONGEST_GAP)
 
     def _accept(self, stamp: float, alignment: Alignment, prior: NDArray) -> ObjectPose:
         """Keeps a pose: covariance = (information + prior^-1 + unknown^-2)^-1."""

@@ -216,7 +216,7 @@ def by_outline(setup: MethodSetup, *, with_wrench: bool) -> Method:
     """Return the method of mode "estimate"."""
     settings = ContactSettings()
     face = build_inner_face(setup.jaw, settings.mesh)
-    return _by_localizer(setup, OutlineLocalizer(face, settings), with_wrench=with_wrench)
+    return _by_localizer(setup, OutlineLocalizer(face), with_wrench=with_wrench)
 
 
 def by_closest(setup: MethodSetup) -> Method:
@@ -228,7 +228,7 @@ def by_closest(setup: MethodSetup) -> Method:
 def _by_localizer(setup: MethodSetup, localizer: Localizer, *, with_wrench: bool) -> Method:
     settings = ContactSettings()
     face = build_inner_face(setup.jaw, settings.mesh)
-    sections = SectionKeeper(setup.mesh, face.half_width, settings)
+    sections = SectionKeeper(setup.mesh, face.half_width)
 
     def locate(T: NDArray, surface: NDArray, wrench: Wrench) -> float | None:
         scene = ContactScene(

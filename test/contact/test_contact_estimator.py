@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from finforce.errors import PoseError
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.estimator import ContactEstimator
-from finforce_contact.localization.touch import TouchBelief, contact_probability
+from finforce_contact.localization.touch import RELEASE_IMAGES, TouchBelief, contact_probability
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.pose.filter import PoseFilter
 from finforce_contact.settings import ContactSettings
@@ -282,38 +282,38 @@ class TestTouch:
         assert contact_probability(depth, 1e-5, 0.5, 1e-5) in (0.0, 1.0)
 
     def test_contact_is_believed_within_two_images_at_two_millimetres_per_second(self):
-        belief = TouchBelief(SETTINGS)
+        belief = TouchBelief()
         for _ in range(60):
             assert not belief.update(0.0, 0.5 * MM, 0.02 * MM)
         touched = [belief.update(0.0, 0.5 * MM, (0.02 + 2.0 * FRAME * frame) * MM) for frame in range(1, 4)]
         assert touched[1]
 
     def test_contact_does_not_flicker(self):
-        belief, random = TouchBelief(SETTINGS), np.random.default_rng(1)
+        belief, random = TouchBelief(), np.random.default_rng(1)
         belief.update(0.0, 0.5 * MM, 0.3 * MM)
         bends = 0.12 * MM + 0.03 * MM * random.standard_normal(300)
         assert all(belief.update(0.0, 0.5 * MM, bend) for bend in bends)
 
     def test_end_of_contact_takes_some_images(self):
-        belief = TouchBelief(SETTINGS)
+        belief = TouchBelief()
         belief.update(0.0, 0.5 * MM, 0.5 * MM)
-        ends = [belief.update(-0.2 * MM, 0.5 * MM, 0.0) for _ in range(SETTINGS.release_frames)]
-        assert ends == [True] * (SETTINGS.release_frames - 1) + [False]
+        ends = [belief.update(-0.2 * MM, 0.5 * MM, 0.0) for _ in range(RELEASE_IMAGES)]
+        assert ends == [True] * (RELEASE_IMAGES - 1) + [False]
 
     def test_pose_alone_decides_when_no_surface_is_known(self):
-        belief = TouchBelief(SETTINGS)
+        belief = TouchBelief()
         assert not belief.update(0.1 * MM, 0.5 * MM, None)
         assert belief.update(2 * MM, 0.5 * MM, None)
 
     def test_constant_error_of_the_pose_is_learnt_from_a_jaw_that_is_not_bent(self):
-        learnt, fresh = TouchBelief(SETTINGS), TouchBelief(SETTINGS)
+        learnt, fresh = TouchBelief(), TouchBelief()
         for _ in range(300):
             assert not learnt.update(1 * MM, 0.5 * MM, 0.02 * MM)
         assert fresh.update(1 * MM, 0.5 * MM, 0.1 * MM)
         assert not learnt.update(1 * MM, 0.5 * MM, 0.1 * MM)
 
     def test_restless_surface_needs_more_bend(self):
-        calm, restless, random = TouchBelief(SETTINGS), TouchBelief(SETTINGS), np.random.default_rng(2)
+        calm, restless, random = TouchBelief(), TouchBelief(), np.random.default_rng(2)
         for _ in range(300):
             calm.update(-0.3 * MM, 0.5 * MM, 0.02 * MM)
             restless.update(-0.3 * MM, 0.5 * MM, min(0.06 * MM * abs(random.standard_normal()), 0.1 * MM))

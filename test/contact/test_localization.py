@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.localization.outline_localizer import (
+    WRENCH_FORCE,
+    WRENCH_GAIN,
     ClosestLocalizer,
     ContactPatch,
     ContactScene,
@@ -28,23 +30,21 @@ from finforce_contact.localization.section import (
     split_turn,
 )
 from finforce_contact.mesh.object_mesh import surrounds
-from finforce_contact.paper_contact import MARGIN, IntersectionLocalizer, NearSolid, centre_of_volume, intersect
-from finforce_contact.settings import ContactSettings
+from finforce_contact.paper_contact import MARGIN, OFFSET, IntersectionLocalizer, NearSolid, centre_of_volume, intersect
 from finforce_ifea.errors import MeshError
 
-SETTINGS = ContactSettings()
 INNER = build_inner_face(JAW, "default")
 NODES = INNER.mesh.nodes
 MM = 1e-3
 
 
 def scene_of(mesh, T, surface=NODES, wrench=None):
-    section = SectionKeeper(mesh, INNER.half_width, SETTINGS).at(T)
+    section = SectionKeeper(mesh, INNER.half_width).at(T)
     return ContactScene(T=T, section=section, surface=surface, line=INNER.deform(surface), wrench=wrench)
 
 
-def locate(mesh, T, surface=NODES, wrench=None, settings=SETTINGS):
-    return OutlineLocalizer(INNER, settings).locate(scene_of(mesh, T, surface, wrench))
+def locate(mesh, T, surface=NODES, wrench=None):
+    return OutlineLocalizer(INNER).locate(scene_of(mesh, T, surface, wrench))
 
 
 def push_at(line, height, size=2.0, lean=0.0):
@@ -108,7 +108,7 @@ class TestGaps:
 
     def test_far_wall_of_a_cup_around_the_finger_does_not_count(self):
         walls = [box((0.003, 0.05, 0.1), (x, 0.0, 0.0)) for x in (-0.025, 0.02)]
-        section = SectionKeeper(joined(*walls), INNER.half_width, SETTINGS).at(pose(0.0, 0.04))
+        section = SectionKeeper(joined(*walls), INNER.half_width).at(pose(0.0, 0.04))
         np.testing.assert_allclose(compute_gaps(INNER.deform(NODES), section.edges), 0.0185 - FACE, atol=1e-5)
 
     def test_points_within_the_outline_are_counted_but_not_those_in_its_holes(self):
@@ -180,17 +180,17 @@ class TestSection:
 
     def test_tilted_outline_is_the_one_cut_at_that_tilt(self):
         mesh = box((0.02, 0.03, 0.04), (0.003, 0.0, -0.002))
-        keeper = SectionKeeper(mesh, INNER.half_width, SETTINGS)
+        keeper = SectionKeeper(mesh, INNER.half_width)
         keeper.at(pose(0.03, 0.04))
         tilted = keeper.at(pose(0.031, 0.041, tilt=0.3))
-        anew = SectionKeeper(mesh, INNER.half_width, SETTINGS).at(pose(0.031, 0.041, tilt=0.3))
+        anew = SectionKeeper(mesh, INNER.half_width).at(pose(0.031, 0.041, tilt=0.3))
         line = INNER.deform(NODES)
         assert keeper.cuts == 1
         assert tilted.tilt == pytest.approx(0.3)
         np.testing.assert_allclose(compute_gaps(line, tilted.edges), compute_gaps(line, anew.edges), atol=0.05 * MM)
 
     def test_outline_is_cut_anew_when_the_object_tips_or_slides_across(self):
-        keeper = SectionKeeper(box(), INNER.half_width, SETTINGS)
+        keeper = SectionKeeper(box(), INNER.half_width)
         keeper.at(pose(0.03, 0.04))
         keeper.at(pose(0.03, 0.04, y=0.9 * MM))
         assert keeper.cuts == 1
@@ -251,7 +251,7 @@ class TestOutline:
 
     def test_rows_follow_the_line_of_action_within_the_overlap(self):
         mesh, T = box(), pose(FACE + 0.015, 0.045)
-        gain = SETTINGS.wrench_gain
+        gain = WRENCH_GAIN
         place = locate(mesh, T, wrench=push_at(INNER.deform(NODES), 0.039))
         shape = locate(mesh, T).patch.mean
         assert place.patch.mean == pytest.approx(shape + gain * (0.039 - shape), abs=1e-6)
@@ -264,7 +264,7 @@ class TestOutline:
 
     def test_force_too_weak_has_no_line_of_action(self):
         T = pose(FACE + 0.015, 0.045)
-        weak = push_at(INNER.deform(NODES), 0.035, size=0.9 * SETTINGS.wrench_force)
+        weak = push_at(INNER.deform(NODES), 0.035, size=0.9 * WRENCH_FORCE)
         assert locate(box(), T, wrench=weak).patch.mean == pytest.approx(locate(box(), T).patch.mean)
 
     def test_open_mesh_has_the_same_place(self):
@@ -274,9 +274,9 @@ class TestOutline:
     def test_right_jaw_has_the_same_place(self):
         face = build_inner_face(JAW.mirrored(), "default")
         T = pose(FACE + 0.0125, 0.0412)
-        section = SectionKeeper(cylinder(), face.half_width, SETTINGS).at(T)
+        section = SectionKeeper(cylinder(), face.half_width).at(T)
         scene = ContactScene(T=T, section=section, surface=face.mesh.nodes, line=face.deform(face.mesh.nodes))
-        assert OutlineLocalizer(face, SETTINGS).locate(scene).patch.mean == pytest.approx(0.0412, abs=0.1 * MM)
+        assert OutlineLocalizer(face).locate(scene).patch.mean == pytest.approx(0.0412, abs=0.1 * MM)
 
 
 class TestClosest:
@@ -297,7 +297,7 @@ class TestIntersection:
     @pytest.fixture
     def localizer(self):
         pytest.importorskip("manifold3d")
-        return IntersectionLocalizer(JAW, INNER, cylinder(), SETTINGS)
+        return IntersectionLocalizer(JAW, INNER, cylinder())
 
     def test_centre_of_volume_of_a_box_is_its_centre(self):
         mesh = box((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
@@ -316,12 +316,12 @@ class TestIntersection:
         assert place.touching is False
 
     def test_shift_before_contact_is_equation_two(self, localizer):
-        expected = FACE - SETTINGS.offset + 0.0125
+        expected = FACE - OFFSET + 0.0125
         assert localizer._slight_contact(pose(0.06, 0.04)) == pytest.approx(expected, abs=1e-12)
 
     def test_shift_goes_by_the_middle_of_an_object_whose_origin_is_elsewhere(self):
         pytest.importorskip("manifold3d")
-        localizer = IntersectionLocalizer(JAW, INNER, box((0.02, 0.03, 0.03), (0.004, 0.0, 0.0)), SETTINGS)
+        localizer = IntersectionLocalizer(JAW, INNER, box((0.02, 0.03, 0.03), (0.004, 0.0, 0.0)))
         assert localizer._slight_contact(pose(0.06, 0.04)) == pytest.approx(FACE - 1 * MM + 0.006, abs=1e-12)
 
     def test_status_turns_false_after_an_empty_intersection_and_the_place_is_kept(self, localizer):
@@ -357,7 +357,7 @@ class TestIntersection:
     def test_open_mesh_is_refused_and_the_way_out_named(self):
         pytest.importorskip("manifold3d")
         with pytest.raises(ObjectMeshError, match="mode 'estimate'"):
-            IntersectionLocalizer(JAW, INNER, opened(cylinder()), SETTINGS)
+            IntersectionLocalizer(JAW, INNER, opened(cylinder()))
 
 
 class TestEnclosure:

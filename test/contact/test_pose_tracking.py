@@ -256,7 +256,7 @@ def test_an_image_of_the_past_is_refused_until_a_reset(tracker, frames):
     assert tracker.latest.stamp == 0.5
 
 
-@pytest.mark.parametrize("wrong", [{"points": 10}, {"noise": np.nan}, {"wide_gate": 0.002, "gate": 0.003}])
+@pytest.mark.parametrize("wrong", [{"points": 10}, {"noise": np.nan}, {"speed": 0.0}])
 def test_settings_out_of_bounds_are_refused_by_name(wrong):
     with pytest.raises(PoseError, match=next(iter(wrong))):
         TrackerSettings(**wrong)
