@@ -25,9 +25,9 @@ from finforce_contact.localization.touch import SURELY_BENT, StillnessWatch, Tou
 from finforce_contact.mesh.object_mesh import surrounds
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.paper_contact import IntersectionLocalizer
+from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.filter import FilteredPose, PoseFilter
 from finforce_contact.pose.symmetry import parse_symmetry, read_symmetry
-from finforce_contact.settings import ContactSettings
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.observation import Contact, ObjectOutline
 

@@ -19,13 +19,10 @@ from finforce.ros import node as ros
 from finforce.settings import refresh_record
 from finforce.skipping import CONTACT, IDLE, Skips
 from finforce.stamps import Idling, StampGate
-from finforce_contact.camera_feed import StampedPose
-from finforce_contact.diagnostics import describe, object_alarms, outcome_of_estimate
 from finforce_contact.jaw_contact import TimedEstimate
-from finforce_contact.parameters import ContactParameters
-from finforce_contact.publishers import ContactOutputs
-from finforce_contact.session import ContactSession, detections_type
-from finforce_contact.settings import ContactSettings, TrackerSettings
+from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
+from finforce_contact.publishers import ContactOutputs, describe, object_alarms, outcome_of_estimate
+from finforce_contact.session import ContactSession, StampedPose, detections_type
 
 CAMERA = "/camera/camera"
 WAITING = ros.QoSProfile(depth=20, reliability=ros.ReliabilityPolicy.BEST_EFFORT)  # a tenth of a second, and more

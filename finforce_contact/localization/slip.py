@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_contact.settings import ContactSettings
+from finforce_contact.parameters import ContactSettings
 
 # The cumulative sum: what is chance of one sample, the most that one may count for, and where it becomes an alarm.
 _CHANCE, _MOST, _ALARM = 1.0, 3.0, 4.5

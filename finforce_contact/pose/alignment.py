@@ -1,18 +1,331 @@
-"""Brings a mesh into agreement with one depth image by Gauss-Newton steps."""
+"""Agreement of a mesh with one depth image: its surface and its outline, by Gauss-Newton steps."""
 
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from finforce.camera import CameraIntrinsics
+from finforce.camera import CameraIntrinsics, check_depth, check_mask, compute_rays, project, rays_from_pixels
 from finforce.transforms import invert_pose
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.mesh.views import MeshView
-from finforce_contact.pose.contour import MeshOutline, Outline, compare_outline
-from finforce_contact.pose.depth_image import Comparison, DepthImage, Glance, Samples, Visibility
-from finforce_contact.settings import TrackerSettings
+from finforce_contact.parameters import TrackerSettings
+
+# With fewer pixels of the object, any pose agrees with any image.
+LEAST_PIXELS = 30
+
+
+class Visibility(IntEnum):
+    """What the image says about one point of the surface."""
+
+    UNKNOWN = 0  # no depth there, or outside the image
+    SEEN = 1  # where it should be
+    HIDDEN = 2  # something is in front of it
+    ABSENT = 3  # what is seen there lies behind it, or is not the object by the mask
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Samples:
+    """Points of a surface or an outline, each measured along one direction.
+
+    Attributes:
+        points: (n, 3) [m].
+        directions: (n, 3) unit vectors: the surface's normal, or the normal of the outline across the view.
+    """
+
+    points: NDArray
+    directions: NDArray
+
+    def moved(self, T: NDArray) -> "Samples":
+        """Returns the same samples in the frame a of a pose T_a_b (4, 4), these being in b."""
+        return Samples(points=self.points @ T[:3, :3].T + T[:3, 3], directions=self.directions @ T[:3, :3].T)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Glance:
+    """What should be seen of an object in one pose, on the grid of every `step`-th pixel.
+
+    Attributes:
+        depth: grid of depths (h, w) [m], NaN beside the object.
+        surface: what is seen of the surface, camera frame.
+        step: pixels from one to the next.
+    """
+
+    depth: NDArray
+    surface: Samples
+    step: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Comparison:
+    """Samples against an image.
+
+    Attributes:
+        residuals: (n,) way along its direction from a sample to what was measured [m], NaN where nothing was.
+        sights: (n,) of type `Visibility`.
+    """
+
+    residuals: NDArray
+    sights: NDArray
+
+    def count(self, sight: Visibility) -> int:
+        """Returns how many samples have this sight."""
+        return int(np.count_nonzero(self.sights == sight))
+
+
+class DepthImage:
+    """A checked depth image, with the mask of the object where there is one.
+
+    Attributes:
+        depth: (h, w) [m], NaN where nothing was measured.
+        mask: (h, w) bool, or None.
+        camera: its intrinsics.
+    """
+
+    def __init__(self, depth: NDArray, camera: CameraIntrinsics, mask: NDArray | None = None) -> None:
+        """Takes an image.
+
+        Raises:
+            ImageError: The image has another size than the camera, no depth at all, or a mask with next to none.
+        """
+        check_depth(depth, camera)
+        # a zero is how many drivers write "nothing measured"
+        self.depth = np.where(np.asarray(depth) > 0.0, depth, np.nan)
+        if mask is not None:
+            check_mask(mask, self.depth, least=LEAST_PIXELS)
+            mask = np.asarray(mask, bool)
+        self.mask, self.camera = mask, camera
+        self._rays = compute_rays(camera)
+
+    def ray(self, pixel: NDArray) -> NDArray:
+        """Returns the viewing ray (3,) with z = 1 of one pixel (2,), which may lie outside the image."""
+        return rays_from_pixels(pixel[None], self.camera)[0]
+
+    def look(self, pixels: NDArray) -> NDArray:
+        """Returns the depths (...,) [m] at pixels (..., 2), NaN where there is none or outside the image."""
+        column, row, inside = self._nearest(pixels)
+        return np.where(inside, self.depth[row, column], np.nan)
+
+    def is_masked_out(self, pixels: NDArray) -> NDArray:
+        """Returns where (...,) the mask says that pixels (..., 2) are not the object; nowhere without a mask."""
+        if self.mask is None:
+            return np.zeros(pixels.shape[:-1], bool)
+        column, row, inside = self._nearest(pixels)
+        return inside & ~self.mask[row, column]
+
+    def compare_surface(self, surface: Samples, gate: float) -> Comparison:
+        """Compares points of a surface with the depths at their pixels.
+
+        residual = n . (q - p) for a point p with normal n and the point q measured on the ray next to p. The point
+        counts as seen where |residual| is below the gate, and the depth itself no farther off than twice the gate:
+        a plate in front of a surface that is seen from the side is near its plane, too.
+
+        Args:
+            surface: samples in the camera frame.
+            gate: [m].
+        """
+        pixels = project(surface.points, self.camera)
+        column, row, inside = self._nearest(pixels)
+        depth = np.where(inside, self.depth[row, column], np.nan)
+        measured = self._rays[row, column] * depth[:, None]
+        residuals = np.einsum("ij,ij->i", surface.directions, measured - surface.points)
+        foreign = self.is_masked_out(pixels)
+        sights = np.where(depth < surface.points[:, 2], Visibility.HIDDEN, Visibility.ABSENT)
+        sights[np.isnan(depth) & ~foreign] = Visibility.UNKNOWN
+        near = (np.abs(residuals) < gate) & (np.abs(depth - surface.points[:, 2]) < 2.0 * gate)
+        sights[near & ~foreign] = Visibility.SEEN
+        return Comparison(residuals=np.where(sights == Visibility.SEEN, residuals, np.nan), sights=sights)
+
+    def _nearest(self, pixels: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        known = np.isfinite(pixels).all(axis=-1)
+        whole = np.rint(np.where(known[..., None], pixels, -1.0)).astype(np.intp)
+        column, row = whole[..., 0], whole[..., 1]
+        inside = (column >= 0) & (column < self.camera.width) & (row >= 0) & (row < self.camera.height)
+        return np.where(inside, column, 0), np.where(inside, row, 0), inside
+
+
+# Behind the outline the image must fall back by this [m] to be told from the object's own shape and from noise.
+_STEP_BACK = 0.006
+# No object that a gripper holds comes nearer than this [m] within a few pixels of its outline: an edge is hidden there.
+_DEEPEST = 0.03
+# Edges that turn by more than this [rad] are sharp: their outline runs along them, and not along the mean surface.
+_SHARP = 0.5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outline:
+    """Points where the object ends in the view.
+
+    Attributes:
+        samples: the points, with their outward normals across the view.
+        bulges: (n,) how far in front of each point the object is a few pixels within the outline [m].
+    """
+
+    samples: Samples
+    bulges: NDArray
+
+    def moved(self, T: NDArray) -> "Outline":
+        """Returns the same points in the frame a of a pose T_a_b (4, 4), these being in b."""
+        return replace(self, samples=self.samples.moved(T))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Edges:
+    """Points along the convex edges of a mesh, object frame: points, tangents, normals of the two faces (n, 3)."""
+
+    points: NDArray
+    tangents: NDArray
+    first: NDArray
+    second: NDArray
+
+
+class MeshOutline:
+    """The edges of a mesh, prepared for finding the outline from any side."""
+
+    def __init__(self, mesh: ObjectMesh, samples: int = 60) -> None:
+        """Puts points along the edges, no farther apart than the mesh's size divided by `samples`."""
+        self._edges = _place_points(mesh, np.ptp(mesh.vertices, axis=0).max() / samples)
+
+    def find(self, T_camera_object: NDArray, glance: Glance, camera: CameraIntrinsics, most: int) -> Outline:
+        """Returns at most `most` points of the outline behind which the object ends, with their outward normals.
+
+        A point of an edge is on the outline where one of its faces looks at the camera and the other away. Its
+        direction is perpendicular to the ray, and to the edge where that is sharp.
+
+        Args:
+            T_camera_object: pose (4, 4) of the glance.
+            glance: the visible part of the mesh there, which tells hidden edges.
+            camera: of the glance.
+            most: points that are kept.
+
+        Returns:
+            The outline in the camera frame.
+        """
+        edges, camera_place = self._edges, invert_pose(T_camera_object)[:3, 3]
+        rays = edges.points - camera_place
+        sides = np.einsum("ij,ij->i", edges.first, rays) * np.einsum("ij,ij->i", edges.second, rays)
+        chosen = np.flatnonzero(sides <= 0.0)
+        outline = Samples(
+            points=edges.points[chosen],
+            directions=_across(rays[chosen], edges.tangents[chosen], edges.first[chosen], edges.second[chosen]),
+        ).moved(T_camera_object)
+        bulges = _find_bulges(outline, glance, camera)
+        kept = np.flatnonzero(np.isfinite(bulges))
+        kept = kept[:: max(1, -(-len(kept) // most))]
+        samples = Samples(points=outline.points[kept], directions=outline.directions[kept])
+        return Outline(samples=samples, bulges=bulges[kept])
+
+
+def compare_outline(outline: Outline, image: DepthImage, reach: float) -> Comparison:
+    """Finds the end of the object in a depth image across points of its outline.
+
+    From inside to outside, the pixels near a point are object up to the split that most of them agree with, and behind
+    the object after it. Points beside which something else is in front, or whose split is not clear, are unknown.
+
+    Args:
+        outline: in the camera frame, as of `MeshOutline.find`.
+        image: where to look.
+        reach: how far to look to either side [m].
+    """
+    places, along = _walk_across(outline.samples, image.camera, reach)
+    depth, edge_depth = image.look(places), outline.samples.points[:, 2:3]
+    nearest = edge_depth - outline.bulges[:, None] - _STEP_BACK
+    foreign = image.is_masked_out(places)
+    behind = (depth > edge_depth + _STEP_BACK) | (foreign & ~(depth < edge_depth))
+    votes = np.where(behind, -1, np.where(np.isnan(depth), 0, 1))
+    votes[(depth < nearest) | (foreign & (depth < edge_depth))] = 0
+    split, agreement = _best_split(votes)
+    rows = np.arange(len(split))
+    before, after = along[rows, split - 1], along[rows, split]
+    clear = (agreement > 0.7 * votes.shape[1]) & (after - before < 3.1 * (along[:, -1] - along[:, 0]) / along.shape[1])
+    clear &= (votes[rows, split - 1] == 1) & (votes[rows, split] == -1)
+    residuals = np.where(clear, 0.5 * (before + after), np.nan)
+    return Comparison(residuals=residuals, sights=np.where(clear, Visibility.SEEN, Visibility.UNKNOWN))
+
+
+def _walk_across(outline: Samples, camera: CameraIntrinsics, reach: float) -> tuple[NDArray, NDArray]:
+    """Returns whole pixels (n, k, 2) across the outline, and how far out they lie (n, k) [m]."""
+    start = project(outline.points, camera)
+    metres = outline.points[:, 2] / (0.5 * (camera.fx + camera.fy))
+    across = project(outline.points + outline.directions * metres[:, None], camera) - start
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+    count = max(4, int(np.ceil(reach / np.median(metres)))) if len(metres) else 4
+    places = np.rint(start[:, None] + across[:, None] * np.arange(-count, count + 1)[:, None])
+    along = np.einsum("nki,ni->nk", places - start[:, None], across) * metres[:, None]
+    return places, along
+
+
+def _best_split(votes: NDArray) -> tuple[NDArray, NDArray]:
+    """Returns where the outside begins in votes (n, k) of +1 inside and -1 outside, and how many agree with it."""
+    inside = np.cumsum(votes, axis=1)
+    agreement = 2 * inside[:, :-1] - inside[:, -1:]
+    split = agreement.argmax(axis=1)
+    return split + 1, agreement[np.arange(len(split)), split]
+
+
+def _find_bulges(outline: Samples, glance: Glance, camera: CameraIntrinsics) -> NDArray:
+    """Returns the bulges (n,) [m] of points of an outline, NaN where the mesh does not end behind them."""
+    pixels = project(outline.points, camera)
+    metres = glance.step * outline.points[:, 2] / camera.fx
+    outward = project(outline.points + outline.directions * metres[:, None], camera) - pixels
+    depth = outline.points[:, 2]
+    outer = _look(glance, pixels + 1.5 * outward)
+    inner = np.array([depth - _look(glance, pixels - steps * outward) for steps in (1.5, 3.0)])
+    bulges = np.maximum(inner[0], np.nan_to_num(inner[1], nan=0.0))
+    ends = (np.abs(bulges) < _DEEPEST) & ~(outer < depth + _STEP_BACK)
+    return np.where(ends, np.maximum(bulges, 0.0), np.nan)
+
+
+def _look(glance: Glance, pixels: NDArray) -> NDArray:
+    """Returns the depths (n,) of a glance next to pixels (n, 2), NaN outside."""
+    height, width = glance.depth.shape
+    whole = np.rint(np.nan_to_num(pixels, nan=-1e6) / glance.step).astype(np.intp)
+    inside = ((whole >= 0) & (whole < (width, height))).all(axis=1)
+    whole[~inside] = 0
+    return np.where(inside, glance.depth[whole[:, 1], whole[:, 0]], np.nan)
+
+
+def _across(rays: NDArray, tangents: NDArray, first: NDArray, second: NDArray) -> NDArray:
+    """Returns the outward unit normals (n, 3) of outline points, perpendicular to their rays."""
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    mean = first + second
+    smooth = mean - np.einsum("ij,ij->i", mean, rays)[:, None] * rays
+    sharp = np.cross(rays, tangents)
+    sharp *= np.sign(np.einsum("ij,ij->i", sharp, mean))[:, None]
+    is_sharp = np.einsum("ij,ij->i", first, second) < np.cos(_SHARP)
+    across = np.where(is_sharp[:, None], sharp, smooth)
+    return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+
+
+def _place_points(mesh: ObjectMesh, spacing: float) -> _Edges:
+    table = mesh.edges
+    corners = mesh.vertices[mesh.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    flat = table.of_triangles.ravel()
+    paired = np.flatnonzero(np.bincount(flat, minlength=len(table.ends)) == 2)
+    order = np.argsort(flat, kind="stable")
+    starts = np.searchsorted(flat[order], paired)
+    one, other = order[starts] // 3, order[starts + 1] // 3
+    begin, end = mesh.vertices[table.ends[paired, 0]], mesh.vertices[table.ends[paired, 1]]
+    # seen from one face, the middle of the other one lies below an edge that can be an outline
+    dip = np.einsum("ij,ij->i", normals[one], corners[other].mean(axis=1) - begin)
+    convex = dip < -1e-6 * spacing
+    one, other, begin, end = one[convex], other[convex], begin[convex], end[convex]
+    lengths = np.linalg.norm(end - begin, axis=1)
+    counts = np.maximum(1, np.ceil(lengths / spacing)).astype(int)
+    which = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts) + 0.5) / counts[which]
+    tangents = (end - begin) / np.maximum(lengths, 1e-30)[:, None]
+    return _Edges(
+        points=begin[which] + share[:, None] * (end - begin)[which],
+        tangents=tangents[which],
+        first=normals[one[which]],
+        second=normals[other[which]],
+    )
+
 
 _EDGE_POINTS = 200  # of the outline that are compared per image
 _NOISE_WIDTH = 5.0  # [px] over which the errors of the depth are alike

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from finforce.errors import PoseError
 from finforce.transforms import check_pose, move_pose, step_between
 from finforce_contact.errors import check_stamp, to_floats
-from finforce_contact.settings import ContactSettings
+from finforce_contact.parameters import ContactSettings
 
 _X = 0
 # Random walks of the object along the jaw [m/s^0.5], of its rotation [rad/s^0.5] and of its closing speed [m/s^1.5];

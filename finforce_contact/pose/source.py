@@ -11,10 +11,7 @@ from finforce.errors import PoseError
 from finforce.transforms import check_pose, invert_pose, pose_from_quaternion
 from finforce_contact.mesh.object_mesh import surrounds
 from finforce_contact.mesh.triangles import ObjectMesh
-
-# How many times the middle of the mesh's bounding box, in the mesh's axes, is taken off a pose: some trackers tell that
-# of the middle, and isaac_ros_foundationpose up to release 4.4 adds the middle where it ought to be taken off.
-ORIGINS = {"mesh": 0.0, "middle": 1.0, "added": 2.0}
+from finforce_contact.parameters import ORIGINS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from finforce.transforms import rotation_between
 from finforce_contact.errors import ContactError
-from finforce_contact.mesh.chamfer import sample_with_normals
 from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.views import sample_with_normals
 
 AUTO, NONE, FULL = "auto", "none", "full"
 AXES = {"x": 0, "y": 1, "z": 2}

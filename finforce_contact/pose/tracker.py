@@ -13,10 +13,9 @@ from finforce.errors import PoseError
 from finforce.transforms import move_pose, rotation_between
 from finforce_contact.errors import PoseLostError
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.pose.alignment import Alignment, Effort, MeshAligner
-from finforce_contact.pose.depth_image import LEAST_PIXELS, DepthImage
+from finforce_contact.parameters import TrackerSettings
+from finforce_contact.pose.alignment import LEAST_PIXELS, Alignment, DepthImage, Effort, MeshAligner
 from finforce_contact.pose.source import ObjectPose, check_camera_outside
-from finforce_contact.settings import TrackerSettings
 
 # Depth farther off than this [m] is not the object, at first and in the end.
 _WIDE_GATE, _GATE = 0.006, 0.003

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.optional import import_trimesh
-from finforce_contact.reconstruction.evidence import ImageEvidence, collect_evidence
+from finforce_contact.reconstruction.evidence import GeneratedMesh, ImageEvidence, Reconstruction, collect_evidence
 from finforce_contact.reconstruction.generated import read_generated as read_mesh
 from finforce_contact.reconstruction.reconstruction import FROM_GENERATED, reconstruct
-from finforce_contact.reconstruction.result import GeneratedMesh, Reconstruction
 from finforce_eval.cli.parser import picture_file
 from finforce_eval.errors import OptionError
 from finforce_eval.recordings.image_files import read_depth, read_generated_pose, read_image, read_intrinsics, read_mask

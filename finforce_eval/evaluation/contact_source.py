@@ -92,7 +92,7 @@ def build_estimator(choice: ContactChoice, mode: str, recording: Recording, jaw:
     """
     from finforce_contact.estimator import ContactEstimator
     from finforce_contact.mesh.object_mesh import load_object_mesh
-    from finforce_contact.settings import ContactSettings
+    from finforce_contact.parameters import ContactSettings
 
     body = load_object_mesh(require_mesh(recording, choice.object_file), unit=choice.object_unit)
     return ContactEstimator(jaw, mesh=body, settings=ContactSettings(mode=mode, mesh=mesh))

@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from finforce_contact.mesh.views import MeshView, RenderedMesh
-from finforce_contact.reconstruction.evidence import ImageEvidence
-from finforce_contact.reconstruction.result import Reconstruction
+from finforce_contact.reconstruction.evidence import ImageEvidence, Reconstruction
 from finforce_eval.figures.figures import BLUE, ORANGE, new_figure
 
 MARGIN = 0.25  # of the object's size, shown around it

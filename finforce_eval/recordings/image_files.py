@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from finforce.camera import LARGEST_PICTURE, PLUMB_BOB, CameraIntrinsics, decode_depth
 from finforce.errors import MissingDependencyError, PoseError, one_line
 from finforce.files import FileError, read_bytes, read_json, read_yaml
-from finforce_contact.reconstruction.paper_alignment import affine_from_generator
+from finforce_contact.reconstruction.generated import affine_from_generator
 from finforce_eval.errors import OptionError
 
 _LARGEST_FILE = 1 << 28  # bytes

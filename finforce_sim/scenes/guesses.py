@@ -10,9 +10,9 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from finforce.optional import import_trimesh
-from finforce_contact.mesh.chamfer import compute_chamfer
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.reconstruction.result import GeneratedMesh
+from finforce_contact.mesh.views import compute_chamfer
+from finforce_contact.reconstruction.evidence import GeneratedMesh
 from finforce_sim.scenes.pose_sequences import TableScene
 
 EDGE_LENGTH = 4e-3  # [m] of the triangles before they are bent

@@ -28,7 +28,7 @@ from finforce_contact.localization.section import SectionKeeper
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.paper_contact import MARGIN, NearSolid, intersect
-from finforce_contact.settings import ContactSettings
+from finforce_contact.parameters import ContactSettings
 from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.objects import track_object

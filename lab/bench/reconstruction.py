@@ -18,10 +18,9 @@ from tqdm import tqdm
 
 from finforce.camera import deproject
 from finforce_contact.errors import ReconstructionError
-from finforce_contact.mesh.chamfer import Chamfer, compute_chamfer
-from finforce_contact.mesh.closing import build_poisson_mesh
+from finforce_contact.mesh.views import Chamfer, compute_chamfer
 from finforce_contact.reconstruction.evidence import collect_evidence
-from finforce_contact.reconstruction.paper_alignment import scale_coarsely
+from finforce_contact.reconstruction.generated import build_poisson_mesh, scale_coarsely
 from finforce_contact.reconstruction.reconstruction import METHODS, reconstruct
 from finforce_sim.rendering.depth_camera import build_d405
 from finforce_sim.scenes.guesses import GuessError, draw_guess, place_mesh

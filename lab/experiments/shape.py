@@ -16,13 +16,16 @@ from finforce.camera import deproject
 from finforce.errors import one_line
 from finforce.optional import import_trimesh
 from finforce_contact.errors import ReconstructionError
-from finforce_contact.mesh.chamfer import compute_chamfer, sample_surface
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.reconstruction.evidence import collect_evidence
-from finforce_contact.reconstruction.generated import read_generated
-from finforce_contact.reconstruction.paper_alignment import CAMERA_FROM_PYTORCH3D, CANONICAL_FROM_GLB, scale_coarsely
+from finforce_contact.mesh.views import compute_chamfer, sample_surface
+from finforce_contact.reconstruction.evidence import GeneratedMesh, collect_evidence
+from finforce_contact.reconstruction.generated import (
+    CAMERA_FROM_PYTORCH3D,
+    CANONICAL_FROM_GLB,
+    read_generated,
+    scale_coarsely,
+)
 from finforce_contact.reconstruction.reconstruction import reconstruct
-from finforce_contact.reconstruction.result import GeneratedMesh
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.image_files import read_generated_pose
 from finforce_sim.rendering.depth_camera import build_d405

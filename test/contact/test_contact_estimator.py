@@ -10,8 +10,8 @@ from finforce_contact.errors import ObjectMeshError
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.localization.touch import RELEASE_IMAGES, TouchBelief, contact_probability
 from finforce_contact.mesh.object_mesh import load_object_mesh
+from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.filter import PoseFilter
-from finforce_contact.settings import ContactSettings
 from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_eval.recordings.recording import read_recording

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import finforce_contact
-from finforce_contact.settings import MODES, ContactSettings
+from finforce_contact.parameters import MODES, ContactSettings
 from finforce_ifea.errors import ContactError
 
 NAMES = [item.name for item in fields(ContactSettings)]

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from finforce_contact.estimator import blank_estimate
 from finforce_contact.jaw_contact import JawContact, PosePairing, turn_covariance
+from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.filter import PoseFilter
-from finforce_contact.settings import ContactSettings
 
 MS = 1_000_000
 FRAME = 33 * MS

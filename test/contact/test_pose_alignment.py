@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import compute_rays
 from finforce.transforms import move_pose
 from finforce_contact.mesh.views import MeshView
-from finforce_contact.pose.alignment import Effort, MeshAligner
-from finforce_contact.pose.depth_image import DepthImage, Samples, Visibility
+from finforce_contact.parameters import TrackerSettings
+from finforce_contact.pose.alignment import DepthImage, Effort, MeshAligner, Samples, Visibility
 from finforce_contact.pose.tracker import spread_rotations
-from finforce_contact.settings import TrackerSettings
 from finforce_sim.rendering.depth_camera import build_d405
 from finforce_sim.scenes.objects import build_object
 

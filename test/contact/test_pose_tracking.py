@@ -10,8 +10,8 @@ from finforce.camera import CameraIntrinsics, ImageError
 from finforce.errors import FinforceError, PoseError
 from finforce.transforms import invert_pose, move_pose, rotation_between, step_between
 from finforce_contact.errors import PoseLostError
+from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.tracker import PoseTracker
-from finforce_contact.settings import TrackerSettings
 from finforce_sim.rendering.depth_camera import build_d405
 from finforce_sim.scenes.objects import build_object
 from finforce_sim.scenes.pose_sequences import Motion, render_sequence

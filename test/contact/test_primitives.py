@@ -7,10 +7,9 @@ from contact_fakes import distance_mm, make_case
 from finforce.optional import import_manifold3d
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.reconstruction import reconstruction
-from finforce_contact.reconstruction.completion import complete_surface
 from finforce_contact.reconstruction.evidence import collect_evidence
-from finforce_contact.reconstruction.primitives import HANDICAP, build_primitive, fit_primitive, spread_directions
-from finforce_contact.reconstruction.reconstruction import reconstruct
+from finforce_contact.reconstruction.reconstruction import complete_surface, reconstruct
+from finforce_contact.reconstruction.shape_search import HANDICAP, build_primitive, fit_primitive, spread_directions
 from finforce_sim.rendering.depth_camera import build_d405
 from finforce_sim.scenes.pose_sequences import draw_scene
 

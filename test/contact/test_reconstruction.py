@@ -9,16 +9,21 @@ from finforce.camera import ImageError, deproject
 from finforce.errors import PoseError
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.mesh import closing
-from finforce_contact.mesh.chamfer import compute_chamfer
-from finforce_contact.mesh.closing import build_poisson_mesh, close_mesh
-from finforce_contact.mesh.views import MeshView
-from finforce_contact.reconstruction.evidence import collect_evidence
-from finforce_contact.reconstruction.paper_alignment import (
+from finforce_contact.mesh.views import MeshView, compute_chamfer
+from finforce_contact.reconstruction.evidence import (
+    GeneratedMesh,
+    ShapeScore,
+    check_agreement,
+    collect_evidence,
+    score_shape,
+)
+from finforce_contact.reconstruction.generated import (
     affine_from_generator,
+    build_poisson_mesh,
+    close_mesh,
     scale_coarsely,
 )
 from finforce_contact.reconstruction.reconstruction import reconstruct
-from finforce_contact.reconstruction.result import GeneratedMesh, ShapeScore, check_agreement, score_shape
 from finforce_contact.reconstruction.shape_search import Placement
 from finforce_sim.scenes.guesses import place_mesh
 from finforce_sim.scenes.objects import build_object

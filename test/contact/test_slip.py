@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from finforce_contact.localization.slip import SlipWatch, TouchedFace, face_at
-from finforce_contact.settings import ContactSettings
+from finforce_contact.parameters import ContactSettings
 
 SETTINGS = ContactSettings()
 FACE = TouchedFace(point=np.array([0.012, 0.0, 0.040]), tangent=np.array([0.0, 0.0, 1.0]))

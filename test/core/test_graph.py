@@ -15,8 +15,7 @@ from finforce.settings import TimeParameters, is_parameter
 from finforce.systems.launch import options_from_texts
 from finforce.systems.live import bench_processes
 from finforce.systems.processes import BenchOptions, Process, ReplayOptions, RobotOptions, replay_processes
-from finforce_contact.parameters import ContactParameters
-from finforce_contact.settings import ContactSettings
+from finforce_contact.parameters import ContactParameters, ContactSettings
 from finforce_driver.grasp.settings import GraspSettings
 from finforce_driver.joint.node import LINKS
 from finforce_driver.joint.settings import JointSettings

@@ -25,8 +25,7 @@ from finforce.health import Level, Report
 from finforce.messages import decode_keypoints, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import refresh_record
-from finforce_contact.parameters import ContactParameters
-from finforce_contact.settings import ContactSettings, TrackerSettings
+from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
 from finforce_driver.grasp.settings import GraspSettings
 from finforce_driver.parameters import DriverParameters
 from finforce_driver.settings import GripperSettings

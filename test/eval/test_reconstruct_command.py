@@ -83,7 +83,7 @@ def test_other_endings_hold_the_same_mesh(files, ending):
 
 
 def test_without_a_generated_mesh_a_primitive_is_found(files, capsys, monkeypatch):
-    monkeypatch.setattr("finforce_contact.reconstruction.primitives.HANDICAP", {"cylinder": 1.0})
+    monkeypatch.setattr("finforce_contact.reconstruction.shape_search.HANDICAP", {"cylinder": 1.0})
     assert run(files, without=("--mesh", "--pose")) == 0
     assert "primitive: cylinder" in capsys.readouterr().out
 

@@ -13,10 +13,10 @@ from eval_fakes import FakeContactEstimator, make_recording
 from finforce.errors import FinforceError
 from finforce.transforms import pose_from_quaternion
 from finforce_contact.errors import ObjectMeshError
-from finforce_contact.mesh.chamfer import compute_chamfer
 from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.views import compute_chamfer
+from finforce_contact.reconstruction.evidence import GeneratedMesh
 from finforce_contact.reconstruction.generated import read_generated
-from finforce_contact.reconstruction.result import GeneratedMesh
 from finforce_eval.cli.main import main
 from finforce_eval.engine.tasks import Manifest
 from finforce_eval.errors import RecordingError
