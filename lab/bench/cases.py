@@ -184,7 +184,7 @@ def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, s
     random = np.random.default_rng([seed, round(1e4 * case.radius), round(1e3 * case.height)])
     sight = MeasuredKeypoints(points=points, likelihood=np.ones(points.shape[:2]))
     if camera is not None:
-        sight = camera.look(points, axes, case.radius, random)
+        sight = camera.observe(points, axes, case.radius, random)
     contact = Contact.fixed(jaw, case.height)
     return ReplayedPress(
         case=case,
@@ -259,10 +259,10 @@ class MeasuredKeypoints:
 
 @dataclass(frozen=True, kw_only=True)
 class NoisyCamera:
-    """A fixed RGB-D camera beside the finger.
+    """A fixed RGB-D camera next to the finger.
 
     Attributes:
-        place: in the jaw frame [m].
+        position: in the jaw frame [m].
         noise: standard deviation of a point in every direction [m].
         depth_noise: the same along its line of sight, in addition [m].
         offset: constant error of each point of a recording [m].
@@ -273,7 +273,7 @@ class NoisyCamera:
         hidden_trusted: share of hidden points whose likelihood is high.
     """
 
-    place: tuple[float, float, float] = (0.055, 0.095, -0.045)
+    position: tuple[float, float, float] = (0.055, 0.095, -0.045)
     noise: float = 0.20e-3
     depth_noise: float = 0.45e-3
     offset: float = 0.35e-3
@@ -283,8 +283,8 @@ class NoisyCamera:
     holes: float = 0.01
     hidden_trusted: float = 0.05
 
-    def look(self, points: NDArray, axes: NDArray, radius: float, random: np.random.Generator) -> MeasuredKeypoints:
-        """Return what the camera sees of key points (n, K, 3) [m] beside a cylinder along y.
+    def observe(self, points: NDArray, axes: NDArray, radius: float, random: np.random.Generator) -> MeasuredKeypoints:
+        """Return what the camera sees of key points (n, K, 3) [m] next to a cylinder along y.
 
         Args:
             points: true key points, jaw frame.
@@ -295,12 +295,12 @@ class NoisyCamera:
         shape = points.shape[:2]
         reach = self._find_cover(points, axes, radius)
         hidden = np.isfinite(reach)
-        rays = points - self.place
-        seen = np.where(hidden[..., None], self.place + np.where(hidden, reach, 1.0)[..., None] * rays, points)
+        rays = points - self.position
+        seen = np.where(hidden[..., None], self.position + np.where(hidden, reach, 1.0)[..., None] * rays, points)
         sight = rays / np.linalg.norm(rays, axis=2, keepdims=True)
         constant = self.offset / np.sqrt(3.0) * random.standard_normal(points.shape[1:])
         scale = 1.0 + self.depth_scale * random.standard_normal()
-        seen = self.place + scale * (seen - self.place) + constant
+        seen = self.position + scale * (seen - self.position) + constant
         seen = seen + self.noise * random.standard_normal(points.shape)
         seen += self.depth_noise * random.standard_normal((*shape, 1)) * sight
         gross = random.random(shape) < self.gross
@@ -314,15 +314,15 @@ class NoisyCamera:
 
     def _find_cover(self, points: NDArray, axes: NDArray, radius: float) -> NDArray:
         """Return which share of the way to each point (n, K) a cylinder lets the sight go; NaN when all of it."""
-        ray = points - self.place
-        start = np.array(self.place)[[0, 2]] - axes[:, None]
+        ray = points - self.position
+        start = np.array(self.position)[[0, 2]] - axes[:, None]
         a = (ray[..., [0, 2]] ** 2).sum(-1)
         b = (start * ray[..., [0, 2]]).sum(-1)
         inside = b**2 - a * ((start**2).sum(-1) - radius**2)
         wall = (-b - np.sqrt(np.maximum(inside, 0.0))) / a
         on_wall = (inside > 0.0) & (wall > 0.0) & (wall < 1.0)
-        on_wall &= np.abs(self.place[1] + wall * ray[..., 1]) < _HALF_LENGTH
-        end = (_HALF_LENGTH - self.place[1]) / ray[..., 1]
+        on_wall &= np.abs(self.position[1] + wall * ray[..., 1]) < _HALF_LENGTH
+        end = (_HALF_LENGTH - self.position[1]) / ray[..., 1]
         met = start + end[..., None] * ray[..., [0, 2]]
         on_end = (end > 0.0) & (end < 1.0) & ((met**2).sum(-1) < radius**2)
         return np.where(on_end, end, np.where(on_wall, wall, np.nan))

@@ -1,6 +1,6 @@
 """Time against pixel error of the ways to find key points, on rendered images with truth.
 
-All ways look at a second of images each, one way after the other, so that a busy machine slows all of them alike.
+All ways get a second of images each, one way after the other, so that a busy machine slows all of them alike.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Way:
     Attributes:
         name: for tables.
         parameters: of the detector node, where they differ from the defaults.
-        searches: whether the jaws are looked for anew in every image, not where they were before.
+        searches: whether the jaws are searched in every image, not tracked.
         rests: whether it leaves out pixels and depth where nothing has moved.
         dots: whether it looks at images with printed dots.
     """
@@ -64,7 +64,7 @@ WAYS = (
 
 @dataclass(kw_only=True)
 class _DetectionRun:
-    """A way at work on one recording: its detector, and what it said of each jaw."""
+    """A way on one recording: its detector, and what it found of each jaw."""
 
     way: Way
     detector: Detector
@@ -72,8 +72,8 @@ class _DetectionRun:
     seconds: list[float] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
 
-    def look(self, stamp: int, image: RgbdImage) -> None:
-        """Let it look at an image, and keep the time and the answer."""
+    def detect(self, stamp: int, image: RgbdImage) -> None:
+        """Detect the key points in an image, and keep the time and the answer."""
         begin, used = perf_counter(), process_time()
         if self.way.searches:
             self.detector.reset()
@@ -163,7 +163,7 @@ def sight_columns(stats: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def _look_at(recording: Recording, ways: Sequence[Way], yardstick: list[float]) -> list[_DetectionRun]:
-    """Return what each way said of the images of a recording; times of the yardstick [s] go to a list."""
+    """Return what each way found in the images of a recording; times of the yardstick [s] go to a list."""
     from tqdm import tqdm
 
     jaws = {side: load_jaw("bench", side) for side in recording.jaws}
@@ -173,7 +173,7 @@ def _look_at(recording: Recording, ways: Sequence[Way], yardstick: list[float]) 
         dotted = [(stamp, paint_dots(image, stamp, jaws, recording.jaws)) for stamp, image in block]
         for run in runs:
             for stamp, image in dotted if run.way.dots else block:
-                run.look(stamp, image)
+                run.detect(stamp, image)
             yardstick.append(time_product())
     return runs
 

@@ -256,8 +256,8 @@ class FaultRun:
         self._goal, self._allowed = 0.030 if self.emulated.true_opening < 0.02 else 0.010, True
         self.gripper.move(self._goal, 0.1)
         state = self.gripper.wait(lambda state: state.phase is not Phase.MOVING, 5.0)
-        way = self.tape.truths[-1].place - self.gripper.scale.counts_of(self._goal)
-        return state.outcome is MoveOutcome.REACHED and abs(way) < 3.0
+        distance = self.tape.truths[-1].position - self.gripper.scale.counts_of(self._goal)
+        return state.outcome is MoveOutcome.REACHED and abs(distance) < 3.0
 
 
 def choose_kinds(seed: int) -> tuple[FaultKind, ...]:
@@ -278,7 +278,7 @@ def run_all(faults: int, seed: int = 1) -> FaultTally:
 
 WINDOW = 0.06  # [s] a reply may be as old as its time-out, and is stamped when it comes
 LONG_WINDOW = 0.4  # [s] in which a contact or an outcome is to have been true: they are debounced
-PLACE_TOLERANCE = 3.0  # [counts] truncation, and what one flipped digit can pretend unnoticed in motion
+POSITION_TOLERANCE = 3.0  # [counts] truncation, and what one flipped digit can pretend unnoticed in motion
 GOAL_TOLERANCE = 3.0  # [counts]
 CURRENT_TOLERANCE = 0.15  # [A]
 FAULT_NAMES = {
@@ -293,10 +293,10 @@ FAULT_NAMES = {
 
 @dataclass(frozen=True, kw_only=True)
 class TrueGripper:
-    """One millisecond of a gripper: place [counts] between its own end stops, what it latched and does."""
+    """One millisecond of a gripper: position [counts] between its own end stops, latched faults and motion."""
 
     time: float
-    place: float
+    position: float
     current: float
     calibrated: bool
     configured: bool
@@ -325,7 +325,7 @@ class Tape:
         self.truths.append(
             TrueGripper(
                 time=self.now,
-                place=(jaws.encoder - ends.open) * 255.0 / span if span else math.nan,
+                position=(jaws.encoder - ends.open) * 255.0 / span if span else math.nan,
                 current=1e-3 * gripper.reported_current,
                 calibrated=gripper.calibrated,
                 configured=gripper.configured,
@@ -423,11 +423,11 @@ class Oracle:
         wrong = []
         # a controller that ceases to be a gripper freezes its position byte, which only a calibration finds out
         if not math.isnan(state.opening) and all(truth.configured for truth in near):
-            place = self._scale.counts_of(state.opening)
-            # the reply tells a place between the stops
-            error = min(abs(place - min(max(truth.place, 0.0), 255.0)) for truth in near)
+            position = self._scale.counts_of(state.opening)
+            # the reply tells a position between the stops
+            error = min(abs(position - min(max(truth.position, 0.0), 255.0)) for truth in near)
             self.worst["place [counts]"] = max(self.worst["place [counts]"], error)
-            wrong += ["opening"] * (error > PLACE_TOLERANCE)
+            wrong += ["opening"] * (error > POSITION_TOLERANCE)
         error = min(abs(state.current - truth.current) for truth in near)
         self.worst["current [A]"] = max(self.worst["current [A]"], error)
         wrong += ["current"] * (error > CURRENT_TOLERANCE)
@@ -451,8 +451,8 @@ class Oracle:
         recent = self.tape.last(state.stamp, LONG_WINDOW)
         right = True
         if state.outcome is MoveOutcome.REACHED:
-            place = self._scale.counts_of(goal)
-            right = any(abs(truth.place - place) <= GOAL_TOLERANCE for truth in recent)
+            position = self._scale.counts_of(goal)
+            right = any(abs(truth.position - position) <= GOAL_TOLERANCE for truth in recent)
         elif state.outcome in (MoveOutcome.GRASPED, MoveOutcome.CLOSED_EMPTY):
             right = any(truth.blocked in (1, 2) for truth in recent)
         elif state.outcome is MoveOutcome.BLOCKED:
@@ -485,8 +485,10 @@ class Guard:
             return ["motion after the emergency stop"]
         if not allowed:
             return ["motion without a command"]
-        places = [truth.place for truth in self._tape.last(self._tape.now, 0.2)] + ([] if goal is None else [goal])
-        low, high = min(places) - 4.0, max(places) + 4.0
+        positions = [truth.position for truth in self._tape.last(self._tape.now, 0.2)] + (
+            [] if goal is None else [goal]
+        )
+        low, high = min(positions) - 4.0, max(positions) + 4.0
         return [] if low <= order.position <= high else ["motion beyond what was asked for"]
 
 

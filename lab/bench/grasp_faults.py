@@ -7,8 +7,8 @@ reads low, jumps or speaks nonsense for a while; and a user who stops, presses t
 | complaint | |
 |---|---|
 | pressed | the true force was above the limit of a grasp by force, 8 N |
-| holds something else | it is said to hold, camera and link were sound for a second, and the true force is 1 N away |
-| ready in motion | the gripper is said to be ready while its jaws close |
+| holds something else | it reports holding, camera and link were sound for a second, and the true force is off by 1 N |
+| ready in motion | the gripper reports ready while its jaws close |
 | motion after stop | the jaws close by more than two counts after the grasp ended, was stopped or failed |
 | not told | the grasp failed, and no reason was given |
 """
@@ -41,8 +41,8 @@ FAULTS_FROM, PERIOD, MOST = 1.2, 0.5, 6  # [s], [s], faults of the line and the 
 HELD = 1.5  # [s] that is held before the user is content
 WATCHED = 1.2  # [s] after the end
 SOUND = 1.0  # [s] for which camera and link have to have been sound for a held force to be judged
-DEBOUNCED = 0.1  # [s] in which jaws that are said to be ready may come to rest
-SILENT = 0.15  # [s] without a believed reply after which the link counts as away
+DEBOUNCED = 0.1  # [s] in which jaws of a gripper that reports ready may come to rest
+SILENT = 0.15  # [s] without a believed reply after which the link counts as lost
 SETTLED = 0.3  # [s] in which a stop may take effect, from when the link is there
 CREEP = 2.2  # [counts] of closing that are none
 # left out: another program that drives the jaws, a gripper that takes itself for none and lets go of them unseen (both
@@ -79,7 +79,7 @@ class FaultyCamera:
     """A camera with noise that is at fault for a while.
 
     Attributes:
-        touching: nothing is said of it.
+        touching: unknown.
         stddev: stated [N].
         kind: of the fault.
         span: when it begins and ends [s], after the first image.
@@ -178,12 +178,12 @@ class FaultyGrasp(World):
         self._act_at = draw.uniform(0.1, 4.0)
         self._began = self._ended = math.nan
         self._least = math.inf  # opening [m] since the end was to have taken effect
-        self._unlinked = -math.inf  # when the link was last seen to be away [s]
-        self._ready_at, self._ready_place, self._outcome = math.inf, math.inf, MoveOutcome.NONE
+        self._unlinked = -math.inf  # when the link was last seen to be lost [s]
+        self._ready_at, self._ready_opening, self._outcome = math.inf, math.inf, MoveOutcome.NONE
         self.gripper.listen(self._check_state)
 
     def play(self) -> GraspTally:
-        """Live through it and return what came of it."""
+        """Play the grasp and return what came of it."""
         self._prepare()
         self._began = self.clock.now()
         goal = GraspGoal(force=self._case.force, speed=self._case.speed, time_limit=8.0)
@@ -210,7 +210,7 @@ class FaultyGrasp(World):
         return tally
 
     def step(self, dt: float) -> None:
-        """Let the fingers live and look at them."""
+        """Advance the fingers and check them."""
         super().step(dt)
         now = self.clock.now()
         if not self.adapter.plugged or not now - self.gripper.state.stamp <= SILENT:
@@ -239,7 +239,7 @@ class FaultyGrasp(World):
         return late
 
     def _is_over(self, status: GraspStatus) -> bool:
-        """Do what the user does, and look at what is said of the grasp."""
+        """Do what the user does, and check what the grasp reports."""
         now = self.clock.now()
         if math.isnan(self.course.held_at) and status.phase is GraspPhase.HOLDING:
             self.course.held_at = now
@@ -255,18 +255,18 @@ class FaultyGrasp(World):
         return now - self.course.held_at > HELD
 
     def _check_state(self, state: GripperState) -> None:
-        """Look at what is said of the gripper: it is not ready while it closes."""
+        """Check what the gripper reports: it is not ready while it closes."""
         opening, now = self.emulated.true_opening, self.clock.now()
         if state.phase is not Phase.READY or state.outcome is not self._outcome or now - self._unlinked < SETTLED:
-            self._ready_at, self._ready_place = now, math.inf
+            self._ready_at, self._ready_opening = now, math.inf
         elif now - self._ready_at > DEBOUNCED:
-            self._ready_place = opening if self._ready_place == math.inf else self._ready_place
-            if (self._ready_place - opening) / self.gripper.resolution > CREEP:
+            self._ready_opening = opening if self._ready_opening == math.inf else self._ready_opening
+            if (self._ready_opening - opening) / self.gripper.resolution > CREEP:
                 self._complain("ready in motion")
         self._outcome = state.outcome
 
     def _check_rest(self, now: float) -> None:
-        """Look whether the jaws close after the end."""
+        """Check whether the jaws close after the end."""
         if not now - max(self._ended, self._unlinked) > SETTLED:
             return
         opening = self.emulated.true_opening

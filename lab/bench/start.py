@@ -1,6 +1,6 @@
-"""From a node's start to its being ready, and the memory that it then has: with nothing compiled, and as ever after.
+"""Time from the start of a node until it is ready, and its memory then: with an empty cache and with a full one.
 
-The first start compiles and builds into an empty folder, which the later ones find full.
+The first start compiles and builds into an empty folder, which later ones find full.
 """
 
 from __future__ import annotations
@@ -80,11 +80,11 @@ def _start(
     process: Process, times: int, folder: str, progress: Callable[[], Any], *, compiled: bool = True
 ) -> dict[str, Any]:
     """Start a process several times, one after the other, with a folder for what it keeps."""
-    surroundings = {**os.environ, **SINGLE_THREAD, "FINFORCE_CACHE": folder, "NUMBA_CACHE_DIR": ""}
+    environment = {**os.environ, **SINGLE_THREAD, "FINFORCE_CACHE": folder, "NUMBA_CACHE_DIR": ""}
     name = "all in one process" if process.executable == PIPELINE else process.executable
     seconds, memory = [], []
     for _ in range(times):
-        took, taken = time_start(process.command(), len(executables_of([process])), surroundings)
+        took, taken = time_start(process.command(), len(executables_of([process])), environment)
         seconds.append(took)
         memory.append(1e-6 * taken)
         progress()
@@ -98,13 +98,13 @@ def _start(
     }
 
 
-def time_start(command: Sequence[str], nodes: int, surroundings: Mapping[str, str]) -> tuple[float, int]:
+def time_start(command: Sequence[str], nodes: int, environment: Mapping[str, str]) -> tuple[float, int]:
     """Start a command and end it as soon as it is ready.
 
     Args:
         command: that runs nodes.
         nodes: of these, how many.
-        surroundings: its environment.
+        environment: its environment.
 
     Returns:
         The time until then [s], and its resident memory [bytes].
@@ -112,11 +112,11 @@ def time_start(command: Sequence[str], nodes: int, surroundings: Mapping[str, st
     Raises:
         ProcessError: it ended, or was not ready after ten minutes.
     """
-    surroundings = {**surroundings, "ROS_DOMAIN_ID": str(free_domain())}
+    environment = {**environment, "ROS_DOMAIN_ID": str(free_domain())}
     # read by its name: what it is opened with is where the child writes
     with tempfile.NamedTemporaryFile() as log:
         begin = monotonic()
-        child = subprocess.Popen(command, env=surroundings, stdout=log, stderr=subprocess.STDOUT)
+        child = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
         try:
             while _count_ready(Path(log.name)) < nodes:
                 if child.poll() is not None or monotonic() - begin > LONGEST:

@@ -60,7 +60,7 @@ def test_noise_has_the_size_of_the_bench_across_and_along_the_sight():
     seen = [0, 1, 2, 3, 7, 8, 9]  # below the object, which hides none of them
     rest = stack(press)[:60, seen]
     scatter = (rest - rest.mean(axis=0)).reshape(-1, 3)
-    sight = JAW.keypoints[seen].mean(0) - NoisyCamera().place
+    sight = JAW.keypoints[seen].mean(0) - NoisyCamera().position
     along = scatter @ (sight / np.linalg.norm(sight))
     across = np.sqrt(((scatter**2).sum(1) - along**2).mean() / 2)
     # 420 samples: 3.5 % standard deviation of a standard deviation; 12 % is more than three
