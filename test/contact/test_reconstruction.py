@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import ImageError, deproject
 from finforce.errors import PoseError
 from finforce_contact.errors import ReconstructionError
-from finforce_contact.mesh import closing
 from finforce_contact.mesh.views import MeshView, compute_chamfer
+from finforce_contact.reconstruction import generated
 from finforce_contact.reconstruction.evidence import (
     GeneratedMesh,
     ShapeScore,
@@ -43,8 +43,8 @@ def turned(guess, turn, about):
 @pytest.fixture
 def coarse_poisson(monkeypatch):
     """A Poisson surface of few cells: quick, and 2 mm coarse."""
-    monkeypatch.setattr(closing, "POISSON_POINTS", 8000)
-    monkeypatch.setattr(closing, "POISSON_DEPTH", 6)
+    monkeypatch.setattr(generated, "POISSON_POINTS", 8000)
+    monkeypatch.setattr(generated, "POISSON_DEPTH", 6)
 
 
 @pytest.mark.parametrize("name", ["cylinder", "asymmetric"])
