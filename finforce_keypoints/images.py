@@ -136,23 +136,11 @@ def _brightest(seen: NDArray) -> float:
     return float(np.partition(brightness, place)[place])
 
 
-def _cut_tiles(shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:
-    """Return where rows and columns of a picture are cut into tiles, (_TILES + 1,) each, as evenly as they can be."""
-    rows, columns = (np.arange(_TILES + 1) * size // _TILES for size in shape)
-    return rows, columns
-
-
-def _size_tiles(shape: tuple[int, ...]) -> NDArray:
-    """Return how many values the parts of an array (h, w) have, (_TILES, _TILES)."""
-    rows, columns = _cut_tiles(shape)
-    return np.outer(np.diff(rows), np.diff(columns))
-
-
-def _sum_tiles(values: NDArray) -> NDArray:
-    """Return the sums (_TILES, _TILES) of the parts of values (h, w)."""
-    summed = np.zeros((values.shape[0] + 1, values.shape[1] + 1), dtype=int)
-    summed[1:, 1:] = values.cumsum(axis=0).cumsum(axis=1)
-    return np.diff(np.diff(summed[np.ix_(*_cut_tiles(values.shape))], axis=0), axis=1)
+def _share_of_tiles(values: NDArray) -> NDArray:
+    """Return the share (_TILES, _TILES) of the parts of values (h, w) bool that hold."""
+    height, width = (size // _TILES for size in values.shape)
+    parts = values[: _TILES * height, : _TILES * width].reshape(_TILES, height, _TILES, width)
+    return parts.sum(axis=(1, 3)) / max(height * width, 1)
 
 
 class ImageWatch:
@@ -208,8 +196,7 @@ class ImageWatch:
         same = _all_colors(seen == self._color) if is_known else np.zeros(seen.shape[:2], dtype=bool)
         lively = _all_colors((seen > _NEAR_BLACK) & (seen < _NEAR_WHITE))
         self._same = self._same + 1 if same.all() else 0
-        pixels = _size_tiles(same.shape)
-        still = (pixels > 0) & (_sum_tiles(same) == pixels) & (_sum_tiles(lively) >= _LIVELY * pixels)
+        still = (_share_of_tiles(same) == 1.0) & (_share_of_tiles(lively) >= _LIVELY)
         self._same_tiles = np.where(still, self._same_tiles + 1, 0)
         measured = np.empty(0) if depth is None else depth[::_WATCHED_STEP, ::_WATCHED_STEP].copy()
         # a plain depth image, or one without any depth, is no camera's: it is refused for what it is

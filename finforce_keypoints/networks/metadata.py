@@ -33,7 +33,6 @@ class ModelMetadata:
 
     Attributes:
         bodyparts: (K,) names, in the order of the heatmaps.
-        net_type: the architecture's name, "" where it is not said.
         colormode: "RGB" or "BGR", the order that the network was trained on.
         normalize: whether ImageNet's mean and standard deviation are taken off.
         divisors: height and width are padded to multiples of these [px]; (1, 1) for none.
@@ -46,7 +45,6 @@ class ModelMetadata:
     """
 
     bodyparts: tuple[str, ...]
-    net_type: str = ""
     colormode: str = "RGB"
     normalize: bool = True
     divisors: tuple[int, int] = (1, 1)
@@ -151,7 +149,6 @@ def parse_metadata(content: Any) -> ModelMetadata:
     extra = _look_up(content, "finforce", Mapping, {})
     metadata = ModelMetadata(
         bodyparts=_parse_bodyparts(content),
-        net_type=str(_look_up(content, "net_type", object, "")),
         colormode=_parse_colormode(content),
         normalize=_look_up(content, f"{inference}.normalize_images", bool, True),
         divisors=_parse_divisors(content),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from finforce_keypoints.errors import DetectionError, ModelError
 from finforce_keypoints.networks.metadata import LARGEST_SIDE, METADATA_FILE, ModelMetadata, read_metadata
-from finforce_keypoints.networks.network import COLOURS, CPU, Network, OutputLayout, find_network, find_outputs
+from finforce_keypoints.networks.network import COLOURS, Network, OutputLayout, find_network, find_outputs
 
 # Likelihood and standard deviation [px of the network's input] of a network that was never calibrated: DeepLabCut's
 # networks err by 2 to 3 px above its cut-off of 0.6, and by tens of pixels where they see nothing.
@@ -232,18 +231,12 @@ class KeypointModel:
         metadata: what stands beside it.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        threads: int = 2,
-        providers: Sequence[str] = (CPU,),
-    ) -> None:
+    def __init__(self, path: str | Path, threads: int = 2) -> None:
         """Load a network and try it once.
 
         Args:
             path: the folder with one .onnx file and its metadata, or that .onnx file.
             threads: that one picture is computed with.
-            providers: onnxruntime's execution providers, best first.
 
         Raises:
             ModelError: files are missing, or network and metadata do not agree.
@@ -251,10 +244,8 @@ class KeypointModel:
         """
         self.path = find_network(path)
         self.metadata: ModelMetadata = read_metadata(self.path.parent / METADATA_FILE)
-        self._network = Network(self.path, threads, providers)
+        self._network = Network(self.path, threads)
         self._scale, self._shift = self._build_normalization()
-        self._buffer = np.empty(0)
-        self._rules: dict[tuple[int, ...], DecodingRule] = {}
         self._check_sizes()
         try:
             self._outputs = self._probe()
@@ -324,7 +315,7 @@ class KeypointModel:
             batch: (B, H, W, 3) uint8 RGB.
 
         Returns:
-            (B, 3, H', W') or (B, H', W', 3), of the network's type; overwritten by the next call.
+            (B, 3, H', W') or (B, H', W', 3), of the network's type.
 
         Raises:
             DetectionError: it is no batch of colour pictures, or the network is frozen to another size.
@@ -339,11 +330,9 @@ class KeypointModel:
             batch = batch.transpose(0, 3, 1, 2)
         if layout.dtype == np.uint8:
             return np.ascontiguousarray(batch)
-        if self._buffer.shape != batch.shape:
-            self._buffer = np.empty(batch.shape, np.float32)
-        np.multiply(batch, self._scale, out=self._buffer)
-        self._buffer += self._shift
-        return self._buffer.astype(layout.dtype, copy=False)
+        tensor = batch * self._scale
+        tensor += self._shift
+        return tensor.astype(layout.dtype, copy=False)
 
     def find_rule(self, pixels: tuple[int, int], cells: tuple[int, int]) -> DecodingRule:
         """Return how maps of some height and width are decoded, for an input of some height and width [px].
@@ -351,12 +340,6 @@ class KeypointModel:
         Raises:
             ModelError: the stride of the metadata is not that of the network.
         """
-        key = (*pixels, *cells)
-        if key not in self._rules:
-            self._rules[key] = self._build_rule(pixels, cells)
-        return self._rules[key]
-
-    def _build_rule(self, pixels: tuple[int, int], cells: tuple[int, int]) -> DecodingRule:
         metadata = self.metadata
         stride = metadata.stride or stride_from_shapes(cells[0], pixels[0])
         off = np.log2(np.divide(pixels, cells) / stride)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +21,7 @@ from finforce_keypoints.networks.trial import try_network
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-CPU = "CPUExecutionProvider"
 COLOURS = 3
-# A search looks at many places; onnxruntime never gives back what its largest batch took.
-_MOST_AT_ONCE = 2
 INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _HEATMAP_WORDS = ("heat", "score", "pred")
 _LOCREF_WORDS = ("locref", "offset")
@@ -38,7 +35,7 @@ class InputLayout:
         name: of the input.
         channel_axis: 1 of NCHW, 3 of NHWC.
         dtype: of the input; uint8 takes the image as it is.
-        batch: frozen number of images, None where any will do.
+        batch: pictures that it takes at a time; where that is not frozen, it is given one.
         height: frozen height [px], None where any will do.
         width: frozen width [px], None where any will do.
     """
@@ -46,7 +43,7 @@ class InputLayout:
     name: str
     channel_axis: int
     dtype: type
-    batch: int | None
+    batch: int
     height: int | None
     width: int | None
 
@@ -95,20 +92,14 @@ class OutputLayout:
         return np.moveaxis(maps, self.channel_axis, 1).astype(np.float32, copy=False)
 
 
-def open_session(path: Path, threads: int, providers: Sequence[str]) -> InferenceSession:
+def open_session(path: Path, threads: int) -> InferenceSession:
     """Return an onnxruntime session of a network file.
 
     Raises:
-        ModelError: there is no such provider, no thread, or the file cannot be loaded and run within bounds.
+        ModelError: the file cannot be loaded and run within bounds.
         MissingDependencyError: onnxruntime is not installed.
     """
     runtime = import_onnxruntime()
-    unknown = [name for name in providers if name not in runtime.get_available_providers()]
-    if unknown or threads < 1:
-        raise ModelError(
-            f"got providers {list(providers)} and {threads} threads, expected at least one thread and providers "
-            f"among {runtime.get_available_providers()}"
-        )
     try_network(path, runtime.__version__)
     options = runtime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
@@ -118,7 +109,7 @@ def open_session(path: Path, threads: int, providers: Sequence[str]) -> Inferenc
     if places := places_of_helpers(threads):
         options.add_session_config_entry("session.intra_op_thread_affinities", places)
     try:
-        return runtime.InferenceSession(str(path), options, providers=list(providers))
+        return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has no base class of its errors
         raise ModelError(f"{path}: onnxruntime cannot load it ({one_line(error)}); expected an ONNX network") from error
 
@@ -176,20 +167,19 @@ class Helpers:
 class Network:
     """An ONNX network of one image input; not for several threads at once."""
 
-    def __init__(self, path: Path, threads: int = 2, providers: Sequence[str] = (CPU,)) -> None:
+    def __init__(self, path: Path, threads: int = 2) -> None:
         """Load a network.
 
         Args:
             path: the .onnx file.
             threads: that one picture is computed with, or that several are shared among.
-            providers: onnxruntime's execution providers, best first.
 
         Raises:
             ModelError: the file cannot be loaded, or its input is no colour image.
             MissingDependencyError: onnxruntime is not installed.
         """
-        self._session = open_session(path, threads, providers)
-        self._open_single, self._threads = partial(open_session, path, 1, providers), threads
+        self._path, self._threads = path, threads
+        self._session = open_session(path, threads)
         self.input = find_input([(item.name, item.shape, item.type) for item in self._session.get_inputs()])
         self.output_names = tuple(item.name for item in self._session.get_outputs())
 
@@ -199,28 +189,20 @@ class Network:
         Raises:
             DetectionError: the network cannot be computed for this input.
         """
-        if len(tensor) > 1 and self._threads > 1 and self.input.batch is None:
-            single, helpers = self._shared
-            each = helpers.share(lambda number: self._run_once(tensor[number : number + 1], single), len(tensor))
-            return [np.concatenate(outputs) for outputs in zip(*each, strict=True)]
-        size, parts = self.input.batch or min(len(tensor), _MOST_AT_ONCE), []
-        if size == len(tensor):
-            return self._run_once(tensor)
-        for start in range(0, len(tensor), size):
-            part = tensor[start : start + size]
-            missing = size - len(part) if self.input.batch else 0
-            outputs = self._run_once(np.concatenate((part, part[:1].repeat(missing, axis=0))))
-            parts.append([output[: len(part)] for output in outputs])
-        return [np.concatenate(outputs) for outputs in zip(*parts, strict=True)]
+        if len(tensor) == 1:
+            return self._run_once(tensor, self._session)
+        single, helpers = self._shared
+        each = helpers.share(lambda number: self._run_once(tensor[number : number + 1], single), len(tensor))
+        return [np.concatenate(outputs) for outputs in zip(*each, strict=True)]
 
     @cached_property
     def _shared(self) -> tuple[InferenceSession, Helpers]:
         """A session of one thread, and the threads that run it, each with a picture of its own."""
-        return self._open_single(), Helpers(self._threads)
+        return open_session(self._path, 1), Helpers(self._threads)
 
-    def _run_once(self, tensor: NDArray, session: InferenceSession | None = None) -> list[NDArray]:
+    def _run_once(self, tensor: NDArray, session: InferenceSession) -> list[NDArray]:
         try:
-            outputs = (session or self._session).run(None, {self.input.name: tensor})
+            outputs = session.run(None, {self.input.name: tensor.repeat(self.input.batch, axis=0)})
         except Exception as error:  # as above
             raise DetectionError(
                 f"the network cannot be computed for an input of {tensor.shape}: {one_line(error)}"
@@ -232,7 +214,7 @@ class Network:
         ]
         if strange:
             raise DetectionError(f"the network's outputs {strange} are no arrays of numbers, expected heatmaps")
-        return outputs
+        return [output[: max(len(output) // self.input.batch, 1)] for output in outputs]
 
 
 def find_input(inputs: Sequence[tuple]) -> InputLayout:
@@ -259,7 +241,7 @@ def find_input(inputs: Sequence[tuple]) -> InputLayout:
         name=name,
         channel_axis=axes[0],
         dtype=INPUT_TYPES[kind],
-        batch=_frozen(shape[0]),
+        batch=_frozen(shape[0]) or 1,
         height=_frozen(shape[height]),
         width=_frozen(shape[width]),
     )

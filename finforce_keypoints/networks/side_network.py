@@ -22,7 +22,7 @@ from finforce.errors import one_line
 from finforce.optional import import_cv2
 from finforce_keypoints.errors import DetectionError, ModelError
 from finforce_keypoints.geometry.template import fit_motion, trust
-from finforce_keypoints.networks.network import CPU, Helpers, open_session
+from finforce_keypoints.networks.network import Helpers, open_session
 
 METADATA = "finforce"  # key of the files' own metadata
 KIND = "side plane"
@@ -78,13 +78,12 @@ class SideNetwork:
         width: of pictures and templates [px].
     """
 
-    def __init__(self, path: str | Path, threads: int = 2, providers: Sequence[str] = (CPU,)) -> None:
+    def __init__(self, path: str | Path, threads: int = 2) -> None:
         """Load a network.
 
         Args:
             path: the folder with `coarse.onnx` and `fine.onnx`.
             threads: that the pictures of a batch are shared among.
-            providers: onnxruntime's execution providers, best first.
 
         Raises:
             ModelError: a file is missing, cannot be loaded, or is of another kind of network.
@@ -97,7 +96,7 @@ class SideNetwork:
                 f"{path}: there is no {' and no '.join(missing)}; expected the folder of a network for side planes; a "
                 "DeepLabCut network is used with detection_method frame"
             )
-        self._coarse, self._fine = (open_session(self.path / name, 1, providers) for name in (COARSE, FINE))
+        self._coarse, self._fine = (open_session(self.path / name, 1) for name in (COARSE, FINE))
         self._helpers = Helpers(threads)
         for session, layout, name in ((self._coarse, COARSE_LAYOUT, COARSE), (self._fine, FINE_LAYOUT, FINE)):
             self._check_layout(session, layout, name)

@@ -20,7 +20,7 @@ from finforce_eval.evaluation.scoring import rms
 from finforce_eval.evaluation.setup import evaluate_all
 from finforce_eval.figures.figures import BLACK, BLUE, ORANGE, new_figure, style_axes
 from finforce_eval.recordings.images import StampedImage
-from finforce_keypoints.networks.network import CPU, open_session
+from finforce_keypoints.networks.network import open_session
 from finforce_keypoints.networks.side_network import METADATA
 from lab.experiments.experiment import Case, Findings, ResultTable, leave_out
 from lab.experiments.grasp import join_jaws
@@ -76,7 +76,7 @@ class ForceNetwork:
 
     def __init__(self, path: str | Path = SHIPPED) -> None:
         self.path = Path(path)
-        self._session = open_session(self.path, 1, (CPU,))
+        self._session = open_session(self.path, 1)
         text = self._session.get_modelmeta().custom_metadata_map.get(METADATA, "")
         try:
             self.about = json.loads(text)

@@ -10,7 +10,7 @@ from keypoint_scene_fakes import CAMERA, Fake, FakePixelDetector, FakeScene, bar
 from onnx import TensorProto, helper, numpy_helper
 
 from finforce_keypoints.detector import KeypointDetector
-from finforce_keypoints.errors import DetectionError, FrozenImageError, ModelError
+from finforce_keypoints.errors import FrozenImageError, ModelError
 from finforce_keypoints.images import ImageWatch
 from finforce_keypoints.networks.metadata import parse_metadata, read_metadata
 from finforce_keypoints.networks.model import DecodingRule, KeypointModel, decode
@@ -62,13 +62,6 @@ def test_a_network_that_makes_no_maps_of_one_picture_is_refused_at_the_start(tmp
     with pytest.raises(ModelError, match="expected") as caught:
         KeypointModel(write_constant(tmp_path, *outputs, **options), threads=1)
     assert "\n" not in str(caught.value)
-
-
-def test_a_network_that_answers_for_fewer_pictures_than_it_is_given_is_refused(tmp_path):
-    model = KeypointModel(write_constant(tmp_path, maps(0.0)), threads=1)
-    model.run(PICTURE)
-    with pytest.raises(DetectionError, match="of 2 pictures"):
-        model.run(np.concatenate((PICTURE, PICTURE)))
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, 1e30, np.nan, np.inf, -np.inf])
