@@ -16,6 +16,8 @@ from finforce.settings import check_bounds, setting
 from finforce_keypoints.errors import DetectorSettingsError
 from finforce_keypoints.images import PixelDetection
 
+SIZE_TOLERANCE = 2.5  # factor by which a dot's area may be larger or smaller
+GATE = 0.006  # [m] by which a dot may be off where its neighbours let expect it
 _LARGEST_ELONGATION = 4.0  # a disc that is seen at 75 degrees off its normal
 _DIMMEST = 8  # of 255: darker pixels have no colour
 
@@ -26,20 +28,20 @@ class DotSettings:
 
     kind: str = setting(
         "colored",
-        "dots of one colour on any jaw, light dots on a dark one, or dark on light",
+        "Kind of dots: of one colour on any jaw, light on a dark jaw, or dark on a light jaw",
         choices=("colored", "light", "dark"),
     )
     hue: float = setting(
-        120.0, "of colored dots: 0 red, 60 yellow, 120 green, 240 blue, 300 magenta", "deg", 0.0, 360.0
+        120.0, "Hue of colored dots: 0 red, 60 yellow, 120 green, 240 blue, 300 magenta", "deg", 0.0, 360.0
     )
-    hue_tolerance: float = setting(30.0, "a dot's hue may be off by this", "deg", 1.0, 60.0)
+    hue_tolerance: float = setting(30.0, "Maximum deviation from the hue", "deg", 1.0, 60.0)
     least_saturation: float = setting(
-        0.3, "of a colored dot: (strongest - weakest) / strongest channel", "1", 0.05, 1.0
+        0.3, "Minimum saturation of colored dots: (strongest - weakest) / strongest channel", "1", 0.05, 1.0
     )
-    least_contrast: float = setting(0.25, "of a light or dark dot: relative to its surroundings", "1", 0.01, 1.0)
-    diameter: float = setting(0.003, "of a dot", "m", 5e-4, 0.02)
-    size_tolerance: float = setting(2.5, "a dot's area may be larger or smaller by this factor", "1", 1.1, 10.0)
-    gate: float = setting(0.006, "how far a dot may be from where its neighbours let expect it", "m", 5e-4, 0.05)
+    least_contrast: float = setting(
+        0.25, "Minimum contrast of light or dark dots, relative to their surroundings", "1", 0.01, 1.0
+    )
+    diameter: float = setting(0.003, "Diameter of a dot", "m", 5e-4, 0.02)
 
     def __post_init__(self) -> None:
         """Refuse values out of bounds.
@@ -82,7 +84,7 @@ def find_dots(color: NDArray, settings: DotSettings, diameter: float) -> Dots:
     count, labels, stats, _ = cv2.connectedComponentsWithStats(look.select(color), connectivity=8, ltype=cv2.CV_16U)
     expected = 0.25 * np.pi * diameter**2
     area = stats[:, cv2.CC_STAT_AREA]
-    tolerance = 2.0 * settings.size_tolerance  # the distance of each dot is not known here
+    tolerance = 2.0 * SIZE_TOLERANCE  # the distance of each dot is not known here
     is_wanted = (area >= expected / tolerance) & (area <= expected * tolerance)
     rows = []
     for number in np.flatnonzero(is_wanted[1:]) + 1:
@@ -286,7 +288,7 @@ class DotDetector:
 
     def _follow(self, pattern: _Pattern, dots: Dots, field: NDArray | None) -> _Match:
         """Return the best match, from the last image's field or, where that fails, grown from the base."""
-        gate = self._settings.gate
+        gate = GATE
         if field is not None:
             match = _grow(pattern, dots.pixels, gate, field, (1.0, 1.0))
             if match.cost < 0.5 * len(match.dots):
@@ -302,7 +304,7 @@ class DotDetector:
         index = np.where(found, match.dots, 0)
         diameter = self._settings.diameter * pattern.scale
         ratio = np.where(found, dots.areas[index] / (0.25 * np.pi * diameter**2), np.nan)
-        limit = self._settings.size_tolerance
+        limit = SIZE_TOLERANCE
         ratio /= np.clip(np.nanmedian(ratio), 1.0 / limit, limit)  # paint runs, lenses blur
         odd = np.log(ratio) / _AREA_STDDEV
         shape = np.clip(dots.fills[index], 0.0, 1.0)

@@ -10,6 +10,7 @@ from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA, jaw_in_camera
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_keypoints.errors import DetectionError
+from finforce_keypoints.images import ImageWatch
 from finforce_sim.gripper.footage import Footage
 from finforce_sim.gripper.gripper import JawState, TwinState
 from finforce_sim.rendering.photographer import SceneSetting, Shot, TrueKeypoints, WristView
@@ -123,9 +124,11 @@ class FakeDetector:
     refused: tuple = ()
     stamps: list = field(default_factory=list)
     warnings: dict = field(default_factory=dict)
+    watch: ImageWatch = field(default_factory=ImageWatch)
 
     def detect(self, image) -> Mapping[str, FakeKeypoints]:
         index = int(np.argmin(np.abs(self.recording.images.stamps * 1e-9 - image.stamp)))
+        self.watch.check(image)
         self.stamps.append(image.stamp)
         if index in self.refused:
             raise DetectionError("no picture for this detector")
