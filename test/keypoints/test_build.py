@@ -6,7 +6,7 @@ from hashlib import sha256
 import pytest
 from keypoint_scene_fakes import Fake, small_jaws, write_model
 
-from finforce_keypoints.build import build_detector, build_pixel_detector
+from finforce_keypoints.build import build_detector, build_pixel_detector, choose_network
 from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.detectors.dots import DotDetector
 from finforce_keypoints.detectors.side_plane import SidePlaneDetector
@@ -32,9 +32,10 @@ def test_a_network_of_side_planes_is_used_by_the_plane_finder(tmp_path):
 
 def test_the_finger_chooses_among_the_shipped_networks():
     for name, folder in (("bench", "plane"), ("umi", "side_plane"), ("ssg48_fin_ray_1", "side_plane")):
-        parameters = DetectorParameters(jaw_file=name)
-        built = build_pixel_detector(load_jaws(parameters), parameters, DetectorSettings())
-        assert isinstance(built, SidePlaneDetector) and built.name == f"network {folder}"
+        assert choose_network(load_jaws(DetectorParameters(jaw_file=name))).name == folder
+    parameters = DetectorParameters(threads=1)
+    built = build_pixel_detector(load_jaws(parameters), parameters, DetectorSettings())
+    assert isinstance(built, SidePlaneDetector) and built.name == "network plane"
 
 
 def test_any_network_is_used_by_the_frame_finder(tmp_path):
