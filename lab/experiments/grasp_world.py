@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from finforce.messages import magnitude_stddev
 from finforce_contact.estimator import ContactEstimator
+from finforce_contact.jaw_contact import ForceLoop
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
 from finforce_driver.grasp.session import hold_force
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
@@ -266,35 +267,33 @@ def observe_found(stamp: float, keypoints: JawKeypoints) -> Observation:
 
 
 class JawSensor:
-    """Contact estimator and solver of one jaw, fed as their nodes are: with the surface of the image before."""
+    """The loop of contact and force of one jaw, with the object's poses in the gripper's frame."""
 
     def __init__(self, pressed: PressedGrasp, side: str) -> None:
         self._side = side
-        self._solver = JawEstimator(
+        solver = JawEstimator(
             pressed.assembly.jaws[side],
             settings=EstimatorSettings(held="yes"),  # as the nodes have it for two jaws
             calibration=load_calibration("twin"),
         )
-        self._contacts = ContactEstimator(self._solver.jaw, mesh=pressed.assembly.object_mesh)
-        self._solver.warm_up()
-        self._last: Solution | None = None
+        solver.warm_up()
+        self._loop = ForceLoop(ContactEstimator(solver.jaw, mesh=pressed.assembly.object_mesh), solver)
+
+    @property
+    def touching(self) -> bool:
+        """Whether the solver was told of a touch in the last image."""
+        return self._loop.contact.estimate.touching
 
     def take_pose(self, stamp: float, T_gripper_object: NDArray, origin_x: float) -> None:
         """Take a pose of the object in the gripper's frame, where the jaw's origin is at x [m]."""
         T_jaw_gripper = np.eye(4)
         T_jaw_gripper[:3, :3] = R_GRIPPER_JAW[self._side].T
         T_jaw_gripper[:3, 3] = -T_jaw_gripper[:3, 0] * origin_x
-        self._contacts.take_pose(stamp, T_jaw_gripper @ T_gripper_object)
+        self._loop.take_pose(stamp, T_jaw_gripper @ T_gripper_object)
 
     def solve(self, observation: Observation) -> Solution:
-        """Return what the solver says of key points; `touching` says what it was told."""
-        last = self._last
-        surface = None if last is None or not last.trusted else self._solver.surface()
-        wrench = None if surface is None else (last.force, last.torque)
-        estimate = self._contacts.update(observation.stamp, surface, wrench)
-        self.touching = estimate.touching
-        self._last = self._solver.update(observation, estimate.contact)
-        return self._last
+        """Return what the solver says of key points."""
+        return self._loop.update(observation)
 
 
 class EstimatorSensor:

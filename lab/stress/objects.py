@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_contact.estimator import ContactEstimator
+from finforce_contact.jaw_contact import ForceLoop
 from finforce_contact.localization.section import cut_outline
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.parameters import ContactSettings
@@ -17,7 +18,7 @@ from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profi
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Solution
-from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, SessionStep, judge, noise_of, update
+from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, SessionStep, judge, noise_of, observe
 from lab.stress.stress import Family, Plan, Trial, attempt
 
 APPROACH, RISE, HOLD = 10, 20, 20
@@ -110,14 +111,15 @@ def rotation_of(tilt: float) -> NDArray:
 
 
 class Chain:
-    """Contact estimator and solver of one jaw, fed as their nodes are."""
+    """Contact estimator and solver of one jaw in their loop, and the camera that sees the jaw with noise."""
 
     def __init__(self, bench: Bench, scene: HardScene, random: np.random.Generator) -> None:
-        """Start both anew and lets the solver tare while the object is clear."""
-        self._bench, self._random = bench, random
-        self._contact = ContactEstimator(bench.jaw, mesh=scene.mesh, settings=ContactSettings(mesh=bench.plan.mesh))
+        """Start both anew."""
+        self._random = random
+        contact = ContactEstimator(bench.jaw, mesh=scene.mesh, settings=ContactSettings(mesh=bench.plan.mesh))
+        self._loop = ForceLoop(contact, bench.estimator)
         self._offsets = OFFSET * random.normal(size=bench.jaw.keypoints.shape)
-        self._stamp, self._last = 10.0, None
+        self._stamp = 10.0
         bench.estimator.reset()
 
     def see(self, frame: PressedImage) -> SessionStep:
@@ -137,14 +139,8 @@ class Chain:
         """Return what both make of an image and a pose T_jaw_object (4, 4)."""
         T = T.copy()
         T[:3, 3] += POSE_NOISE * self._random.normal(size=3)
-        self._contact.take_pose(step.stamp, T)
-        last = self._last
-        wrench = (last.force, last.torque) if last is not None and last.trusted else None
-        surface = None if last is None else self._bench.estimator.surface()
-        estimate = self._contact.update(step.stamp, surface, wrench)
-        self._last = None
-        self._last = update(self._bench, replace(step, contact=estimate.contact))
-        return self._last
+        self._loop.take_pose(step.stamp, T)
+        return self._loop.update(observe(step))
 
 
 def run_objects(plan: Plan) -> Iterator[Trial]:

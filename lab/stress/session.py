@@ -152,10 +152,14 @@ def take_another(session: Session, random: np.random.Generator) -> Session:
     return replace(session, history=history, contact=Contact.fixed(session.bench.jaw, history.height + error))
 
 
+def observe(step: SessionStep) -> Observation:
+    """Return what an estimator sees of a step."""
+    return Observation(stamp=step.stamp, points=step.points, likelihood=step.likelihood, stddev=step.stddev)
+
+
 def update(bench: Bench, step: SessionStep) -> Solution:
     """Return what the bench's estimator says of a step."""
-    seen = Observation(stamp=step.stamp, points=step.points, likelihood=step.likelihood, stddev=step.stddev)
-    return bench.estimator.update(seen, step.contact)
+    return bench.estimator.update(observe(step), step.contact)
 
 
 def judge(solution: Solution, step: SessionStep, balance: float = math.nan) -> Trial:
