@@ -16,7 +16,6 @@ from tqdm import tqdm
 
 from finforce.settings import check_bounds, setting
 from lab.training.batches import AugmentSettings, Batch, load_batches
-from lab.training.checkpoint import load_checkpoint, read_network, save_checkpoint, shape_from
 from lab.training.commands import (
     CheckpointError,
     RecipeError,
@@ -26,7 +25,7 @@ from lab.training.commands import (
     settings_from,
 )
 from lab.training.evaluate import Detections, Score, gather_detections, score_detections
-from lab.training.export import write_network
+from lab.training.export import load_checkpoint, read_network, save_checkpoint, shape_from, write_network
 from lab.training.losses import compute_losses, to_layers
 from lab.training.network import FingerNetwork
 from lab.training.pictures import TRAIN, VALIDATION, FingerPictures, load_pictures

@@ -13,19 +13,19 @@ pytest.importorskip("cv2", reason="pictures need OpenCV: pip install opencv-cont
 import torch
 
 from lab.experiments.network import HEIGHT, SHOWN, WIDTH, ForceNetwork
-from lab.training.baseline.network import EndToEnd
 from lab.training.baseline.scenes import GraspFilm, draw_scenario, load_films, main
 from lab.training.baseline.train import (
     NETWORK,
     SEGMENT,
     BaselineRecipe,
     BaselineTraining,
+    EndToEnd,
     alter_images,
     draw_batch,
     write_network,
 )
-from lab.training.checkpoint import load_checkpoint
 from lab.training.commands import CheckpointError, DatasetError, RecipeError
+from lab.training.export import load_checkpoint
 from lab.training.pictures import TRAIN, VALIDATION
 from lab.training.train import CHECKPOINT
 

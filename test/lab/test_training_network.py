@@ -21,11 +21,10 @@ import lab.training.evaluate
 from finforce_keypoints.networks.side_network import COARSE, FINE, SideNetwork
 from lab.training.batches import AugmentSettings, augment, choose_pictures, load_batches
 from lab.training.calibrate import main as calibrate_main
-from lab.training.checkpoint import load_checkpoint, read_network, save_checkpoint
 from lab.training.commands import CheckpointError, DatasetError, RecipeError
 from lab.training.evaluate import Detections, fit_factor, score_detections
+from lab.training.export import load_checkpoint, read_network, save_checkpoint, write_network
 from lab.training.export import main as export_main
-from lab.training.export import write_network
 from lab.training.losses import COVERED, choose_points, compute_losses
 from lab.training.network import FingerNetwork, NetworkShape, fold_batch_norm
 from lab.training.pictures import MARGIN, TRAIN, VALIDATION, FingerPictures, load_pictures, save_shard
