@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from finforce_eval.errors import OptionError
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE, new_figure, style_axes
 from finforce_sim.gripper.pressing import PressedGrasp
 from finforce_sim.scenes.scenarios import build_scenario
-from lab.experiments.experiment import Case, Findings, ResultTable, leave_out
+from lab.experiments.experiment import Case, Findings, ResultTable, tabulate
 from lab.experiments.grasp_world import EstimatorSensor, GraspCase, ImageSensor, NoisySensor, World, build_plant
 from lab.experiments.runs import RunOptions
 
@@ -32,6 +33,7 @@ WAYS = {
     "position": "position alone",
     "current": "the motor's current alone",
 }
+SPREAD = ("least", "mean", "largest")
 DRAWN_EVERY = 20  # milliseconds
 
 
@@ -88,41 +90,28 @@ class ChipExperiment:
             "error": course.error,
             "untold": [[round(stamp - start, 3), words] for stamp, words in untold],
             "violations": sum(course.violations.values()),
-            "seconds": np.round(times[::DRAWN_EVERY] - start, 3).tolist(),
-            "force": np.round(forces[::DRAWN_EVERY], 3).tolist(),
+            "drawn": {
+                "seconds": np.round(times[::DRAWN_EVERY] - start, 3).tolist(),
+                "force": np.round(forces[::DRAWN_EVERY], 3).tolist(),
+            },
         }
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return how many broke; see `Experiment`."""
         draw_chips(figures).savefig(folder / "chips.png")
-        summary, rows = {}, []
-        for way, words in WAYS.items():
-            members = [row for row in figures.values() if row["way"] == way]
-            if not members:
-                continue
-            peaks, ends = (np.array([row[key] for row in members]) for key in ("peak_N", "end_N"))
-            summary[way] = one = {
-                "grasps": len(members),
-                "broken": sum(row["is_broken"] for row in members),
-                "peak_N": [float(peaks.min()), float(peaks.mean()), float(peaks.max())],
-                "end_N": [float(ends.min()), float(ends.mean()), float(ends.max())],
-                "ended_early": sum(bool(row["error"]) for row in members),
-                "images_without_force": sum(len(row["untold"]) for row in members),
-                "violations": sum(row["violations"] for row in members),
-            }
-            numbers = (f"{value:.2f}" for value in (*one["peak_N"], *one["end_N"]))
-            rows.append((words, str(one["grasps"]), str(one["broken"]), *numbers, str(one["ended_early"])))
-        head = ("by", "grasps", "broken", "peak/N: least", "mean", "largest", "at the end/N: least", "mean", "largest",
-                "ended early")  # fmt: skip
+        rows = []
+        for way, grasps in tabulate(figures).groupby("way", sort=False):
+            row: dict[str, Any] = {"by": WAYS[way], "grasps": len(grasps), "broken": int(grasps.is_broken.sum())}
+            for column, heading in (("peak_N", "peak/N"), ("end_N", "at the end/N")):
+                spread = grasps[column].agg(["min", "mean", "max"]).tolist()
+                row |= {f"{heading}: {name}": value for name, value in zip(SPREAD, spread, strict=True)}
+            row["ended early"] = int(grasps.error.astype(bool).sum())
+            row["images without force"] = int(grasps.untold.map(len).sum())
+            rows.append(row | {"violations": int(grasps.violations.sum())})
         note = f"Broken: a true force of {BREAKS:g} N was reached; wanted: {BEARS:g} N."
         note += "".join(_tell_end(name, row) for name, row in figures.items() if row["error"])
-        table = ResultTable(title="**Grasps**", head=head, rows=rows, note=note)
-        pictures = {"True force over time; the line is where it breaks": "chips.png"}
-        return Findings(
-            figures={"ways": summary, "grasps": leave_out(figures, "seconds", "force")},
-            tables=[table],
-            pictures=pictures,
-        )
+        table = ResultTable(title="Grasps", rows=pd.DataFrame(rows), note=note)
+        return Findings(tables=[table], pictures={"True force over time; the line is where it breaks": "chips.png"})
 
 
 def _tell_end(name: str, row: Mapping[str, Any]) -> str:
@@ -158,7 +147,7 @@ def draw_chips(figures: Mapping[str, Mapping[str, Any]]) -> Any:
         members = [row for row in figures.values() if row["way"] == way]
         for row in members:
             colour = ORANGE if row["is_broken"] else BLUE
-            axes.plot(row["seconds"], row["force"], color=colour, linewidth=0.9, alpha=0.7)
+            axes.plot(row["drawn"]["seconds"], row["drawn"]["force"], color=colour, linewidth=0.9, alpha=0.7)
         axes.axhline(BREAKS, color=BLACK, linewidth=0.9, dashes=(4, 2))
         axes.axhline(BEARS, color=GREEN, linewidth=0.9, dashes=(4, 2))
         broken = sum(row["is_broken"] for row in members)

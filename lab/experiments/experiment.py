@@ -10,11 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import pandas as pd
+
 from finforce.errors import FinforceError
 from finforce_eval.engine.engines import EngineOptions, run_tasks
 from finforce_eval.engine.tasks import OK, Manifest, Task, choose_shard
-from finforce_eval.evaluation.tables import align_rows
 from finforce_eval.machine import commit, version, write_figures
+from lab.harness import format_table
 
 PAGE = "README.md"
 EDITION = 1  # of what is kept of a case; another one does not go on where an older one ended
@@ -33,20 +35,18 @@ class Case:
     settings: Mapping[str, Any]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ResultTable:
-    """Figures in rows, the first column of which are words.
+    """Figures in rows, whose columns name their units.
 
     Attributes:
         title: what it shows.
-        head: names of the columns, with units.
-        rows: cells, as many as the head has.
+        rows: the figures; columns of text come first when they are shown.
         note: what there is to say of them.
     """
 
     title: str
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: pd.DataFrame
     note: str = ""
 
 
@@ -55,12 +55,10 @@ class Findings:
     """What an experiment found.
 
     Attributes:
-        figures: as JSON has them.
-        tables: for the terminal and the page.
+        tables: for the terminal, the page and the JSON.
         pictures: file names in the experiment's folder, by what they show.
     """
 
-    figures: Mapping[str, Any]
     tables: Sequence[ResultTable]
     pictures: Mapping[str, str] = field(default_factory=dict)
 
@@ -87,7 +85,10 @@ class Experiment(Protocol):
         ...
 
     def run(self, case: Case, folder: Path) -> dict[str, Any]:
-        """Return the figures of a case as JSON has them; files go into a folder of the experiment's own."""
+        """Return the figures of a case as JSON has them, those that are only drawn under `drawn`.
+
+        Files go into a folder of the experiment's own.
+        """
         ...
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
@@ -150,14 +151,38 @@ def run_experiment(
                             f"{next(iter(failed.values()), 'there are none')}")  # fmt: skip
     findings = experiment.find(figures, folder)
     about = {"experiment": experiment.name, "version": version(), "cases": len(cases), "failed": failed}
-    write_figures(folder / f"{experiment.name}.json", {**about, **findings.figures})
+    about["tables"] = {table.title: table.rows.to_dict("records") for table in findings.tables}
+    about["figures"] = {name: _without_drawn(row) for name, row in figures.items()}
+    write_figures(folder / f"{experiment.name}.json", about)
     (folder / PAGE).write_text(_write_page(experiment, findings, len(cases), failed), encoding="utf-8")
     return findings
 
 
-def leave_out(figures: Mapping[str, Mapping[str, Any]], *names: str) -> dict[str, dict[str, Any]]:
-    """Return the figures of the cases without some of them: series that are only drawn."""
-    return {case: {name: row[name] for name in row if name not in names} for case, row in figures.items()}
+def tabulate(figures: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    """Return a row for each case, nested figures in columns of their own ("rmse_N load"), without what is drawn."""
+    table = pd.json_normalize([_without_drawn(row) for row in figures.values()], sep=" ")
+    table.insert(0, "case", list(figures))
+    return table
+
+
+def average(table: pd.DataFrame, by: Sequence[str], columns: Mapping[str, str]) -> pd.DataFrame:
+    """Return the number of rows, and mean and standard deviation of some columns, by groups in their order.
+
+    Args:
+        table: of `tabulate`.
+        by: columns that tell the groups apart.
+        columns: headings of the averages by column.
+    """
+    groups = table.groupby(list(by), sort=False)
+    means = groups.size().rename("n").to_frame()
+    for column, heading in columns.items():
+        values = groups[column]
+        means[heading], means[f"±{heading}"] = values.mean(), values.std(ddof=0)
+    return means.reset_index()
+
+
+def _without_drawn(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in row.items() if name != "drawn"}
 
 
 def format_tables(findings: Findings) -> str:
@@ -165,7 +190,7 @@ def format_tables(findings: Findings) -> str:
     blocks = []
     for table in findings.tables:
         note = ("", table.note) if table.note else ()
-        blocks.append("\n".join((table.title, "", align_rows(table.head, table.rows), *note)))
+        blocks.append("\n".join((f"**{table.title}**", "", format_table(table.rows), *note)))
     return "\n\n".join(blocks)
 
 

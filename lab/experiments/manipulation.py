@@ -14,13 +14,12 @@ from finforce.gripper_frames import SIDES
 from finforce_eval.evaluation.manipulation import NetForces, join_net
 from finforce_eval.evaluation.scoring import rms
 from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
-from finforce_eval.evaluation.tables import format_number
 from finforce_eval.figures.figures import BLACK, BLUE, new_figure
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_sim.gripper.footage import START
 from finforce_sim.scenes.scenarios import build_scenario, write_script
-from lab.experiments.experiment import Case, Findings, ResultTable, leave_out
+from lab.experiments.experiment import Case, Findings, ResultTable, average, tabulate
 from lab.experiments.runs import RunOptions, build_setup
 
 MASS, SPEED = 0.1, 1.2  # [kg], [rad/s]
@@ -83,38 +82,35 @@ class ManipulationExperiment:
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return errors along gravity by light; see `Experiment`."""
         draw_weights(figures).savefig(folder / "weights.png")
-        groups = sorted({(row.get("axis", ""), row.get("light", "")) for row in figures.values()})
-        summary, rows = {}, []
-        for axis, light in groups:
-            members = [row for row in figures.values() if (row.get("axis", ""), row.get("light", "")) == (axis, light)]
-            known = np.array([row["along_rmse_N"] for row in members], dtype=float)
-            known = known[np.isfinite(known)]
-            name = f"{axis}, {light}" if axis else "all"
-            summary[name] = {"n": len(members), "along_rmse_N": float(known.mean()), "std": float(known.std())}
-            cells = [f"{known.mean():.3f} ± {known.std():.3f}", "-"]
-            told = [row["told_along_rmse_N"] for row in members if row.get("told_along_rmse_N") is not None]
-            if told:
-                summary[name] |= {"told_along_rmse_N": float(np.mean(told)), "told_std": float(np.std(told))}
-                cells[1] = f"{np.mean(told):.3f} ± {np.std(told):.3f}"
-            rows.append((axis, light, str(len(members)), *cells, PAPER.get((axis, light), "-")))
+        turns = tabulate(figures).reindex(columns=list(COLUMNS))
+        turns[["axis", "light"]] = turns[["axis", "light"]].fillna("")
+        errors = {"along_rmse_N": "along gravity/N", "told_along_rmse_N": "direction told/N"}
+        lights = average(turns, ("axis", "light"), errors)
+        lights["paper/N"] = [PAPER.get(key, "") for key in zip(lights.axis, lights.light, strict=True)]
         note = (
-            "RMSE of the net force of both jaws (Eq. 3) along the true one, while that is above 0.5 N; direction told: "
-            "the solvers know which way gravity points in the gripper, as an arm does."
+            "RMSE of the net force of both jaws (Eq. 3) along the true one, while that is above 0.5 N: mean and "
+            "standard deviation over the turns; direction told: the solvers know which way gravity points in "
+            "the gripper, as an arm does."
         )
-        head = ("axis", "light", "turns", "along gravity/N", "direction told/N", "paper/N")
-        first = ResultTable(title="**By axis and light**", head=head, rows=rows, note=note)
-        head = ("turn", "along gravity/N", "bias/N", "across/N", "x/N", "y/N", "z/N", "within 3σ/%", "answered/%")
-        cells = [(name, *(format_number(row[key], 3) for key in KEYS)) for name, row in figures.items()]
-        second = ResultTable(title="**Each turn**", head=head, rows=cells)
+        first = ResultTable(title="By axis and light", rows=lights, note=note)
+        each = turns[["case", *KEYS]].rename(columns=COLUMNS)
         return Findings(
-            figures={"groups": summary, "turns": leave_out(figures, "course")},
-            tables=[first, second],
+            tables=[first, ResultTable(title="Each turn", rows=each)],
             pictures={"Net force along gravity over its direction in the gripper": "weights.png"},
         )
 
 
-KEYS = ("along_rmse_N", "along_bias_N", "across_rmse_N", "x_rmse_N", "y_rmse_N", "z_rmse_N", "within_3_sigma_pct",
-        "answered_pct")  # fmt: skip
+KEYS = {
+    "along_rmse_N": "along gravity/N",
+    "along_bias_N": "bias/N",
+    "across_rmse_N": "across/N",
+    "x_rmse_N": "x/N",
+    "y_rmse_N": "y/N",
+    "z_rmse_N": "z/N",
+    "within_3_sigma_pct": "within 3σ/%",
+    "answered_pct": "answered/%",
+}
+COLUMNS = {"case": "turn", "axis": "axis", "light": "light", "told_along_rmse_N": "direction told/N", **KEYS}
 
 
 def score_turn(recording: Recording, setup: EvaluationSetup) -> dict[str, Any]:
@@ -139,7 +135,7 @@ def tell_gravity(recording: Recording, gravity: Mapping[int, NDArray]) -> Record
 
 
 def score_weight(net: NetForces) -> dict[str, Any]:
-    """Return errors of a net force along the true one and across it, and the course that is drawn."""
+    """Return errors of a net force along the true one and across it, and what is drawn."""
     size = np.linalg.norm(net.true.force, axis=1)
     held = size > LEAST
     down = net.true.force[held] / size[held, None]
@@ -158,7 +154,7 @@ def score_weight(net: NetForces) -> dict[str, Any]:
         **{f"{axis}_rmse_N": rms(error[:, row]) for row, axis in enumerate("xyz")},
         "within_3_sigma_pct": 100.0 * float((np.abs(along) <= 3.0 * sigma).mean()) if known else float("nan"),
         "answered_pct": net.answered_pct,
-        "course": {
+        "drawn": {
             "angle": np.round(angle, 4).tolist(),
             "truth": np.round(size[held], 4).tolist(),
             "found": np.round(found, 4).tolist(),
@@ -173,10 +169,10 @@ def draw_weights(figures: Mapping[str, Mapping[str, Any]]) -> Any:
     figure = new_figure(3.2 * columns, 3.4 * rows + 0.2)
     for number, (name, row) in enumerate(figures.items()):
         axes = figure.add_subplot(rows, columns, number + 1, projection="polar")
-        course = row["course"]
-        axes.plot(course["angle"], course["found"], color=BLUE, linewidth=0.9)
-        axes.plot(course["angle"], course["truth"], color=BLACK, linewidth=1.0, dashes=(4, 2))
+        drawn = row["drawn"]
+        axes.plot(drawn["angle"], drawn["found"], color=BLUE, linewidth=0.9)
+        axes.plot(drawn["angle"], drawn["truth"], color=BLACK, linewidth=1.0, dashes=(4, 2))
         axes.set_title(name, fontsize=10)
-        axes.set_rlim(0.0, 1.3 * max([*course["truth"], 0.1]))
+        axes.set_rlim(0.0, 1.3 * max([*drawn["truth"], 0.1]))
         axes.tick_params(labelsize=7)
     return figure

@@ -22,7 +22,7 @@ from finforce_eval.figures.figures import BLACK, BLUE, ORANGE, new_figure, style
 from finforce_eval.recordings.images import StampedImage
 from finforce_keypoints.networks.network import open_session
 from finforce_keypoints.networks.side_network import METADATA
-from lab.experiments.experiment import Case, Findings, ResultTable, leave_out
+from lab.experiments.experiment import Case, Findings, ResultTable, average, tabulate
 from lab.experiments.grasp import join_jaws
 from lab.experiments.runs import RunOptions, build_setup
 
@@ -164,56 +164,44 @@ class NetworkExperiment:
             "network_rmse_N": rms((theirs - course.truth)[held]),
             "network_bias_N": float((theirs - course.truth)[held].mean()) if held.any() else float("nan"),
             "answered_pct": 100.0 * float(both.sum() / max(held.sum(), 1)),
-            "course": {name: np.round(values, 4).tolist() for name, values in series.items()},
+            "drawn": {name: np.round(values, 4).tolist() for name, values in series.items()},
         }
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return both methods' errors by what the network had seen; see `Experiment`."""
         draw_networks(figures).savefig(folder / "network.png")
-        groups = list(dict.fromkeys(row.get("group", "recordings") for row in figures.values()))
-        summary = {}
-        for group in groups:
-            rows = [row for row in figures.values() if row.get("group", "recordings") == group]
-            summary[group] = _compare(rows)
-        head = ("grasps", "n", "peak/N", "finforce/N", "NRMSD/%", "network/N", "NRMSD/%", "network : finforce")
-        rows = [
-            (group, str(one["n"]), f"{one['peak_N']:.2f}", f"{one['rmse_N']:.3f}", f"{one['nrmsd_pct']:.1f}",
-             f"{one['network_rmse_N']:.3f}", f"{one['network_nrmsd_pct']:.1f}", f"{one['ratio']:.1f}")
-            for group, one in summary.items()
-        ]  # fmt: skip
+        grasps = tabulate(figures)
+        grasps["group"] = grasps.get("group", "recordings")
+        for column in ("", "network_"):
+            grasps[f"{column}nrmsd_pct"] = 100.0 * grasps[f"{column}rmse_N"] / grasps.span_N
+        groups = average(grasps, ("group",), GROUPS)[["group", "n", *GROUPS.values()]]
+        groups["network : finforce"] = groups["network/N"] / groups["finforce/N"]
         note = (
             "Mean over the grasps of each one's RMSE of min(|F_left|, |F_right|) while the true force is above 0.02 N; "
-            "NRMSD of each grasp's own range."
+            f"NRMSD of each grasp's own range. The network: {self._network.about}."
         )
-        first = ResultTable(title="**By what the network has seen**", head=head, rows=rows, note=note)
-        cells = [
-            (name, f"{row['peak_N']:.2f}", f"{row['rmse_N']:.3f}", f"{row['network_rmse_N']:.3f}",
-             f"{row['network_bias_N']:+.3f}", f"{row['answered_pct']:.1f}")
-            for name, row in figures.items()
-        ]  # fmt: skip
-        head = ("grasp", "peak/N", "finforce/N", "network/N", "network's bias/N", "answered/%")
-        second = ResultTable(title="**Each grasp**", head=head, rows=cells)
+        first = ResultTable(title="By what the network has seen", rows=groups, note=note)
+        each = grasps[["case", *GRASP_COLUMNS]].rename(columns={"case": "grasp", **GRASP_COLUMNS})
         return Findings(
-            figures={"groups": summary, "trained": dict(self._network.about), "grasps": leave_out(figures, "course")},
-            tables=[first, second],
+            tables=[first, ResultTable(title="Each grasp", rows=each)],
             pictures={"Measured force (dashed), finforce (blue), network (orange)": "network.png"},
         )
 
 
-def _compare(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Return the mean errors of both methods over some grasps."""
-    ours, theirs, span, peak = (
-        np.array([row[key] for row in rows], dtype=float) for key in ("rmse_N", "network_rmse_N", "span_N", "peak_N")
-    )
-    return {
-        "n": len(rows),
-        "peak_N": float(np.nanmean(peak)),
-        "rmse_N": float(np.nanmean(ours)),
-        "nrmsd_pct": 100.0 * float(np.nanmean(ours / span)),
-        "network_rmse_N": float(np.nanmean(theirs)),
-        "network_nrmsd_pct": 100.0 * float(np.nanmean(theirs / span)),
-        "ratio": float(np.nanmean(theirs) / np.nanmean(ours)),
-    }
+GROUPS = {
+    "peak_N": "peak/N",
+    "rmse_N": "finforce/N",
+    "nrmsd_pct": "finforce: NRMSD/%",
+    "network_rmse_N": "network/N",
+    "network_nrmsd_pct": "network: NRMSD/%",
+}
+GRASP_COLUMNS = {
+    "peak_N": "peak/N",
+    "rmse_N": "finforce/N",
+    "network_rmse_N": "network/N",
+    "network_bias_N": "network's bias/N",
+    "answered_pct": "answered/%",
+}
 
 
 def draw_networks(figures: Mapping[str, Mapping[str, Any]]) -> Any:
@@ -226,7 +214,7 @@ def draw_networks(figures: Mapping[str, Mapping[str, Any]]) -> Any:
         axes.set_visible(False)
     for axes, (name, row) in zip(panels.flat, figures.items(), strict=False):
         style_axes(axes)
-        course = {key: np.array(values, dtype=float) for key, values in row["course"].items()}
+        course = {key: np.array(values, dtype=float) for key, values in row["drawn"].items()}
         axes.plot(course["seconds"], course["network"], color=ORANGE, linewidth=1.0)
         axes.plot(course["seconds"], course["found"], color=BLUE, linewidth=1.2)
         axes.plot(course["seconds"], course["truth"], color=BLACK, linewidth=0.9, dashes=(4, 2))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice
@@ -145,7 +146,7 @@ class BenchExperiment:
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return Table I; see `Experiment`."""
-        tables, summary = [], {}
+        tables = []
         for contact, words in (("given", "the place given, as in the paper"), (ESTIMATE, "the place estimated")):
             rows = []
             for place in HEIGHTS:
@@ -156,11 +157,10 @@ class BenchExperiment:
             known = [value for value in known if value is not None]
             note = ""
             if known:
-                summary[contact] = one = {"mean_N": float(np.mean(known)), "worst_N": float(np.max(known))}
-                note = f"Mean {one['mean_N']:.3f} N, worst {one['worst_N']:.3f} N; the paper's in brackets."
+                note = f"Mean {np.mean(known):.3f} N, worst {np.max(known):.3f} N; the paper's in brackets."
             head = ("RMSE/N", *(f"Ø{diameter}" for diameter in DIAMETERS))
-            tables.append(ResultTable(title=f"**With {words}**", head=head, rows=rows, note=note))
-        return Findings(figures={"summary": summary, "cylinders": figures}, tables=tables)
+            tables.append(ResultTable(title=f"With {words}", rows=pd.DataFrame(rows, columns=head), note=note))
+        return Findings(tables=tables)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,8 +199,7 @@ class PlacesExperiment:
                 rows.append((place, *ours, *others))
         head = ("really at", "estimated", *(f"fixed {place}" for place in HEIGHTS), *OTHERS.values())
         note = "RMSE [N] over the record phases, the paper's in brackets; %: share of the images that was answered."
-        table = ResultTable(title="**Ø15**", head=head, rows=rows, note=note)
-        return Findings(figures={"cylinders": figures}, tables=[table])
+        return Findings(tables=[ResultTable(title="Ø15", rows=pd.DataFrame(rows, columns=head), note=note)])
 
 
 def _find_cell(

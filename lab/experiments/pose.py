@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -21,7 +22,6 @@ from finforce_contact.pose.tracker import PoseTracker
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.setup import evaluate_all
-from finforce_eval.evaluation.tables import format_number
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.tracks import PoseTrack, Recording
 from finforce_keypoints.images import RgbdImage
@@ -47,8 +47,14 @@ FLIPPED = 0.1  # share of the poses that are turned
 GAP, GAPS_EVERY = 0.8, 2.0  # [s] without poses, and from one such gap to the next
 WORST, TRACKER = "200 ms late, flips, gaps", "built-in tracker"
 SOURCES = {"on time": "recorded poses", WORST: "as FoundationPose, at its worst", TRACKER: "built-in tracker, CPU"}
-POSE_FIGURES = ("rate_Hz", "delay_ms", "position_median_mm", "position_p95_mm", "rotation_median_deg",
-                "rotation_p95_deg")  # fmt: skip
+POSE_FIGURES = {
+    "rate_Hz": "rate/Hz",
+    "delay_ms": "delay/ms",
+    "position_median_mm": "position: median/mm",
+    "position_p95_mm": "position: 95 %/mm",
+    "rotation_median_deg": "turn: median/°",
+    "rotation_p95_deg": "turn: 95 %/°",
+}
 ON_MESH = 4e-3  # [m] within which a pixel's depth is that of the object, for the first pose
 FIRST_WITHIN = 50_000_000  # [ns] between the first pose that is known and an image
 NANOSECOND = 1e-9
@@ -118,60 +124,44 @@ class PoseExperiment:
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return what each way adds to the error; see `Experiment`."""
-        ways = [
-            way for way in next(iter(figures.values()))["ways"] if all(way in row["ways"] for row in figures.values())
+        rows = [
+            {"case": name, "poses": way, **one, "rmse_N": one["rmse_N"]["all"]}
+            for name, row in figures.items()
+            for way, one in row["ways"].items()
         ]
-        summary, rows = {}, []
-        base = _errors(figures, "on time")
-        for way in ways:
-            errors = _errors(figures, way)
-            answered = [row["ways"][way]["answered_pct"] for row in figures.values()]
-            places = [row["ways"][way]["place_median_mm"] for row in figures.values()]
-            added = errors - base
-            summary[way] = one = {
-                "rmse_N": float(errors.mean()),
-                "added_N": float(added.mean()),
-                "most_added_N": float(added.max()),
-                "answered_pct": float(np.mean(answered)),
-                "place_worst_median_mm": float(max((place for place in places if place is not None), default=0.0)),
-            }
-            rows.append((way, *(f"{one[key]:.3f}" for key in ("rmse_N", "added_N", "most_added_N")),
-                         f"{one['place_worst_median_mm']:.2f}", f"{one['answered_pct']:.1f}"))  # fmt: skip
-        head = ("poses", "RMSE/N", "added/N", "most added/N", "place: worst median/mm", "answered/%")
+        scores = pd.DataFrame(rows)
+        errors = scores.pivot(index="case", columns="poses", values="rmse_N").astype(float)
+        errors = errors[scores.poses.unique()].dropna(axis=1)
+        added, ways = errors.sub(errors["on time"], axis=0), scores.groupby("poses")
+        summary = {
+            "RMSE/N": errors.mean(),
+            "added/N": added.mean(),
+            "most added/N": added.max(),
+            "place: worst median/mm": ways.place_median_mm.max(),
+            "answered/%": ways.answered_pct.mean(),
+        }
+        by_way = pd.DataFrame(summary).loc[errors.columns].reset_index()
         note = "Grasp force, mean over the grasps of each one's RMSE while the true force is above 0.02 N."
-        first = ResultTable(title="**By way**", head=head, rows=rows, note=note)
-        cells = [(name, *(f"{row['ways'][way]['rmse_N']['all']:.3f}" for way in ways)) for name, row in figures.items()]
-        second = ResultTable(title="**Each grasp, RMSE [N]**", head=("grasp", *ways), rows=cells)
-        return Findings(
-            figures={"ways": summary, "grasps": figures}, tables=[first, _source_table(figures, summary), second]
-        )
+        first = ResultTable(title="By way", rows=by_way, note=note)
+        last = ResultTable(title="Each grasp, RMSE [N]", rows=errors.reset_index())
+        return Findings(tables=[first, _source_table(figures, errors.mean()), last])
 
 
-def _source_table(figures: Mapping[str, Mapping[str, Any]], summary: Mapping[str, Mapping[str, float]]) -> ResultTable:
+def _source_table(figures: Mapping[str, Mapping[str, Any]], errors: pd.Series) -> ResultTable:
     """Return what poses and forces are worth by where the poses come from."""
-    rows = []
-    for way, words in SOURCES.items():
-        known = [row["poses"][way] for row in figures.values() if way in row["poses"]]
-        if known:
-            cells = [np.mean([one.get(key, np.nan) for one in known]) for key in POSE_FIGURES]
-            rows.append(
-                (
-                    words,
-                    *(format_number(None if np.isnan(cell) else cell) for cell in cells),
-                    f"{summary[way]['rmse_N']:.3f}",
-                )
-            )
-    head = ("source", "rate/Hz", "delay/ms", "position: median/mm", "95 %/mm", "turn: median/°", "95 %/°", "force/N")
+    rows = [
+        {"way": way, **{heading: one.get(key) for key, heading in POSE_FIGURES.items()}}
+        for row in figures.values()
+        for way, one in row["poses"].items()
+    ]
+    means = pd.DataFrame(rows).groupby("way").mean().reindex(SOURCES).dropna(how="all")
+    means["force/N"] = errors.reindex(means.index)
+    means.insert(0, "source", [SOURCES[way] for way in means.index])
     note = (
         "Means over the grasps. FoundationPose needs a GPU and is not run: its figures are those of a publisher that "
         "behaves like it. Delay of the built-in tracker: the median of its computation here."
     )
-    return ResultTable(title="**By source**", head=head, rows=rows, note=note)
-
-
-def _errors(figures: Mapping[str, Mapping[str, Any]], way: str) -> np.ndarray:
-    """Return the RMSE (n,) [N] of the grasps whose poses come in a way."""
-    return np.array([row["ways"][way]["rmse_N"]["all"] for row in figures.values()], dtype=float)
+    return ResultTable(title="By source", rows=means, note=note)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

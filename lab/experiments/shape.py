@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import deproject
@@ -32,7 +33,7 @@ from finforce_sim.rendering.depth_camera import build_d405
 from finforce_sim.scenes.guesses import GuessError, draw_guess, place_mesh
 from finforce_sim.scenes.objects import OBJECT_NAMES, build_object
 from finforce_sim.scenes.pose_sequences import draw_scene, roughen_mask
-from lab.experiments.experiment import Case, Findings, ResultTable
+from lab.experiments.experiment import Case, Findings, ResultTable, average, tabulate
 from lab.experiments.runs import RunOptions
 
 FORMS = ("glb", "ply")
@@ -41,7 +42,15 @@ DISTANCES = (13e-3, 16e-3)  # [m] of the raw mesh from the true one, as the pape
 HIDDEN, MASK_ERROR = 0.2, 1.0  # share of the object's pixels, [px] of the mask's outline
 ERROR = GuessError(stretch=0.03, bend=0.5e-3)
 SPLATS, SPREAD, STRAYS = 20000, 3e-3, 300  # count, of the mesh's size, count of faint ones
-PAPER = {"cylinder": (13.39, 2.80, 2.36), "cube": (14.69, 6.69, 3.53), "asymmetric": (15.69, 3.26, 3.35)}
+# of the paper: its raw mesh, scaled coarsely, reconstructed [mm]
+PAPER = {
+    name: {"raw/mm": raw, "scaled coarsely/mm": coarse, "as the paper/mm": fine}
+    for name, raw, coarse, fine in (
+        ("cylinder", 13.39, 2.80, 2.36),
+        ("cube", 14.69, 6.69, 3.53),
+        ("asymmetric", 15.69, 3.26, 3.35),
+    )
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,33 +114,23 @@ class ShapeExperiment:
 
     def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
         """Return the distances by object and format; see `Experiment`."""
-        names = list(dict.fromkeys(row["object"] for row in figures.values()))
-        rows, summary = [], {}
-        for name in names:
-            for form in FORMS:
-                members = [row for row in figures.values() if (row["object"], row["form"]) == (name, form)]
-                if members:
-                    one = {key: _mean([row[key] for row in members]) for key in COLUMNS}
-                    summary[f"{name}_{form}"] = one
-                    rows.append((name, form, *(f"{one[key]:.2f}" for key in COLUMNS)))
-            if name in PAPER:
-                raw, coarse, fine = PAPER[name]
-                rows.append((name, "paper", f"{raw:.2f}", f"{coarse:.2f}", "-", f"{fine:.2f}"))
-        head = ("object", "file", "raw/mm", "scaled coarsely/mm", "robust/mm", "as the paper/mm")
+        images = tabulate(figures)
+        shapes = average(images, ("object", "form"), COLUMNS)[["object", "form", *COLUMNS.values()]]
+        told = [{"object": name, "form": "paper", **PAPER[name]} for name in PAPER if name in set(images.object)]
         note = (
-            "Mean Chamfer distance from the true mesh in the camera's frame; nan: refused. The paper's objects and "
+            "Mean Chamfer distance from the true mesh in the camera's frame; blank: refused. The paper's objects and "
             "raw meshes are its own."
         )
-        table = ResultTable(title="**Distance from the true mesh**", head=head, rows=rows, note=note)
-        return Findings(figures={"shapes": summary, "images": figures}, tables=[table])
+        rows = pd.concat([shapes, pd.DataFrame(told)]).sort_values("object", kind="stable")
+        return Findings(tables=[ResultTable(title="Distance from the true mesh", rows=rows, note=note)])
 
 
-COLUMNS = ("raw_mm", "coarse_mm", "robust_mm", "paper_mm")
-
-
-def _mean(values: Sequence[float | None]) -> float:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else float("nan")
+COLUMNS = {
+    "raw_mm": "raw/mm",
+    "coarse_mm": "scaled coarsely/mm",
+    "robust_mm": "robust/mm",
+    "paper_mm": "as the paper/mm",
+}
 
 
 def _distance(mesh: ObjectMesh, true: ObjectMesh) -> float:

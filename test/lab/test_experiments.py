@@ -33,7 +33,7 @@ from finforce_sim.scenes.guesses import place_mesh
 from finforce_sim.scenes.objects import build_object
 from lab.experiments import grasp_world
 from lab.experiments.chip import ChipExperiment
-from lab.experiments.experiment import Case, Findings, ResultTable, format_tables, run_experiment
+from lab.experiments.experiment import Case, Findings, ResultTable, average, format_tables, run_experiment, tabulate
 from lab.experiments.grasp import GraspCourse, GraspExperiment, score_course
 from lab.experiments.manipulation import (
     ManipulationExperiment,
@@ -45,7 +45,7 @@ from lab.experiments.network import HEIGHT, SHOWN, WIDTH, ForceNetwork, NetworkE
 from lab.experiments.paper_tables import BenchExperiment
 from lab.experiments.pose import PoseExperiment, drop_poses, flip_poses, score_poses, track_object, true_poses
 from lab.experiments.runs import RunOptions, keep_poses, list_missing, render_scene
-from lab.experiments.shape import write_generated
+from lab.experiments.shape import ShapeExperiment, write_generated
 
 DATA = Path(__file__).parents[2] / "finforce_eval" / "data"
 
@@ -74,9 +74,7 @@ class Counting:
         return {"letters": len(case.name), "nothing": float("nan")}
 
     def find(self, figures, folder):
-        total = sum(row["letters"] for row in figures.values())
-        table = ResultTable(title="**Letters**", head=("case", "n"), rows=[(name, "1") for name in figures])
-        return Findings(figures={"total": total}, tables=[table])
+        return Findings(tables=[ResultTable(title="Letters", rows=tabulate(figures))])
 
 
 def test_a_run_that_was_killed_goes_on_where_it_was(tmp_path):
@@ -86,7 +84,8 @@ def test_a_run_that_was_killed_goes_on_where_it_was(tmp_path):
     again = Counting()
     run_experiment(again, tmp_path)
     assert again.ran == ["three"]
-    assert json.loads((tmp_path / "count" / "count.json").read_text())["total"] == 11
+    rows = json.loads((tmp_path / "count" / "count.json").read_text())["tables"]["Letters"]
+    assert sum(row["letters"] for row in rows) == 11
     assert "It counts." in (tmp_path / "count" / "README.md").read_text()
     nothing = Counting()
     run_experiment(nothing, tmp_path)
@@ -186,7 +185,8 @@ def test_parts_are_put_on_a_page_by_a_run_of_all(tmp_path):
     run_experiment(second, tmp_path, shard="2/2")
     run_experiment(whole, tmp_path)
     assert (first.ran, second.ran, whole.ran) == (["one", "three"], ["two"], [])
-    assert json.loads((tmp_path / "count" / "count.json").read_text())["total"] == 11
+    rows = json.loads((tmp_path / "count" / "count.json").read_text())["tables"]["Letters"]
+    assert sum(row["letters"] for row in rows) == 11
 
 
 def course(error=0.0, stddev=0.1):
@@ -248,7 +248,7 @@ def test_a_weight_is_scored_along_gravity():
     assert score["along_bias_N"] == pytest.approx(0.1)
     assert score["across_rmse_N"] == pytest.approx(0.3)
     assert score["within_3_sigma_pct"] == 100.0
-    assert np.ptp(score["course"]["angle"]) == pytest.approx(2.0 * np.pi, rel=0.01)
+    assert np.ptp(score["drawn"]["angle"]) == pytest.approx(2.0 * np.pi, rel=0.01)
 
 
 def test_gravity_is_told_in_each_jaws_frame():
@@ -324,13 +324,13 @@ def test_images_without_a_force_are_told_with_what_the_jaws_said(monkeypatch):
 
 def test_why_a_grasp_ended_early_is_on_the_page(tmp_path):
     row = {"way": "force", "peak_N": 3.0, "end_N": 2.9, "is_broken": False, "error": "", "violations": 0,
-           "seconds": [0.0], "force": [0.0], "untold": []}  # fmt: skip
+           "drawn": {"seconds": [0.0], "force": [0.0]}, "untold": []}  # fmt: skip
     early = {"error": "the newest force is 0.27 s old", "untold": [[0.1, "left waiting"], [0.2, "right unobservable"]]}
     findings = ChipExperiment(options=RunOptions()).find({"force_00": row, "force_01": row | early}, tmp_path)
     assert "force_01 ended early: the newest force is 0.27 s old (right unobservable)" in findings.tables[0].note
     assert "force_00" not in findings.tables[0].note
-    assert findings.figures["ways"]["force"]["images_without_force"] == 2
-    assert findings.figures["grasps"]["force_01"]["untold"] == early["untold"]
+    (row,) = findings.tables[0].rows.to_dict("records")
+    assert (row["grasps"], row["images without force"], row["ended early"]) == (2, 2, 1)
 
 
 def test_a_recording_that_lacks_something_is_told_what(tmp_path, capsys):
@@ -464,15 +464,24 @@ def test_the_bench_runs_on_the_recording_in_the_package(tmp_path, capsys):
     command = ["experiment", "bench", "--on", bag, "--calibration", "bench", "--report", str(tmp_path)]
     assert main(command) == 0
     figures = json.loads((tmp_path / "bench" / "bench.json").read_text())
-    assert figures["summary"]["estimate"]["worst_N"] < 0.2
+    assert figures["figures"]["cyl25_middle"]["contacts"]["estimate"]["rmse_N"] < 0.2
     assert "(0.28)" in capsys.readouterr().out
     assert bag not in (tmp_path / "bench" / "README.md").read_text()
 
 
 def test_tables_have_a_title_and_a_note():
-    table = ResultTable(title="**T**", head=("a", "b"), rows=[("x", "1")], note="N.")
-    lines = format_tables(Findings(figures={}, tables=[table])).splitlines()
-    assert lines[0] == "**T**" and lines[-1] == "N."
+    table = ResultTable(title="T", rows=tabulate({"x": {"b": 1, "drawn": [1]}}), note="N.")
+    lines = format_tables(Findings(tables=[table])).splitlines()
+    assert lines[0] == "**T**" and lines[2].split() == ["|", "case", "|", "b", "|"] and lines[-1] == "N."
+
+
+def test_averages_are_of_what_is_known_in_the_order_of_the_groups():
+    rows = {"a": {"g": "late", "e": {"all": 1.0}}, "b": {"g": "early", "e": {"all": None}}}
+    rows |= {"c": {"g": "late", "e": {"all": 3.0}}}
+    means = average(tabulate(rows), ("g",), {"e all": "error/N"})
+    assert means.g.tolist() == ["late", "early"] and means.n.tolist() == [2, 1]
+    assert means["error/N"].tolist() == pytest.approx([2.0, np.nan], nan_ok=True)
+    assert means["±error/N"].tolist() == pytest.approx([1.0, np.nan], nan_ok=True)
 
 
 def test_the_end_to_end_network_needs_ten_images():
@@ -504,14 +513,48 @@ def test_another_network_than_an_end_to_end_one_is_refused(tmp_path, capsys):
 
 def test_both_methods_are_compared_by_what_the_network_has_seen(tmp_path):
     series = {"seconds": [0.0, 1.0], "truth": [0.0, 2.0], "found": [0.0, 2.1], "network": [None, 1.0]}
-    row = {"peak_N": 2.0, "span_N": 2.0, "network_bias_N": 0.0, "answered_pct": 100.0, "course": series}
+    row = {"peak_N": 2.0, "span_N": 2.0, "network_bias_N": 0.0, "answered_pct": 100.0, "drawn": series}
     figures = {
         "known": {**row, "group": "as trained", "rmse_N": 0.1, "network_rmse_N": 0.2},
         "new": {**row, "group": "another object", "rmse_N": 0.1, "network_rmse_N": 0.6},
         "newer": {**row, "group": "another object", "rmse_N": 0.3, "network_rmse_N": 1.0},
     }
-    groups = NetworkExperiment(options=RunOptions()).find(figures, tmp_path).figures["groups"]
-    assert groups["as trained"]["ratio"] == pytest.approx(2.0)
-    assert groups["another object"]["ratio"] == pytest.approx(4.0)
-    assert groups["another object"]["network_nrmsd_pct"] == pytest.approx(40.0)
+    groups = NetworkExperiment(options=RunOptions()).find(figures, tmp_path).tables[0].rows.set_index("group")
+    assert groups["network : finforce"].to_dict() == pytest.approx({"as trained": 2.0, "another object": 4.0})
+    assert groups["network: NRMSD/%"]["another object"] == pytest.approx(40.0)
     assert (tmp_path / "network.png").stat().st_size > 1000
+
+
+def test_what_each_way_of_poses_adds_is_counted_from_those_on_time(tmp_path):
+    def grasp(*errors):
+        ways = ("on time", "late")
+        scores = {"answered_pct": 99.0, "place_median_mm": 1.0}
+        return {
+            "ways": {way: {"rmse_N": {"all": error}, **scores} for way, error in zip(ways, errors, strict=True)},
+            "poses": {"on time": {"rate_Hz": 10.0, "delay_ms": 0.0}},
+        }
+
+    found = PoseExperiment(options=RunOptions()).find({"one": grasp(0.1, 0.1), "two": grasp(0.1, 0.4)}, tmp_path)
+    rows = found.tables[0].rows.set_index("poses")
+    assert rows["added/N"].to_dict() == pytest.approx({"on time": 0.0, "late": 0.15})
+    assert rows["most added/N"]["late"] == pytest.approx(0.3)
+    assert found.tables[1].rows["rate/Hz"].tolist() == [10.0]
+
+
+def test_grasps_and_turns_and_shapes_are_put_in_tables(tmp_path):
+    phases = dict.fromkeys(("all", "load", "hold", "release"), 0.1)
+    series = {"seconds": [0.0, 1.0], "truth": [0.0, 2.0], "found": [0.0, 2.1]}
+    score = {"rmse_N": phases, "nrmsd_pct": phases, "peak_N": 2.0, "bias_N": 0.0, "max_error_N": 0.1}
+    score |= {"answered_pct": 100.0, "within_3_sigma_pct": 100.0, "delay_ms": [100.0, None]}
+    row = {**score, "hidden": score, "drawn": series, "object": "cube", "place": "upper", "level": "low"}
+    found = GraspExperiment(options=RunOptions()).find({"one": row}, tmp_path)
+    assert found.tables[0].rows.force.tolist() == ["low", "all"]
+    assert found.tables[0].rows["shows after/ms"].tolist() == [100.0, 100.0]
+    one = Wrench(np.eye(3)[:2], np.eye(3)[:2])
+    net = NetForces(stamps=np.arange(2), found=one, true=one, stated=None, answered_pct=100.0)
+    turn = score_weight(net) | {"axis": "roll", "light": "dim"}
+    found = ManipulationExperiment(options=RunOptions()).find({"one": turn}, tmp_path)
+    assert found.tables[0].rows["paper/N"].tolist() == ["0.28 ± 0.02"]
+    images = {"raw_mm": 14.0, "coarse_mm": 12.0, "robust_mm": 0.4, "paper_mm": None, "object": "cube", "form": "glb"}
+    found = ShapeExperiment(options=RunOptions()).find({"one": images}, tmp_path)
+    assert found.tables[0].rows.form.tolist() == ["glb", "paper"]

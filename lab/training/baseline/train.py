@@ -1,7 +1,7 @@
 """Trains the end-to-end network: `python -m lab.training.baseline.train DATA -o RUN`.
 
-After the comparison of K. Zuo et al. (RA-L 2026), which follows Zhu et al.: an encoder of each image (theirs: ResNet-50)
-and a transformer over the features of ten images. The small encoder is for a CPU.
+After the comparison of K. Zuo et al. (RA-L 2026), which follows Zhu et al.: an encoder of each image, a ResNet-50,
+and a transformer over the features of ten images. A small encoder in its place is for a CPU.
 """
 
 from __future__ import annotations
