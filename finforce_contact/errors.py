@@ -25,7 +25,7 @@ class ReconstructionError(FinforceError, RuntimeError):
 
 
 def to_floats(values: ArrayLike, what: str, error: type[FinforceError]) -> NDArray:
-    """Returns values as an array of floats; raises `error` for what holds no numbers or has ragged rows."""
+    """Return values as an array of floats; raises `error` for what holds no numbers or has ragged rows."""
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -33,13 +33,13 @@ def to_floats(values: ArrayLike, what: str, error: type[FinforceError]) -> NDArr
 
 
 def check_stamp(stamp: float, what: str, error: type[FinforceError]) -> None:
-    """Refuses a stamp [s] that is not finite by raising `error`; one such would stop a clock for ever."""
+    """Refuse a stamp [s] that is not finite by raising `error`; one such would stop a clock for ever."""
     if not isfinite(stamp):
         raise error(f"{what}: got stamp {stamp}, expected the capture time in seconds")
 
 
 def check_wrench(wrench: tuple[NDArray, NDArray]) -> tuple[NDArray, NDArray]:
-    """Returns force (3,) [N] and torque (3,) [N m] as floats; raises ContactError for what is no wrench."""
+    """Return force (3,) [N] and torque (3,) [N m] as floats; raises ContactError for what is no wrench."""
     try:
         force, torque = (to_floats(part, "wrench", ContactError) for part in wrench)
     except (TypeError, ValueError) as error:

@@ -74,7 +74,7 @@ class ContactEstimate:
 
 
 def blank_estimate(stamp: float, status: str, message: str, T_jaw_object: NDArray | None = None) -> ContactEstimate:
-    """Returns an estimate without rows, for whatever is no known contact."""
+    """Return an estimate without rows, for whatever is no known contact."""
     return ContactEstimate(
         stamp=stamp,
         status=status,
@@ -135,7 +135,7 @@ class ContactEstimator:
         settings: ContactSettings | None = None,
         skips: Skips | None = None,
     ) -> None:
-        """Prepares the jaw's inner face; without `skips` every rule of what need not be done is applied.
+        """Prepare the jaw's inner face; without `skips` every rule of what need not be done is applied.
 
         Raises:
             FinforceError: The jaw has no mesh of that density, or symmetry or object do not do.
@@ -162,7 +162,7 @@ class ContactEstimator:
         return self._rest.still
 
     def set_object(self, mesh: ObjectMesh | None) -> None:
-        """Takes another object, or none; its pose is not known yet.
+        """Take another object, or none; its pose is not known yet.
 
         Raises:
             ObjectMeshError: The mode needs a watertight mesh, and this one is not.
@@ -180,7 +180,7 @@ class ContactEstimator:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets poses, contact and counts; jaw and object stay."""
+        """Forget poses, contact and counts; jaw and object stay."""
         self._poses.reset()
         self._belief.reset()
         self._rest.reset()
@@ -207,7 +207,7 @@ class ContactEstimator:
         *,
         camera: NDArray | None = None,
     ) -> None:
-        """Takes a pose of the object.
+        """Take a pose of the object.
 
         Args:
             stamp: image capture time [s].
@@ -233,13 +233,13 @@ class ContactEstimator:
         self._counts["odd pose"] += outcome == "aside"
 
     def carry(self, T: NDArray) -> None:
-        """Takes the jaw's own motion since the last pose: T (4, 4) leads from its frame then to its frame now."""
+        """Take the jaw's own motion since the last pose: T (4, 4) leads from its frame then to its frame now."""
         self._poses.carry(T)
 
     def update(
         self, stamp: float, surface: NDArray | None = None, wrench: tuple[NDArray, NDArray] | None = None
     ) -> ContactEstimate:
-        """Returns where the object touches in the image of a stamp [s].
+        """Return where the object touches in the image of a stamp [s].
 
         Args:
             stamp: image capture time [s].
@@ -271,7 +271,7 @@ class ContactEstimator:
         return self._follow(stamp, pose, scene)
 
     def _follow(self, stamp: float, pose: FilteredPose, scene: ContactScene) -> ContactEstimate:
-        """Finds the place in a scene, or keeps the last one, and says whether the object touches."""
+        """Find the place in a scene, or keeps the last one, and says whether the object touches."""
         is_still = self.skips.allows(STILL) and self._is_still(scene)
         if not is_still:
             if self._surrounds_jaw(scene):
@@ -302,11 +302,11 @@ class ContactEstimator:
         return bool(np.abs(scene.wrench[0] - before.wrench[0]).max() < _STILL_FORCE)
 
     def _is_live(self, scene: ContactScene) -> bool:
-        """Whether the surface is that of a solver at work."""
+        """Return whether the surface is that of a solver at work."""
         return bool(np.abs(scene.line - self._rest_line).max() > _AT_REST)
 
     def _surrounds_jaw(self, scene: ContactScene) -> bool:
-        """Whether most of the jaw lies within the object."""
+        """Return whether most of the jaw lies within the object."""
         jaw = scene.surface[self._samples]
         inside = np.abs((jaw - scene.T[:3, 3]) @ scene.T[:3, :3] - self._centre) < self._half
         if inside.all(axis=1).mean() < _SURROUNDED:
@@ -314,7 +314,7 @@ class ContactEstimator:
         return count_inside(np.ascontiguousarray(jaw[:, ::2]), scene.section.edges) > _SURROUNDED * len(jaw)
 
     def _judge_touch(self, pose: FilteredPose, scene: ContactScene) -> str:
-        """Decides whether the object touches, and returns what is odd about that."""
+        """Decide whether the object touches, and returns what is odd about that."""
         place, settings = self._place, self.settings
         if place.touching is not None:
             self._belief.set(place.touching)
@@ -330,7 +330,7 @@ class ContactEstimator:
     def _report(
         self, stamp: float, pose: FilteredPose, scene: ContactScene, is_still: bool, message: str
     ) -> ContactEstimate:
-        """Returns the estimate of an image."""
+        """Return the estimate of an image."""
         touching = self._belief.touching
         self._follow_face(scene, touching)
         return ContactEstimate(
@@ -349,7 +349,7 @@ class ContactEstimator:
         )
 
     def _follow_face(self, scene: ContactScene, touching: bool) -> None:
-        """Keeps the face where the object touches, for the slip of the next pose."""
+        """Keep the face where the object touches, for the slip of the next pose."""
         if not touching or self._place is None:
             self._face = None
             self._slips.release()
@@ -358,7 +358,7 @@ class ContactEstimator:
         self._face = face_at(scene.line, self.face.heights, height)
 
     def _outline(self, pose: FilteredPose, section: Section) -> ObjectOutline | None:
-        """Returns the outline for the solver, with the errors of the pose that no average removes."""
+        """Return the outline for the solver, with the errors of the pose that no average removes."""
         if self.settings.mode != "estimate":
             return None
         bias = np.array([self.settings.pose_bias, self.settings.pose_bias, self.settings.rotation_bias])
@@ -370,7 +370,7 @@ class ContactEstimator:
         )
 
     def _give_up(self, stamp: float, status: str, message: str, reason: str = "") -> ContactEstimate:
-        """Returns an estimate without rows; nothing of the last contact is kept."""
+        """Return an estimate without rows; nothing of the last contact is kept."""
         self._counts[reason or status] += 1
         self._belief.reset()
         self._rest.update(stamp, None)
@@ -382,7 +382,7 @@ class ContactEstimator:
 
 
 def _points_of(place: Place, jaw: Jaw) -> "_RowPoints":
-    """Returns the rows of a place as points on the undeformed inner surface."""
+    """Return the rows of a place as points on the undeformed inner surface."""
     heights = place.patch.heights
     points = np.zeros((len(heights), 3))
     points[:, 0], points[:, 2] = jaw.face.read(heights), heights

@@ -32,7 +32,7 @@ class IntersectionLocalizer:
     """
 
     def __init__(self, jaw: Jaw, face: InnerFace, mesh: ObjectMesh) -> None:
-        """Builds the object's solid.
+        """Build the object's solid.
 
         Raises:
             ObjectMeshError: The mesh is not watertight.
@@ -45,12 +45,12 @@ class IntersectionLocalizer:
         self.reset()
 
     def reset(self) -> None:
-        """Starts anew, apart."""
+        """Start anew, apart."""
         self._status = False
         self._last: ContactPatch | None = None
 
     def locate(self, scene: ContactScene) -> Place | None:
-        """Returns the place, None before any was found."""
+        """Return the place, None before any was found."""
         shift = self._slight_contact(scene.T) - scene.T[0, 3] if not self._status else 0.0
         T = scene.T.copy()
         T[0, 3] += min(shift, 0.0)
@@ -65,13 +65,13 @@ class IntersectionLocalizer:
         return Place(patch=self._last, gap=float("nan"), bend=bend, touching=bool(self._status and shift >= 0.0))
 
     def _slight_contact(self, T: NDArray) -> float:
-        """Returns t_x = l_0 + l_bd / 2 [m] (Eq. 2), corrected for objects whose origin is not in their middle."""
+        """Return t_x = l_0 + l_bd / 2 [m] (Eq. 2), corrected for objects whose origin is not in their middle."""
         turned = self._vertices @ T[0, :3]
         low, high = turned.min(), turned.max()
         return float(self._face.front - OFFSET + 0.5 * (high - low) - 0.5 * (high + low))
 
     def _candidate_of(self, centre: NDArray, surface: NDArray) -> ContactPatch:
-        """Returns the candidate of an intersection's centre (3,) [m]."""
+        """Return the candidate of an intersection's centre (3,) [m]."""
         nearest = int(((surface - centre) ** 2).sum(axis=1).argmin())
         projected = self._mesh.nodes[nearest, 1:]
         chosen = int(((self._candidates - projected) ** 2).sum(axis=1).argmin())
@@ -87,7 +87,7 @@ class NearSolid:
     """
 
     def __init__(self, mesh: ObjectMesh, margin: float) -> None:
-        """Builds the solid; `margin` [m] is kept around the jaw's box.
+        """Build the solid; `margin` [m] is kept around the jaw's box.
 
         Raises:
             ObjectMeshError: The mesh is not watertight.
@@ -104,7 +104,7 @@ class NearSolid:
         self._part: Manifold | None = None
 
     def near(self, T: NDArray, surface: NDArray) -> "Manifold":
-        """Returns the part, object frame, for a pose T_jaw_object (4, 4) and the jaw's vertices (n, 3) [m]."""
+        """Return the part, object frame, for a pose T_jaw_object (4, 4) and the jaw's vertices (n, 3) [m]."""
         low, high = surface.min(axis=0), surface.max(axis=0)
         corners = np.array(list(product(*zip(low, high, strict=True))))
         if self._part is not None:
@@ -116,7 +116,7 @@ class NearSolid:
         return self._part
 
     def _cut(self, T: NDArray, low: NDArray, high: NDArray) -> None:
-        """Cuts the object by the jaw's box widened by the margin."""
+        """Cut the object by the jaw's box widened by the margin."""
         self._T_jaw_object, self._low, self._high = T.copy(), low - self._margin, high + self._margin
         box = import_manifold3d().Manifold.cube(self._high - self._low).translate(self._low)
         part = self.whole ^ box.transform(invert_pose(T)[:3])
@@ -126,7 +126,7 @@ class NearSolid:
 
 
 def intersect(solid: "Manifold", T: NDArray, surface: NDArray, triangles: NDArray) -> NDArray | None:
-    """Returns the centre of volume (3,) [m, jaw frame] of the intersection of an object and a jaw, None if empty.
+    """Return the centre of volume (3,) [m, jaw frame] of the intersection of an object and a jaw, None if empty.
 
     Args:
         solid: the object's solid, object frame.
@@ -145,7 +145,7 @@ def intersect(solid: "Manifold", T: NDArray, surface: NDArray, triangles: NDArra
 
 
 def centre_of_volume(vertices: NDArray, triangles: NDArray) -> NDArray:
-    """Returns the centre (3,) [m] of the volume that triangles bound: the mean of tetrahedra from a vertex."""
+    """Return the centre (3,) [m] of the volume that triangles bound: the mean of tetrahedra from a vertex."""
     a, b, c = np.moveaxis(vertices[triangles] - vertices[0], 1, 0)
     volumes = np.einsum("ij,ij->i", a, np.cross(b, c))
     total = volumes.sum()

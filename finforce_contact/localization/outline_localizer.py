@@ -46,7 +46,7 @@ class InnerFace:
     weights: NDArray
 
     def check_surface(self, surface: NDArray) -> NDArray:
-        """Returns a deformed surface (n, 3) [m] as floats after having refused what does not belong to the mesh.
+        """Return a deformed surface (n, 3) [m] as floats after having refused what does not belong to the mesh.
 
         Raises:
             MeshError: Another number of vertices than the mesh has, coordinates that are not finite, or vertices
@@ -79,12 +79,12 @@ class InnerFace:
         return float(self.x.max())
 
     def deform(self, surface: NDArray) -> NDArray:
-        """Returns x and z (h, 2) [m] of the line on a deformed surface (n, 3) [m] in mesh order."""
+        """Return x and z (h, 2) [m] of the line on a deformed surface (n, 3) [m] in mesh order."""
         return _average(surface, self.nodes, self.weights)
 
 
 def build_inner_face(jaw: Jaw, density: str) -> InnerFace:
-    """Builds the line every half millimetre along the inner surface of a jaw's mesh.
+    """Build the line every half millimetre along the inner surface of a jaw's mesh.
 
     Args:
         jaw: the jaw, with its calibration applied if the solver has one.
@@ -119,7 +119,7 @@ def build_inner_face(jaw: Jaw, density: str) -> InnerFace:
 
 
 def _locate(corners: NDArray, samples: NDArray) -> tuple[NDArray, NDArray]:
-    """Returns the triangle of corners (t, 3, 2) that each sample (p, 2) is in, and its shares of the corners (p, 3)."""
+    """Return the triangle of corners (t, 3, 2) that each sample (p, 2) is in, and its shares of the corners (p, 3)."""
     origin, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     offset = samples[:, None] - origin
@@ -132,7 +132,7 @@ def _locate(corners: NDArray, samples: NDArray) -> tuple[NDArray, NDArray]:
 
 @njit(cache=True, error_model="numpy")
 def _average(surface, nodes, weights):
-    """Returns the weighted x and z (h, 2) of nodes (h, m)."""
+    """Return the weighted x and z (h, 2) of nodes (h, m)."""
     line = np.zeros((len(nodes), 2))
     for h in range(len(nodes)):
         for k in range(nodes.shape[1]):
@@ -166,7 +166,7 @@ class ContactPatch:
 
 
 def overlap_of(gaps: NDArray, depth: float) -> NDArray:
-    """Returns the overlap (h,) [m] with gaps (h,) [m] closed along x until the deepest overlap is `depth` [m].
+    """Return the overlap (h,) [m] with gaps (h,) [m] closed along x until the deepest overlap is `depth` [m].
 
     o = max(0, depth + min g - g): whatever the pose errs along x drops out.
     """
@@ -174,7 +174,7 @@ def overlap_of(gaps: NDArray, depth: float) -> NDArray:
 
 
 def patch_from_overlap(heights: NDArray, overlap: NDArray, spacing: float, narrow: float) -> ContactPatch:
-    """Returns rows no farther apart than `spacing` [m], weighted by the overlap that each stands for.
+    """Return rows no farther apart than `spacing` [m], weighted by the overlap that each stands for.
 
     A contact whose overlap has the spread of an even one no higher than `narrow` [m], 12^0.5 standard deviations,
     is one row at its centre. Heights without overlap between two contacts part them.
@@ -190,14 +190,14 @@ def patch_from_overlap(heights: NDArray, overlap: NDArray, spacing: float, narro
 
 
 def tilt_patch(patch: ContactPatch, mean: float) -> ContactPatch:
-    """Returns the rows with weights w_i exp(s z_i) whose mean is `mean` [m], or one row there when none has it."""
+    """Return the rows with weights w_i exp(s z_i) whose mean is `mean` [m], or one row there when none has it."""
     if not patch.heights[0] < mean < patch.heights[-1]:
         return ContactPatch(heights=np.array([mean]), weights=np.ones(1))
     return ContactPatch(heights=patch.heights, weights=_tilt(patch.heights, patch.weights, mean))
 
 
 def cross_line_of_action(line: NDArray, heights: NDArray, force: NDArray, torque: NDArray, near: float) -> float:
-    """Returns the undeformed height [m] where the force's line of action cuts the deformed line, NaN if nowhere.
+    """Return the undeformed height [m] where the force's line of action cuts the deformed line, NaN if nowhere.
 
     The cut is where z F_x - x F_z = M_y; of several the one nearest to the height `near` [m] counts.
 
@@ -219,7 +219,7 @@ def cross_line_of_action(line: NDArray, heights: NDArray, force: NDArray, torque
 
 @njit(**_OPTIONS)
 def _gather(heights, overlap, spacing, narrow):
-    """Returns heights and weights of the rows of every contact."""
+    """Return heights and weights of the rows of every contact."""
     places, weights, count = np.empty(len(heights)), np.empty(len(heights)), 0
     first = 0
     while first < len(heights):
@@ -245,7 +245,7 @@ def _gather(heights, overlap, spacing, narrow):
 
 @njit(**_OPTIONS)
 def _tilt(heights, weights, mean):
-    """Returns the tilted weights; the slope is found by bisection."""
+    """Return the tilted weights; the slope is found by bisection."""
     span = heights[-1] - heights[0]
     low, high = -_STEEPEST, _STEEPEST
     tilted = weights.copy()
@@ -268,16 +268,16 @@ class ClosestLocalizer:
     """
 
     def __init__(self, jaw: Jaw, face: InnerFace) -> None:
-        """Keeps the candidates and the inner face at rest."""
+        """Keep the candidates and the inner face at rest."""
         self._candidates = jaw.candidates[:, 2]
         self._face = face
         self._line = face.deform(face.mesh.nodes)
 
     def reset(self) -> None:
-        """Starts anew; nothing is remembered."""
+        """Start anew; nothing is remembered."""
 
     def locate(self, scene: ContactScene) -> Place | None:
-        """Returns the place, None when the object does not stand before the inner surface."""
+        """Return the place, None when the object does not stand before the inner surface."""
         gaps = compute_gaps(self._line, scene.section.edges)
         if not np.isfinite(gaps).any():
             return None
@@ -329,10 +329,10 @@ class Localizer(Protocol):
     """Finds the place in a scene."""
 
     def reset(self) -> None:
-        """Starts anew, apart."""
+        """Start anew, apart."""
 
     def locate(self, scene: ContactScene) -> Place | None:
-        """Returns the place, None when the object does not stand before the inner surface."""
+        """Return the place, None when the object does not stand before the inner surface."""
 
 
 _OVERLAP = 0.2e-3  # [m] into which the object is brought with the deformed surface
@@ -355,10 +355,10 @@ class OutlineLocalizer:
         self._face = face
 
     def reset(self) -> None:
-        """Starts anew; nothing is remembered."""
+        """Start anew; nothing is remembered."""
 
     def locate(self, scene: ContactScene) -> Place | None:
-        """Returns the place, None when the object does not stand before the inner surface."""
+        """Return the place, None when the object does not stand before the inner surface."""
         gaps = compute_gaps(scene.line, scene.section.edges)
         nearest = int(gaps.argmin())
         if not np.isfinite(gaps[nearest]):
@@ -372,7 +372,7 @@ class OutlineLocalizer:
         return Place(patch=patch, gap=float(gaps[nearest]), bend=bend)
 
     def _follow_wrench(self, patch: ContactPatch, gaps: NDArray, scene: ContactScene) -> ContactPatch:
-        """Returns the rows with their mean moved towards the pressure centre, if that agrees with the gaps left (h,).
+        """Return the rows with their mean moved towards the pressure centre, if that agrees with the gaps left (h,).
 
         A pose that is a little off along z closes the gap at one end of a wrapped surface and opens it at the other.
         """

@@ -37,7 +37,7 @@ class Edges:
 
 
 def edges_of(polygons: tuple[NDArray, ...]) -> Edges:
-    """Returns the edges of closed polygons (n, 2) [m]."""
+    """Return the edges of closed polygons (n, 2) [m]."""
     if not polygons:
         return Edges(starts=np.empty((0, 2)), ends=np.empty((0, 2)))
     ends = [np.roll(polygon, -1, axis=0) for polygon in polygons]
@@ -45,14 +45,14 @@ def edges_of(polygons: tuple[NDArray, ...]) -> Edges:
 
 
 def place_edges(edges: Edges, origin: NDArray, tilt: float) -> Edges:
-    """Returns edges turned by a tilt [rad], positive from x to z, and moved to an origin (2,) [m]."""
+    """Return edges turned by a tilt [rad], positive from x to z, and moved to an origin (2,) [m]."""
     c, s = np.cos(tilt), np.sin(tilt)
     turn = np.array([[c, s], [-s, c]])
     return Edges(starts=edges.starts @ turn + origin, ends=edges.ends @ turn + origin)
 
 
 def compute_gaps(line: NDArray, edges: Edges) -> NDArray:
-    """Returns the way along x from a line (h, 2) [m] to the object's near side (h,) [m].
+    """Return the way along x from a line (h, 2) [m] to the object's near side (h,) [m].
 
     Negative where the point lies in the object, infinite where nothing of the object stands before the point. What
     lies behind the point by more than a wall's thickness, as the far wall of a cup around the finger, does not count.
@@ -61,12 +61,12 @@ def compute_gaps(line: NDArray, edges: Edges) -> NDArray:
 
 
 def count_inside(points: NDArray, edges: Edges) -> int:
-    """Returns how many of points (p, 2) [m] lie within the outline, by the even-odd rule."""
+    """Return how many of points (p, 2) [m] lie within the outline, by the even-odd rule."""
     return int(_count_inside(points, edges.starts, edges.ends))
 
 
 def distances_to(line: NDArray, edges: Edges) -> NDArray:
-    """Returns the distance of each point of a line (h, 2) [m] to the outline's boundary (h,) [m]."""
+    """Return the distance of each point of a line (h, 2) [m] to the outline's boundary (h,) [m]."""
     along = edges.ends - edges.starts
     offset = line[:, None] - edges.starts
     share = np.clip((offset * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-30), 0.0, 1.0)
@@ -75,7 +75,7 @@ def distances_to(line: NDArray, edges: Edges) -> NDArray:
 
 @njit(**_OPTIONS)
 def _cross(z, starts, ends, crossings):
-    """Fills in the sorted x where the outline crosses the height z; returns their number."""
+    """Fill in the sorted x where the outline crosses the height z; returns their number."""
     count = 0
     for e in range(len(starts)):
         z0, z1 = starts[e, 1], ends[e, 1]
@@ -351,13 +351,13 @@ class SectionKeeper:
     """Cuts an object's outline anew when it turned out of the plane or moved across it, and tilts it in between."""
 
     def __init__(self, mesh: ObjectMesh, half_width: float, span: tuple[float, float] = (-1.0, 1.0)) -> None:
-        """Keeps the mesh, half the width of the finger, which the outline is that of, and its lowest and highest z."""
+        """Keep the mesh, half the width of the finger, which the outline is that of, and its lowest and highest z."""
         self._mesh, self._half_width, self._span = mesh, half_width, span
         self._R: NDArray | None = None
         self.cuts = 0
 
     def at(self, T: NDArray) -> Section:
-        """Returns the outline at T_jaw_object (4, 4)."""
+        """Return the outline at T_jaw_object (4, 4)."""
         tilt = 0.0
         if self._R is None:
             self._cut(T)
@@ -379,7 +379,7 @@ class SectionKeeper:
 
 
 def split_turn(R: NDArray) -> tuple[float, float]:
-    """Returns a rotation's turn in the x-z plane, positive from x to z, and the angle by which it tips y, [rad].
+    """Return a rotation's turn in the x-z plane, positive from x to z, and the angle by which it tips y, [rad].
 
     With the quaternion (x, y, z, w): R_02 - R_20 = 4 w y and R_00 + R_22 = 2 (w^2 - y^2), so that their quotient is the
     tangent of the twist about y, 2 atan2(y, w).

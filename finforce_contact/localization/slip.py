@@ -63,7 +63,7 @@ class TouchedFace:
 
 
 def face_at(line: NDArray, heights: NDArray, height: float) -> TouchedFace:
-    """Returns the face at a material height [m] of a deformed line (h, 2) [m] over heights (h,) [m]."""
+    """Return the face at a material height [m] of a deformed line (h, 2) [m] over heights (h,) [m]."""
     x, z = np.interp(height, heights, line[:, 0]), np.interp(height, heights, line[:, 1])
     row = int(np.clip(np.searchsorted(heights, height), 2, len(heights) - 3))
     along = line[row + 2] - line[row - 2]
@@ -75,30 +75,30 @@ class SlipWatch:
     """Follows one contact, pose after pose."""
 
     def __init__(self, settings: ContactSettings) -> None:
-        """Keeps the noise that is expected of poses."""
+        """Keep the noise that is expected of poses."""
         self._settings = settings
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the contact."""
+        """Forget the contact."""
         self._noise, self._learnt = self._settings.pose_noise, _NOISE_PRIOR
         self.release()
 
     def release(self) -> None:
-        """Takes the object for let go; what is known of the noise stays."""
+        """Take the object for let go; what is known of the noise stays."""
         self.slip: Slip | None = None
         self._height: float | None = None
         self._on_object: NDArray | None = None
         self._samples: deque[tuple[float, NDArray, float]] = deque()
 
     def place(self, height: float) -> float:
-        """Returns the material height [m] that is followed: that at which the contact began, near `height`."""
+        """Return the material height [m] that is followed: that at which the contact began, near `height`."""
         if self._height is None or abs(self._height - height) > _REACH:
             self._height, self._on_object = height, None
         return self._height
 
     def update(self, stamp: float, T: NDArray, face: TouchedFace, *, odd: bool = False) -> Slip | None:
-        """Takes a pose and the face where the object touches.
+        """Take a pose and the face where the object touches.
 
         The first poses of a slip are odd to who has seen the object rest: they count, unless they are far away.
 
@@ -138,7 +138,7 @@ class SlipWatch:
         self._above, self._below, self._sliding, self._slow = np.zeros(2), np.zeros(2), False, 0
 
     def _fit_speed(self) -> tuple[NDArray, float, float]:
-        """Returns the slope of the last samples (2,), its standard deviation, and the speed of the face along x."""
+        """Return the slope of the last samples (2,), its standard deviation, and the speed of the face along x."""
         if len(self._samples) < _FEWEST:
             return np.zeros(2), np.inf, 0.0
         stamps = np.array([sample[0] for sample in self._samples])
@@ -149,7 +149,7 @@ class SlipWatch:
         return slopes, self._noise / np.sqrt(spread), closing
 
     def _judge(self, offset: NDArray, speed: NDArray, stddev: float, closing: float) -> None:
-        """Decides whether the object slides."""
+        """Decide whether the object slides."""
         if abs(closing) > _CLOSING or self._learnt < _TOO_FEW:
             self._rest, self._count = offset.copy(), 1.0
             self._above[:] = self._below[:] = 0.0

@@ -23,7 +23,7 @@ _TEACHING_BEND = 0.3e-3
 
 
 def contact_probability(depth: float, depth_stddev: float, bend: float, bend_stddev: float) -> float:
-    """Returns the probability that an object is in the jaw, given where it seems to be and how far the jaw is bent.
+    """Return the probability that an object is in the jaw, given where it seems to be and how far the jaw is bent.
 
     The true depth u of the object beyond the undeformed surface has the density N(u; depth, depth_stddev), and the
     surface gives way by max(u, 0), seen as `bend` with a normal error. With s = depth_stddev, t = bend_stddev and the
@@ -49,7 +49,7 @@ def contact_probability(depth: float, depth_stddev: float, bend: float, bend_std
 
 
 def describe_conflict(name: str, gap: float, bend: float) -> str:
-    """Returns how pose and bend contradict each other, empty where they do not.
+    """Return how pose and bend contradict each other, empty where they do not.
 
     Args:
         name: of the object.
@@ -73,7 +73,7 @@ class TouchBelief:
         self.reset()
 
     def reset(self) -> None:
-        """Starts anew, apart."""
+        """Start anew, apart."""
         self.touching = False
         self.probability = 0.0
         self._images_apart = 0
@@ -81,11 +81,11 @@ class TouchBelief:
         self._bias = 0.0
 
     def set(self, touching: bool) -> None:
-        """Takes over what a localizer says itself."""
+        """Take over what a localizer says itself."""
         self.touching, self.probability, self._images_apart = touching, float(touching), 0
 
     def update(self, depth: float, depth_stddev: float, bend: float | None) -> bool:
-        """Takes one image and returns whether the object touches.
+        """Take one image and returns whether the object touches.
 
         Args:
             depth: of the object beyond the undeformed surface as the pose has it [m].
@@ -106,7 +106,7 @@ class TouchBelief:
         return self.touching
 
     def _learn(self, depth: float, depth_stddev: float, bend: float) -> None:
-        """Learns how deep [m] the pose has an object that is as deep as the jaw is bent, and the noise of a rest."""
+        """Learn how deep [m] the pose has an object that is as deep as the jaw is bent, and the noise of a rest."""
         error = depth - self._bias - bend
         plausible = abs(error) < 3.0 * depth_stddev
         if plausible and (error > 0.0 or self.touching) and (not self.touching or bend > _TEACHING_BEND):
@@ -118,12 +118,12 @@ class TouchBelief:
 
 
 def _normal(value: float, stddev: float) -> float:
-    """Returns the density of a normal distribution about zero."""
+    """Return the density of a normal distribution about zero."""
     return exp(-0.5 * (value / stddev) ** 2) / (sqrt(2.0 * pi) * stddev)
 
 
 def _below(value: float) -> float:
-    """Returns the standard normal distribution function."""
+    """Return the standard normal distribution function."""
     return 0.5 * (1.0 + erf(value / sqrt(2.0)))
 
 
@@ -134,14 +134,14 @@ class StillnessWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Starts anew, moving."""
+        """Start anew, moving."""
         self.still = False
         self.ended = -np.inf
         self._since = np.inf
         self._line: NDArray | None = None
 
     def update(self, stamp: float, line: NDArray | None) -> None:
-        """Takes the inner face (h, 2) [m] of an image [s] in contact; None without contact or surface."""
+        """Take the inner face (h, 2) [m] of an image [s] in contact; None without contact or surface."""
         held = self._line is not None and line is not None
         if not held or np.abs(line - self._line).max() > _REST_MOTION:
             if self.still:

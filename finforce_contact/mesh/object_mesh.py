@@ -199,7 +199,7 @@ _INSIDE = 0.5
 
 
 def surrounds(mesh: ObjectMesh, point: NDArray) -> bool:
-    """Whether a mesh, watertight or not, surrounds a point (3,) [m, object frame].
+    """Return whether a mesh, watertight or not, surrounds a point (3,) [m, object frame].
 
     The generalised winding number, the triangles' solid angles over 4 pi, exceeds a half (Jacobson et al. 2013).
     """
@@ -212,7 +212,7 @@ def surrounds(mesh: ObjectMesh, point: NDArray) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def _sum_solid_angles(corners):
-    """Returns the sum of the solid angles of triangles (m, 3, 3) seen from the origin (Van Oosterom, Strackee 1983)."""
+    """Return the sum of the solid angles of triangles (m, 3, 3) seen from the origin (Van Oosterom, Strackee 1983)."""
     total = 0.0
     for m in range(len(corners)):
         a, b, c = corners[m, 0], corners[m, 1], corners[m, 2]

@@ -61,7 +61,7 @@ _TOUCH = 1e-9
 
 
 def crosses_itself(vertices: NDArray, triangles: NDArray) -> bool:
-    """Returns whether a surface of triangles (m, 3) on vertices (n, 3) [m] crosses itself.
+    """Return whether a surface of triangles (m, 3) on vertices (n, 3) [m] crosses itself.
 
     Triangles that lie in one plane and overlap there do not count.
     """
@@ -81,7 +81,7 @@ def crosses_itself(vertices: NDArray, triangles: NDArray) -> bool:
 
 @njit(**_OPTIONS)
 def _sweep(corners, triangles, low, high):
-    """Returns whether two triangles cross; their boxes are sorted by their lower end along the first axis."""
+    """Return whether two triangles cross; their boxes are sorted by their lower end along the first axis."""
     for i in range(len(corners)):
         for j in range(i + 1, len(corners)):
             if low[j, 0] > high[i, 0]:
@@ -104,7 +104,7 @@ def _share_corner(one, other):
 
 @njit(**_OPTIONS)
 def _cross(one, other):
-    """Returns whether an edge of either triangle (3, 3) goes through the other one."""
+    """Return whether an edge of either triangle (3, 3) goes through the other one."""
     for k in range(3):
         n = (k + 1) % 3
         if _pierces(one[k], one[n], other) or _pierces(other[k], other[n], one):
@@ -114,7 +114,7 @@ def _cross(one, other):
 
 @njit(**_OPTIONS)
 def _pierces(start, end, triangle):
-    """Returns whether the way from start to end (3,) goes through a triangle (3, 3)."""
+    """Return whether the way from start to end (3,) goes through a triangle (3, 3)."""
     ax, ay, az = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     bx, by, bz = triangle[1, 0] - triangle[0, 0], triangle[1, 1] - triangle[0, 1], triangle[1, 2] - triangle[0, 2]
     cx, cy, cz = triangle[2, 0] - triangle[0, 0], triangle[2, 1] - triangle[0, 1], triangle[2, 2] - triangle[0, 2]

@@ -39,7 +39,7 @@ class Samples:
     directions: NDArray
 
     def moved(self, T: NDArray) -> "Samples":
-        """Returns the same samples in the frame a of a pose T_a_b (4, 4), these being in b."""
+        """Return the same samples in the frame a of a pose T_a_b (4, 4), these being in b."""
         return Samples(points=self.points @ T[:3, :3].T + T[:3, 3], directions=self.directions @ T[:3, :3].T)
 
 
@@ -71,7 +71,7 @@ class Comparison:
     sights: NDArray
 
     def count(self, sight: Visibility) -> int:
-        """Returns how many samples have this sight."""
+        """Return how many samples have this sight."""
         return int(np.count_nonzero(self.sights == sight))
 
 
@@ -85,7 +85,7 @@ class DepthImage:
     """
 
     def __init__(self, depth: NDArray, camera: CameraIntrinsics, mask: NDArray | None = None) -> None:
-        """Takes an image.
+        """Take an image.
 
         Raises:
             ImageError: The image has another size than the camera, no depth at all, or a mask with next to none.
@@ -100,23 +100,23 @@ class DepthImage:
         self._rays = compute_rays(camera)
 
     def ray(self, pixel: NDArray) -> NDArray:
-        """Returns the viewing ray (3,) with z = 1 of one pixel (2,), which may lie outside the image."""
+        """Return the viewing ray (3,) with z = 1 of one pixel (2,), which may lie outside the image."""
         return rays_from_pixels(pixel[None], self.camera)[0]
 
     def look(self, pixels: NDArray) -> NDArray:
-        """Returns the depths (...,) [m] at pixels (..., 2), NaN where there is none or outside the image."""
+        """Return the depths (...,) [m] at pixels (..., 2), NaN where there is none or outside the image."""
         column, row, inside = self._nearest(pixels)
         return np.where(inside, self.depth[row, column], np.nan)
 
     def is_masked_out(self, pixels: NDArray) -> NDArray:
-        """Returns where (...,) the mask says that pixels (..., 2) are not the object; nowhere without a mask."""
+        """Return where (...,) the mask says that pixels (..., 2) are not the object; nowhere without a mask."""
         if self.mask is None:
             return np.zeros(pixels.shape[:-1], bool)
         column, row, inside = self._nearest(pixels)
         return inside & ~self.mask[row, column]
 
     def compare_surface(self, surface: Samples, gate: float) -> Comparison:
-        """Compares points of a surface with the depths at their pixels.
+        """Compare points of a surface with the depths at their pixels.
 
         residual = n . (q - p) for a point p with normal n and the point q measured on the ray next to p. The point
         counts as seen where |residual| is below the gate, and the depth itself no farther off than twice the gate:
@@ -167,7 +167,7 @@ class Outline:
     bulges: NDArray
 
     def moved(self, T: NDArray) -> "Outline":
-        """Returns the same points in the frame a of a pose T_a_b (4, 4), these being in b."""
+        """Return the same points in the frame a of a pose T_a_b (4, 4), these being in b."""
         return replace(self, samples=self.samples.moved(T))
 
 
@@ -185,11 +185,11 @@ class MeshOutline:
     """The edges of a mesh, prepared for finding the outline from any side."""
 
     def __init__(self, mesh: ObjectMesh, samples: int = 60) -> None:
-        """Puts points along the edges, no farther apart than the mesh's size divided by `samples`."""
+        """Put points along the edges, no farther apart than the mesh's size divided by `samples`."""
         self._edges = _place_points(mesh, np.ptp(mesh.vertices, axis=0).max() / samples)
 
     def find(self, T_camera_object: NDArray, glance: Glance, camera: CameraIntrinsics, most: int) -> Outline:
-        """Returns at most `most` points of the outline behind which the object ends, with their outward normals.
+        """Return at most `most` points of the outline behind which the object ends, with their outward normals.
 
         A point of an edge is on the outline where one of its faces looks at the camera and the other away. Its
         direction is perpendicular to the ray, and to the edge where that is sharp.
@@ -219,7 +219,7 @@ class MeshOutline:
 
 
 def compare_outline(outline: Outline, image: DepthImage, reach: float) -> Comparison:
-    """Finds the end of the object in a depth image across points of its outline.
+    """Find the end of the object in a depth image across points of its outline.
 
     From inside to outside, the pixels near a point are object up to the split that most of them agree with, and behind
     the object after it. Points beside which something else is in front, or whose split is not clear, are unknown.
@@ -246,7 +246,7 @@ def compare_outline(outline: Outline, image: DepthImage, reach: float) -> Compar
 
 
 def _walk_across(outline: Samples, camera: CameraIntrinsics, reach: float) -> tuple[NDArray, NDArray]:
-    """Returns whole pixels (n, k, 2) across the outline, and how far out they lie (n, k) [m]."""
+    """Return whole pixels (n, k, 2) across the outline, and how far out they lie (n, k) [m]."""
     start = project(outline.points, camera)
     metres = outline.points[:, 2] / (0.5 * (camera.fx + camera.fy))
     across = project(outline.points + outline.directions * metres[:, None], camera) - start
@@ -258,7 +258,7 @@ def _walk_across(outline: Samples, camera: CameraIntrinsics, reach: float) -> tu
 
 
 def _best_split(votes: NDArray) -> tuple[NDArray, NDArray]:
-    """Returns where the outside begins in votes (n, k) of +1 inside and -1 outside, and how many agree with it."""
+    """Return where the outside begins in votes (n, k) of +1 inside and -1 outside, and how many agree with it."""
     inside = np.cumsum(votes, axis=1)
     agreement = 2 * inside[:, :-1] - inside[:, -1:]
     split = agreement.argmax(axis=1)
@@ -266,7 +266,7 @@ def _best_split(votes: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _find_bulges(outline: Samples, glance: Glance, camera: CameraIntrinsics) -> NDArray:
-    """Returns the bulges (n,) [m] of points of an outline, NaN where the mesh does not end behind them."""
+    """Return the bulges (n,) [m] of points of an outline, NaN where the mesh does not end behind them."""
     pixels = project(outline.points, camera)
     metres = glance.step * outline.points[:, 2] / camera.fx
     outward = project(outline.points + outline.directions * metres[:, None], camera) - pixels
@@ -279,7 +279,7 @@ def _find_bulges(outline: Samples, glance: Glance, camera: CameraIntrinsics) -> 
 
 
 def _look(glance: Glance, pixels: NDArray) -> NDArray:
-    """Returns the depths (n,) of a glance next to pixels (n, 2), NaN outside."""
+    """Return the depths (n,) of a glance next to pixels (n, 2), NaN outside."""
     height, width = glance.depth.shape
     whole = np.rint(np.nan_to_num(pixels, nan=-1e6) / glance.step).astype(np.intp)
     inside = ((whole >= 0) & (whole < (width, height))).all(axis=1)
@@ -288,7 +288,7 @@ def _look(glance: Glance, pixels: NDArray) -> NDArray:
 
 
 def _across(rays: NDArray, tangents: NDArray, first: NDArray, second: NDArray) -> NDArray:
-    """Returns the outward unit normals (n, 3) of outline points, perpendicular to their rays."""
+    """Return the outward unit normals (n, 3) of outline points, perpendicular to their rays."""
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     mean = first + second
     smooth = mean - np.einsum("ij,ij->i", mean, rays)[:, None] * rays
@@ -407,7 +407,7 @@ class _Normal:
     outlined: float = 0.0
 
     def plus(self, other: "_Normal") -> "_Normal":
-        """Returns both together, the other being that of the outline."""
+        """Return both together, the other being that of the outline."""
         return replace(
             self,
             outlined=float((other.sights == Visibility.SEEN).mean()) if len(other.sights) else 0.0,
@@ -418,12 +418,12 @@ class _Normal:
         )
 
     def directions(self) -> NDArray:
-        """Returns an orthonormal basis (6, k) of the directions that the image tells."""
+        """Return an orthonormal basis (6, k) of the directions that the image tells."""
         values, vectors = np.linalg.eigh(self.told)
         return vectors[:, values > 1.0]
 
     def sure_directions(self) -> NDArray:
-        """Returns an orthonormal basis (6, k) of those of them that more than a few points tell."""
+        """Return an orthonormal basis (6, k) of those of them that more than a few points tell."""
         basis = self.directions()
         values, vectors = np.linalg.eigh(basis.T @ self.counted @ basis)
         return basis @ vectors[:, values > _SURE]
@@ -451,7 +451,7 @@ class MeshAligner:
     """A mesh prepared for being aligned to images of one camera."""
 
     def __init__(self, mesh: ObjectMesh, camera: CameraIntrinsics, settings: TrackerSettings) -> None:
-        """Prepares rays and edges.
+        """Prepare rays and edges.
 
         Raises:
             MissingDependencyError: Open3D is not installed.
@@ -462,11 +462,11 @@ class MeshAligner:
         self._view, self._outline = MeshView(mesh), MeshOutline(mesh)
 
     def middle_of(self, T_camera_object: NDArray) -> NDArray:
-        """Returns the middle of the object's bounding box (3,) [m] in the camera frame, for a pose (4, 4)."""
+        """Return the middle of the object's bounding box (3,) [m] in the camera frame, for a pose (4, 4)."""
         return T_camera_object[:3, :3] @ self.middle + T_camera_object[:3, 3]
 
     def glance(self, T_camera_object: NDArray, points: int) -> Glance:
-        """Returns what should be seen of the object in a pose (4, 4), in about so many points."""
+        """Return what should be seen of the object in a pose (4, 4), in about so many points."""
         distance = max(float(self.middle_of(T_camera_object)[2]), 0.02)
         # from the side, a box fills about a third of the disc around its bounding sphere
         area = (self.radius * self.camera.fx / distance) ** 2
@@ -479,7 +479,7 @@ class MeshAligner:
         )
 
     def align(self, T_camera_object: NDArray, image: DepthImage, effort: Effort) -> Alignment:
-        """Returns the mesh aligned to an image.
+        """Return the mesh aligned to an image.
 
         Args:
             T_camera_object: pose (4, 4) to start from; directions that the image does not tell keep it.
@@ -497,7 +497,7 @@ class MeshAligner:
         return self._judge(T, image, effort)
 
     def _expect(self, T: NDArray, effort: Effort) -> _Expected:
-        """Returns what should be seen in a pose (4, 4), in the object's frame."""
+        """Return what should be seen in a pose (4, 4), in the object's frame."""
         glance, back = self.glance(T, effort.points), invert_pose(T)
         outline = None
         if effort.outline:
@@ -519,7 +519,7 @@ class MeshAligner:
         return normal.plus(_normal_equations(outline.samples, edges, about, _EDGE_ERROR))
 
     def _step(self, normal: _Normal) -> NDArray:
-        """Returns the step (6,) in the directions that the image tells."""
+        """Return the step (6,) in the directions that the image tells."""
         basis = normal.directions()
         step = basis @ np.linalg.solve(basis.T @ normal.information @ basis, basis.T @ normal.gradient)
         return step * min(1.0, _LONGEST_STEP / max(np.abs(step).max(), 1e-12))
@@ -551,7 +551,7 @@ class MeshAligner:
         )
 
     def _to_middle(self, T: NDArray) -> NDArray:
-        """Returns what turns a step (6,) about the object's origin [m, rad] into one about its middle [m, m at rim]."""
+        """Return what turns a step (6,) about the object's origin [m, rad] into one about its middle [m, m at rim]."""
         x, y, z = T[:3, :3] @ self.middle
         change = np.eye(6)
         change[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
@@ -565,7 +565,7 @@ def _spread(comparison: Comparison, least: float) -> float:
 
 
 def _normal_equations(samples: Samples, seen: Comparison, about: _About, error: float) -> _Normal:
-    """Returns sum w J^T J and sum w J^T r with J = [d, (p - m) x d / radius] and Cauchy weights w over stddev^2.
+    """Return sum w J^T J and sum w J^T r with J = [d, (p - m) x d / radius] and Cauchy weights w over stddev^2.
 
     Directions d that are off by an angle `error` make a motion along the surface look like one across it, this much
     smaller: what is told must be more than error^2 sum w.

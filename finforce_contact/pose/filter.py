@@ -62,7 +62,7 @@ class PoseFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets every pose and what was learnt of their noise."""
+        """Forget every pose and what was learnt of their noise."""
         self.stamp: float | None = None
         self.believed = 0.0
         self.latest: NDArray | None = None
@@ -71,7 +71,7 @@ class PoseFilter:
         self._aside: deque[tuple[float, NDArray]] = deque(maxlen=_JUMP_POSES)
 
     def update(self, stamp: float, T: NDArray, covariance: NDArray | None = None) -> str:
-        """Takes a pose and returns what became of it: "used", "late", "aside" or "jump".
+        """Take a pose and returns what became of it: "used", "late", "aside" or "jump".
 
         Args:
             stamp: image capture time [s].
@@ -103,13 +103,13 @@ class PoseFilter:
         return "used"
 
     def carry(self, T: NDArray) -> None:
-        """Takes the motion of the frame itself: T (4, 4) leads from where it was to where it is."""
+        """Take the motion of the frame itself: T (4, 4) leads from where it was to where it is."""
         if self.stamp is not None:
             self._T = T @ self._T
             self._aside = deque(((stamp, T @ aside) for stamp, aside in self._aside), maxlen=self._aside.maxlen)
 
     def slide(self, T: NDArray, velocity: NDArray) -> None:
-        """Takes an object for one that slides: this pose, the last that came, is near it, and it goes on so.
+        """Take an object for one that slides: this pose, the last that came, is near it, and it goes on so.
 
         Args:
             T: T_jaw_object (4, 4).
@@ -124,7 +124,7 @@ class PoseFilter:
             self._aside.clear()
 
     def at(self, stamp: float) -> FilteredPose:
-        """Returns the pose at a time [s], continued at its speed for a fifth of a second at most.
+        """Return the pose at a time [s], continued at its speed for a fifth of a second at most.
 
         Raises:
             PoseError: No pose has come yet.
@@ -140,7 +140,7 @@ class PoseFilter:
         return FilteredPose(T=T, stddev=np.sqrt(np.maximum(variance, 0.0)), speed=self._speed)
 
     def _noise(self, covariance: NDArray | None) -> NDArray:
-        """Returns the variances (6,) of a pose; stated ones are raised when the poses scatter more."""
+        """Return the variances (6,) of a pose; stated ones are raised when the poses scatter more."""
         if covariance is None:
             return self._assumed * self._scale
         stated = to_floats(covariance, "a pose covariance", PoseError)
@@ -152,14 +152,14 @@ class PoseFilter:
         return np.diag(stated) * np.maximum(self._scale, 1.0)
 
     def _begin(self, stamp: float, T: NDArray, noise: NDArray, speed: float = 0.0) -> None:
-        """Starts the trajectory at a pose."""
+        """Start the trajectory at a pose."""
         self.stamp, self.believed, self._T, self._speed = stamp, stamp, T.copy(), speed
         self._P, self._cross, self._speed_variance = noise.copy(), 0.0, _SPEED_SURPRISE**2
         self._trend = np.zeros(6)
         self._aside.clear()
 
     def _predict(self, stamp: float) -> None:
-        """Moves the trajectory on to a time [s]: constant speed under white acceleration in x, a random walk else."""
+        """Move the trajectory on to a time [s]: constant speed under white acceleration in x, a random walk else."""
         dt, power = stamp - self.stamp, _ACCELERATION**2
         self._T[:3, 3] += dt * np.array([self._speed, *self._slide])
         self._P = self._P + self._drift * dt
@@ -169,7 +169,7 @@ class PoseFilter:
         self.stamp = stamp
 
     def _correct(self, innovation: NDArray, noise: NDArray) -> None:
-        """Moves the trajectory towards a pose by the Kalman gain p / (p + r)."""
+        """Move the trajectory towards a pose by the Kalman gain p / (p + r)."""
         gain = self._P / (self._P + noise)
         speed_gain = self._cross / (self._P[_X] + noise[_X])
         self._T = move_pose(self._T, gain * innovation)
@@ -179,14 +179,14 @@ class PoseFilter:
         self._P = self._P * (1.0 - gain)
 
     def _learn(self, innovation: NDArray, stated: NDArray | None) -> None:
-        """Averages how much larger the noise is than assumed, or than stated."""
+        """Average how much larger the noise is than assumed, or than stated."""
         base = self._assumed if stated is None else stated / np.maximum(self._scale, 1.0)
         seen = (innovation**2 - self._P) / base
         self._learnt = min(self._learnt + 1.0, _NOISE_MEMORY)
         self._scale = np.clip(self._scale + (seen - self._scale) / self._learnt, *_NOISE_RANGE)
 
     def _follow_trend(self, standard: NDArray, noise: NDArray) -> None:
-        """Widens what the innovations, in standard deviations (6,), have been off for some while."""
+        """Widen what the innovations, in standard deviations (6,), have been off for some while."""
         self._trend += _TREND_SHARE * (standard - self._trend)
         turning = np.abs(self._trend) > _TREND_SIGMA * _TREND_STDDEV
         if not turning.any():
@@ -197,7 +197,7 @@ class PoseFilter:
             self._speed_variance += _SPEED_SURPRISE**2
 
     def _set_aside(self, stamp: float, T: NDArray, noise: NDArray) -> str:
-        """Keeps a pose off the trajectory; once enough in a row agree, the trajectory starts anew from them."""
+        """Keep a pose off the trajectory; once enough in a row agree, the trajectory starts anew from them."""
         self._aside.append((stamp, T))
         if len(self._aside) < _JUMP_POSES or not self._agree(noise):
             return "aside"
@@ -206,7 +206,7 @@ class PoseFilter:
         return "jump"
 
     def _agree(self, noise: NDArray) -> bool:
-        """Whether the poses set aside lie on one straight trajectory."""
+        """Return whether the poses set aside lie on one straight trajectory."""
         stamps = np.array([stamp for stamp, _ in self._aside])
         steps = np.array([step_between(self._aside[0][1], T) for _, T in self._aside])
         line = np.outer((stamps - stamps[0]) / (stamps[-1] - stamps[0]), steps[-1])

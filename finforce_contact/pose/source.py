@@ -34,7 +34,7 @@ class ObjectPose:
     source: str
 
     def age(self, now: float) -> float:
-        """Returns the time since the image was taken [s], at the time `now` [s] of the same clock."""
+        """Return the time since the image was taken [s], at the time `now` [s] of the same clock."""
         return now - self.stamp
 
 
@@ -46,7 +46,7 @@ class PoseSource(Protocol):
         """The newest pose that could be trusted, with its stamp; None before the first and after a reset."""
 
     def reset(self) -> None:
-        """Forgets the poses; the next one starts afresh."""
+        """Forget the poses; the next one starts afresh."""
 
 
 class ExternalPoseSource:
@@ -64,7 +64,7 @@ class ExternalPoseSource:
         origin: str = "mesh",
         stddev: ArrayLike = (0.002,) * 3 + (0.02,) * 3,
     ) -> None:
-        """Prepares to listen.
+        """Prepare to listen.
 
         Args:
             frame: the camera optical frame that the messages must be in.
@@ -85,11 +85,11 @@ class ExternalPoseSource:
             self._back = -ORIGINS[origin] * mesh.middle
 
     def reset(self) -> None:
-        """Forgets the latest pose, so that a stamp before it is taken again."""
+        """Forget the latest pose, so that a stamp before it is taken again."""
         self.latest = None
 
     def take_pose(self, message: Any) -> ObjectPose:
-        """Takes an object shaped like a geometry_msgs/PoseStamped.
+        """Take an object shaped like a geometry_msgs/PoseStamped.
 
         Raises:
             PoseError: The frame is another one, the stamp is not after the last one taken, the numbers are no rigid
@@ -98,7 +98,7 @@ class ExternalPoseSource:
         return self._take(message.header, message.pose, "PoseStamped")
 
     def take_detections(self, message: Any) -> ObjectPose | None:
-        """Takes an object shaped like a vision_msgs/Detection3DArray, of which the first detection counts.
+        """Take an object shaped like a vision_msgs/Detection3DArray, of which the first detection counts.
 
         Its pose is `bbox.center`, where isaac_ros_foundationpose writes it, or `results[0].pose.pose` when the former
         was left as the message type makes it.
@@ -140,7 +140,7 @@ class ExternalPoseSource:
 
 
 def check_camera_outside(T_camera_object: ArrayLike, mesh: ObjectMesh) -> NDArray:
-    """Returns a checked pose (4, 4) after having refused one that puts the object around the camera.
+    """Return a checked pose (4, 4) after having refused one that puts the object around the camera.
 
     Raises:
         PoseError: The pose is not rigid, or the mesh surrounds the camera's origin.
@@ -164,7 +164,7 @@ def _quaternion(pose: Any) -> NDArray:
 
 
 def _is_unset(pose: Any) -> bool:
-    """Whether a pose is what a new message holds: at the origin, turned by nothing."""
+    """Return whether a pose is what a new message holds: at the origin, turned by nothing."""
     return not _position(pose).any() and not _quaternion(pose)[:3].any()
 
 

@@ -29,7 +29,7 @@ _TURNS = 6  # about the line of sight, for each direction
 
 
 def search_pose(aligner: MeshAligner, image: DepthImage, kept: int = 4) -> list[NDArray]:
-    """Returns the poses (4, 4) that agree best with a masked image, best first.
+    """Return the poses (4, 4) that agree best with a masked image, best first.
 
     Args:
         aligner: the object.
@@ -42,7 +42,7 @@ def search_pose(aligner: MeshAligner, image: DepthImage, kept: int = 4) -> list[
 
 
 def spread_rotations() -> NDArray:
-    """Returns 252 rotations (n, 3, 3) over the sphere: 42 directions of an icosphere, 6 turns about each.
+    """Return 252 rotations (n, 3, 3) over the sphere: 42 directions of an icosphere, 6 turns about each.
 
     Among them is one within 34 degrees of any rotation.
     """
@@ -56,7 +56,7 @@ def spread_rotations() -> NDArray:
 
 
 def compute_agreement(aligner: MeshAligner, T_camera_object: NDArray, image: DepthImage) -> float:
-    """Returns how well a pose explains a masked image, 0 to 1.
+    """Return how well a pose explains a masked image, 0 to 1.
 
     One minus the mean of min(|z_mesh - z|, 10 mm) / 10 mm over the pixels of mesh and mask; a pixel of one of them
     alone disagrees altogether, unless something stands in front of the mesh there.
@@ -74,7 +74,7 @@ def compute_agreement(aligner: MeshAligner, T_camera_object: NDArray, image: Dep
 
 
 def _place(aligner: MeshAligner, image: DepthImage, rotation: NDArray) -> NDArray:
-    """Returns a pose (4, 4) of a given rotation that covers the mask: its box and its depth."""
+    """Return a pose (4, 4) of a given rotation that covers the mask: its box and its depth."""
     rows, columns = np.nonzero(image.mask)
     box = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2.0
     depth = float(np.nanmedian(image.depth[image.mask]))
@@ -100,7 +100,7 @@ def _best(aligner: MeshAligner, image: DepthImage, alignments: list[Alignment], 
 
 
 def _icosphere() -> NDArray:
-    """Returns the vertices and edge midpoints (42, 3) of an icosahedron, on the unit sphere."""
+    """Return the vertices and edge midpoints (42, 3) of an icosahedron, on the unit sphere."""
     golden = (1.0 + np.sqrt(5.0)) / 2.0
     corners = np.array([np.roll([0.0, a, b * golden], k) for k in range(3) for a in (-1, 1) for b in (-1, 1)])
     middles = [a + b for i, a in enumerate(corners) for b in corners[:i] if np.linalg.norm(a - b) < 2.1]
@@ -140,7 +140,7 @@ class PoseTracker:
     """
 
     def __init__(self, mesh: ObjectMesh, camera: CameraIntrinsics, settings: TrackerSettings | None = None) -> None:
-        """Prepares the mesh.
+        """Prepare the mesh.
 
         Args:
             mesh: the object.
@@ -163,11 +163,11 @@ class PoseTracker:
         return MappingProxyType(self._counts)
 
     def reset(self) -> None:
-        """Forgets the pose; `locate` is needed again."""
+        """Forget the pose; `locate` is needed again."""
         self.latest, self._searched, self._missed = None, -np.inf, 0
 
     def locate(self, stamp: float, depth: NDArray, mask: NDArray, guesses: Sequence[ArrayLike] = ()) -> ObjectPose:
-        """Finds the object in an image with no pose before it.
+        """Find the object in an image with no pose before it.
 
         The guesses come first; where none of them fits, turns over the whole sphere are tried (a second).
 
@@ -193,7 +193,7 @@ class PoseTracker:
         return self._accept(stamp, alignment, np.diag(_UNKNOWN**2))
 
     def track(self, stamp: float, depth: NDArray, mask: NDArray | None = None) -> ObjectPose:
-        """Follows the object into the next image.
+        """Follow the object into the next image.
 
         Args:
             stamp: capture time [s], after that of the last pose.
@@ -228,7 +228,7 @@ class PoseTracker:
         return Effort(gates=gates, steps=3, points=self._settings.points)
 
     def _recover(self, stamp: float, image: DepthImage) -> Alignment | None:
-        """Looks for a lost object around its last pose and, where there is a mask, everywhere."""
+        """Look for a lost object around its last pose and, where there is a mask, everywhere."""
         starts = [move_pose(self.latest.T_camera_object, step) for step in _steps_around(self._missed)]
         tried = [self._aligner.align(start, image, _QUICK) for start in [self.latest.T_camera_object, *starts]]
         tried.sort(key=lambda one: -self._rate(one, image))
@@ -243,13 +243,13 @@ class PoseTracker:
         return self._best_of(search_pose(self._aligner, image), image)
 
     def _best_of(self, starts: Sequence[NDArray], image: DepthImage) -> Alignment | None:
-        """Returns the alignment that explains the image best, of those that are good enough."""
+        """Return the alignment that explains the image best, of those that are good enough."""
         found = [self._aligner.align(start, image, self._near_effort()) for start in starts]
         good = [one for one in found if self._is_good(one) and self._is_convincing(one, image)]
         return max(good, key=lambda one: self._rate(one, image), default=None)
 
     def _is_convincing(self, alignment: Alignment, image: DepthImage) -> bool:
-        """Whether a pose can be believed that does not follow from the one before."""
+        """Return whether a pose can be believed that does not follow from the one before."""
         if image.mask is not None:
             return self._rate(alignment, image) > _AGREEING
         return alignment.fitness > _FIT and alignment.visible > _SHOWN and alignment.outlined > _OUTLINED
@@ -271,14 +271,14 @@ class PoseTracker:
         )
 
     def _is_near(self, alignment: Alignment, elapsed: float) -> bool:
-        """Whether the object's middle and rim moved no farther than it can; the gates follow little more."""
+        """Return whether the object's middle and rim moved no farther than it can; the gates follow little more."""
         before, after = self.latest.T_camera_object, alignment.T_camera_object
         way = np.linalg.norm(self._aligner.middle_of(after) - self._aligner.middle_of(before))
         way = max(way, self._aligner.radius * rotation_between(before, after))
         return way < _WIDE_GATE + self._settings.speed * min(elapsed, _LONGEST_GAP)
 
     def _accept(self, stamp: float, alignment: Alignment, prior: NDArray) -> ObjectPose:
-        """Keeps a pose: covariance = (information + prior^-1 + unknown^-2)^-1."""
+        """Keep a pose: covariance = (information + prior^-1 + unknown^-2)^-1."""
         known = alignment.information + np.linalg.inv(prior) + np.diag(_UNKNOWN**-2)
         self._missed = 0
         self.latest = ObjectPose(
@@ -296,7 +296,7 @@ class PoseTracker:
 
 
 def _steps_around(missed: int) -> NDArray:
-    """Returns steps (n, 6) [m, rad] in random directions, their lengths by how many images did not show the object."""
+    """Return steps (n, 6) [m, rad] in random directions, their lengths by how many images did not show the object."""
     steps = np.random.default_rng(missed).standard_normal((_NEARBY, 6))
     for part, length in ((slice(0, 3), _NEAR), (slice(3, 6), _TURNED)):
         lengths = np.linalg.norm(steps[:, part], axis=1, keepdims=True)
