@@ -75,7 +75,7 @@ class IfeaSolverNode(Node):
         self.contacts = build_contact_feed(jaw, parameters)
         self.gravity = GravityFeed(parameters) if settings.held == "yes" else None
         ros.warn_first_start(self)
-        with self._patience(jaw.name):
+        with self._announce_wait(jaw.name):
             self.estimator = build(jaw, parameters, settings)
         self.gate = StampGate(max_age=parameters.max_age, restart_gap=parameters.restart_gap)
         self.health = Health(source=f"{parameters.jaw_name}/keypoints", stale_after=parameters.max_age)
@@ -91,7 +91,7 @@ class IfeaSolverNode(Node):
         self.get_logger().info(f"{parameters.jaw_name} jaw '{jaw.name}' ready, contact {source}")
 
     @contextmanager
-    def _patience(self, jaw: str) -> Iterator[None]:
+    def _announce_wait(self, jaw: str) -> Iterator[None]:
         """Say what takes so long, if it does."""
         words = f"preparing jaw '{jaw}': a minute or two at its first start, seconds later on"
         late = Timer(SLOW, lambda: self.get_logger().info(words))
@@ -105,7 +105,7 @@ class IfeaSolverNode(Node):
         """Offer services and diagnostics."""
         ros.serve_trigger(self.qos, f"{side}/tare", lambda: str(self.estimator.tare()))
         ros.serve_trigger(self.qos, f"{side}/reset", lambda: self._restart("reset by service"))
-        longest = self.parameters.contact_patience
+        longest = self.parameters.contact_timeout
         self.overdue = self.create_timer(longest, self.qos.guard(self._solve_waiting), clock=ros.STEADY_CLOCK)
         self.overdue.cancel()
         period = self.parameters.diagnostics_period

@@ -23,42 +23,41 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class NodeParameters(TimeParameters):
-    """What a solver node is told beside the estimator's own settings; units stand in the metadata."""
+    """Parameters of a solver node, in addition to the settings of its estimator; metadata holds units."""
 
-    jaw_name: str = setting("left", "the jaw that this node solves", choices=("left", "right"))
-    jaw_file: str = setting("bench", "jaw file, or the name of a shipped jaw")
-    calibration_file: str = setting("", "calibration file, or a shipped name; empty: the material of the jaw file")
-    jaw_frame: str = setting("", "frame of key points, contact and wrench; empty: <jaw_name>_jaw")
-    gripper_frame: str = setting("gripper_base", "frame of grasp_wrench and manipulation_wrench")
+    jaw_name: str = setting("left", "Jaw that this node solves", choices=("left", "right"))
+    jaw_file: str = setting("bench", "Jaw file, or name of a shipped jaw")
+    calibration_file: str = setting(
+        "", "Calibration file, or name of a shipped one; empty for the material of the jaw file"
+    )
+    jaw_frame: str = setting("", "Frame of key points, contact and wrench; empty for <jaw_name>_jaw")
+    gripper_frame: str = setting("gripper_base", "Frame of grasp_wrench and manipulation_wrench")
     contact_height: float = setting(
         math.nan,
-        "height of first touch above the clamped base; NaN: contacts come on <jaw_name>/contact",
+        "Height of first touch above the clamped base; NaN when contacts come on <jaw_name>/contact",
         "m",
         0.0,
         1.0,
     )
-    contact_free: bool = setting(False, "the solver may move a contact that came on the topic")
-    contact_patience: float = setting(
+    contact_free: bool = setting(False, "Whether the solver may move a contact that came on the topic")
+    contact_timeout: float = setting(
         0.008,
-        "wait so long for the contact of an image, where those of the two images before came in time",
+        "Maximum wait for the contact of an image, while contacts keep up with images",
         "s",
         0.0,
         1.0,
+        alias="contact_patience",
     )
     peer: str = setting(
         "",
-        "the other jaw, whose wrenches complete grasp_wrench and manipulation_wrench here; empty: none",
+        "Other jaw, whose wrenches complete grasp_wrench and manipulation_wrench here; empty for none",
         choices=("", "left", "right"),
     )
-    paired: bool = setting(False, "without a peer: there is another jaw, and the two hold what they press")
-    completes_grasp: bool = setting(False, "without a peer: publish this jaw's force as grasp_wrench")
-    publish_surface: bool = setting(True, "publish the deformed mesh vertices with every solved image")
-    skip_off: tuple[str, ...] = setting(
-        ("",), "rules that are not applied, by their names in the diagnostics after `skipped:`, or all"
-    )
-    marker_rate: float = setting(
-        10.0, "greatest rate of the markers, which are sent only to listeners", "Hz", 0.1, 60.0
-    )
+    paired: bool = setting(False, "Whether another jaw holds the same object, without a peer")
+    completes_grasp: bool = setting(False, "Whether this jaw's force is published as grasp_wrench, without a peer")
+    publish_surface: bool = setting(True, "Whether the deformed mesh vertices are published with every solved image")
+    skip_off: tuple[str, ...] = setting(("",), "Skip rules that are not applied, as named in the diagnostics, or all")
+    marker_rate: float = setting(10.0, "Maximum rate of the markers", "Hz", 0.1, 60.0)
 
     @property
     def frame(self) -> str:
@@ -89,7 +88,7 @@ def build_contact_feed(jaw: Jaw, parameters: NodeParameters) -> ContactFeed:
         fixed=None if math.isnan(height) else Contact.fixed(jaw, height),
         free=parameters.contact_free,
         max_age=round(1e9 * parameters.max_age),
-        patience=parameters.contact_patience,
+        timeout=parameters.contact_timeout,
     )
 
 
@@ -122,11 +121,11 @@ class ContactFeed:
         fixed: a contact that holds for ever, instead of messages.
         free: whether the solver may move a contact that came by message.
         max_age: greatest distance between the stamps of contact and image [ns].
-        patience: after an image, in which its contact comes in time [s].
+        timeout: after an image, in which its contact comes in time [s].
     """
 
-    def __init__(self, *, frame: str, fixed: Contact | None, free: bool, max_age: int, patience: float = 0.0) -> None:
-        self._patience = patience
+    def __init__(self, *, frame: str, fixed: Contact | None, free: bool, max_age: int, timeout: float = 0.0) -> None:
+        self._timeout = timeout
         self._frame, self._fixed, self._free, self._max_age = frame, fixed, free, max_age
         self._contact: Contact | None = None
         self._outline: ObjectOutline | None = None
@@ -144,7 +143,7 @@ class ContactFeed:
     def completes(self, now: float) -> bool:
         """Say whether the contact of the last image is there, at a time [s]; outlines come before their contacts."""
         is_there, is_next = self._is_there(self._image), self._is_there(self._image + 1)
-        self._in_time = self._in_time + 1 if is_next or (is_there and now - self._seen <= self._patience) else 0
+        self._in_time = self._in_time + 1 if is_next or (is_there and now - self._seen <= self._timeout) else 0
         return is_there
 
     def _is_there(self, stamp: int) -> bool:

@@ -57,7 +57,7 @@ def solve(probe, composed, mesh, images, shift):
         calibration_file="bench",
         object_mesh=str(mesh),
     )
-    solver = build(IfeaSolverNode, contact_patience=1.0, calibration_file="bench")
+    solver = build(IfeaSolverNode, contact_timeout=1.0, calibration_file="bench")
     pipeline.open()
     nodes = (detector, contact, solver)
     for node in nodes:

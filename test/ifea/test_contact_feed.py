@@ -10,13 +10,13 @@ from finforce_ifea.messages import columns_from_outline
 from finforce_ifea.observation import Contact
 from finforce_ifea.parameters import ContactFeed
 
-PERIOD, PATIENCE = 33_000_000, 0.008
+PERIOD, TIMEOUT = 33_000_000, 0.008
 FRAME = "left_jaw"
 
 
 @pytest.fixture
 def feed():
-    return ContactFeed(frame=FRAME, fixed=None, free=False, max_age=200_000_000, patience=PATIENCE)
+    return ContactFeed(frame=FRAME, fixed=None, free=False, max_age=200_000_000, timeout=TIMEOUT)
 
 
 def say(feed, image, late, *, outline=True):
@@ -43,7 +43,7 @@ def test_an_image_waits_after_two_whose_contacts_came_in_time(feed):
 def test_contacts_that_come_late_are_not_waited_for(feed):
     for image in range(1, 5):
         assert not expect(feed, image)
-        assert say(feed, image, 2.0 * PATIENCE)  # there, but nobody waits any more
+        assert say(feed, image, 2.0 * TIMEOUT)  # there, but nobody waits any more
 
 
 def test_one_that_fails_to_come_ends_the_waiting_until_two_are_in_time_again(feed):
@@ -80,5 +80,5 @@ def test_a_contact_without_its_outline_is_not_whole(feed):
 
 def test_a_fixed_contact_is_there():
     fixed = Contact.fixed(load_jaw("bench"), 0.04)
-    feed = ContactFeed(frame=FRAME, fixed=fixed, free=False, max_age=1, patience=PATIENCE)
+    feed = ContactFeed(frame=FRAME, fixed=fixed, free=False, max_age=1, timeout=TIMEOUT)
     assert not any(expect(feed, image) for image in range(5)) and feed.at(10**12) is fixed
