@@ -31,8 +31,6 @@ from finforce_contact.pose.symmetry import parse_symmetry, read_symmetry
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.observation import Contact, ObjectOutline
 
-STATUSES = ("touching", "apart", "no_object", "no_pose")
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContactEstimate:

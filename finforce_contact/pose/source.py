@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,17 +36,6 @@ class ObjectPose:
     def age(self, now: float) -> float:
         """Return the time since the image was taken [s], at the time `now` [s] of the same clock."""
         return now - self.stamp
-
-
-class PoseSource(Protocol):
-    """Anything that says where the object is: another program's tracker, or `PoseTracker`."""
-
-    @property
-    def latest(self) -> ObjectPose | None:
-        """The newest pose that could be trusted, with its stamp; None before the first and after a reset."""
-
-    def reset(self) -> None:
-        """Forget the poses; the next one starts afresh."""
 
 
 class ExternalPoseSource:
