@@ -24,7 +24,7 @@ _HOMES = {
     "Observation": "finforce_ifea.observation",
     "RgbdImage": "finforce_keypoints.images",
     "Solution": "finforce_ifea.observation",
-    "build_bus": "finforce_driver.can.build",
+    "build_bus": "finforce_driver.can",
     "build_detector": "finforce_keypoints.build",
     "find_mesh": "finforce_eval.recordings.objects",
     "load_calibration": "finforce_ifea.jaw.calibration",

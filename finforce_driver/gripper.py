@@ -12,19 +12,25 @@ stepped time.
 
 from __future__ import annotations
 
+import logging
 import secrets
 from collections.abc import Callable
-from threading import Condition, Event, Thread
+from threading import Condition, Event, RLock, Thread
 
-from finforce_driver.can.bus import Bus
+from finforce.errors import FinforceError
+from finforce_driver.can.protocol import Bus
 from finforce_driver.clock import Clock, MonotonicClock
-from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError
-from finforce_driver.machine.loop import GripperLoop
+from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, LinkError
+from finforce_driver.machine.exchange import Request
 from finforce_driver.machine.machine import GripperMachine
-from finforce_driver.settings import GripperSettings
+from finforce_driver.settings import GripperScale, GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
-from finforce_driver.units import GripperScale
 
+LOG = logging.getLogger(__name__)
+FIRST_PAUSE, LONGEST_PAUSE = 0.5, 5.0  # [s] between two tries to open the bus
+SHORTEST_WAIT = 1e-4  # [s], so that a rounding error of the clock makes no endless loop
+LATE_MESSAGES = 64  # that are taken at most between two requests, however many come
+LEAVING_TURNS = 20  # that the last order may take
 Listener = Callable[[GripperState], None]
 StateCondition = Callable[[GripperState], bool]
 JOIN_TIMEOUT = 2.0  # [s], for a cycle under way: the longest wait for a reply is 1 s
@@ -32,7 +38,10 @@ LOST = (Phase.DISCONNECTED, Phase.PROBING, Phase.FAULT, Phase.UNCALIBRATED)
 
 
 class Gripper:
-    """An SSG-48 behind a bus.
+    """An SSG-48 behind a bus: one request at a time, and the bus opened again and again.
+
+    Whatever is sent is chosen and sent under one lock, so that after an emergency stop, which takes it too, no message
+    that was chosen before can leave.
 
     Args:
         bus: what carries the messages; the gripper opens and closes it.
@@ -45,12 +54,15 @@ class Gripper:
         self.clock = clock or MonotonicClock()
         self.scale = GripperScale(self.settings)
         # a gripper that an earlier program left must not take our first command for its last one
-        machine = GripperMachine(self.settings, salt=secrets.randbelow(16))
-        self._loop = GripperLoop(machine, bus, self.clock)
-        self._changed = Condition()
-        self._stop = Event()
+        self._machine = GripperMachine(self.settings, salt=secrets.randbelow(16))
+        self._bus = bus
+        self._lock = RLock()
+        self._wake, self._stop, self._changed = Event(), Event(), Condition()
         self._thread: Thread | None = None
-        self._loop.listen(self._tell_waiters)
+        self._listeners: list[Listener] = [self._tell_waiters]
+        self._told: GripperState | None = None
+        self._opened = False
+        self._pause, self._next_open = FIRST_PAUSE, self.clock.now()
 
     def __enter__(self) -> Gripper:
         """Start."""
@@ -64,7 +76,7 @@ class Gripper:
     @property
     def state(self) -> GripperState:
         """What is known now; never blocks."""
-        return self._loop.state
+        return self._machine.state
 
     @property
     def resolution(self) -> float:
@@ -75,21 +87,44 @@ class Gripper:
         """Run in a thread of its own from now on; nothing moves by that."""
         if self._thread is None:
             self._stop.clear()
-            self._thread = Thread(target=self._loop.run, args=(self._stop,), name="gripper", daemon=True)
+            self._thread = Thread(target=self._run, name="gripper", daemon=True)
             self._thread.start()
 
     def close(self) -> None:
         """End the thread and close the port; the gripper holds in place, or lets go with `release_on_stop`."""
         thread, self._thread = self._thread, None
         self._stop.set()
-        self._loop.wake()
+        self._wake.set()
         if thread is not None:
             thread.join(JOIN_TIMEOUT)
-        self._loop.close()
+        if self._opened:
+            with self._lock:
+                self._machine.leave(self.clock.now())
+            for _ in range(LEAVING_TURNS):
+                if not (self._opened and self._machine.has_orders):
+                    break
+                self.turn(0.0)
+        self._drop("the driver has ended")
+        self._tell()
 
-    def turn(self) -> None:
-        """Make one cycle: at most one request and its reply, or the wait for what is due; only without `start`."""
-        self._loop.turn()
+    def turn(self, longest: float = LONGEST_PAUSE) -> None:
+        """Make one cycle, only without `start`: open the bus, or one request and its reply, or wait for what is due.
+
+        Args:
+            longest: wait [s].
+        """
+        self._wake.clear()
+        try:
+            if self._opened:
+                self._exchange(longest)
+            else:
+                self._open(longest)
+        except FinforceError as error:
+            self._lose(str(error))
+        except Exception as error:  # a driver that dies would leave the gripper alone with its last order
+            LOG.exception("unexpected error in the gripper's loop")
+            self._lose(f"unexpected error, please report it: {type(error).__name__}: {error}")
+        self._tell()
 
     def listen(self, callback: Listener) -> Callable[[], None]:
         """Have a function called with the state after every believed reply and every change of phase.
@@ -99,11 +134,13 @@ class Gripper:
         Returns:
             What ends it.
         """
-        return self._loop.listen(callback)
+        self._listeners.append(callback)
+        return lambda: self._listeners.remove(callback) if callback in self._listeners else None
 
     def opening_at(self, time: float) -> float:
         """Return the opening [m] at a time of the last 5 s [s]; NaN where it is not known."""
-        return self._loop.opening_at(time)
+        with self._lock:
+            return self._machine.opening_at(time)
 
     def move(
         self, opening: float, speed: float | None = None, force: float | None = None, *, current: float | None = None
@@ -122,7 +159,7 @@ class Gripper:
         """
         if current is not None:
             force = self.scale.force_for(current, force)
-        self._loop.command(lambda machine, now: machine.move(opening, speed, force, now))
+        self._command(lambda machine, now: machine.move(opening, speed, force, now))
 
     def check_move(self, opening: float, speed: float | None = None, force: float | None = None) -> None:
         """Refuse what `move` would refuse in whatever state.
@@ -130,7 +167,7 @@ class Gripper:
         Raises:
             TargetError: a value is no number or out of bounds.
         """
-        self._loop.command(lambda machine, _: machine.check_move(opening, speed, force))
+        self._command(lambda machine, _: machine.check_move(opening, speed, force))
 
     def hold(self) -> None:
         """Stop in place and hold there; during a calibration: stop, limp.
@@ -138,7 +175,7 @@ class Gripper:
         Raises:
             GripperStateError: the gripper is absent, faulty or not calibrated: its jaws are limp.
         """
-        self._loop.command(lambda machine, now: machine.hold(now))
+        self._command(lambda machine, now: machine.hold(now))
 
     def calibrate(self) -> None:
         """Find the end stops: the jaws open fully, then close fully, with some 24 N.
@@ -146,7 +183,7 @@ class Gripper:
         Raises:
             GripperStateError: the gripper is absent or faulty, or calibrates already.
         """
-        self._loop.command(lambda machine, now: machine.calibrate())
+        self._command(lambda machine, now: machine.calibrate())
 
     def clear_errors(self) -> None:
         """Clear what is latched, an emergency stop too; does nothing without a fault, since it would let go.
@@ -154,14 +191,22 @@ class Gripper:
         Raises:
             GripperStateError: the gripper is absent or calibrates.
         """
-        self._loop.command(lambda machine, now: machine.clear_errors())
+        self._command(lambda machine, now: machine.clear_errors())
 
     def estop(self) -> None:
         """Stop at once: the messages leave from the calling thread, and the jaws go limp.
 
         Repeated until the gripper says that it is stopped, also after a lost link; only `clear_errors` ends it.
         """
-        self._loop.estop()
+        with self._lock:
+            messages = self._machine.estop(self.clock.now())
+            if self._opened:
+                try:
+                    for message in messages:
+                        self._bus.send(message)
+                except FinforceError as error:
+                    LOG.warning("the emergency stop waits for the link: %s", error)
+        self._wake.set()
 
     def activate(self, on: bool) -> None:
         """Switch the power stage on, holding in place, or off, limp: it then refuses moves.
@@ -169,7 +214,7 @@ class Gripper:
         Raises:
             GripperStateError: the gripper is absent, faulty or calibrating.
         """
-        self._loop.command(lambda machine, now: machine.activate(on, now))
+        self._command(lambda machine, now: machine.activate(on, now))
 
     def release_power(self) -> None:
         """Let the jaws go limp, ready for the next move; what is held may drop.
@@ -177,7 +222,7 @@ class Gripper:
         Raises:
             GripperStateError: the gripper is absent, faulty or calibrating.
         """
-        self._loop.command(lambda machine, now: machine.release_power(now))
+        self._command(lambda machine, now: machine.release_power(now))
 
     def wait(self, condition: StateCondition, timeout: float) -> GripperState:
         """Return the first state that fulfils a condition.
@@ -238,7 +283,7 @@ class Gripper:
     def _pass_time(self, condition: StateCondition, left: float) -> None:
         """Let the gripper get on, by a turn of our own where no thread makes them."""
         if self._thread is None:
-            self._loop.turn(left)
+            self.turn(left)
             return
         with self._changed:
             if not condition(self.state):
@@ -248,3 +293,89 @@ class Gripper:
         """Wake those who wait for a state."""
         with self._changed:
             self._changed.notify_all()
+
+    def _command(self, action: Callable[[GripperMachine, float], None]) -> None:
+        """Give the machine a command and wake the thread."""
+        with self._lock:
+            action(self._machine, self.clock.now())
+        self._wake.set()
+
+    def _run(self) -> None:
+        """Make turns until the gripper is closed."""
+        while not self._stop.is_set():
+            self.turn()
+
+    def _open(self, longest: float) -> None:
+        """Open the bus when its time has come, else wait for that."""
+        left = self._next_open - self.clock.now()
+        if left > SHORTEST_WAIT:
+            self.clock.wait(max(min(left, longest), SHORTEST_WAIT), self._wake)
+            return
+        self._bus.open()
+        with self._lock:
+            self._opened = True
+            self._machine.on_link_open()
+
+    def _exchange(self, longest: float) -> None:
+        """Send what is due and receive its reply, or wait."""
+        self._take_late_messages()
+        with self._lock:
+            now = self.clock.now()
+            request = self._machine.next_request(now)
+            if request is not None:
+                self._bus.send(request.message)
+            left = self._machine.next_time(now) - now
+        if request is None:
+            self.clock.wait(max(min(left, longest), SHORTEST_WAIT), self._wake)
+        elif request.answer is not None:
+            self._receive(request, now)
+        if self._machine.must_reopen:
+            raise LinkError(self._machine.state.message)
+
+    def _take_late_messages(self) -> None:
+        """Take what has come without being asked for: it must not pass for the next reply."""
+        for _ in range(LATE_MESSAGES):
+            message = self._bus.receive(0.0)
+            if message is None:
+                return
+            with self._lock:
+                self._machine.on_message(message, self.clock.now())
+
+    def _receive(self, request: Request, sent: float) -> None:
+        """Wait for the reply to a request that was sent at a time [s]."""
+        deadline = sent + self._machine.settings.reply_timeout
+        while (left := deadline - self.clock.now()) > 0.0:
+            message = self._bus.receive(left)
+            if message is None:
+                break
+            with self._lock:
+                if self._machine.on_message(message, self.clock.now(), self._bus.counts):
+                    self._pause = FIRST_PAUSE
+                    return
+        with self._lock:
+            self._machine.on_silence(self.clock.now(), self._bus.suspicion)
+
+    def _lose(self, reason: str) -> None:
+        """Close a bus that failed, and open it later."""
+        self._drop(reason)
+        self._next_open = self.clock.now() + self._pause
+        self._pause = min(2.0 * self._pause, LONGEST_PAUSE)
+
+    def _drop(self, reason: str) -> None:
+        """Close the bus and tell the machine."""
+        with self._lock:
+            self._opened = False
+            self._machine.on_link_lost(reason)
+        self._bus.close()
+
+    def _tell(self) -> None:
+        """Call the listeners if the state is new."""
+        state = self._machine.state
+        if state is self._told:
+            return
+        self._told = state
+        for listener in list(self._listeners):
+            try:
+                listener(state)
+            except Exception:  # somebody else's error must not stop the gripper's driver
+                LOG.exception("a listener to the gripper failed")

@@ -21,33 +21,163 @@ from finforce.health import Level, Outcome, Report
 from finforce.messages import stamp_of
 from finforce.optional import import_library
 from finforce.ros import node as ros
-from finforce_driver.actions import GripperCommandAction, ParallelGripperCommandAction
+from finforce_driver.can import build_bus
 from finforce_driver.clock import MessageTimes
-from finforce_driver.errors import GraspError
+from finforce_driver.errors import GraspError, TargetError
 from finforce_driver.grasp.controller import check_force_value
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import GraspSession
-from finforce_driver.grasp.settings import GraspSettings
-from finforce_driver.joint.node import LINKS, JointLink
-from finforce_driver.joint.settings import JointSettings
-from finforce_driver.messages import goal_from_joint_state, move_from_joint_state
-from finforce_driver.parameters import DriverParameters, build_gripper
-from finforce_driver.publishers import (
-    DriverOutputs,
+from finforce_driver.grasp.settings import GraspGoal, GraspSettings, GraspStatus
+from finforce_driver.gripper import Gripper
+from finforce_driver.joint import JointCommand, JointGripper, JointSettings
+from finforce_driver.messages import (
     GripperHealth,
     describe_grasp,
     describe_state,
+    fill_joint_state,
+    goal_from_joint_state,
     grasp_alarms,
     gripper_alarms,
+    move_from_joint_state,
     news_of_state,
+    outcome_of_grasp,
     outcome_of_state,
 )
-from finforce_driver.services import GripperTasks
-from finforce_driver.settings import GripperSettings
+from finforce_driver.settings import DriverParameters, GripperSettings
 from finforce_driver.state import GripperState
+from finforce_driver.tasks import GripperCommandAction, GripperTasks, ParallelGripperCommandAction
 
 JAWS = ("left", "right")
+LINKS = ("joint_command", "parallel_gripper_command", "gripper_command")  # of other grippers
 ACTIONS = {"GripperCommand": "~/gripper_cmd", "ParallelGripperCommand": "~/parallel_gripper_cmd"}
+
+
+def build_gripper(parameters: DriverParameters, settings: GripperSettings) -> Gripper:
+    """Make the driver of the gripper that the parameters name; nothing is opened before it starts.
+
+    Raises:
+        TargetError: the baud rate is none that ports know, or release_opening is beyond the stroke.
+    """
+    if not math.isnan(parameters.release_opening):
+        settings.check_opening("release_opening", parameters.release_opening)
+    return Gripper(build_bus(parameters.port, parameters.interface, baud_rate=parameters.baud_rate), settings)
+
+
+class DriverOutputs:
+    """The publishers of a gripper driver node.
+
+    Args:
+        qos: makes publishers and watches them.
+        parameters: names of the joints.
+        own_joints: nobody else tells the state of the joints.
+    """
+
+    def __init__(self, qos: ros.QosWatch, parameters: DriverParameters, *, own_joints: bool = True) -> None:
+        self._names, self._source = parameters.joint_names, qos.node.get_name()
+        self._told: tuple[str, str] | None = None
+        self.joints = qos.publisher(ros.JointState, "joint_states", ros.RESULT) if own_joints else None
+        self.grasp = qos.publisher(ros.DiagnosticStatus, "~/grasp_state", ros.LATCHED)
+
+    def send_joints(self, stamp: int, state: GripperState, effort: float | None) -> None:
+        """Send the joints as a reply at `stamp` [ns] shows them; what is not known stays empty.
+
+        Args:
+            stamp: of the reply [ns].
+            state: with it.
+            effort: force that is trusted [N]; None: none is.
+        """
+        if self.joints is None:
+            return
+        message = ros.JointState(header=ros.Header(stamp=ros.stamp_message(stamp)))
+        fill_joint_state(message, self._names, state, effort)
+        self.joints.publish(message)
+
+    def send_grasp(self, status: GraspStatus | None) -> None:
+        """Send how the grasp is, when its phase or its reason has changed."""
+        if status is None:
+            return
+        outcome = outcome_of_grasp(status)
+        if self._told != (told := (outcome.reason, outcome.text)):
+            self._told = told
+            report = Report(level=outcome.level, message=outcome.text, values=describe_grasp(status))
+            self.grasp.publish(ros.status_message("finforce: grasp", self._source, report))
+
+
+class JointLink:
+    """A `JointGripper` on a node: it listens to the joint's states and sends commands.
+
+    Args:
+        node: whose topics and clock they are.
+        kind: of `LINKS`: a topic with JointState, or an action.
+        target: name of the topic or the action.
+        settings: of the gripper.
+        joint: of the joint.
+
+    Attributes:
+        gripper: it.
+
+    Raises:
+        TargetError: there is no name.
+        MissingDependencyError: it is an action, and control_msgs is not installed.
+    """
+
+    def __init__(self, node: Any, kind: str, target: str, settings: GripperSettings, joint: JointSettings) -> None:
+        if not target:
+            raise TargetError(f"port: got none, expected the name of the {kind} to send to")
+        self._node, self._joint = node, joint
+        self._send = self._topic(target) if kind == "joint_command" else self._action(kind, target)
+        self.gripper = JointGripper(self._send, settings, joint)
+        node.create_subscription(JointState, "joint_states", self._take, ros.SENSOR)
+        node.create_timer(1.0 / (joint.rate or 10.0), self.gripper.tick)
+
+    def _take(self, message: JointState) -> None:
+        """Hand on the joint's value, with the time at which it came: the joint's clock may be another one."""
+        names = list(message.name)
+        first = self._joint.names[0]
+        if first not in names or len(message.position) != len(names):
+            return
+        index = names.index(first)
+        effort = message.effort[index] if len(message.effort) == len(names) else math.nan
+        try:
+            self.gripper.take(message.position[index], self.gripper.clock.now(), effort)
+        except FinforceError as error:
+            self._node.get_logger().warning(f"joint state refused: {error}", throttle_duration_sec=5.0)
+
+    def _message(self, command: JointCommand) -> JointState:
+        """Return a command for all joints alike; what it does not say stays empty."""
+        count = len(self._joint.names)
+        return JointState(
+            name=list(self._joint.names),
+            position=[command.position] * count,
+            velocity=[command.velocity] * count if math.isfinite(command.velocity) and not self._joint.rate else [],
+            effort=[command.effort] * count if math.isfinite(command.effort) else [],
+        )
+
+    def _topic(self, target: str) -> Callable[[JointCommand], None]:
+        out = self._node.create_publisher(JointState, target, ros.RESULT)
+        return lambda command: out.publish(self._message(command))
+
+    def _action(self, kind: str, target: str) -> Callable[[JointCommand], None]:
+        from rclpy.action import ActionClient
+
+        actions = import_library("control_msgs.action", f"port:={target}")
+        parallel = kind == "parallel_gripper_command"
+        action = actions.ParallelGripperCommand if parallel else actions.GripperCommand
+        client = ActionClient(self._node, action, target)
+
+        def send(command: JointCommand) -> None:
+            goal = action.Goal()
+            if parallel:
+                goal.command = self._message(command)
+            else:
+                goal.command.position = command.position
+                goal.command.max_effort = command.effort if math.isfinite(command.effort) else 0.0
+            if client.server_is_ready():
+                client.send_goal_async(goal)
+            else:
+                self._node.get_logger().warning(f"no action server {target}", throttle_duration_sec=5.0)
+
+        return send
 
 
 class GripperDriverNode(Node):
@@ -75,7 +205,8 @@ class GripperDriverNode(Node):
         else:
             self.gripper = build(parameters, settings)
         self.wake = self.create_guard_condition(self._on_states)
-        self.session = GraspSession(self.gripper, parameters.goal, grasp, self.wake.trigger)
+        first = {name: getattr(parameters, f"grasp_{name}") for name in ("force", "speed", "time_limit")}
+        self.session = GraspSession(self.gripper, GraspGoal(**first), grasp, self.wake.trigger)
         self.tasks = GripperTasks(self.gripper, self.session, parameters)
         gate = {"max_age": parameters.max_age, "restart_gap": parameters.restart_gap}
         told = [f"{side} {what}" for side in JAWS for what in ("stddev", "slip")]

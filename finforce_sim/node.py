@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
@@ -16,9 +17,10 @@ from std_msgs.msg import Header, String
 
 from finforce.camera import CameraIntrinsics
 from finforce.ros import node as ros
+from finforce.settings import setting
 from finforce.transforms import pose_numbers
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_sim.gripper.footage import (
+from finforce_sim.footage import (
     Footage,
     TwinFrame,
     build_footage,
@@ -27,10 +29,9 @@ from finforce_sim.gripper.footage import (
     info_fields,
     parse_size,
 )
-from finforce_sim.gripper.live import CoupledGripper, LiveScene, build_live_scene
-from finforce_sim.parameters import TwinParameters
-from finforce_sim.rendering.sensor import Flicker
-from finforce_sim.scenes.scenarios import RATE
+from finforce_sim.live import CoupledGripper, LiveScene, build_live_scene
+from finforce_sim.scenarios import RATE, Scenario, build_scenario
+from finforce_sim.sensor import Flicker
 
 PIXEL_TYPES = {"rgb8": np.uint8, "16UC1": np.uint16}
 TOLD_EVERY = 5.0  # s between two words on how far the rendering is
@@ -203,3 +204,37 @@ def main(args: Sequence[str] | None = None) -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinParameters:
+    """What a twin camera node is told; units stand in the metadata."""
+
+    scene: str = setting("grasp_cylinder", "Scene, by a name that `finforce twin list` prints")
+    seed: int = setting(0, "Seed of textures, light and noise", "", 0, 2**31 - 1)
+    finger: int = setting(0, "Seed of the jaws' material", "", 0, 2**31 - 1)
+    light: str = setting("", "Light: bright, dim or any; empty: that of the scene")
+    object: str = setting("", "Object, by the name of a shape or a mesh file; empty: that of the scene")
+    jaw_file: str = setting("", "Jaw, by the name of a shipped one or a jaw file; empty: that of the scene")
+    size: str = setting("640x480", "Size of the images, WIDTHxHEIGHT [px]")
+    depth_step: float = setting(0.001, "Resolution of the depth image", "m", 1e-5, 0.01)
+    loop: bool = setting(True, "Whether the scene is repeated; else the node ends with it")
+    gripper_link: str = setting(
+        "", "Port link of an emulated gripper that grasps the scene; empty: the scene as scripted"
+    )
+    gripper_firmware: str = setting("new", "Firmware of the emulated gripper", choices=("new", "old"))
+    detects: bool = setting(
+        False, "Whether true key points and jaw poses are published, as by a detector without errors"
+    )
+    camera_frame: str = setting("camera_color_optical_frame", "Frame of the images")
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scene with what is changed in it.
+
+        Raises:
+            ScenarioError: there is no such scene, light or object.
+            JawFileError: there is no such jaw.
+        """
+        changes = {"light": self.light, "object": self.object, "jaw": self.jaw_file}
+        return build_scenario(self.scene, **{name: value for name, value in changes.items() if value})

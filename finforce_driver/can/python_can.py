@@ -9,7 +9,7 @@ from typing import Any
 
 from finforce.errors import one_line
 from finforce.optional import import_library
-from finforce_driver.can.bus import LARGEST_DATA, LARGEST_ID, Bus, CanMessage
+from finforce_driver.can.protocol import LARGEST_DATA, LARGEST_ID, Bus, CanMessage
 from finforce_driver.errors import LinkError
 
 _ADVICE = {

@@ -30,7 +30,7 @@ class GraspGoal:
     time_limit: float = setting(20.0, "Maximum time to reach the set force", "s", 0.1, 3600.0)
 
     def __post_init__(self) -> None:
-        """Refuses what no grasp can be.
+        """Refuse what no grasp can be.
 
         Raises:
             TargetError: a value is no number or out of bounds.
@@ -65,7 +65,7 @@ class GraspSettings:
     )
 
     def __post_init__(self) -> None:
-        """Refuses values out of bounds.
+        """Refuse values out of bounds.
 
         Raises:
             TargetError: a value is out of its bounds.

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from finforce_driver.can.bus import CanMessage
-from finforce_driver.can.protocol import Command, Move, encode_request, split_identifier
+from finforce_driver.can.protocol import CanMessage, Command, Move, encode_request, split_identifier
 
 LENGTHS = {
     Command.REPLY: 4,

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from statistics import median_low
 
-from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import (
     LARGEST_BYTE,
     LARGEST_CURRENT_MA,
+    CanMessage,
     Command,
     ErrorReport,
     Flag,

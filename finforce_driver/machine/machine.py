@@ -6,22 +6,31 @@ Times are those of the carrier's clock [s].
 
 from __future__ import annotations
 
-import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Mapping
 
-from finforce_driver.can.bus import CanMessage
-from finforce_driver.can.protocol import Command, Flag, Move, Reply, decode_reply, encode_watchdog, split_identifier
+from finforce_driver.can.protocol import (
+    CanMessage,
+    Command,
+    Flag,
+    Reply,
+    decode_reply,
+    encode_watchdog,
+    split_identifier,
+)
 from finforce_driver.errors import GripperStateError
-from finforce_driver.machine.calibration import CalibrationRun, CalibrationStep
-from finforce_driver.machine.exchange import Exchange, Request
-from finforce_driver.machine.knowledge import Knowledge
-from finforce_driver.machine.move import GRACE, Goal, MoveJob
-from finforce_driver.machine.orders import Arrival, Echo, EchoWatch, Orders
+from finforce_driver.machine.drive import GO, USABLE, Drive
+from finforce_driver.machine.exchange import Request
+from finforce_driver.machine.move import Arrival, Echo, EchoWatch, Goal, MoveJob
+from finforce_driver.machine.procedures import (
+    CalibrationRun,
+    CalibrationStep,
+    Recovery,
+    RecoveryStep,
+    StopStage,
+)
 from finforce_driver.machine.requests import RequestSource
-from finforce_driver.machine.state_report import build_state
-from finforce_driver.machine.stop import EmergencyStop, Recovery, RecoveryStep, StopStage
-from finforce_driver.settings import GripperSettings
+from finforce_driver.settings import GripperSettings, check_numbers
 from finforce_driver.state import (
     HALF_CALIBRATED,
     OTHER_MASTER,
@@ -31,21 +40,17 @@ from finforce_driver.state import (
     MoveOutcome,
     Phase,
 )
-from finforce_driver.units import SLOWEST_BYTE, GripperScale, check_numbers
 
 SHORT_SILENCE = 5  # requests in a row without a reply after which the gripper is taken to be absent
-MISSED_REPLIES = 25  # requests in a row without a reply after which the link is opened anew
 PROBES = 20  # the same before the first reply: a second
 ECHOES = 8  # last messages, in which one of ours is recognised that an adapter gives back
 OLD = 0.1  # [s] after which a reply does not tell where moving jaws are
 STANDING = 2.0  # [counts/s], below which an unknown order is taken to hold
-GO = Flag.ACTIVATE | Flag.GO
 FOREIGN = frozenset({Command.ESTOP, Command.CLEAR, Command.IDLE, Command.RESET, Command.CALIBRATE})
 INHERITED = "the jaws were moving by an order from before the link was there; they are held"
 LOST_ORDER = "the gripper fell silent before the order could be sent: command again"
 NO_FAULTS = (False, False, False, False)
 CONNECTED = (Phase.UNCALIBRATED, Phase.READY, Phase.MOVING)
-USABLE = (Phase.READY, Phase.MOVING)
 REFUSALS = {
     Phase.DISCONNECTED: "no gripper answers",
     Phase.PROBING: "the gripper has not answered yet: wait for its first reply",
@@ -55,27 +60,11 @@ REFUSALS = {
 }
 
 
-class GripperMachine:
-    """Drives one gripper, without input or output of its own.
-
-    Its parts are read by what chooses the next request and by what shows the state; they change here alone.
+class GripperMachine(Drive):
+    """Drives one gripper, without input or output of its own; what is known and wanted changes here.
 
     Attributes:
-        state: what is known.
-        settings: of the gripper.
-        scale: its units.
-        known: what the replies say.
-        exchange: requests and replies.
-        orders: what the gripper shall do.
-        stop: the emergency stop.
-        recovery: errors being cleared; None: none are.
-        calibration: under way; None: none is.
-        job: the last move; None: none, or it was replaced by something else.
-        outcome: of the last move.
-        farewell: messages that have still to leave before the end.
-        hold_wanted: the jaws are to be held where the next reply says that they are.
-        note: sentence that stays until the next command.
-        counts: of events by name.
+        state: what is known now.
 
     Args:
         settings: of the gripper.
@@ -83,90 +72,12 @@ class GripperMachine:
     """
 
     def __init__(self, settings: GripperSettings | None = None, salt: int = 0) -> None:
-        self.settings = settings or GripperSettings()
-        self.scale = GripperScale(self.settings)
-        self.known = Knowledge(self.settings)
-        self.exchange = Exchange(self.settings.node_id)
-        self.orders = Orders(salt)
-        self.stop = EmergencyStop()
-        self.recovery: Recovery | None = None
-        self.calibration: CalibrationRun | None = None
-        self.job: MoveJob | None = None
-        self.hold_wanted = False
-        self.note = ""
-        self.counts: Counter[str] = Counter()
+        super().__init__(settings or GripperSettings(), salt)
         self._echo = EchoWatch()
-        self._ended = MoveOutcome.NONE  # of the last move that is no job any more
         self._enabled = True  # not switched off
-        self._joined = self._silent = False
-        self._arrival: Arrival | None = None
-        self._order_sent = -math.inf
-        self.farewell: deque[CanMessage] = deque()
-        self._link_counts: Mapping[str, int] = {}
         self._requests = RequestSource(self)
         self._sent: deque[CanMessage] = deque(maxlen=ECHOES)
-        self._refresh()
-
-    # What is known
-
-    @property
-    def phase(self) -> Phase:
-        """Where the driver is with the gripper."""
-        if not self._joined or self._silent:
-            return Phase.DISCONNECTED
-        if self.known.reply is None:
-            return Phase.PROBING
-        if self.stop.active or self.recovery is not None or self.known.error:
-            return Phase.FAULT
-        if self.calibration is not None:
-            return Phase.CALIBRATING
-        if not self.known.calibrated:
-            return Phase.UNCALIBRATED
-        if self._arrival is not None and not self.moving:
-            return Phase.MOVING if self._arrival.moving else Phase.PROBING
-        return Phase.MOVING if self.moving else Phase.READY
-
-    @property
-    def moving(self) -> bool:
-        """Whether a move is under way."""
-        return self.job is not None and self.job.outcome is MoveOutcome.NONE
-
-    @property
-    def outcome(self) -> MoveOutcome:
-        """What became of the last move."""
-        outcome = self._ended if self.job is None else self.job.outcome
-        limp = self.known.reply is not None and not self.known.driving
-        return MoveOutcome.NONE if outcome is MoveOutcome.GRASPED and limp else outcome
-
-    @property
-    def silent(self) -> bool:
-        """Whether nothing has answered for long."""
-        return self._silent
-
-    @property
-    def may_drive(self) -> bool:
-        """Whether an order that moves the jaws may leave: everything that speaks against it is known and does not."""
-        return self.phase in USABLE and self.exchange.in_step and not self.known.filter.alarming
-
-    @property
-    def settled(self) -> bool:
-        """Whether the last believed reply speaks of the last order, not of the one before."""
-        return self.known.stamp - self._order_sent >= GRACE
-
-    @property
-    def has_orders(self) -> bool:
-        """Whether an order or an emergency stop has still to be sent."""
-        return self.orders.pending or bool(self.farewell) or (self.stop.active and not self.known.error)
-
-    @property
-    def must_reopen(self) -> bool:
-        """Whether nothing has answered for so long that the link is to be opened anew."""
-        return self.exchange.misses >= MISSED_REPLIES
-
-    def opening_at(self, time: float) -> float:
-        """Return the opening [m] at a past time; NaN unknown."""
-        reach = 2.0 / self.settings.poll_rate + self.settings.reply_timeout
-        return self.scale.opening_of(self.known.history.place_at(time, reach))
+        self.state = self.report()
 
     # Commands; each is refused by name where it cannot be done
 
@@ -184,12 +95,12 @@ class GripperMachine:
         job = self.job
         if job is not None and job.goal == goal and job.outcome in (MoveOutcome.NONE, MoveOutcome.REACHED):
             return
-        start = self._setpoint(now)
+        start = self.setpoint(now)
         self.hold_wanted = False
         self._end_job(MoveOutcome.REPLACED)
-        self.note, self._ended = goal.pace.note, MoveOutcome.NONE
+        self.note, self.ended = goal.pace.note, MoveOutcome.NONE
         self.job = MoveJob(goal, start=start, rate=goal.pace.speed / self.scale.resolution, now=now)
-        self._want_position()
+        self.want_position()
         self._refresh()
 
     def hold(self, now: float) -> None:
@@ -199,7 +110,7 @@ class GripperMachine:
             GripperStateError: the jaws are limp, or unknown. One that has just fallen silent is held as soon as it
                 answers again.
         """
-        if self._silent and self.calibration is None and self.known.driving:
+        if self.silent and self.calibration is None and self.known.driving:
             self._end_job(MoveOutcome.REPLACED)
             self._postpone_hold()
             self._refresh()
@@ -307,7 +218,7 @@ class GripperMachine:
     def on_link_open(self) -> None:
         """Begin on a link that was opened."""
         self.exchange.reset()
-        self._joined, self._arrival = True, Arrival()
+        self.joined, self.arrival = True, Arrival()
         self._refresh()
 
     def on_link_lost(self, reason: str) -> None:
@@ -321,8 +232,8 @@ class GripperMachine:
         self._abort(reason)
         self.known.forget()
         self.exchange.reset()
-        self._joined = self._silent = False
-        self._arrival = None
+        self.joined = self.silent = False
+        self.arrival = None
         self._refresh()
 
     def on_message(self, message: CanMessage, now: float, link_counts: Mapping[str, int] | None = None) -> bool:
@@ -333,7 +244,7 @@ class GripperMachine:
             now: when [s].
             link_counts: what the link counts, to be shown in the state.
         """
-        self._link_counts = link_counts or self._link_counts
+        self.link_counts = link_counts or self.link_counts
         if not self.exchange.answers(message):
             if message not in self._sent:
                 self._take_unasked(message)
@@ -360,8 +271,8 @@ class GripperMachine:
         if not request.counted:
             self._miss_answer(request, now)
             return
-        if self.exchange.misses >= (PROBES if self.known.reply is None else SHORT_SILENCE) and not self._silent:
-            self._silent = True
+        if self.exchange.misses >= (PROBES if self.known.reply is None else SHORT_SILENCE) and not self.silent:
+            self.silent = True
             if self.orders.pending:
                 self._abort(LOST_ORDER)
             self.note = self.note or suspicion or SILENT.format(node=self.settings.node_id)
@@ -380,37 +291,6 @@ class GripperMachine:
             self.known.telemetry.miss(now)
         elif self.calibration is not None:
             self.calibration.travel.miss()
-
-    # For the choice of requests
-
-    def order(self, *, position: int, flags: int, speed: int | None = None, current_mA: int | None = None) -> Move:
-        """Return an order; what is not given stays as it was last."""
-        last = self.orders.wanted or self.orders.taken
-        if last is None:
-            default = round(1e3 * self.settings.default_current)
-            last = Move(position=0, speed=SLOWEST_BYTE, current_mA=default, flags=Flag.OFF)
-        return Move(
-            position=position,
-            speed=last.speed if speed is None else speed,
-            current_mA=last.current_mA if current_mA is None else current_mA,
-            flags=flags,
-        )
-
-    def place_for_order(self, now: float) -> int:
-        """Return the position that holds the jaws where they are [counts].
-
-        The reply truncates: jaws that rest between two counts report the one on the open side.
-        """
-        place = self._place_now(now)
-        if math.isnan(place):
-            return 0
-        return math.ceil(place) if self.known.history.speed() >= 0.0 else math.floor(place)
-
-    def advance_move(self, now: float) -> None:
-        """Let the target of a slow move go on when it is due."""
-        if self.job is not None and self.orders.wanted is not None and not (self.job.sent and self.orders.pending):
-            self.job.advance(now, self.known.place, self.known.stamp)
-            self._want_position()
 
     # Within
 
@@ -434,12 +314,6 @@ class GripperMachine:
             current_mA=default if force is None else self.scale.current_of(force),
         )
 
-    def _want_position(self) -> None:
-        """Have the gripper get the order that the present move wants."""
-        goal = self.job.goal
-        order = self.order(position=self.job.position, flags=GO, speed=goal.pace.byte, current_mA=goal.current_mA)
-        self.orders.want(order)
-
     def _hold(self, now: float) -> None:
         """Stop in place; see `hold`."""
         if self.calibration is not None:
@@ -457,7 +331,7 @@ class GripperMachine:
         if now - self.known.stamp > OLD and drives:
             self._postpone_hold()
             return
-        kept, place = self.orders.wanted, self._place_now(now)
+        kept, place = self.orders.wanted, self.place_now(now)
         if standing or not drives or (kept is not None and (not kept.drives or abs(kept.position - place) <= 1.0)):
             return
         self._hold_here(now)
@@ -471,7 +345,7 @@ class GripperMachine:
     def _end_job(self, outcome: MoveOutcome) -> None:
         """End a move that is under way; one that has ended keeps its outcome."""
         if self.job is not None:
-            self._ended = outcome if self.moving else self.job.outcome
+            self.ended = outcome if self.moving else self.job.outcome
             self.job = None
 
     def _abort(self, note: str = "") -> None:
@@ -493,19 +367,6 @@ class GripperMachine:
         self._echo.forget()
         self.hold_wanted = True
 
-    def _place_now(self, now: float) -> float:
-        """Return where the jaws are by now [counts]; NaN unknown."""
-        order = self.orders.taken
-        return self.known.place_now(now, float(order.position) if order is not None and order.drives else None)
-
-    def _setpoint(self, now: float) -> float:
-        """Return where the target or the jaws are now [counts], for a move that goes on from there."""
-        place, wanted = self._place_now(now), self.orders.wanted
-        if wanted is None or not wanted.flags & Flag.GO:
-            return place
-        ramp = self.job.steps.ramp(now) if self.job and self.job.steps else float(wanted.position)
-        return ramp if abs(ramp - place) <= 2.0 else place
-
     def _take_reply(self, request: Request, message: CanMessage, now: float) -> None:
         """Take the reply to a poll or an order, and draw the conclusions if it is believed."""
         if request.move is not None:
@@ -525,15 +386,15 @@ class GripperMachine:
         elif request.move == self.orders.wanted:
             self.orders.take(request.move)
             self._echo.send(request.move, now)
-            self._order_sent = now
+            self.order_sent = now
             self.known.restart_contact()
             if self.job is not None:
                 self.job.send(now)
 
     def _conclude(self, before: Reply | None, reply: Reply, now: float) -> None:
         """Draw the conclusions from a reply that is believed; `before` is the one before it."""
-        if self._silent or before is None:
-            self._silent, self.note = False, ""
+        if self.silent or before is None:
+            self.silent, self.note = False, ""
         self.stop.take(reply)
         self._follow_recovery(reply, now)
         self._follow_fault(before, reply, now)
@@ -550,13 +411,13 @@ class GripperMachine:
 
     def _follow_arrival(self, reply: Reply, now: float) -> None:
         """Hold jaws that move by an order from before the link was there."""
-        arrival = self._arrival
+        arrival = self.arrival
         if arrival is None:
             return
         was_moving = arrival.moving
         arrival.take(reply, now)
         if arrival.over:
-            self._arrival = None
+            self.arrival = None
         elif arrival.moving and not was_moving and self.orders.wanted is None:
             self._hold_here(now)
             self.note = INHERITED
@@ -596,7 +457,7 @@ class GripperMachine:
             self.known.half_calibrated = run.step is CalibrationStep.FAILED
             self.known.restart_places()
             self._abort(run.reason)
-            self._ended = MoveOutcome.NONE
+            self.ended = MoveOutcome.NONE
 
     def _follow_orders(self, reply: Reply, now: float) -> None:
         """Judge the move, and whether the gripper has our order."""
@@ -633,4 +494,4 @@ class GripperMachine:
 
     def _refresh(self) -> None:
         """Make the state anew."""
-        self.state = build_state(self, self._link_counts)
+        self.state = self.report()

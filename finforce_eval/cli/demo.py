@@ -154,7 +154,7 @@ def _is_synthetic(folder: Path) -> bool:
 def _render(folder: Path) -> None:
     """Render the demo's scene into a new folder, under a progress bar."""
     from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
-    from finforce_sim.gripper.footage import parse_size
-    from finforce_sim.scenes.scenarios import build_scenario
+    from finforce_sim.footage import parse_size
+    from finforce_sim.scenarios import build_scenario
 
     record_scene(build_scenario(SCENE), SEED, folder, camera=parse_size(SIZE), form=RecordingForm(), finger=FINGER)

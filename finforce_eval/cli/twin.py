@@ -11,8 +11,8 @@ from finforce_eval.cli.parser import Parser, whole_number
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.results import parse_changes
 from finforce_eval.recordings.twin_writer import PREVIEW, RecordingForm, record_scene
-from finforce_sim.gripper.footage import parse_size
-from finforce_sim.scenes.scenarios import SCENARIOS, Scenario, build_scenario, write_script
+from finforce_sim.footage import parse_size
+from finforce_sim.scenarios import SCENARIOS, Scenario, build_scenario, write_script
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

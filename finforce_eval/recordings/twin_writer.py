@@ -28,7 +28,7 @@ from finforce_eval.recordings.images import (
 from finforce_eval.recordings.recording import CLOUD, POSE, STRING, TRUE_KEYPOINTS, TRUE_POSE, WRENCH
 from finforce_eval.recordings.writer import Entry, MessageFactory, write_entries
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_sim.gripper.footage import (
+from finforce_sim.footage import (
     FINGER,
     Footage,
     TrueJaw,
@@ -38,7 +38,7 @@ from finforce_sim.gripper.footage import (
     encode_depth,
     info_fields,
 )
-from finforce_sim.scenes.scenarios import Scenario
+from finforce_sim.scenarios import Scenario
 
 FRAME = "camera_color_optical_frame"
 MESH = "object.stl"

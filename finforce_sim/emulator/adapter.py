@@ -6,7 +6,7 @@ import re
 from collections import Counter, deque
 from collections.abc import Iterable
 
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 from finforce_driver.can.slcan import BELL, END, EXTENDED, decode_line, encode_message
 from finforce_driver.errors import TargetError
 from finforce_sim.emulator.firmware import EmulatedGripper

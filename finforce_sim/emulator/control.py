@@ -1,16 +1,85 @@
-"""What the firmware does in its control loop: moves and their object code, and the calibration."""
+"""The firmware's control loop: moves, their object code, the calibration; and what a careful driver does not send."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
 from finforce_sim.emulator.mechanism import Jaws
-from finforce_sim.emulator.settings import Firmware
 
 AT_POSITION = 3  # object code
 _SLOWEST, _SPEED_RANGE = 40, 79960  # [ticks/s] of the speed bytes 0 and 255
 _LARGEST = 255
+
+
+@dataclass(frozen=True, kw_only=True)
+class Firmware:
+    """Where firmware versions differ.
+
+    Attributes:
+        closing_code: object code of contact while the current drives closed.
+        opening_code: object code of contact while the current drives open.
+        contact_speed: largest reading of speed that counts as standing [ticks/s].
+        contact_ratio: share of the current limit above which standing is contact; 0: `contact_margin` decides.
+        contact_margin: largest distance of the current from its limit that counts as contact [mA].
+        tick_tolerance: distance from the target that counts as reached [ticks]; 0: equal position bytes count.
+        calibration_speed: while looking for the end stops [ticks/s].
+        calibration_current: limit meanwhile [mA].
+        calibration_margin: largest distance of the current from that limit at a stop [mA].
+        confirm_time: how long a stop must be felt [ms].
+        calibration_timeout: after which a calibration is given up [ms].
+        watchdog_length: data bytes without which the watchdog's setter is ignored.
+        has_torque_constant: whether the request for it is answered.
+    """
+
+    closing_code: int
+    opening_code: int
+    contact_speed: float
+    contact_ratio: float
+    contact_margin: float
+    tick_tolerance: int
+    calibration_speed: float
+    calibration_current: float
+    calibration_margin: float
+    confirm_time: int
+    calibration_timeout: int
+    watchdog_length: int
+    has_torque_constant: bool
+
+
+VARIANTS = {
+    "new": Firmware(  # source of 2026-03-13
+        closing_code=1,
+        opening_code=2,
+        contact_speed=500.0,
+        contact_ratio=0.8,
+        contact_margin=0.0,
+        tick_tolerance=5,
+        calibration_speed=12582.0,
+        calibration_current=500.0,
+        calibration_margin=90.0,
+        confirm_time=640,
+        calibration_timeout=30_000,
+        watchdog_length=5,
+        has_torque_constant=True,
+    ),
+    "old": Firmware(  # the maker's prebuilt file of 2024-09-02
+        closing_code=2,
+        opening_code=1,
+        contact_speed=700.0,
+        contact_ratio=0.0,
+        contact_margin=30.0,
+        tick_tolerance=0,
+        calibration_speed=14150.0,
+        calibration_current=450.0,
+        calibration_margin=30.0,
+        confirm_time=1,
+        calibration_timeout=14_000,
+        watchdog_length=4,
+        has_torque_constant=False,
+    ),
+}
 
 
 class Mode(Enum):
@@ -201,3 +270,23 @@ class FirmwareCalibration:
         self._open_found = False
         self._pause = self._PAUSE
         self._elapsed = self._felt = 0
+
+
+_WEAK_CURRENT, _STRONG_CURRENT = 150, 1500  # [mA] that the maker advises against going beyond
+_SLOW_SPEED = 3  # byte below which contact is felt while the jaws still move
+
+
+def list_violations(order: Order, control: MoveControl, mode: Mode) -> Iterator[str]:
+    """Yield what is wrong with an order, given the control that has not taken it yet, and the present mode."""
+    if mode is Mode.CALIBRATE and not order.estop:
+        yield "order during calibration"
+    if not _WEAK_CURRENT <= order.current <= _STRONG_CURRENT:
+        yield "current out of range"
+    if not (order.activated and order.action) or order.estop:
+        return
+    if order.speed < _SLOW_SPEED:
+        yield "too slow"
+    if order == control.order and mode is Mode.GRIPPER:
+        yield "repeated order"
+    if order == control.order and mode is not Mode.GRIPPER and control.latched:
+        yield "stale latch"

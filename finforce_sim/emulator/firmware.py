@@ -8,16 +8,37 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 from finforce_driver.errors import TargetError
-from finforce_sim.emulator.conduct import list_violations
-from finforce_sim.emulator.control import Endpoints, FirmwareCalibration, Mode, MoveControl, Order
-from finforce_sim.emulator.mechanism import STEP, Jaws
-from finforce_sim.emulator.settings import VARIANTS, EmulatorSettings, StoredConfiguration
+from finforce_sim.emulator.control import (
+    VARIANTS,
+    Endpoints,
+    FirmwareCalibration,
+    Mode,
+    MoveControl,
+    Order,
+    list_violations,
+)
+from finforce_sim.emulator.mechanism import STEP, EmulatorSettings, Jaws
 
 _REPLY, _ORDER = 60, 61
 _FIFO = 3  # messages that the CAN controller keeps while the firmware is busy
 _ADVISED_BURST = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredConfiguration:
+    """What outlives a reset once it was saved.
+
+    Attributes:
+        node_id: on the CAN bus.
+        watchdog: longest silence [ms]; 0: any.
+        heartbeat: period [ms]; 0: none.
+    """
+
+    node_id: int
+    watchdog: int = 0
+    heartbeat: int = 0
 
 
 class EmulatedGripper:

@@ -1,18 +1,54 @@
-"""Motor, racks and jaws in steps of a millisecond: motion, current and what the jaws press on."""
+"""An emulated gripper's build, and its motor, racks and jaws: motion, current, what they press on, step by step."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 
-from finforce_sim.emulator.settings import EmulatorSettings
+from finforce.settings import check_bounds, setting
+from finforce_driver.errors import TargetError
 
 STEP = 0.001  # [s]
 TURN = 16384  # ticks of the encoder
 _FILTER_STEPS = 4  # of the velocity reading: 20 samples of 0.2 ms
 _GIVE_WAY = 20.0  # [ticks] in one step, by which a load that is too strong pushes the jaws open
 _BISECTIONS = 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulatorSettings:
+    """Settings of `EmulatedGripper`; each field's metadata says unit, bounds and meaning."""
+
+    stop_open: int = setting(10329, "of the motor at the open end stop", "ticks", 0, 16383)
+    stop_closed: int = setting(-229, "of the motor at the closed end stop", "ticks", -16384, 0)
+    stroke: float = setting(0.048, "opening of the mechanism between its end stops", "m", 0.001, 0.5)
+    closed_opening: float = setting(0.0, "between the jaws' inner faces when the mechanism is closed", "m", 0.0, 0.2)
+    start_opening: float = setting(0.048, "between the jaws when the emulation begins", "m", 0.0, 0.7)
+    force_per_current: float = setting(47.7, "grip force per motor current", "N/A", 1.0, 500.0)
+    current_lag: float = setting(0.02, "time constant of the current", "s", 0.001, 1.0)
+    free_current: float = setting(0.06, "that moves the unloaded jaws, at most a fifth of the limit", "A", 0.0, 0.5)
+    limp_force: float = setting(0.0, "grip force below which jaws without power stay where they are", "N", 0.0, 100.0)
+    hold_speed: float = setting(80_000.0, "of the drive's own position control", "ticks/s", 1000.0, 800_000.0)
+    rest_error: int = setting(0, "that the position control leaves, positive on the open side", "ticks", -4, 4)
+    boot_time: float = setting(0.3, "of silence after a reset", "s", 0.0, 10.0)
+    save_time: float = setting(0.5, "of deafness while the configuration is written", "s", 0.0, 10.0)
+    resets_integrators: bool = setting(False, "each order of five bytes lets the current start anew", "")
+    supply_limit: float = setting(29.0, "supply above which a fault is latched", "V", 9.0, 30.0)
+
+    def __post_init__(self) -> None:
+        """Refuse values out of bounds.
+
+        Raises:
+            TargetError: a value is out of its bounds, or the jaws would start beyond an end stop.
+        """
+        check_bounds(self, TargetError)
+        widest = self.closed_opening + self.stroke
+        if not self.closed_opening <= self.start_opening <= widest:
+            raise TargetError(
+                f"start_opening: got {self.start_opening:g} m, expected {self.closed_opening:g} to {widest:g} m"
+            )
 
 
 class Jaws:

@@ -20,9 +20,9 @@ from finforce.errors import FinforceError
 from finforce.signals import StopSignals
 from finforce_driver.errors import LinkError, TargetError
 from finforce_sim.emulator.adapter import ACK_MODES, EmulatedAdapter
+from finforce_sim.emulator.control import VARIANTS
 from finforce_sim.emulator.faults import FaultyAdapter, draw_plan
 from finforce_sim.emulator.firmware import EmulatedGripper
-from finforce_sim.emulator.settings import VARIANTS
 from finforce_sim.emulator.virtual import SteppedAdapter
 
 _IDLE_PERIOD = 0.004  # [s] between two steps of the emulation while nothing comes in

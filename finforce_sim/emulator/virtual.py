@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from threading import Event
 from typing import Protocol
 
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 from finforce_driver.can.slcan import SlcanParser, encode_message
 from finforce_driver.errors import LinkError
 

@@ -20,14 +20,12 @@ from typing import Any
 import pandas as pd
 from tqdm import tqdm
 
-from finforce_driver.can.bus import CanMessage
-from finforce_driver.can.protocol import Command, Move, decode_move, split_identifier
+from finforce_driver.can.protocol import CanMessage, Command, Move, decode_move, split_identifier
 from finforce_driver.errors import DriverError
 from finforce_driver.gripper import Gripper
 from finforce_driver.machine.machine import INHERITED
-from finforce_driver.settings import GripperSettings
+from finforce_driver.settings import GripperScale, GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
-from finforce_driver.units import GripperScale
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, draw_plan

@@ -19,8 +19,8 @@ import pandas as pd
 from finforce.errors import FinforceError
 from finforce_eval.cli.main import main as finforce
 from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
-from finforce_sim.gripper.footage import parse_size
-from finforce_sim.scenes.scenarios import build_scenario
+from finforce_sim.footage import parse_size
+from finforce_sim.scenarios import build_scenario
 from lab.bench.detection import sight_columns, time_product
 from lab.bench.scenes import SIZE, scene_folder
 from lab.harness import Figures

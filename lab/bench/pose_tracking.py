@@ -22,10 +22,10 @@ from finforce.transforms import invert_pose, move_pose, rotation_between
 from finforce_contact.errors import PoseLostError
 from finforce_contact.pose.source import ObjectPose
 from finforce_contact.pose.tracker import PoseTracker
-from finforce_sim.rendering.depth_camera import build_d405
-from finforce_sim.scenes.objects import OBJECT_NAMES, build_object
-from finforce_sim.scenes.pose_sequences import Motion, SequenceImage, render_sequence
+from finforce_sim.objects import OBJECT_NAMES, build_object
+from finforce_sim.sensor import build_d405
 from lab.harness import Figures
+from lab.table_scenes import Motion, SequenceImage, render_sequence
 
 STEPS = {"848x480": 1, "424x240": 2}
 HIDDEN = (0.0, 0.3, 0.5)

@@ -22,11 +22,10 @@ from finforce_contact.mesh.views import Chamfer, compute_chamfer
 from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_contact.reconstruction.generated import build_poisson_mesh, scale_coarsely
 from finforce_contact.reconstruction.reconstruction import METHODS, reconstruct
-from finforce_sim.rendering.depth_camera import build_d405
-from finforce_sim.scenes.guesses import GuessError, draw_guess, place_mesh
-from finforce_sim.scenes.objects import OBJECT_NAMES, build_object
-from finforce_sim.scenes.pose_sequences import draw_scene, roughen_mask
+from finforce_sim.objects import OBJECT_NAMES, build_object
+from finforce_sim.sensor import build_d405
 from lab.harness import Figures
+from lab.table_scenes import GuessError, draw_guess, draw_scene, place_mesh, roughen_mask
 
 DISTANCES = (13e-3, 16e-3)  # [m] of the guess from the truth
 ALONE = "alone"  # the choice between primitive and completion

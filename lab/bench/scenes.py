@@ -16,8 +16,8 @@ from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from finforce_sim.gripper.gripper import TwinState
-    from finforce_sim.scenes.scenarios import Scenario
+    from finforce_sim.gripper import TwinState
+    from finforce_sim.scenarios import Scenario
 
 SCRIPT_SLOTS = 6  # slots from one state of a script to the next
 EVERY_RATE = (0, 2, 3, 4)  # slots of those six that a camera of 30, 60 or 90 Hz sees
@@ -47,7 +47,7 @@ class BenchScene:
         Raises:
             ScenarioError: there is none of this name, or a number is out of its bounds.
         """
-        from finforce_sim.scenes.scenarios import build_scenario
+        from finforce_sim.scenarios import build_scenario
 
         return build_scenario(self.scenario, **self.changes)
 
@@ -132,9 +132,9 @@ def _render(scene: BenchScene, path: Path) -> None:
     from tqdm import tqdm
 
     from finforce_eval.recordings.twin_writer import RecordingForm, write_footage
-    from finforce_sim.gripper.footage import FINGER, Footage, parse_size, set_stage
-    from finforce_sim.gripper.gripper import TwinGripper
-    from finforce_sim.rendering.photographer import Photographer
+    from finforce_sim.footage import FINGER, Footage, parse_size, set_stage
+    from finforce_sim.gripper import TwinGripper
+    from finforce_sim.photographer import Photographer
 
     gripper = TwinGripper(scene.build(), FINGER)
     setting = set_stage(gripper, parse_size(SIZE), 1e-3)

@@ -13,8 +13,8 @@ import pandas as pd
 
 from finforce_eval.errors import OptionError
 from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE, new_figure, style_axes
-from finforce_sim.gripper.pressing import PressedGrasp
-from finforce_sim.scenes.scenarios import build_scenario
+from finforce_sim.gripper import PressedGrasp
+from finforce_sim.scenarios import build_scenario
 from lab.experiments.experiment import Case, Findings, ResultTable, tabulate
 from lab.experiments.grasp_world import EstimatorSensor, GraspCase, ImageSensor, NoisySensor, World, build_plant
 from lab.experiments.runs import RunOptions

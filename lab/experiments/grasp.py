@@ -188,8 +188,8 @@ def _with_displacement(case: Case) -> Case:
     settings = case.settings
     if "bag" in settings:
         return case
-    from finforce_sim.gripper.pressing import PressedGrasp
-    from finforce_sim.scenes.scenarios import build_scenario
+    from finforce_sim.gripper import PressedGrasp
+    from finforce_sim.scenarios import build_scenario
 
     grasp = PressedGrasp(build_scenario(settings["scene"], **settings["changes"]), step=5e-4)
     way = grasp.find_closing(settings["words"]["force"])

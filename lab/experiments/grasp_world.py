@@ -39,10 +39,9 @@ from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.faults import FaultyAdapter, PlannedFault
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
-from finforce_sim.gripper.footage import disturb_pose, parse_size, set_stage
-from finforce_sim.gripper.gripper import TwinState
-from finforce_sim.gripper.pressing import PressedGrasp
-from finforce_sim.rendering.photographer import Photographer
+from finforce_sim.footage import disturb_pose, parse_size, set_stage
+from finforce_sim.gripper import PressedGrasp, TwinState
+from finforce_sim.photographer import Photographer
 
 IMAGES = 30.0  # [Hz]
 LOST = 0.02  # share of the images

@@ -17,8 +17,8 @@ from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
 from finforce_eval.figures.figures import BLACK, BLUE, new_figure
 from finforce_eval.recordings.tracks import Recording
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
-from finforce_sim.gripper.footage import START
-from finforce_sim.scenes.scenarios import build_scenario, write_script
+from finforce_sim.footage import START
+from finforce_sim.scenarios import build_scenario, write_script
 from lab.experiments.experiment import Case, Findings, ResultTable, average, tabulate
 from lab.experiments.runs import RunOptions, build_setup
 

@@ -25,9 +25,9 @@ from finforce_eval.evaluation.setup import evaluate_all
 from finforce_eval.recordings.objects import require_mesh
 from finforce_eval.recordings.tracks import PoseTrack, Recording
 from finforce_keypoints.images import RgbdImage
-from finforce_sim.gripper.footage import CAMERAS, FINGER, START
-from finforce_sim.gripper.gripper import TwinGripper
-from finforce_sim.scenes.scenarios import build_scenario
+from finforce_sim.footage import CAMERAS, FINGER, START
+from finforce_sim.gripper import TwinGripper
+from finforce_sim.scenarios import build_scenario
 from lab.experiments.experiment import Case, Findings, ResultTable
 from lab.experiments.grasp import join_jaws, score_course
 from lab.experiments.runs import RunOptions, build_setup, keep_poses

@@ -26,8 +26,8 @@ from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.settings import EstimatorSettings
-from finforce_sim.gripper.footage import parse_size
-from finforce_sim.scenes.scenarios import build_scenario
+from finforce_sim.footage import parse_size
+from finforce_sim.scenarios import build_scenario
 from lab.experiments.experiment import Case
 
 RECORDINGS, SCENE = "recordings", "scene.json"

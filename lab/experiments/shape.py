@@ -29,12 +29,11 @@ from finforce_contact.reconstruction.generated import (
 from finforce_contact.reconstruction.reconstruction import reconstruct
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.image_files import read_generated_pose
-from finforce_sim.rendering.depth_camera import build_d405
-from finforce_sim.scenes.guesses import GuessError, draw_guess, place_mesh
-from finforce_sim.scenes.objects import OBJECT_NAMES, build_object
-from finforce_sim.scenes.pose_sequences import draw_scene, roughen_mask
+from finforce_sim.objects import OBJECT_NAMES, build_object
+from finforce_sim.sensor import build_d405
 from lab.experiments.experiment import Case, Findings, ResultTable, average, tabulate
 from lab.experiments.runs import RunOptions
+from lab.table_scenes import GuessError, draw_guess, draw_scene, place_mesh, roughen_mask
 
 FORMS = ("glb", "ply")
 IMAGES, QUICK_OBJECTS = 2, ("cube", "bottle")

@@ -25,11 +25,20 @@ from finforce_eval.engine.engines import EngineOptions
 from finforce_eval.engine.tasks import Task, choose_shard
 from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.geometry.template import MARK_RADIUS, SideShape, draw_template, fit_grid
-from finforce_sim.rendering.bodies import build_box
-from finforce_sim.rendering.lighting import Lighting, Paint, draw_color, draw_jaw_paint, draw_look, draw_paint
-from finforce_sim.rendering.render import Body, Decal, RenderedScene
-from finforce_sim.rendering.sensor import expose
-from finforce_sim.scenes.objects import OBJECT_NAMES, build_object
+from finforce_sim.objects import OBJECT_NAMES, build_object
+from finforce_sim.photographer import build_box
+from finforce_sim.render import (
+    Body,
+    Decal,
+    Lighting,
+    Paint,
+    RenderedScene,
+    draw_color,
+    draw_jaw_paint,
+    draw_look,
+    draw_paint,
+)
+from finforce_sim.sensor import expose
 from lab.training.commands import one_line_errors, read_share
 from lab.training.fingers import FIRST_VALIDATION, SEED, BentFinger, Finger, draw_finger, outline
 from lab.training.pictures import MARGIN, TRAIN, VALIDATION, FingerPictures, make_all, save_shard

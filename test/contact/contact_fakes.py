@@ -12,10 +12,9 @@ from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.mesh.views import compute_chamfer
 from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_sim.rendering.depth_camera import build_d405
-from finforce_sim.scenes.guesses import GuessError, draw_guess, place_mesh
-from finforce_sim.scenes.objects import build_object
-from finforce_sim.scenes.pose_sequences import draw_scene
+from finforce_sim.objects import build_object
+from finforce_sim.sensor import build_d405
+from lab.table_scenes import GuessError, draw_guess, draw_scene, place_mesh
 
 JAW = load_jaw("bench")
 FACE = JAW.inner_face_x

@@ -16,7 +16,7 @@ from finforce.ros import node as ros
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.node import CAMERA as CAMERA_TOPICS
-from finforce_sim.rendering.depth_camera import build_d405
+from finforce_sim.sensor import build_d405
 
 # from above and the side, 0.22 m away, so that the cylinder shows its wall and a lid
 T_CAMERA_JAW = np.eye(4)

@@ -12,8 +12,8 @@ from finforce_contact.mesh.views import MeshView
 from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.alignment import DepthImage, Effort, MeshAligner, Samples, Visibility
 from finforce_contact.pose.tracker import spread_rotations
-from finforce_sim.rendering.depth_camera import build_d405
-from finforce_sim.scenes.objects import build_object
+from finforce_sim.objects import build_object
+from finforce_sim.sensor import build_d405
 
 CAMERA = build_d405(step=2)
 

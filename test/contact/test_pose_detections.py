@@ -13,7 +13,7 @@ from finforce_contact.estimator import ContactEstimator
 from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.symmetry import find_symmetries, read_symmetry
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_sim.scenes.objects import build_object
+from finforce_sim.objects import build_object
 
 
 def test_poses_of_foundationpose_over_real_ros():

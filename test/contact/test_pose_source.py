@@ -8,7 +8,7 @@ import pytest
 from finforce.errors import PoseError
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.pose.source import ExternalPoseSource, check_camera_outside
-from finforce_sim.scenes.objects import build_object
+from finforce_sim.objects import build_object
 
 FRAME = "camera_color_optical_frame"
 CORNERS = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (-0.03, 0.03)])

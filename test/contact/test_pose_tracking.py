@@ -12,9 +12,9 @@ from finforce.transforms import invert_pose, move_pose, rotation_between, step_b
 from finforce_contact.errors import PoseLostError
 from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.tracker import PoseTracker
-from finforce_sim.rendering.depth_camera import build_d405
-from finforce_sim.scenes.objects import build_object
-from finforce_sim.scenes.pose_sequences import Motion, render_sequence
+from finforce_sim.objects import build_object
+from finforce_sim.sensor import build_d405
+from lab.table_scenes import Motion, render_sequence
 
 CAMERA = build_d405(step=2)
 # The aim is 1 mm and 2 degrees in the median; at this noise it is 0.2 mm and 0.5 degrees, the worst three times that.

@@ -10,8 +10,8 @@ from finforce_contact.reconstruction import reconstruction
 from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_contact.reconstruction.reconstruction import complete_surface, reconstruct
 from finforce_contact.reconstruction.shape_search import HANDICAP, build_primitive, fit_primitive, spread_directions
-from finforce_sim.rendering.depth_camera import build_d405
-from finforce_sim.scenes.pose_sequences import draw_scene
+from finforce_sim.sensor import build_d405
+from lab.table_scenes import draw_scene
 
 
 def make_ball(radius):

@@ -25,8 +25,8 @@ from finforce_contact.reconstruction.generated import (
 )
 from finforce_contact.reconstruction.reconstruction import reconstruct
 from finforce_contact.reconstruction.shape_search import Placement
-from finforce_sim.scenes.guesses import place_mesh
-from finforce_sim.scenes.objects import build_object
+from finforce_sim.objects import build_object
+from lab.table_scenes import place_mesh
 
 # at a quarter of the pixels the robust way stays below 0.4 mm; the aim at full size is 1 mm
 NEAR_MM = 0.6

@@ -7,9 +7,10 @@ from scipy.spatial.transform import Rotation
 from finforce.camera import project
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.mesh.views import MeshView
-from finforce_sim.rendering.depth_camera import DepthNoise, build_d405, disturb_depth, smooth_field
-from finforce_sim.scenes.objects import OBJECT_NAMES, build_object
-from finforce_sim.scenes.pose_sequences import draw_scene
+from finforce_sim.objects import OBJECT_NAMES, build_object
+from finforce_sim.render import smooth_field
+from finforce_sim.sensor import DepthNoise, build_d405, disturb_depth
+from lab.table_scenes import draw_scene
 
 CAMERA = build_d405(step=4)
 

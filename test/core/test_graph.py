@@ -17,16 +17,15 @@ from finforce.systems.live import bench_processes
 from finforce.systems.processes import BenchOptions, Process, ReplayOptions, RobotOptions, replay_processes
 from finforce_contact.parameters import ContactParameters, ContactSettings
 from finforce_driver.grasp.settings import GraspSettings
-from finforce_driver.joint.node import LINKS
-from finforce_driver.joint.settings import JointSettings
-from finforce_driver.parameters import DriverParameters
-from finforce_driver.settings import GripperSettings
+from finforce_driver.joint import JointSettings
+from finforce_driver.node import LINKS
+from finforce_driver.settings import DriverParameters, GripperSettings
 from finforce_eval.replay.node import PlayerParameters
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings
 from finforce_keypoints.detectors.dots import DotSettings
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
-from finforce_sim.parameters import TwinParameters
+from finforce_sim.node import TwinParameters
 
 ROOT = Path(__file__).resolve().parents[2]
 SOLVER_PARAMETERS = {entry.name for entry in fields(NodeParameters)}

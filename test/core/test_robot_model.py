@@ -9,8 +9,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from finforce.gripper_frames import SIDES, jaw_in_gripper
-from finforce_driver.parameters import DriverParameters
-from finforce_driver.settings import GripperSettings
+from finforce_driver.settings import DriverParameters, GripperSettings
 from finforce_ifea.jaw.jaw import load_jaw
 
 URDF = Path(__file__).resolve().parents[2] / "urdf"

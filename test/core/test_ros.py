@@ -27,8 +27,7 @@ from finforce.ros import node as ros
 from finforce.settings import refresh_record
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
 from finforce_driver.grasp.settings import GraspSettings
-from finforce_driver.parameters import DriverParameters
-from finforce_driver.settings import GripperSettings
+from finforce_driver.settings import DriverParameters, GripperSettings
 from finforce_eval.replay.node import PlayerParameters
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings

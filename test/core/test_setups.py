@@ -19,9 +19,9 @@ from finforce.systems.live import (
 from finforce.systems.processes import BenchOptions, Include, RobotOptions
 from finforce_contact.mesh.object_mesh import load_object_mesh
 from finforce_contact.parameters import ContactParameters
-from finforce_driver.parameters import DriverParameters
+from finforce_driver.settings import DriverParameters
 from finforce_keypoints.parameters import DetectorParameters
-from finforce_sim.parameters import TwinParameters
+from finforce_sim.node import TwinParameters
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = {

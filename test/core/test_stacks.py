@@ -9,7 +9,7 @@ import yaml
 from finforce.errors import MissingDependencyError
 from finforce.systems.processes import Process
 from finforce.systems.stacks import StackOptions, control_processes, describe, flatten, moveit_processes
-from finforce_driver.parameters import DriverParameters
+from finforce_driver.settings import DriverParameters
 
 ROOT = Path(__file__).resolve().parents[2]
 JOINTS = DriverParameters().joint_names

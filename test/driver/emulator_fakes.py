@@ -12,8 +12,7 @@ from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from finforce_driver.can.bus import Bus, CanMessage
-from finforce_driver.can.protocol import Reply, decode_move
+from finforce_driver.can.protocol import Bus, CanMessage, Reply, decode_move
 from finforce_driver.can.slcan import decode_line, encode_message
 from finforce_driver.errors import CanMessageError
 from finforce_driver.gripper import Gripper

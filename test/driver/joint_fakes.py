@@ -3,8 +3,7 @@
 import math
 from collections import deque
 
-from finforce_driver.joint.gripper import JointGripper
-from finforce_driver.joint.settings import JointSettings
+from finforce_driver.joint import JointGripper, JointSettings
 from finforce_driver.settings import GripperSettings
 from finforce_sim.emulator.virtual import VirtualClock
 

@@ -3,7 +3,7 @@
 import pytest
 from emulator_fakes import LONG, POLL, REPLY
 
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 from finforce_driver.can.python_can import PythonCanBus
 from finforce_driver.can.slcan import encode_message
 from finforce_driver.errors import LinkError

@@ -8,7 +8,7 @@ import pytest
 from emulator_fakes import COUNT, VARIANTS, Rig
 
 from finforce_driver.can.protocol import Flag
-from finforce_driver.can.serial_bus import SerialBus
+from finforce_driver.can.slcan import SerialBus
 from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, TargetError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings

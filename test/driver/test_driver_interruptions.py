@@ -8,7 +8,7 @@ from test_driver_tasks import Grasping, build
 
 from finforce.health import Level
 from finforce_driver.errors import GraspError, GripperStateError
-from finforce_driver.publishers import news_of_state, outcome_of_state
+from finforce_driver.messages import news_of_state, outcome_of_state
 from finforce_driver.state import MoveOutcome, Phase
 
 

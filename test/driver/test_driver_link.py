@@ -8,10 +8,9 @@ import pytest
 from emulator_fakes import LONG, POLL, REPLY, REPLY_LINE, receive_until
 
 from finforce.errors import MissingDependencyError
-from finforce_driver.can import serial_bus
-from finforce_driver.can.build import build_bus
+from finforce_driver.can import build_bus, slcan
 from finforce_driver.can.python_can import PythonCanBus
-from finforce_driver.can.serial_bus import SerialBus
+from finforce_driver.can.slcan import SerialBus
 from finforce_driver.errors import LinkError
 
 GREETING = b"\rC\rS8\rO\r"
@@ -68,7 +67,7 @@ def test_what_came_before_opening_is_forgotten(adapter):
 
 
 def test_what_an_open_channel_still_sends_while_it_is_closed_is_forgotten(adapter, monkeypatch):
-    monkeypatch.setattr(serial_bus, "sleep", lambda _: adapter.write_and_wait(REPLY_LINE))
+    monkeypatch.setattr(slcan, "sleep", lambda _: adapter.write_and_wait(REPLY_LINE))
     link = SerialBus(adapter.link)
     link.open()
     adapter.write(b"z\r")
@@ -193,7 +192,7 @@ def test_lines_of_two_threads_stay_whole(monkeypatch, bus):
         sleep(0.001)  # lets the other thread in
         halves.append(data[3:])
 
-    monkeypatch.setattr(serial_bus, "write_all", write_slowly)
+    monkeypatch.setattr(slcan, "write_all", write_slowly)
     threads = [
         threading.Thread(target=lambda one=message: [bus.send(one) for _ in range(10)]) for message in (POLL, REPLY)
     ]
@@ -251,7 +250,7 @@ def test_a_line_that_went_out_in_part_spoils_no_other(monkeypatch, bus):
         if len(written) == 1:
             raise TimeoutError("the port takes no more")
 
-    monkeypatch.setattr(serial_bus, "write_all", write)
+    monkeypatch.setattr(slcan, "write_all", write)
     with pytest.raises(LinkError):
         bus.send(POLL)
     bus.send(POLL)

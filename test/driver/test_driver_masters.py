@@ -3,7 +3,7 @@
 import pytest
 from emulator_fakes import VARIANTS, Rig
 
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 from finforce_driver.state import MoveOutcome, Phase
 
 both_variants = pytest.mark.parametrize("variant", VARIANTS)

@@ -14,10 +14,16 @@ from finforce_driver.clock import MessageTimes
 from finforce_driver.errors import TargetError
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.grasp.settings import GraspGoal, GraspSettings
-from finforce_driver.messages import goal_from_joint_state, move_from_gripper_command, move_from_joint_state
-from finforce_driver.parameters import DriverParameters, build_gripper
-from finforce_driver.publishers import describe_state, news_of_state, outcome_of_state
-from finforce_driver.settings import GripperSettings
+from finforce_driver.messages import (
+    describe_state,
+    goal_from_joint_state,
+    move_from_gripper_command,
+    move_from_joint_state,
+    news_of_state,
+    outcome_of_state,
+)
+from finforce_driver.node import build_gripper
+from finforce_driver.settings import DriverParameters, GripperSettings
 from finforce_driver.state import MoveOutcome, Phase
 
 JOINTS = ("left_jaw_joint", "right_jaw_joint")

@@ -14,7 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 from finforce.health import Level
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 
 VARIANTS = ("new", "old")
 STEP = 0.048 / 255  # m, of the position byte

@@ -5,16 +5,13 @@ import math
 import pytest
 from emulator_fakes import reply
 
-from finforce_driver.can.bus import CanMessage
-from finforce_driver.can.protocol import Command, Flag, Move, encode_poll
-from finforce_driver.machine.calibration import CalibrationRun, CalibrationStep
+from finforce_driver.can.protocol import CanMessage, Command, Flag, Move, encode_poll
 from finforce_driver.machine.exchange import MARKERS, Exchange, Request
 from finforce_driver.machine.knowledge import History, Telemetry
-from finforce_driver.machine.move import GRACE, Goal, MoveJob, MoveWatch
-from finforce_driver.machine.orders import Orders
-from finforce_driver.settings import GripperSettings
+from finforce_driver.machine.move import GRACE, Goal, MoveJob, MoveWatch, Orders
+from finforce_driver.machine.procedures import CalibrationRun, CalibrationStep
+from finforce_driver.settings import GripperSettings, Pace
 from finforce_driver.state import MoveOutcome
-from finforce_driver.units import Pace
 
 POLL = Request(message=encode_poll(0), answer=Command.REPLY)
 REPLY = CanMessage(id=0x078, data=b"\x00\x00\x00\xf1")

@@ -6,7 +6,7 @@ import pytest
 import serial
 from serial.tools.list_ports_common import ListPortInfo
 
-from finforce_driver.can.serial_bus import SerialBus, explain_refusal
+from finforce_driver.can.slcan import SerialBus, explain_refusal
 from finforce_driver.errors import LinkError, TargetError
 
 

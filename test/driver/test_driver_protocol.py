@@ -5,8 +5,8 @@ from emulator_fakes import message_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finforce_driver.can.bus import CanMessage
 from finforce_driver.can.protocol import (
+    CanMessage,
     Command,
     Flag,
     Move,

@@ -7,8 +7,7 @@ from emulator_fakes import reply
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finforce_driver.can.bus import CanMessage
-from finforce_driver.can.protocol import decode_reply
+from finforce_driver.can.protocol import CanMessage, decode_reply
 from finforce_driver.errors import CanMessageError
 from finforce_driver.machine.knowledge import MOST_DOUBTS, Expectation, ReplyFilter, TimedReply
 

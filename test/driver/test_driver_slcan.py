@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 from finforce_driver.can.slcan import LONGEST_LINE, SlcanParser, decode_line, encode_message
 
 # CanMessages that a gripper's maker's own library writes, and replies that it reads.

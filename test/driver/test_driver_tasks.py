@@ -7,15 +7,14 @@ import pytest
 from driver_node_fakes import READY, Caller, FakeGoal, FakeGripper
 from emulator_fakes import Rig
 
-from finforce_driver.actions import GripperCommandAction
 from finforce_driver.errors import DriverError, GraspError, GripperStateError, TargetError
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
 from finforce_driver.messages import move_from_joint_state
-from finforce_driver.parameters import DriverParameters
-from finforce_driver.services import GripperTasks
+from finforce_driver.settings import DriverParameters
 from finforce_driver.state import MoveOutcome, Phase
+from finforce_driver.tasks import GripperCommandAction, GripperTasks
 
 
 def build(gripper=None, **parameters):

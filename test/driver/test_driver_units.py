@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from finforce_driver.errors import TargetError
-from finforce_driver.settings import GripperSettings
-from finforce_driver.units import GripperScale
+from finforce_driver.settings import GripperScale, GripperSettings
 
 SCALE = GripperScale(GripperSettings())
 FINGERS = GripperScale(GripperSettings(closed_opening=0.012, stroke=0.04))

@@ -3,7 +3,7 @@ from emulator_fakes import LineHost
 from hypothesis import given
 from hypothesis import strategies as st
 
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 from finforce_driver.can.slcan import decode_line, encode_message
 from finforce_driver.errors import TargetError
 from finforce_sim.emulator.adapter import EmulatedAdapter

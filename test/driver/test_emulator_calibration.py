@@ -2,7 +2,7 @@ import pytest
 from emulator_fakes import CALIBRATE, CLEAR, IDLE, RESET, Host, calibrated_host
 
 from finforce_sim.emulator.control import Mode
-from finforce_sim.emulator.settings import EmulatorSettings
+from finforce_sim.emulator.mechanism import EmulatorSettings
 
 
 def test_calibration_finds_the_stops_closes_and_goes_limp(variant):

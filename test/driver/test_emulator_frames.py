@@ -3,7 +3,7 @@ import struct
 import pytest
 from emulator_fakes import CALIBRATE, CLEAR, ESTOP, IDLE, VARIANTS, Host, calibrated_host, code_of, current_of
 
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 from finforce_driver.errors import TargetError
 from finforce_sim.emulator.control import Endpoints, Mode, Order
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault

@@ -1,7 +1,7 @@
 import pytest
 from emulator_fakes import VARIANTS
 
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 from finforce_driver.errors import TargetError
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, PlannedFault, draw_plan

@@ -2,7 +2,7 @@ import pytest
 from emulator_fakes import CLEAR, IDLE, VARIANTS, Host, calibrated_host, code_of, current_of
 
 from finforce_driver.errors import TargetError
-from finforce_sim.emulator.settings import EmulatorSettings
+from finforce_sim.emulator.mechanism import EmulatorSettings
 
 CONTACT = {("new", "closing"): 0x20, ("new", "opening"): 0x10, ("old", "closing"): 0x10, ("old", "opening"): 0x20}
 AT_POSITION = 0x30

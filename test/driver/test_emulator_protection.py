@@ -3,7 +3,7 @@ from emulator_fakes import CALIBRATE, CLEAR, ESTOP, RESET, VARIANTS, Host, calib
 
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.firmware import Fault
-from finforce_sim.emulator.settings import EmulatorSettings
+from finforce_sim.emulator.mechanism import EmulatorSettings
 
 
 @pytest.fixture(params=VARIANTS)

@@ -3,7 +3,7 @@ from threading import Event
 import pytest
 from emulator_fakes import VARIANTS
 
-from finforce_driver.can.bus import CanMessage
+from finforce_driver.can.protocol import CanMessage
 from finforce_driver.errors import LinkError
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.faults import FaultKind, FaultyAdapter

@@ -11,7 +11,7 @@ from finforce_driver.errors import GraspError, GripperStateError, GripperTimeout
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import hold_force
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
-from finforce_driver.joint.settings import JointSettings
+from finforce_driver.joint import JointSettings
 from finforce_driver.state import MoveOutcome, Phase
 from finforce_ifea.relaxation import Relaxation
 from lab.experiments.grasp_world import TERMS, build_spring

@@ -17,7 +17,7 @@ from finforce_eval.recordings.twin_writer import ImageFactory, RecordingForm, _f
 from finforce_eval.recordings.writer import MessageFactory, write_entries
 from finforce_eval.replay.playback import read_playback
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_sim.gripper.footage import encode_depth
+from finforce_sim.footage import encode_depth
 
 FORMS = {
     "jpeg": RecordingForm(),

@@ -22,8 +22,8 @@ from finforce_eval.replay.synthetic_stream import (
     thin_messages,
 )
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
-from finforce_sim.gripper.footage import Footage
-from finforce_sim.rendering.photographer import SceneSetting
+from finforce_sim.footage import Footage
+from finforce_sim.photographer import SceneSetting
 from lab.bench.scenes import EVERY_RATE, SmoothGripper
 
 

@@ -16,7 +16,7 @@ from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.tables import evaluation_json, format_sight, format_table, markdown_sight
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.twin_writer import write_footage
-from finforce_sim.scenes.scenarios import SCENARIOS
+from finforce_sim.scenarios import SCENARIOS
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.geometry.side_picture import find_side, intersect_plane
 from finforce_keypoints.images import PixelDetection, RgbdImage
 from finforce_keypoints.parameters import DetectorSettings
-from finforce_sim.rendering.depth_camera import D405_DISTORTION, DepthNoise, disturb_depth
+from finforce_sim.sensor import D405_DISTORTION, DepthNoise, disturb_depth
 
 STRIDE = 8
 LOCREF_STD = 7.2801

@@ -22,8 +22,8 @@ from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED
 from finforce_eval.recordings.listening import CameraTopics, record_camera
 from finforce_eval.recordings.twin_writer import write_footage
 from finforce_keypoints.parameters import COLOR_TOPIC
-from finforce_sim.gripper.footage import build_footage
-from finforce_sim.scenes.scenarios import build_scenario
+from finforce_sim.footage import build_footage
+from finforce_sim.scenarios import build_scenario
 
 IMAGES = 6
 

@@ -14,9 +14,9 @@ from finforce_eval.recordings.twin_writer import write_footage
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.geometry.extrinsics import SeenJaw, find_extrinsics
-from finforce_sim.gripper.footage import Footage, build_footage
-from finforce_sim.rendering.depth_camera import build_d405_vga
-from finforce_sim.scenes.scenarios import build_scenario
+from finforce_sim.footage import Footage, build_footage
+from finforce_sim.scenarios import build_scenario
+from finforce_sim.sensor import build_d405_vga
 
 CAMERA = build_d405_vga()
 WRONG = np.array([4e-3, -6e-3, 5e-3, 0.03, -0.04, 0.03])  # [m], [rad]

@@ -12,8 +12,8 @@ from finforce_keypoints.build import build_pixel_detector
 from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings
-from finforce_sim.gripper.footage import build_footage
-from finforce_sim.scenes.scenarios import build_scenario
+from finforce_sim.footage import build_footage
+from finforce_sim.scenarios import build_scenario
 
 IMAGES = 16  # half a second: what is said by then is said within three
 

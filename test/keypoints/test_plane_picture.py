@@ -13,7 +13,7 @@ from finforce_keypoints.geometry.side_picture import (
     project_plane,
     take_picture,
 )
-from finforce_sim.rendering.depth_camera import build_d405_vga
+from finforce_sim.sensor import build_d405_vga
 
 CAMERA = build_d405_vga()
 POSES = {

@@ -7,7 +7,7 @@ from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.geometry import jaw_pose as reference_patch
 from finforce_keypoints.geometry.jaw_pose import TEMPLATE_IMAGES, Origin, ReferencePatch, build_matcher
 from finforce_keypoints.geometry.side_picture import find_side, intersect_plane
-from finforce_sim.rendering.depth_camera import build_d405_vga
+from finforce_sim.sensor import build_d405_vga
 
 CAMERA = build_d405_vga()
 RNG = np.random.default_rng(3)

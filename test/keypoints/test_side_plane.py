@@ -15,7 +15,7 @@ from finforce_keypoints.geometry.side_picture import PlaneGrid
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.networks.model import Peaks
 from finforce_keypoints.networks.side_network import Places, Template
-from finforce_sim.rendering.depth_camera import build_d405_vga
+from finforce_sim.sensor import build_d405_vga
 
 CAMERA = build_d405_vga()
 

@@ -11,7 +11,7 @@ from lab.bench.skipping import SCENE, SETTLED, WARM_UP, SceneMeter, arrange, fin
 
 
 def test_idling_approach_and_holding_are_measured_once_they_have_begun():
-    from finforce_sim.scenes.scenarios import write_script
+    from finforce_sim.scenarios import write_script
 
     script = write_script(SCENE.build())
     begins = [n for n, word in enumerate(script.phases) if n == 0 or word != script.phases[n - 1]]

@@ -29,8 +29,7 @@ from finforce_eval.recordings.objects import ObjectTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench
-from finforce_sim.scenes.guesses import place_mesh
-from finforce_sim.scenes.objects import build_object
+from finforce_sim.objects import build_object
 from lab.experiments import grasp_world
 from lab.experiments.chip import ChipExperiment
 from lab.experiments.experiment import Case, Findings, ResultTable, average, format_tables, run_experiment, tabulate
@@ -46,6 +45,7 @@ from lab.experiments.paper_tables import BenchExperiment
 from lab.experiments.pose import PoseExperiment, drop_poses, flip_poses, score_poses, track_object, true_poses
 from lab.experiments.runs import RunOptions, keep_poses, list_missing, render_scene
 from lab.experiments.shape import ShapeExperiment, write_generated
+from lab.table_scenes import place_mesh
 
 DATA = Path(__file__).parents[2] / "finforce_eval" / "data"
 

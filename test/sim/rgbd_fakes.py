@@ -11,9 +11,9 @@ from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA, jaw_in_camera
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.images import ImageWatch
-from finforce_sim.gripper.footage import Footage
-from finforce_sim.gripper.gripper import JawState, TwinState
-from finforce_sim.rendering.photographer import SceneSetting, Shot, TrueKeypoints, WristView
+from finforce_sim.footage import Footage
+from finforce_sim.gripper import JawState, TwinState
+from finforce_sim.photographer import SceneSetting, Shot, TrueKeypoints, WristView
 
 CAMERA = CameraIntrinsics(width=64, height=48, fx=43.0, fy=43.0, cx=31.5, cy=23.5, distortion=np.full(5, 0.01))
 KEYPOINTS = 4

@@ -6,11 +6,10 @@ import pytest
 
 from finforce.camera import project
 from finforce.gripper_frames import ROBOT_CAMERA
-from finforce_sim.gripper.gripper import TwinGripper
-from finforce_sim.rendering.bodies import DrawnJaw
-from finforce_sim.rendering.depth_camera import build_d405_vga
-from finforce_sim.rendering.photographer import BANDS, Photographer, SceneSetting
-from finforce_sim.scenes.scenarios import build_scenario
+from finforce_sim.gripper import TwinGripper
+from finforce_sim.photographer import BANDS, DrawnJaw, Photographer, SceneSetting
+from finforce_sim.scenarios import build_scenario
+from finforce_sim.sensor import build_d405_vga
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finforce_sim.rendering.sensor import DENSITY, Flicker
+from finforce_sim.sensor import DENSITY, Flicker
 
 PICTURE = np.random.default_rng(1).integers(0, 60000, 20000).astype(np.uint16)
 

@@ -11,11 +11,19 @@ from finforce_eval.recordings.tracks import parse_phases
 from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench, combine_wrenches
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation
-from finforce_sim.errors import BalanceError, ScenarioError
-from finforce_sim.gripper.gripper import TwinGripper
-from finforce_sim.mechanics.assembly import RelaxedWrench, draw_material, find_elastic_weight
-from finforce_sim.scenes.objects import place_object
-from finforce_sim.scenes.scenarios import GRAVITY, RATE, SCENARIOS, Scenario, build_scenario, write_script
+from finforce_sim.gripper import TwinGripper
+from finforce_sim.mechanics import RelaxedWrench, draw_material, find_elastic_weight
+from finforce_sim.objects import place_object
+from finforce_sim.scenarios import (
+    GRAVITY,
+    RATE,
+    SCENARIOS,
+    BalanceError,
+    Scenario,
+    ScenarioError,
+    build_scenario,
+    write_script,
+)
 
 QUICK = {"settle": 0.1, "record": 0.2}
 

@@ -8,8 +8,8 @@ from rgbd_fakes import CAMERA_POSE, FakeLens
 
 from finforce.transforms import invert_pose
 from finforce_driver.errors import LinkError
-from finforce_sim.errors import ScenarioError
-from finforce_sim.gripper.live import (
+from finforce_sim.gripper import PressedGrasp, RelaxedGrasp
+from finforce_sim.live import (
     BEFORE_TOUCH,
     COUNTS,
     OPEN_STRIDE,
@@ -20,8 +20,7 @@ from finforce_sim.gripper.live import (
     choose_openings,
     render_openings,
 )
-from finforce_sim.gripper.pressing import PressedGrasp, RelaxedGrasp
-from finforce_sim.scenes.scenarios import build_scenario
+from finforce_sim.scenarios import ScenarioError, build_scenario
 
 STROKE = 0.048
 COUNT = STROKE / COUNTS
@@ -96,7 +95,7 @@ def test_the_same_seed_gives_the_same_images_whatever_the_threads(grasp, monkeyp
     openings = np.linspace(0.0, 0.03, 12)
     reels = []
     for workers in (1, 4):
-        monkeypatch.setattr("finforce_sim.gripper.live.MOST_WORKERS", workers)
+        monkeypatch.setattr("finforce_sim.live.MOST_WORKERS", workers)
         reels.append(render_openings(grasp, FakeLens(), openings, lambda frame: frame.color))
     np.testing.assert_array_equal(reels[0].takes, reels[1].takes)
 

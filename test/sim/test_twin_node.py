@@ -18,13 +18,11 @@ from finforce.messages import decode_columns, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import ParameterError
 from finforce_sim import node as twin_node
-from finforce_sim.errors import ScenarioError
-from finforce_sim.gripper.footage import encode_depth, parse_size
-from finforce_sim.gripper.live import LiveScene
-from finforce_sim.gripper.pressing import PressedGrasp
-from finforce_sim.node import TwinCameraNode
-from finforce_sim.parameters import TwinParameters
-from finforce_sim.scenes.scenarios import build_scenario
+from finforce_sim.footage import encode_depth, parse_size
+from finforce_sim.gripper import PressedGrasp
+from finforce_sim.live import LiveScene
+from finforce_sim.node import TwinCameraNode, TwinParameters
+from finforce_sim.scenarios import ScenarioError, build_scenario
 
 COLOR = "/camera/camera/color/image_raw"
 DEPTH = "/camera/camera/aligned_depth_to_color/image_raw"

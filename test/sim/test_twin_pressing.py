@@ -8,10 +8,8 @@ from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench, combine_wrenches
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.relaxation import apply_relaxation
 from finforce_sim.emulator.firmware import EmulatedGripper
-from finforce_sim.errors import BalanceError
-from finforce_sim.gripper.gripper import TwinGripper
-from finforce_sim.gripper.pressing import JAMMED, PressedGrasp, RelaxedGrasp
-from finforce_sim.scenes.scenarios import Posture, build_scenario
+from finforce_sim.gripper import JAMMED, PressedGrasp, RelaxedGrasp, TwinGripper
+from finforce_sim.scenarios import BalanceError, Posture, build_scenario
 
 SEED = 3
 FACE = load_jaw("bench").inner_face_x
@@ -153,7 +151,7 @@ def test_a_grasp_that_never_finds_an_equilibrium_is_refused(monkeypatch):
     def refuse(*_):
         raise BalanceError("no equilibrium")
 
-    monkeypatch.setattr("finforce_sim.mechanics.balance.HeldObject.follow", refuse)
+    monkeypatch.setattr("finforce_sim.mechanics.HeldObject.follow", refuse)
     with pytest.raises(BalanceError, match="equilibrium"):
         PressedGrasp(build_scenario("grasp_cylinder"), SEED, "coarse")
 

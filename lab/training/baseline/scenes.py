@@ -17,10 +17,10 @@ from finforce.errors import FinforceError
 from finforce_eval.cli.parser import add_engine_options, read_engine, whole_number
 from finforce_eval.engine.engines import EngineOptions
 from finforce_eval.engine.tasks import Task, choose_shard
-from finforce_sim.gripper.footage import FINGER, parse_size, set_stage
-from finforce_sim.gripper.gripper import TwinGripper
-from finforce_sim.rendering.photographer import Photographer
-from finforce_sim.scenes.scenarios import Scenario, build_scenario
+from finforce_sim.footage import FINGER, parse_size, set_stage
+from finforce_sim.gripper import TwinGripper
+from finforce_sim.photographer import Photographer
+from finforce_sim.scenarios import Scenario, build_scenario
 from lab.experiments.network import reduce_image
 from lab.training.commands import DatasetError, one_line_errors
 from lab.training.pictures import TRAIN, VALIDATION, make_all, save_arrays

@@ -1,23 +1,146 @@
-"""A grasp as a function of the jaws' opening, solved once and then read off.
+"""The synthetic gripper: playing a scenario image by image, or as a function of the jaws' opening."""
 
-The opening w is the gap between the undeformed inner faces; a jaw's origin is at w / 2 + inner_face_x from the middle.
-A bench has one jaw, which stands where the object of two jaws would meet it: the object comes by half the closing.
-"""
+from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from finforce_ifea.grasp_force import Wrench
 from finforce_ifea.jaw.drawing import MeshDensity
-from finforce_sim.errors import BalanceError, ScenarioError
-from finforce_sim.gripper.footage import FINGER
-from finforce_sim.gripper.gripper import JawState, TwinState
-from finforce_sim.mechanics.assembly import Assembly, RelaxedWrench
-from finforce_sim.mechanics.pressed_jaw import TWIN_DENSITY, JawShape
-from finforce_sim.scenes.scenarios import Posture, Scenario
+from finforce_sim.mechanics import TWIN_DENSITY, Assembly, JawShape, RelaxedWrench, find_elastic_weight
+from finforce_sim.scenarios import BalanceError, Posture, Scenario, ScenarioError, write_script
+
+FINGER = 0  # seed of the material for which the package has a calibration, `twin`
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JawState:
+    """One jaw at one instant; all but its place in its own jaw frame.
+
+    Attributes:
+        origin_x: of its frame on the closing axis of `gripper_base` [m].
+        vertices: deformed (n, 3) [m], in mesh order.
+        keypoints: (K, 3) [m], in the order of the jaw file.
+        reference: of the reference point, which does not deform (3,) [m].
+        force: that the object applies to the jaw (3,) [N].
+        torque: of the same about the jaw frame's origin (3,) [N m].
+    """
+
+    origin_x: float
+    vertices: NDArray
+    keypoints: NDArray
+    reference: NDArray
+    force: NDArray
+    torque: NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TwinState:
+    """The gripper at the time of one image.
+
+    Attributes:
+        stamp: [s] since the scenario began.
+        phase: as in `/bench/phase`, "cycle:load|unload:displacement_mm:ramp|settle|record".
+        jaws: by side.
+        T_gripper_object: (4, 4) of the object mesh's own frame in `gripper_base`; None without an object.
+        gravity: unit vector (3,) in `gripper_base`.
+    """
+
+    stamp: float
+    phase: str
+    jaws: Mapping[str, JawState]
+    T_gripper_object: NDArray | None
+    gravity: NDArray
+
+    def blend(self, other: TwinState, share: float) -> TwinState:
+        """Return the state at a share of the way to another: x = (1 - s) x + s x_other; turns the short way."""
+        pose = self.T_gripper_object
+        if pose is not None:
+            pose = _blend_poses(pose, other.T_gripper_object, share)
+        return replace(
+            self,
+            stamp=_blend(self.stamp, other.stamp, share),
+            jaws={side: _blend_jaws(jaw, other.jaws[side], share) for side, jaw in self.jaws.items()},
+            T_gripper_object=pose,
+            gravity=_blend(self.gravity, other.gravity, share),
+        )
+
+
+def _blend(value: Any, other: Any, share: float) -> Any:
+    return (1.0 - share) * value + share * other
+
+
+def _blend_jaws(jaw: JawState, other: JawState, share: float) -> JawState:
+    """Return a jaw between two states: place, shape and wrench."""
+    return replace(jaw, **{name: _blend(value, vars(other)[name], share) for name, value in vars(jaw).items()})
+
+
+def _blend_poses(pose: NDArray, other: NDArray, share: float) -> NDArray:
+    """Return a pose (4, 4) between two."""
+    turn = Rotation.from_matrix(pose[:3, :3].T @ other[:3, :3]).as_rotvec()
+    blended = _blend(pose, other, share)
+    blended[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+    return blended
+
+
+class TwinGripper(Assembly):
+    """A gripper that plays a scenario, with a material drawn from a seed."""
+
+    def __init__(self, scenario: Scenario, seed: int, density: MeshDensity | str = TWIN_DENSITY) -> None:
+        """Build jaws and object and writes the script; see `Assembly`."""
+        super().__init__(scenario, seed, density)
+        self._script = write_script(scenario)
+
+    def __len__(self) -> int:
+        """Return the number of states."""
+        return len(self._script.stamps)
+
+    def states(self) -> Iterator[TwinState]:
+        """Yield the states at the scenario's rate, always from the beginning.
+
+        Raises:
+            GraspError: A jaw buckles, or the object slips or falls.
+        """
+        script = self._script
+        weights = find_elastic_weight(script.weight, script.stamps, self.material.terms)
+        # set down, the object rests on the table, which also takes what the creep left
+        weights[~script.weight.any(axis=1)] = 0.0
+        held = self.hold_object()
+        wrenches = {side: RelaxedWrench(self.material.terms) for side in self._jaws}
+        posture, weight, shapes, slid = None, None, self.rest_shapes(), 0.0
+        for index, stamp in enumerate(script.stamps):
+            slid += held.creep / self.scenario.rate if held is not None else 0.0
+            planned = script.postures[index]
+            planned = replace(planned, slide=planned.slide + slid)
+            is_same = planned == posture and np.array_equal(weights[index], weight)
+            posture, weight = planned, weights[index]
+            if held is not None and not is_same:
+                shapes = held.follow(self.setting_of(posture, weight))
+            x = held.x if held is not None else 0.0
+            yield TwinState(
+                stamp=float(stamp),
+                phase=script.phases[index],
+                jaws={side: self._jaw_state(side, posture, shapes[side], wrenches[side]) for side in self._jaws},
+                T_gripper_object=self.object_pose(posture, x),
+                gravity=script.gravity[index],
+            )
+
+    def _jaw_state(self, side: str, posture: Posture, shape: JawShape, wrench: RelaxedWrench) -> JawState:
+        force, torque = wrench.update(shape.force, shape.torque, 1.0 / self.scenario.rate)
+        return JawState(
+            origin_x=self.origin_x(side, posture),
+            vertices=shape.vertices,
+            keypoints=shape.keypoints,
+            reference=self._jaws[side].jaw.reference_point,
+            force=force,
+            torque=torque,
+        )
+
 
 STEP = 1e-4  # [m] of each jaw from one solved grasp to the next
 JAMMED = 5e4  # [N/m] of opening, by which the force grows where jaws find no equilibrium any more
@@ -36,7 +159,7 @@ class PressedGrasp:
     def __init__(
         self, scenario: Scenario, seed: int = FINGER, density: MeshDensity | str = TWIN_DENSITY, step: float = STEP
     ) -> None:
-        """Solves the grasp from first touch on, until the jaws' faces would meet or no equilibrium is left.
+        """Solve the grasp from first touch on, until the jaws' faces would meet or no equilibrium is left.
 
         Args:
             scenario: jaws, object and where it lies.
@@ -61,18 +184,18 @@ class PressedGrasp:
         self.least_opening = 0.0 if is_empty else float(2.0 * (self._reach - self._closings[-1]))
 
     def closing_at(self, opening: float) -> float:
-        """Returns how far each jaw is beyond first touch [m] at an opening [m], negative before."""
+        """Return how far each jaw is beyond first touch [m] at an opening [m], negative before."""
         return self._reach - 0.5 * opening
 
     def elastic_force(self, opening: float) -> float:
-        """Returns the grasp force [N] at an opening [m] before anything relaxes: that of the jaw pressed less."""
+        """Return the grasp force [N] at an opening [m] before anything relaxes: that of the jaw pressed less."""
         if not opening < self.touch_opening:
             return 0.0
         jammed = JAMMED * max(self.least_opening - opening, 0.0)
         return float(np.interp(self.closing_at(opening), self._closings, self._forces)) + jammed
 
     def find_closing(self, force: float) -> float:
-        """Returns how far beyond first touch [m] each jaw goes for an elastic grasp force [N].
+        """Return how far beyond first touch [m] each jaw goes for an elastic grasp force [N].
 
         Raises:
             ScenarioError: The jaws meet before they press that hard.
@@ -83,7 +206,7 @@ class PressedGrasp:
         return float(np.interp(force, np.maximum.accumulate(self._forces), self._closings))
 
     def wrenches(self, opening: float) -> Mapping[str, Wrench]:
-        """Returns the elastic wrench on each jaw at an opening [m]."""
+        """Return the elastic wrench on each jaw at an opening [m]."""
         growth = self._find_growth(opening)
         return {
             side: Wrench(
@@ -93,7 +216,7 @@ class PressedGrasp:
         }
 
     def state(self, opening: float, stamp: float = 0.0) -> TwinState:
-        """Returns jaws and object at an opening [m], with elastic wrenches, as of a stamp [s]."""
+        """Return jaws and object at an opening [m], with elastic wrenches, as of a stamp [s]."""
         wrenches, closing = self.wrenches(opening), self.closing_at(opening)
         posture = Posture(closing=closing)
         jaws = {
@@ -110,25 +233,25 @@ class PressedGrasp:
         return TwinState(stamp=stamp, phase="", jaws=jaws, T_gripper_object=self.object_pose(opening), gravity=_DOWN)
 
     def object_pose(self, opening: float) -> NDArray | None:
-        """Returns T_gripper_object (4, 4) at an opening [m]; None without an object."""
+        """Return T_gripper_object (4, 4) at an opening [m]; None without an object."""
         closing = self.closing_at(opening)
         return self.assembly.object_pose(Posture(closing=closing), self._place_object(closing))
 
     def _find_growth(self, opening: float) -> float:
-        """Returns by which factor forces exceed the table's last ones; 0 without contact, for that has no force."""
+        """Return by which factor forces exceed the table's last ones; 0 without contact, for that has no force."""
         if not opening < self.touch_opening:
             return 0.0
         return 1.0 + JAMMED * max(self.least_opening - opening, 0.0) / max(self._forces[-1], 1e-9)
 
     def _place_object(self, closing: float) -> float:
-        """Returns the object's x [m]: solved in contact; before, where it lay unless a jaw has pushed it."""
+        """Return the object's x [m]: solved in contact; before, where it lay unless a jaw has pushed it."""
         if closing >= 0.0:
             return float(np.interp(closing, self._closings, self._places))
         pushed = self._places[0]
         return float(np.clip(self.assembly.scenario.offset, pushed + closing, pushed - closing))
 
     def _read(self, rows: NDArray, opening: float) -> NDArray:
-        """Returns what lies between two rows of a table (m, ...) at an opening [m]."""
+        """Return what lies between two rows of a table (m, ...) at an opening [m]."""
         place = np.interp(self.closing_at(opening), self._closings, np.arange(len(self._closings)))
         low = min(int(place), max(len(rows) - 2, 0))
         share, high = place - low, min(low + 1, len(rows) - 1)
@@ -139,7 +262,7 @@ class RelaxedGrasp:
     """The wrenches of a grasp as the jaws' material gives way in time."""
 
     def __init__(self, grasp: PressedGrasp) -> None:
-        """Starts relaxed and without load."""
+        """Start relaxed and without load."""
         self._grasp = grasp
         terms = grasp.assembly.material.terms
         self._filters = {side: RelaxedWrench(terms) for side in grasp.assembly.jaws}
@@ -148,7 +271,7 @@ class RelaxedGrasp:
         }
 
     def update(self, opening: float, dt: float) -> Mapping[str, Wrench]:
-        """Returns the wrench on each jaw at an opening [m], reached on a straight way in dt [s]."""
+        """Return the wrench on each jaw at an opening [m], reached on a straight way in dt [s]."""
         elastic = self._grasp.wrenches(opening)
         relaxed = {}
         for side, wrench in elastic.items():
@@ -173,7 +296,7 @@ class _SolvedGrasp:
 
 
 def _solve_grasps(assembly: Assembly, step: float) -> list[_SolvedGrasp]:
-    """Returns grasps from first touch on, at most `step` [m] of closing apart; the jaws at rest without an object."""
+    """Return grasps from first touch on, at most `step` [m] of closing apart; the jaws at rest without an object."""
     held, solved = assembly.hold_object(), []
     if held is None:
         return [_SolvedGrasp(closing=0.0, x=0.0, shapes=assembly.rest_shapes())]
@@ -191,6 +314,6 @@ def _solve_grasps(assembly: Assembly, step: float) -> list[_SolvedGrasp]:
 
 
 def _stack_shapes(shapes: Sequence[JawShape]) -> JawShape:
-    """Returns shapes of one jaw as rows of arrays: vertices (m, n, 3), keypoints (m, K, 3), force and torque (m, 3)."""
+    """Return shapes of one jaw as rows of arrays: vertices (m, n, 3), keypoints (m, K, 3), force and torque (m, 3)."""
     names = ("vertices", "keypoints", "force", "torque")
     return JawShape(**{name: np.stack([getattr(shape, name) for shape in shapes]) for name in names})

@@ -14,7 +14,7 @@ from finforce.optional import import_manifold3d
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.mesh.object_mesh import FORMATS, load_object_mesh
 from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_sim.scenes.scenarios import Scenario
+from finforce_sim.scenarios import Scenario
 
 SEGMENTS = 96  # around a full turn: the chords stay within 0.02 mm of a circle of 40 mm radius
 MILLIMETRE = 1e-3
@@ -151,7 +151,7 @@ class PlacedObject:
     middle: NDArray
 
     def pose_at(self, position: NDArray, tilt: float) -> NDArray:
-        """Returns T_gripper_object (4, 4) with the middle at a position (3,) [m], tilted from x to z [rad]."""
+        """Return T_gripper_object (4, 4) with the middle at a position (3,) [m], tilted from x to z [rad]."""
         T = np.eye(4)
         # the right-hand rule about y turns z to x
         T[:3, :3] = Rotation.from_rotvec([0.0, -tilt, 0.0]).as_matrix() @ self.R_gripper_object
@@ -160,7 +160,7 @@ class PlacedObject:
 
 
 def place_object(scenario: Scenario) -> PlacedObject:
-    """Returns a scenario's object, scaled and turned.
+    """Return a scenario's object, scaled and turned.
 
     Raises:
         ObjectMeshError: There is no such object, or the file holds none.

@@ -11,13 +11,47 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Event, RLock
 
+from finforce.settings import check_bounds, setting
 from finforce_driver.clock import Clock, MonotonicClock
 from finforce_driver.errors import GripperStateError, GripperTimeoutError, TargetError
-from finforce_driver.joint.settings import JointSettings
 from finforce_driver.machine.knowledge import History
-from finforce_driver.settings import GripperSettings
+from finforce_driver.settings import GripperSettings, check_numbers, is_number
 from finforce_driver.state import GripperState, MoveOutcome, Phase
-from finforce_driver.units import check_numbers, is_number
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointSettings:
+    """How a joint's value goes with the opening, and how it follows its commands; units stand in the metadata.
+
+    The opening is linear between the two ends: `gripper.closed_opening` at `closed`, that and `gripper.stroke` at
+    `open`.
+    """
+
+    names: tuple[str, ...] = setting(("gripper_joint",), "Names of the commanded joints; the first is read")
+    closed: float = setting(0.0, "Joint value of the closed gripper, in the joint's unit", "", -1e4, 1e4)
+    open: float = setting(1.0, "Joint value of the open gripper, in the joint's unit", "", -1e4, 1e4)
+    resolution: float = setting(0.0002, "Smallest step of the opening that the joint follows", "m", 1e-6, 0.01)
+    rate: float = setting(
+        25.0, "Rate of setpoints on the way; 0: one command, the joint keeps the speed itself", "Hz", 0.0, 500.0
+    )
+    largest_speed: float = setting(0.1, "Maximum speed of the opening", "m/s", 1e-4, 2.0)
+    largest_force: float = setting(0.0, "Maximum effort of a command; 0: the joint takes none", "N", 0.0, 1000.0)
+    effort_is_force: bool = setting(
+        False, "Whether the joint's effort is its grip force [N], as a check of the camera's", ""
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse what no joint is.
+
+        Raises:
+            TargetError: a value is out of bounds, there is no joint, or both ends are the same.
+        """
+        check_bounds(self, TargetError)
+        if not self.names or not all(self.names) or len(set(self.names)) != len(self.names):
+            raise TargetError(f"joint.names: got {self.names!r}, expected one name or more, each once")
+        if self.closed == self.open:
+            raise TargetError(f"joint.closed and joint.open: both are {self.open:g}, expected two values")
+
 
 Listener = Callable[[GripperState], None]
 NEAR = 1.5  # steps within which the target is reached
@@ -239,7 +273,7 @@ class JointGripper:
             self._closed = True
 
     def listen(self, callback: Listener) -> Callable[[], None]:
-        """Have a function called with the state after every state of the joint; returns what ends it."""
+        """Have a function called with the state after every state of the joint; return what ends it."""
         self._listeners.append(callback)
         return lambda: self._listeners.remove(callback) if callback in self._listeners else None
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +15,12 @@ from finforce.camera import CameraIntrinsics
 from finforce.gripper_frames import BENCH_CAMERA, FRONT_CAMERA, HALF_TURN, ROBOT_CAMERA
 from finforce.stamps import NANOSECONDS
 from finforce.transforms import invert_pose
-from finforce_sim.errors import ScenarioError
-from finforce_sim.gripper.gripper import TwinGripper, TwinState
-from finforce_sim.mechanics.assembly import Assembly
-from finforce_sim.rendering.bodies import DrawnJaw
-from finforce_sim.rendering.depth_camera import D405, LENSES, build_d405_vga
-from finforce_sim.rendering.photographer import Photographer, SceneSetting, Shot
-from finforce_sim.scenes.scenarios import Scenario
+from finforce_sim.gripper import FINGER, TwinGripper, TwinState
+from finforce_sim.mechanics import Assembly
+from finforce_sim.photographer import DrawnJaw, Photographer, SceneSetting, Shot
+from finforce_sim.scenarios import Scenario, ScenarioError
+from finforce_sim.sensor import D405, LENSES, build_d405_vga
 
-FINGER = 0  # seed of the material for which the package has a calibration, `twin`
 START = 1_000 * NANOSECONDS  # [ns] stamp of the first image
 TRACKING_PERIOD = 0.1  # [s]; in the first image of each the object is tracked
 POSITION_STDDEV = 0.3e-3  # [m] of a tracked pose, along each axis
@@ -79,23 +76,6 @@ class TwinFrame:
     T_camera_object: NDArray | None
 
 
-class RenderedGripper(Protocol):
-    """What is rendered; `TwinGripper` is one."""
-
-    def __len__(self) -> int:
-        """Return the number of states."""
-
-    def states(self) -> Iterator[TwinState]:
-        """Yield the states, always from the beginning."""
-
-
-class MountedCamera(Protocol):
-    """What renders; `Photographer` is one."""
-
-    def shoot(self, state: TwinState) -> Shot:
-        """Return the image of a state."""
-
-
 class Footage:
     """The images of a gripper; every iteration takes them anew and the same.
 
@@ -112,7 +92,7 @@ class Footage:
         seed: of the object tracker's noise.
     """
 
-    def __init__(self, gripper: RenderedGripper, photographer: MountedCamera, setting: SceneSetting, seed: int) -> None:
+    def __init__(self, gripper: TwinGripper, photographer: Photographer, setting: SceneSetting, seed: int) -> None:
         self._gripper, self._photographer, self._seed = gripper, photographer, seed
         self.camera, self.T_gripper_camera, self.mesh = setting.camera, setting.T_gripper_camera, setting.mesh
         self.depth_step = setting.depth_step

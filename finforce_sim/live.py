@@ -18,14 +18,13 @@ from finforce.transforms import invert_pose
 from finforce_ifea.grasp_force import Wrench
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
+from finforce_sim.emulator.mechanism import EmulatorSettings
 from finforce_sim.emulator.pty_port import PtyPort
-from finforce_sim.emulator.settings import EmulatorSettings
-from finforce_sim.errors import ScenarioError
-from finforce_sim.gripper.footage import FINGER, TwinFrame, disturb_pose, set_stage, true_jaw
-from finforce_sim.gripper.pressing import PressedGrasp, RelaxedGrasp
-from finforce_sim.rendering.depth_camera import build_d405_vga
-from finforce_sim.rendering.photographer import Photographer
-from finforce_sim.scenes.scenarios import Scenario
+from finforce_sim.footage import FINGER, TwinFrame, disturb_pose, set_stage, true_jaw
+from finforce_sim.gripper import PressedGrasp, RelaxedGrasp
+from finforce_sim.photographer import Photographer
+from finforce_sim.scenarios import Scenario, ScenarioError
+from finforce_sim.sensor import build_d405_vga
 
 T = TypeVar("T")
 LEAST_CLEARANCE = 2e-3  # [m] of opening that the open gripper leaves around the object
@@ -83,12 +82,12 @@ class LiveScene(Generic[T]):
         self._count, self._last = 0, None
 
     def render(self, keep: Callable[[TwinFrame], T], tell: Callable[[int, int], None]) -> None:
-        """Takes the images at all openings of the gripper; see `render_openings`."""
+        """Take the images at all openings of the gripper; see `render_openings`."""
         openings = choose_openings(self.grasp, self._low, self._high)
         self.table = render_openings(self.grasp, self._photographer, openings, keep, tell)
 
     def take(self, opening: float, now: float) -> Moment[T]:
-        """Returns the moment at an opening [m], at a time [s] that never goes back; `render` comes first."""
+        """Return the moment at an opening [m], at a time [s] that never goes back; `render` comes first."""
         place = self.table.find(opening)
         takes = self.table.takes[place]
         wrenches = self._relaxed.update(opening, 0.0 if self._last is None else now - self._last)
@@ -142,7 +141,7 @@ class ImageTable(Generic[T]):
     takes: Sequence[Sequence[T]]
 
     def find(self, opening: float) -> int:
-        """Returns the place of the image that was taken nearest to an opening [m]."""
+        """Return the place of the image that was taken nearest to an opening [m]."""
         right = bisect_left(self.openings, opening)
         if right in (0, len(self.openings)):
             return min(right, len(self.openings) - 1)
@@ -151,7 +150,7 @@ class ImageTable(Generic[T]):
 
 
 def choose_openings(grasp: PressedGrasp, low: float, high: float) -> NDArray:
-    """Returns the openings (n,) [m] between two of a gripper's [m] that deserve an image.
+    """Return the openings (n,) [m] between two of a gripper's [m] that deserve an image.
 
     In contact these are the gripper's own steps, at which it comes to rest; where nothing touches they are coarser.
     """
@@ -168,7 +167,7 @@ def render_openings(
     keep: Callable[[TwinFrame], T],
     tell: Callable[[int, int], None] = lambda done, count: None,
 ) -> ImageTable[T]:
-    """Returns the images of a grasp.
+    """Return the images of a grasp.
 
     Args:
         grasp: what is rendered.
@@ -189,7 +188,7 @@ def render_openings(
 
 
 def _render_opening(grasp: PressedGrasp, photographer: Photographer, opening: float, index: int) -> list[TwinFrame]:
-    """Returns all takes at one opening [m]."""
+    """Return all takes at one opening [m]."""
     state = grasp.state(opening)
     view, frames = photographer.look(state), []
     for take in range(TAKES):

@@ -1,5 +1,7 @@
 """What happens in a synthetic recording, as numbers with names, and how it goes on over time."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -8,9 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from finforce.errors import FinforceError
 from finforce.settings import check_bounds, setting
 from finforce_ifea.jaw.jaw import load_jaw
-from finforce_sim.errors import ScenarioError
+
+
+class ScenarioError(FinforceError, ValueError):
+    """A scenario is not known, or its numbers fit no gripper."""
+
+
+class BalanceError(FinforceError, RuntimeError):
+    """Jaws and object find no equilibrium: a jaw buckles, or the object slips or falls."""
+
 
 CAMERAS = ("robot", "turned", "front", "bench")
 RATE = 30.0  # [Hz] of the images, unless a scene says otherwise
@@ -28,7 +39,7 @@ class Scenario:
 
     name: str
     jaw: str = setting("bench", "a shipped jaw's name or a jaw file", "")
-    object: str = setting("rod25", "a name of finforce_sim.scenes.objects or a mesh file; empty for none", "")
+    object: str = setting("rod25", "a name of finforce_sim.objects or a mesh file; empty for none", "")
     unit: str = setting("m", "of the coordinates of a mesh file", choices=("m", "mm", "cm", "inch"))
     scale: float = setting(1.0, "by which the object is enlarged", "", 0.05, 20.0)
     turn_x: float = setting(0.0, "turn of the object about the gripper's x, before y and z", "rad", -np.pi, np.pi)
@@ -67,7 +78,7 @@ class Scenario:
     shift_time: float = setting(1.5, "which each way of that takes", "s", 0.1, 60.0)
 
     def __post_init__(self) -> None:
-        """Refuses numbers beyond their bounds, and what cannot be together.
+        """Refuse numbers beyond their bounds, and what cannot be together.
 
         Raises:
             ScenarioError: a value is out of its bounds, an image takes longer than there is to the next, or a weight is
@@ -123,7 +134,7 @@ SCENARIOS: dict[str, Scenario] = {scenario.name: scenario for scenario in _ALL}
 
 
 def build_scenario(name: str, **overrides: Any) -> Scenario:
-    """Returns the scenario of a name with some of its fields replaced.
+    """Return the scenario of a name with some of its fields replaced.
 
     Raises:
         ScenarioError: There is no such scenario or field, or a value is out of its bounds.
@@ -139,7 +150,7 @@ def build_scenario(name: str, **overrides: Any) -> Scenario:
 
 
 def _fit_jaw(scenario: Scenario, overrides: dict[str, Any]) -> dict[str, float]:
-    """Returns height and displacement for another jaw than the scene's, where they are not given.
+    """Return height and displacement for another jaw than the scene's, where they are not given.
 
     The object meets the same share of the jaw's candidates, and a shorter jaw is pressed as much less.
     """
@@ -208,7 +219,7 @@ class Script:
 
 
 def write_script(scenario: Scenario) -> Script:
-    """Returns the course of a scenario, sampled at its `rate`."""
+    """Return the course of a scenario, sampled at its `rate`."""
     start = Posture(closing=-scenario.clearance)
     steps = list(_plan_steps(scenario, start))
     ends = np.concatenate([[0.0], np.cumsum([step.duration for step in steps])])
@@ -233,7 +244,7 @@ def write_script(scenario: Scenario) -> Script:
 
 
 def _plan_steps(scenario: Scenario, start: Posture) -> Iterator[ScriptStep]:
-    """Yields still, close, load level by level, what is done while held, unload, open; the middle for each cycle."""
+    """Yield still, close, load level by level, what is done while held, unload, open; the middle for each cycle."""
     yield ScriptStep(phase="0:load:0:settle", duration=scenario.tare - _TARE_RECORD, end=start)
     yield ScriptStep(phase="0:load:0:record", duration=_TARE_RECORD, end=start)
     levels = scenario.displacement * np.arange(scenario.levels + 1) / scenario.levels
@@ -253,7 +264,7 @@ def _plan_steps(scenario: Scenario, start: Posture) -> Iterator[ScriptStep]:
 
 
 def _release(scenario: Scenario, phase: str, held: Posture, start: Posture) -> Iterator[ScriptStep]:
-    """Yields the way back to first touch, the opening beyond it, and the rest there."""
+    """Yield the way back to first touch, the opening beyond it, and the rest there."""
     speed = scenario.closing_speed
     yield ScriptStep(phase=f"{phase}:ramp", duration=held.closing / speed, end=replace(held, closing=0.0))
     yield ScriptStep(phase=f"{phase}:settle", duration=scenario.clearance / speed, end=start)
@@ -262,7 +273,7 @@ def _release(scenario: Scenario, phase: str, held: Posture, start: Posture) -> I
 
 
 def _hold_level(scenario: Scenario, prefix: str, level: float, before: Posture) -> Iterator[ScriptStep]:
-    """Yields the way to a level [m] and the rest there."""
+    """Yield the way to a level [m] and the rest there."""
     phase, end = f"{prefix}:{_millimetres(level)}", replace(before, closing=float(level))
     yield ScriptStep(phase=f"{phase}:ramp", duration=abs(level - before.closing) / scenario.closing_speed, end=end)
     yield ScriptStep(phase=f"{phase}:settle", duration=scenario.settle, end=end)
@@ -270,7 +281,7 @@ def _hold_level(scenario: Scenario, prefix: str, level: float, before: Posture) 
 
 
 def _plan_manipulation(scenario: Scenario, phase: str, held: Posture) -> Iterator[ScriptStep]:
-    """Yields lifting, turning there and back and setting down; or drawing the object aside and back."""
+    """Yield lifting, turning there and back and setting down; or drawing the object aside and back."""
     record = f"{phase}:record"
     if scenario.mass > HELD:
         lifted = replace(held, lifted=1.0)

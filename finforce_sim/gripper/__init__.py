@@ -1,1 +1,0 @@
-"""The synthetic gripper over time, alone or coupled to the emulated one."""

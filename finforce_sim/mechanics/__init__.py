@@ -1,1 +1,0 @@
-"""Jaws of drawn material in equilibrium with an object."""

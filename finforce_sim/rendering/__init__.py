@@ -1,1 +1,0 @@
-"""What the wrist camera makes of a scene: ray casting, light, sensor noise."""

@@ -1,1 +1,0 @@
-"""What happens in a synthetic recording: scenarios, scripts, objects."""

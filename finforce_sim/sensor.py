@@ -1,0 +1,277 @@
+"""A colour sensor and a stereo depth camera like the D405: light and true depths into images, and their noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import convolve1d, gaussian_filter, maximum_filter, minimum_filter, uniform_filter
+from scipy.stats import norm
+
+from finforce.camera import EQUIDISTANT, RATIONAL, CameraIntrinsics
+from finforce_sim.render import BRIGHTEST, EXPOSURE_TARGET, Exposure, smooth_field
+
+GAMMA = 2.2
+FLAT_CONTRAST = 0.03  # of grey levels around a pixel, below which stereo finds too little to match
+HOLES_IN_FLAT = 0.25  # share of the depth lost there, and in the dark
+DARK_LEVEL = 0.06  # of an 8-bit image's range
+HOLE_SIZE = 3.0  # [px] standard deviation of the field that is cut to make holes
+
+
+def expose(light: NDArray, exposure: Exposure, rng: np.random.Generator, smear: NDArray | None = None) -> NDArray:
+    """Return the 8-bit picture that a sensor makes of light.
+
+    The camera raises its gain until the mean is right or the gain is at its largest; shot noise grows with the gain.
+
+    Args:
+        light: (h, w, 3) linear; 1 is white in a lit room.
+        exposure: of the sensor.
+        rng: source of the noise.
+        smear: (2,) standard deviations along the rows and columns by which motion blurs [px].
+
+    Returns:
+        (h, w, 3) uint8 red, green, blue.
+    """
+    scene = np.asarray(light, dtype=np.float32) * np.float32(exposure.brightness) * exposure.white.astype(np.float32)
+    scene *= _vignette(scene.shape[:2], exposure.vignetting)[..., None]
+    blur = np.hypot(exposure.blur, np.zeros(2) if smear is None else smear)
+    scene = gaussian_filter(scene, (blur[1], blur[0], 0.0), truncate=3.0)
+    wanted = min(EXPOSURE_TARGET / max(float(scene.mean()), 1e-6), BRIGHTEST / max(_bright_end(scene), 1e-6))
+    gain = float(np.clip(wanted, 0.2, exposure.largest_gain))
+    electrons = scene * exposure.full_well
+    noise = np.sqrt(np.maximum(electrons, 0.0) + exposure.read_noise**2)
+    electrons += noise * _sensor_noise(scene.shape, rng)
+    level = np.clip(gain * electrons / exposure.full_well, 0.0, 1.0) ** np.float32(1.0 / GAMMA)
+    return np.round(255.0 * level).astype(np.uint8)
+
+
+def _bright_end(scene: NDArray) -> float:
+    """Return the brightness that a twentieth of an image exceeds, from every eighth pixel of both axes."""
+    return float(np.quantile(scene[::8, ::8].max(axis=2), 0.95))
+
+
+def _sensor_noise(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray:
+    """Return noise (h, w, 3) of unit variance; interpolating the colour filter makes neighbours alike."""
+    white = rng.standard_normal(shape, dtype=np.float32)
+    kernel = np.array([0.25, 0.5, 0.25], dtype=np.float32)
+    soft = convolve1d(convolve1d(white, kernel, axis=0), kernel, axis=1)
+    return 0.6 * white + 1.7 * soft
+
+
+def _vignette(shape: tuple[int, int], loss: float) -> NDArray:
+    """Return the share of light (h, w) that reaches the pixels."""
+    rows, columns = (np.linspace(-1.0, 1.0, size, dtype=np.float32) for size in shape)
+    return 1.0 - 0.5 * loss * (rows[:, None] ** 2 + columns[None, :] ** 2)
+
+
+def measure_depth(
+    depth: NDArray,
+    color: NDArray,
+    camera: CameraIntrinsics,
+    rng: np.random.Generator,
+    noise: DepthNoise | None = None,
+) -> NDArray:
+    """Return the depth that a stereo camera finds for a picture; it loses some where the picture is flat or dark.
+
+    Args:
+        depth: (h, w) true depths [m].
+        color: (h, w, 3) uint8, the picture of the same view.
+        camera: intrinsics.
+        rng: source of the noise.
+        noise: its size; that of a D405 when absent.
+
+    Returns:
+        (h, w) float32 [m], NaN where nothing was measured.
+    """
+    noise = noise or D405_NOISE
+    measured = disturb_depth(depth, camera, rng, replace(noise, hole_fraction=0.0))
+    chance = noise.hole_fraction + HOLES_IN_FLAT * (noise.hole_fraction > 0.0) * _is_hard_to_match(color)
+    field = smooth_field(measured.shape, HOLE_SIZE, rng)
+    measured[field < norm.ppf(np.clip(chance, 1e-6, 0.99))] = np.nan
+    return measured
+
+
+def _is_hard_to_match(color: NDArray) -> NDArray:
+    """Return from 0 to 1 how flat and dark (h, w) the surroundings of the pixels are."""
+    grey = color.mean(axis=2, dtype=np.float32) / 255.0
+    mean = uniform_filter(grey, 7)
+    spread = np.sqrt(np.maximum(uniform_filter(grey * grey, 7) - mean * mean, 0.0))
+    return np.clip(1.0 - spread / FLAT_CONTRAST, 0.0, 1.0) * np.clip(2.0 - mean / DARK_LEVEL, 0.0, 1.0)
+
+
+DENSITY = 0.005  # share of the numbers that differ by one
+_ROOM = 4096  # places at which the pattern may begin
+
+
+class Flicker:
+    """Lays noise over pictures, and takes the last noise of each away again, so that it does not add up.
+
+    A camera never gives the same picture twice, by which a watch tells it from a frozen one.
+
+    Args:
+        seed: of the noise.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._rng = np.random.default_rng((seed, 11))
+        self._patterns: dict[int, NDArray] = {}
+        self._last: dict[int, int] = {}
+
+    def lay(self, numbers: NDArray, name: int) -> None:
+        """Change some of a picture's numbers (n,) of unsigned integers by one, in place; zeros stay zeros.
+
+        Args:
+            numbers: of the picture.
+            name: of this picture, the same whenever it is shown.
+        """
+        if name in self._last:
+            numbers ^= self._pattern(numbers, self._last[name])
+        self._last[name] = int(self._rng.integers(_ROOM))
+        numbers ^= self._pattern(numbers, self._last[name])
+
+    def _pattern(self, numbers: NDArray, start: int) -> NDArray:
+        """Return the bits (n,) that change; a zero or a one may say that there is nothing."""
+        pattern = self._patterns.get(numbers.size)
+        if pattern is None:
+            pattern = (self._rng.random(numbers.size + _ROOM) < DENSITY).astype(np.uint8)
+            self._patterns[numbers.size] = pattern
+        return pattern[start : start + numbers.size].astype(numbers.dtype) * (numbers > 1)
+
+
+D405_DISTORTION = (-0.0545, 0.0568, 0.0010, 0.00034, -0.0185)
+
+
+def build_d405_vga() -> CameraIntrinsics:
+    """Return the colour camera of a D405 at 640 x 480, with its distortion."""
+    distortion = np.array(D405_DISTORTION)
+    return CameraIntrinsics(width=640, height=480, fx=431.2, fy=430.0, cx=319.6, cy=241.3, distortion=distortion)
+
+
+def build_d405(*, distorted: bool = False, step: int = 1) -> CameraIntrinsics:
+    """Return the colour camera of a D405 at 848 x 480, to which its depth is aligned.
+
+    Args:
+        distorted: with the distortion of a real unit.
+        step: keep every `step`-th pixel only, for quick runs.
+    """
+    return CameraIntrinsics(
+        width=848 // step,
+        height=480 // step,
+        fx=431.2 / step,
+        fy=430.0 / step,
+        cx=424.6 / step,
+        cy=241.3 / step,
+        distortion=np.array(D405_DISTORTION) if distorted else np.zeros(5),
+    )
+
+
+D405, WEBCAM, FISHEYE = "d405", "webcam", "fisheye"
+# by name, at 640 x 480: a webcam calibrated with the rational model, and an action camera of 155 degrees across
+LENSES = {
+    D405: build_d405_vga(),
+    WEBCAM: CameraIntrinsics(
+        width=640,
+        height=480,
+        fx=505.0,
+        fy=504.0,
+        cx=322.8,
+        cy=236.9,
+        distortion=np.array([0.21, -0.35, 0.0009, -0.0006, 0.02, 0.17, -0.27, -0.05]),
+        model=RATIONAL,
+    ),
+    FISHEYE: CameraIntrinsics(
+        width=640,
+        height=480,
+        fx=236.0,
+        fy=235.5,
+        cx=320.9,
+        cy=238.4,
+        distortion=np.array([-0.012, 0.006, -0.004, 0.0007]),
+        model=EQUIDISTANT,
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthNoise:
+    """The faults of a depth image; zero switches each of them off.
+
+    Attributes:
+        disparity_stddev: of the matching [px]; the depth's is z^2 disparity_stddev / (f baseline).
+        baseline: between the two imagers [m].
+        correlation: standard deviation of the smoothing that block matching does to the noise [px].
+        quantum: step of the depth [m]; the ROS driver gives 1 mm.
+        edge_width: half width of the band around a step in depth where pixels can fly [px].
+        edge_fraction: of the pixels in this band that lie between foreground and background.
+        hole_fraction: of the pixels without depth, in patches.
+        scale_stddev: of the relative error that all pixels of an image share; 1 to 2 % in a real unit.
+        nearest: depth below which nothing is measured [m].
+        fattening: by how much near things look wider than they are, on every side [px].
+    """
+
+    disparity_stddev: float = 0.08
+    baseline: float = 0.018
+    correlation: float = 1.5
+    quantum: float = 1e-3
+    edge_width: int = 2
+    edge_fraction: float = 0.4
+    hole_fraction: float = 0.02
+    scale_stddev: float = 0.0
+    nearest: float = 0.07
+    fattening: int = 0
+
+
+D405_NOISE = DepthNoise(hole_fraction=0.005, fattening=1)
+
+
+EDGE_STEP = 4e-3  # [m] in depth between neighbours, above which matching mixes the two sides
+STEEPEST = 2.75  # tangent of 70 degrees between the viewing ray and a surface's normal
+
+
+def disturb_depth(
+    depth: NDArray, camera: CameraIntrinsics, rng: np.random.Generator, noise: DepthNoise | None = None
+) -> NDArray:
+    """Return a depth image as the camera would give it.
+
+    sigma_z = z^2 sigma_d / (f B), correlated over neighbours; then mixed depths at steps, holes and rounding.
+
+    Args:
+        depth: (h, w) true depths [m], NaN where there is nothing.
+        camera: intrinsics of the image.
+        rng: source of the noise.
+        noise: its size; that of a D405 when absent.
+
+    Returns:
+        (h, w) float32 [m], NaN where nothing was measured.
+    """
+    noise = noise or DepthNoise()
+    mixed = _mix_edges(np.asarray(depth, dtype=float), camera, noise, rng)
+    stddev = mixed**2 * noise.disparity_stddev / (camera.fx * noise.baseline)
+    measured = mixed + stddev * smooth_field(mixed.shape, noise.correlation, rng)
+    measured *= 1.0 + noise.scale_stddev * rng.standard_normal()
+    if noise.hole_fraction > 0.0:
+        field = smooth_field(mixed.shape, HOLE_SIZE, rng)
+        measured[field < np.quantile(field, noise.hole_fraction)] = np.nan
+    if noise.quantum > 0.0:
+        measured = np.round(measured / noise.quantum) * noise.quantum
+    measured[~(measured >= noise.nearest)] = np.nan
+    return measured.astype(np.float32)
+
+
+def _mix_edges(depth: NDArray, camera: CameraIntrinsics, noise: DepthNoise, rng: np.random.Generator) -> NDArray:
+    """Return depths (h, w) with some pixels near steps put between the two sides."""
+    size = 2 * noise.edge_width + 1
+    near = minimum_filter(np.where(np.isnan(depth), np.inf, depth), size)
+    far = maximum_filter(np.where(np.isnan(depth), -np.inf, depth), size)
+    # over a band, a slope rises, too: a step is what rises more than a surface seen at 70 degrees would
+    slope = np.where(np.isfinite(near), near, 0.0) * size * STEEPEST / camera.fx
+    flies = (far - near > np.maximum(EDGE_STEP, slope)) & (rng.random(depth.shape) < noise.edge_fraction)
+    flies &= np.isfinite(depth)
+    between = near[flies] + (far - near)[flies] * rng.random(int(flies.sum()))
+    mixed = depth.copy()
+    if noise.fattening:
+        nearest = minimum_filter(np.where(np.isnan(depth), np.inf, depth), 2 * noise.fattening + 1)
+        mixed = np.where(depth - nearest > EDGE_STEP, nearest, depth)
+    mixed[flies] = between
+    return mixed
