@@ -71,12 +71,11 @@ class Health:
         self._last: Outcome | None = None
         self._arrived = self._published = 0
 
-    def arrive(self, superseded: int = 0, source: str = "") -> None:
-        """Count a message that arrived, those that a newer one had overtaken, and keep where it came from."""
+    def arrive(self, source: str = "") -> None:
+        """Count a message that arrived, and keep where it came from."""
         self.source = source or self.source
-        self._arrived += 1 + superseded
+        self._arrived += 1
         self._arrivals.append(monotonic())
-        self._refused["superseded"] += superseded
 
     def publish(self, outcome: Outcome, *, latency: float, age: float) -> None:
         """Count a published result: time since its callback began and age of its data [s]."""

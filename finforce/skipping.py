@@ -10,9 +10,8 @@ from finforce.errors import FinforceError
 ALL = "all"
 
 # of every node
-LATE = "frame late"
 UNHEARD = "nobody subscribes"
-EVERYWHERE = (LATE, UNHEARD)
+EVERYWHERE = (UNHEARD,)
 # of a solver
 IDLE = "idle image"
 SOLVER = (IDLE,)

@@ -32,7 +32,7 @@ class Deferred(NamedTuple):
     """A message of a jaw's solver that is not read until the next contact is looked for, and what takes it."""
 
     take: Callable[[str, Any], list[TimedEstimate]]
-    message: ros.Unread
+    message: Any
 
 
 class ContactEstimatorNode(Node):
@@ -94,15 +94,14 @@ class ContactEstimatorNode(Node):
         else:
             self.objects = qos.subscription(detections_type(), "object_detections", self._on_object, ros.SENSOR)
         for side in self.parameters.sides:
-            # of an image that is passed over no more than the stamp is read
             for kind, name, take in (
                 (ros.WrenchStamped, "wrench", session.take_wrench),
                 (ros.PointCloud2, "surface", session.take_surface),
             ):
                 keep = partial(self._on_solver, side, name, take)
-                qos.subscription(kind, f"{side}/{name}", keep, ros.SENSOR, unread=True)
+                qos.subscription(kind, f"{side}/{name}", keep, ros.SENSOR)
             find = partial(self._on_jaw_pose, side)
-            qos.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, WAITING, unread=True, can_wait=True)
+            qos.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, WAITING, can_wait=True)
 
     def _subscribe_camera(self) -> None:
         """Subscribe to the images in which the object is found; they wait for each other."""
@@ -119,47 +118,43 @@ class ContactEstimatorNode(Node):
         """Return the parameters with the present values of those that may be set at run time."""
         return refresh_record(self.parameters, lambda name: self.get_parameter(name).value)
 
-    def _on_jaw_pose(self, side: str, unread: ros.Unread) -> None:
+    def _on_jaw_pose(self, side: str, pose: ros.PoseStamped) -> None:
         """Find the contact of an image, unless it may be passed over."""
         with self._refusals((side,)):
-            self._find_contact(side, unread, unread.stamp)
+            self._find_contact(side, pose)
 
-    def _find_contact(self, side: str, unread: ros.Unread, stamp: int) -> None:
-        """Find the contact of an image [ns], unless it may be passed over."""
-        began = perf_counter()
+    def _find_contact(self, side: str, pose: ros.PoseStamped) -> None:
+        """Find the contact of an image, unless it may be passed over."""
+        began, stamp = perf_counter(), stamp_of(pose)
         self.health[side].arrive()
         # poses of the object that came while the image was looked at
         for message in ros.take_waiting(self.objects):
             self._on_object(message)
         if self.idling[side].passes(stamp):
             self.skips.count(IDLE)
-            self.session.pass_over(side, stamp, unread.read)
+            self.session.pass_over(side, stamp, lambda: pose)
             return
         if self.gates[side].enter(stamp, self._now()):
             self.session.restart(side)
             self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
-        message = unread.read()
         self.idling[side].end()
         for name, deferred in list(self.deferred[side].items()):
             self._on_solver(side, name, *deferred)
-        self._send(side, began, self.session.take_jaw_pose(side, message))
+        self._send(side, began, self.session.take_jaw_pose(side, pose))
         is_idle = self.session.jaws[side].is_idle and self.skips.allows(IDLE)
         self.idling[side].note(stamp, is_idle)
 
-    def _on_solver(
-        self, side: str, name: str, take: Callable[[str, Any], list[TimedEstimate]], unread: ros.Unread
-    ) -> None:
+    def _on_solver(self, side: str, name: str, take: Callable[[str, Any], list[TimedEstimate]], message: Any) -> None:
         """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own.
 
         Of an image that is passed over it is read when the next contact is looked for, if nothing newer came.
         """
         began = perf_counter()
         with self._refusals((side,)):
-            if self.idling[side].passes(unread.stamp):
-                self.deferred[side][name] = Deferred(take, unread)
+            if self.idling[side].passes(stamp_of(message)):
+                self.deferred[side][name] = Deferred(take, message)
                 return
             self.deferred[side].pop(name, None)
-            message = unread.read()
             self._check_ahead(message)
             self._send(side, began, take(side, message))
 

@@ -19,7 +19,7 @@ from finforce.gripper_frames import SIDES
 from finforce.health import Health, Outcome, Report
 from finforce.messages import pose_from_message, stamp_of, wrench_from_message
 from finforce.ros import node as ros
-from finforce.skipping import IDLE, LATE, SOLVER, Skips
+from finforce.skipping import IDLE, SOLVER, Skips
 from finforce.stamps import Idling, StampGate
 from finforce_ifea.grasp_force import ForcePairing, Wrench, single_jaw_grasp
 from finforce_ifea.messages import observation_from_cloud
@@ -123,28 +123,17 @@ class IfeaSolverNode(Node):
                 self.qos.subscription(PoseStamped, f"{jaw}/jaw_pose", partial(self._on_jaw_pose, jaw), ros.SENSOR)
         if self.gravity is not None:  # of what one jaw presses, friction tells nothing of its weight
             self.qos.subscription(Vector3Stamped, "gravity", self._on_gravity, ros.SENSOR)
-        topic = f"{side}/keypoints"
-        # of an image that is passed over no more than the stamp is read
-        self.keypoints = self.qos.subscription(PointCloud2, topic, self._on_keypoints, ros.SENSOR, unread=True)
+        self.qos.subscription(PointCloud2, f"{side}/keypoints", self._on_keypoints, ros.NEWEST)
 
-    def _on_keypoints(self, unread: ros.Unread) -> None:
-        """Take the newest image, to be solved with its contact, or the one before where that takes too long."""
-        with self._refusals():
-            self._take_keypoints(unread)
-
-    def _take_keypoints(self, unread: ros.Unread) -> None:
-        """Take an image, or the newest behind it."""
-        began, overtaken = perf_counter(), 0
-        if self.skips.allows(LATE):
-            unread, overtaken = ros.take_newest(self.keypoints, unread)
-        passed = self.idling.passes(unread.stamp)
-        # what waited while nothing happened was not late
-        self.skips.count(IDLE if self.idling.is_idle else LATE, overtaken + passed)
-        self.health.arrive(0 if self.idling.is_idle else overtaken)
-        if passed:
+    def _on_keypoints(self, cloud: PointCloud2) -> None:
+        """Take an image, to be solved with its contact, or with the one before where that takes too long."""
+        began, stamp = perf_counter(), stamp_of(cloud)
+        self.health.arrive()
+        if self.idling.passes(stamp):
+            self.skips.count(IDLE)
             return
-        self.waiting = WaitingImage(unread.read(), began)
-        if self.contacts.expect(unread.stamp, began):
+        self.waiting = WaitingImage(cloud, began)
+        if self.contacts.expect(stamp, began):
             self.overdue.reset()
         else:
             self._solve_waiting()

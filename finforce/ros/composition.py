@@ -10,11 +10,12 @@ from importlib import import_module
 from threading import Thread
 from typing import NamedTuple
 
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
 
 from finforce.processors import bind_caller
 from finforce.ros import node as ros
+from finforce.ros.executor import TolerantExecutor
 from finforce.ros.pipeline import Pipeline, Stage
 from finforce.ros.start import NODES
 
@@ -79,7 +80,7 @@ def spin(parts: Sequence[Part], nodes: Sequence[Node], executor: Executor) -> No
 def _spin_apart(node: Node) -> None:
     """Let one node work in this thread; what nobody catches ends it alone."""
     try:
-        ros.spin([node], SingleThreadedExecutor(context=node.context))
+        ros.spin([node], TolerantExecutor(context=node.context))
     except ExternalShutdownException:
         pass
     except Exception:

@@ -23,7 +23,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -42,6 +42,7 @@ from finforce.errors import FinforceError
 from finforce.health import Level, Outcome, Report
 from finforce.messages import CloudColumns
 from finforce.processors import free_caller
+from finforce.ros.executor import TolerantExecutor
 from finforce.ros.messages import (  # noqa: F401 - for those who publish
     KeptMessage,
     cloud_message,
@@ -59,7 +60,7 @@ from finforce.ros.messages import (  # noqa: F401 - for those who publish
     wrench_message,
     xyz_columns,
 )
-from finforce.ros.pipeline import Outlet, Port, Stage, Unread
+from finforce.ros.pipeline import Outlet, Port, Stage
 from finforce.ros.tracing import note, write_trace
 from finforce.ros.transport import CHOICES, PROFILES, TRANSPORT, provide_transport  # noqa: F401 - for tests
 from finforce.settings import ParameterError, RecordT, bounds_of, check_value, constraints, describe, is_parameter
@@ -67,6 +68,7 @@ from finforce.skipping import UNHEARD, Skips
 from finforce.stamps import NANOSECONDS  # noqa: F401 - for those with stamps
 
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # whoever is slow misses what was overtaken
 RESULT = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 STEADY = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # the newest alone
 REQUESTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # one that is passed over waits for ever
@@ -208,7 +210,6 @@ class QosWatch:
         callback: Callable,
         qos: QoSProfile,
         *,
-        unread: bool = False,
         can_wait: bool = False,
         **options: Any,
     ) -> Subscription | Port:
@@ -219,16 +220,12 @@ class QosWatch:
             topic: of the messages.
             callback: takes them.
             qos: that is asked for.
-            unread: give messages as `Unread`, for those of which hardly ever more than the stamp is read.
             can_wait: a process of several nodes may go on without this one where it takes long.
             options: of the subscription, as its callback group.
         """
         events = SubscriptionEventCallbacks(incompatible_qos=lambda _: self._suspect(topic, False, qos))
         guarded = self.guard_taker(topic, callback)
-        take, options = guarded, {**options, "event_callbacks": events}
-        if unread:
-            take, options = lambda data: guarded(Unread(data, kind)), {**options, "raw": True}
-        subscribe = partial(self.node.create_subscription, kind, topic, take, qos, **options)
+        subscribe = partial(self.node.create_subscription, kind, topic, guarded, qos, event_callbacks=events, **options)
         if self._stage is None:
             return subscribe()
         port = Port(
@@ -237,7 +234,6 @@ class QosWatch:
             guarded,
             subscribe,
             self.node.destroy_subscription,
-            is_unread=unread,
             can_wait=can_wait,
         )
         return self._stage.pipeline.add(port)
@@ -401,21 +397,6 @@ def send_kept(publisher: Any, kept: KeptMessage, stamp: int) -> None:
     publisher.publish(kept.message_at(stamp) if isinstance(publisher, Outlet) else kept.at(stamp))
 
 
-def take_newest(subscription: Subscription | Port, message: Any) -> tuple[Any, int]:
-    """Return the newest message waiting behind `message` and how many were passed over."""
-    if isinstance(subscription, Port):
-        if subscription.outside is None:
-            return message, 0  # one of the same process, where nothing waits
-        subscription = subscription.outside
-    if isinstance(message, Unread):
-        data, passed = take_newest(subscription, message.data)
-        return Unread(data, message.kind), passed
-    passed = 0
-    for taken in _take_all(subscription):
-        message, passed = taken, passed + 1
-    return message, passed
-
-
 def take_waiting(subscription: Subscription | Port) -> Iterator[Any]:
     """Yield the messages that wait to be taken, which would have their turn later."""
     if isinstance(subscription, Port):
@@ -490,7 +471,7 @@ def run_nodes(
         print(f"{name}: {str(error).partition(', at ')[0]}", file=sys.stderr)
         return 2
     # an executor that is made after a signal cannot be taken down quietly; a node takes long to build
-    executor, nodes = SingleThreadedExecutor(), ()
+    executor, nodes = TolerantExecutor(), ()
     try:
         with _ending_with_context():
             nodes = build()

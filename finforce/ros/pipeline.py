@@ -13,68 +13,12 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
-from finforce.errors import ObservationError
-from finforce.messages import read_stamp, stamp_of
 from finforce.ros.messages import pack
 
 BUDGET = 5e-3  # [s] that a stage may take before those that could go on without it do
 WATCHED = 15  # messages over which that is judged
-
-
-class Unread:
-    """A serialised message of which nothing was read yet.
-
-    Args:
-        data: its bytes.
-        kind: its type.
-    """
-
-    def __init__(self, data: bytes, kind: type) -> None:
-        self.data, self.kind = data, kind
-
-    @property
-    def stamp(self) -> int:
-        """Its stamp [ns]; raises ObservationError where the bytes are too few for one."""
-        return read_stamp(self.data)
-
-    def read(self) -> Any:
-        """Return the message; raises ObservationError where the bytes are none of its type."""
-        return read_message(self.data, self.kind)
-
-
-def read_message(data: bytes, kind: type) -> Any:
-    """Return a message of its bytes.
-
-    Raises:
-        ObservationError: they are none of this type.
-    """
-    try:
-        return deserialize_message(data, kind)
-    except Exception as error:  # of the middleware, which has its own classes
-        raise ObservationError(f"{len(data)} bytes are no {kind.__name__}: {type(error).__name__}") from error
-
-
-class Handed:
-    """A message of the same process, which need not be read; it is everybody's, and nobody changes it.
-
-    Args:
-        message: as it was published.
-    """
-
-    def __init__(self, message: Any) -> None:
-        self._message = message
-
-    @property
-    def stamp(self) -> int:
-        """Its stamp [ns]."""
-        return stamp_of(self._message)
-
-    def read(self) -> Any:
-        """Return the message."""
-        return self._message
 
 
 class Stage:
@@ -129,7 +73,6 @@ class Port:
         callback: takes messages, guarded.
         subscribe: makes the subscription to what comes from outside.
         drop: ends that.
-        is_unread: whether messages are taken as `Unread`.
         can_wait: whether the process goes on without it where it takes too long.
     """
 
@@ -141,12 +84,11 @@ class Port:
         subscribe: Callable[[], Subscription],
         drop: Callable[[Subscription], Any],
         *,
-        is_unread: bool = False,
         can_wait: bool = False,
     ) -> None:
         self.topic, self._stage, self._callback = topic, stage, callback
         self._subscribe, self._drop = subscribe, drop
-        self._is_unread, self._can_wait = is_unread, can_wait
+        self._can_wait = can_wait
         self._times: deque[float] = deque(maxlen=WATCHED)
         self._is_open = True
         self.outside: Subscription | None = None
@@ -172,7 +114,7 @@ class Port:
     def take(self, message: Any) -> None:
         """Take a message of another stage."""
         before = perf_counter()
-        self._callback(Handed(message) if self._is_unread else message)
+        self._callback(message)
         self._times.append(perf_counter() - before)
 
 

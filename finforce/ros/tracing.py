@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
-from finforce.messages import read_stamp, stamp_of
+from finforce.messages import stamp_of
 
 FOLDER = "FINFORCE_TRACE"  # environment variable: where every process of ours writes what it has noted
 MOST = 200_000  # spans; half an hour of 90 Hz, after which nothing more is noted
@@ -41,9 +41,5 @@ def write_trace() -> None:
 
 
 def _stamp(message: Any) -> int:
-    """Return the stamp [ns] of a message, read or not, 0 of one without."""
-    if isinstance(message, bytes):
-        return read_stamp(message)
-    if hasattr(message, "stamp"):
-        return message.stamp
+    """Return the stamp [ns] of a message, 0 of one without."""
     return stamp_of(message) if hasattr(message, "header") else 0

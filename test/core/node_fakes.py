@@ -13,7 +13,6 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from process_fakes import running
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
@@ -21,6 +20,7 @@ from std_msgs.msg import Header
 
 from finforce.errors import ObservationError
 from finforce.ros import node as ros
+from finforce.ros.executor import TolerantExecutor
 from finforce.ros.transport import free_domain
 from finforce_ifea.errors import UnderLoadError
 from finforce_ifea.jaw.jaw import load_jaw
@@ -141,7 +141,7 @@ def ros_domain():
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=free_domain())
-    executor = SingleThreadedExecutor(context=context)
+    executor = TolerantExecutor(context=context)
     probe = Probe(executor, context=context)
     probe.hear("/diagnostics", DiagnosticArray)
     try:

@@ -126,9 +126,9 @@ def test_alarms_raise_the_level_and_come_first():
 
 def test_latencies_and_counts_are_shown():
     state = after(GOOD, GOOD, POOR)
-    state.arrive(superseded=2)
+    state.arrive()
     values = state.report(values={"tared": "True"}).values
     assert values["callback to published p50 [ms]"] == "2.00"
     assert values["image to published p95 [ms]"] == "10.00"
-    assert (values["arrived"], values["published"], values["tared"]) == ("6", "2", "True")
-    assert values["refused"] == "2 superseded, 1 not_enough_points"
+    assert (values["arrived"], values["published"], values["tared"]) == ("4", "2", "True")
+    assert values["refused"] == "1 not_enough_points"

@@ -3,7 +3,10 @@
 import json
 
 import pytest
+from builtin_interfaces.msg import Time
 from eval_fakes import drawn_hues
+from geometry_msgs.msg import PoseStamped
+from std_msgs.msg import Header
 
 from finforce.ros import tracing
 from finforce_eval.replay.trace import (
@@ -84,7 +87,7 @@ def test_nothing_is_noted_unless_it_is_asked_for(monkeypatch, tmp_path):
     assert tracing.note("node", "/topic", take) is take
     monkeypatch.setenv(tracing.FOLDER, str(tmp_path))
     monkeypatch.setattr(tracing, "_spans", [])
-    tracing.note("node", "/topic", take)(type("Unread", (), {"stamp": 7}))
+    tracing.note("node", "/topic", take)(PoseStamped(header=Header(stamp=Time(nanosec=7))))
     tracing.note("node", "/said", take)("no header")
     tracing.write_trace()
     (path,) = tmp_path.glob("*.json")
