@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from finforce.gripper_frames import BENCH_ORIGIN_X
 from finforce_contact.localization.section import cut_outline
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact, press_field
+from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface, limit_step, profile_surface
 from finforce_ifea.fem.model import JawModel
 from finforce_ifea.fem.solid import SolidModel
@@ -164,7 +164,8 @@ class PressedJaw:
 
     def _press(self, q: NDArray, load: Load) -> PenaltyContact:
         points = self.model.positions(self.surface.probe, q)
-        return press_field(points, self.surface.stiffness, self._indenter.field, load.origin, load.tilt)
+        place = np.array([self._indenter.field.front - load.origin[0], load.tilt, load.origin[1]])
+        return self._indenter.press(points, self.surface.stiffness, 0.0, place)
 
 
 def _share_pull(forces: NDArray, pull: NDArray) -> NDArray:

@@ -11,11 +11,11 @@ import numpy as np
 from scipy.optimize import minimize
 
 from finforce_eval.recordings.steel import SHIPPED, points_from_picture
-from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.jaw.drawing import Drawing
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
+from lab.forward_press import RigidCylinder, press_jaw
 
 # What a clamp may be off by [m]; the hinges are free.
 _CLAMP_STDDEV = 0.003

@@ -6,7 +6,7 @@ logarithmic radius, of a known outline its tilt.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,8 +19,6 @@ from finforce_ifea.contact_mechanics.penalty import (
     Touch,
     build_distance_field,
     find_leading,
-    press_cylinder,
-    press_field,
     read_value,
     touch_cylinder,
     touch_field,
@@ -177,53 +175,70 @@ class ShapeRange:
     settled_change: float
 
 
-class Indenter(Protocol):
-    """A rigid object, endless along y; one with corners may rock between them."""
+@njit(**_OPTIONS)
+def _press_points(pressed, pose, points, stiffness):
+    """Return forces (p, 3), springs (p, 3, 3) and derivatives by the shape (p, 3) of points (p, 3)."""
+    count, weights = len(points), np.zeros((6, 4))
+    forces, springs, by_shape = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3))
+    for p in range(count):
+        touch = touch_object(pressed, pose, points[p, 0], points[p, 2], stiffness[p], weights)
+        forces[p, 0], forces[p, 2], by_shape[p, 0], by_shape[p, 2] = touch.fx, touch.fz, touch.bx, touch.bz
+        springs[p, 0, 0], springs[p, 2, 2] = touch.kxx, touch.kzz
+        springs[p, 0, 2] = springs[p, 2, 0] = touch.kxz
+    return forces, springs, by_shape
+
+
+class Indenter:
+    """A rigid object, endless along y; one with corners may rock between them.
+
+    Attributes:
+        pressed: the object for compiled code.
+        shape_range: what the second number of its places may do.
+        has_corners: whether it has corners.
+    """
 
     pressed: PressedObject
     shape_range: ShapeRange
     has_corners: bool
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, place: NDArray) -> PenaltyContact:
-        """Return the contact with points (p, 3) [m] at a place (3,); `by_shape` is the derivative by place[SHAPE]."""
-        ...
+        """Return the contact with surface points.
+
+        Args:
+            points: deformed positions (p, 3) [m].
+            stiffness: of each point (p,) [N/m].
+            face_x: from which depths count [m].
+            place: of the object (3,).
+        """
+        return PenaltyContact(*_press_points(self.pressed, self._pose(face_x, place), points, stiffness))
 
     def find_gap(self, points: NDArray, face_x: float, place: NDArray) -> float:
         """Return the least distance [m] of points (p, 3) [m] from the object, negative inside."""
-        ...
+        return float(measure_gap(self.pressed, self._pose(face_x, place), np.ascontiguousarray(points)))
 
     def find_touch(self, place: NDArray, face: FaceProfile) -> float:
-        """Return the depth [m] of first touch with an undeformed surface."""
-        ...
+        """Return the depth [m] of first touch with an undeformed surface.
 
-
-@dataclass(frozen=True, kw_only=True)
-class RoundIndenter:
-    """A cylinder of any radius: place (depth [m], ln radius, height of its axis [m])."""
-
-    shape_range: ShapeRange = ShapeRange(
-        low=float(np.log(3e-3)), high=float(np.log(0.2)), largest_change=0.15, settled_change=5e-2
-    )
-    has_corners: bool = False
-    pressed: PressedObject = PressedObject(True, np.zeros((1, 1)), np.zeros(2), 0.0, np.zeros((0, 4)))
-
-    def press(self, points: NDArray, stiffness: NDArray, face_x: float, place: NDArray) -> PenaltyContact:
-        """See `Indenter`; a larger radius moves the axis away, so that the depth stays."""
-        radius = float(np.exp(place[SHAPE]))
-        contact = press_cylinder(points, stiffness, face_x + radius - place[DEPTH], place[HEIGHT], radius)
-        by_shape = radius * (contact.by_shape + contact.springs[:, :, 0])
-        return PenaltyContact(forces=contact.forces, springs=contact.springs, by_shape=by_shape)
-
-    def find_gap(self, points: NDArray, face_x: float, place: NDArray) -> float:
-        """See `Indenter`."""
-        return _find_gap(self.pressed, points, face_x, place)
-
-    def find_touch(self, place: NDArray, face: FaceProfile) -> float:
-        """See `Indenter`; a round object touches a plane surface at once."""
+        An outline beyond the ends of a plane surface touches with its leading point all the same.
+        """
         return find_first_touch(self.pressed, face, place)
 
+    def _pose(self, face_x: float, place: NDArray) -> ObjectPose:
+        return pose_object(self.pressed, face_x, place)
 
-class OutlineIndenter:
+
+class RoundIndenter(Indenter):
+    """A cylinder of any radius: place (depth [m], ln radius, height of its axis [m]).
+
+    A larger radius moves the axis away, so that the depth stays.
+    """
+
+    shape_range = ShapeRange(low=float(np.log(3e-3)), high=float(np.log(0.2)), largest_change=0.15, settled_change=5e-2)
+    has_corners = False
+    pressed = PressedObject(True, np.zeros((1, 1)), np.zeros(2), 0.0, np.zeros((0, 4)))
+
+
+class OutlineIndenter(Indenter):
     """A known outline: place (depth [m], tilt [rad], height of its origin [m]); depth 0 touches without tilt."""
 
     shape_range = ShapeRange(low=-1.0, high=1.0, largest_change=0.03, settled_change=5e-3)
@@ -244,26 +259,6 @@ class OutlineIndenter:
     def resembles(self, other: "OutlineIndenter") -> bool:
         """Whether another outline has about the size of this one, as two cuts of one object do."""
         return other is self or bool((np.abs(np.log(self._size / other._size)) < np.log(_OTHER_SIZE)).all())
-
-    def press(self, points: NDArray, stiffness: NDArray, face_x: float, place: NDArray) -> PenaltyContact:
-        """See `Indenter`."""
-        return press_field(points, stiffness, self.field, self._origin(face_x, place), float(place[SHAPE]))
-
-    def find_gap(self, points: NDArray, face_x: float, place: NDArray) -> float:
-        """See `Indenter`."""
-        return _find_gap(self.pressed, points, face_x, place)
-
-    def find_touch(self, place: NDArray, face: FaceProfile) -> float:
-        """See `Indenter`; an outline beside a plane surface touches with its leading point all the same."""
-        return find_first_touch(self.pressed, face, place)
-
-    def _origin(self, face_x: float, place: NDArray) -> NDArray:
-        return np.array([face_x + self.field.front - place[DEPTH], place[HEIGHT]])
-
-
-def _find_gap(pressed: PressedObject, points: NDArray, face_x: float, place: NDArray) -> float:
-    """Return the gap of points (p, 3) [m]; see `measure_gap`."""
-    return float(measure_gap(pressed, pose_object(pressed, face_x, place), np.ascontiguousarray(points)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -195,17 +195,16 @@ def find_leading(segments, c, s, low, high):
 
 
 # The penalty rises quadratically over this depth [m] before it is linear, so that Newton's method sees no kink.
-_SMOOTH_DEPTH = 2e-5
+SMOOTH_DEPTH = 2e-5
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PenaltyContact:
+class PenaltyContact(NamedTuple):
     """Contact at surface points.
 
     Attributes:
         forces: on the points (p, 3) [N].
         springs: negative derivatives of the forces by the points' positions (p, 3, 3) [N/m].
-        by_shape: derivatives of the forces by the object's size (p, 3) [N/m], its centre held, or by its tilt [N/rad].
+        by_shape: derivatives of the forces by the shape of the object's place (p, 3) [N or N/rad].
     """
 
     forces: NDArray
@@ -214,11 +213,11 @@ class PenaltyContact:
 
 
 @njit(**_OPTIONS)
-def _resist(depth, stiffness):
+def resist(depth, stiffness):
     """Return force [N] and its derivative [N/m] at a depth above zero [m]."""
-    if depth < _SMOOTH_DEPTH:
-        return 0.5 * stiffness * depth * depth / _SMOOTH_DEPTH, stiffness * depth / _SMOOTH_DEPTH
-    return stiffness * (depth - 0.5 * _SMOOTH_DEPTH), stiffness
+    if depth < SMOOTH_DEPTH:
+        return 0.5 * stiffness * depth * depth / SMOOTH_DEPTH, stiffness * depth / SMOOTH_DEPTH
+    return stiffness * (depth - 0.5 * SMOOTH_DEPTH), stiffness
 
 
 class Touch(NamedTuple):
@@ -245,7 +244,10 @@ class Touch(NamedTuple):
 
 @njit(**_OPTIONS)
 def touch_cylinder(x, z, stiffness, centre_x, centre_z, radius):
-    """Return the `Touch` of a cylinder on a point at x and z [m]; see `press_cylinder`."""
+    """Return the `Touch` of a cylinder on a point at x and z [m].
+
+    With the penetration d = radius - r the force is stiffness d n (quadratic below 20 um), n from the axis outwards.
+    """
     dx, dz = x - centre_x, z - centre_z
     square = dx * dx + dz * dz
     if square >= radius * radius or square < 1e-24:
@@ -253,112 +255,25 @@ def touch_cylinder(x, z, stiffness, centre_x, centre_z, radius):
     r = np.sqrt(square)
     depth = radius - r
     nx, nz = dx / r, dz / r
-    push, slope = _resist(depth, stiffness)
+    push, slope = resist(depth, stiffness)
     side = push / r
     xx, xz = slope * nx * nx - side * nz * nz, (slope + side) * nx * nz
     return Touch(push * nx, push * nz, xx, xz, slope * nz * nz - side * nx * nx, slope * nx, slope * nz)
 
 
 @njit(**_OPTIONS)
-def _press_cylinder(points, stiffness, centre_x, centre_z, radius):
-    count = len(points)
-    forces, springs, by_shape = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3))
-    for p in range(count):
-        touch = touch_cylinder(points[p, 0], points[p, 2], stiffness[p], centre_x, centre_z, radius)
-        _write_touch(touch, forces[p], springs[p], by_shape[p])
-    return forces, springs, by_shape
-
-
-@njit(**_OPTIONS)
-def _write_touch(touch, force, spring, by_shape):
-    """Write the touch of one point to its force (3,), springs (3, 3) and derivatives (3,)."""
-    force[0], force[2], by_shape[0], by_shape[2] = touch.fx, touch.fz, touch.bx, touch.bz
-    spring[0, 0], spring[2, 2], spring[0, 2], spring[2, 0] = touch.kxx, touch.kzz, touch.kxz, touch.kxz
-
-
-def measure_penalty_energy(forces: NDArray, stiffness: NDArray) -> float:
-    """Return the energy [J] that the penalty stores where it pushes with forces (p, 3) [N].
-
-    With k = stiffness (p,) [N/m], s = 20 um and d the depth that belongs to a force it is k d^3 / (6 s) up to s, and
-    k (d^2 - s^2) / 2 - k s (d - s) / 2 more beyond.
-    """
-    push, smooth = np.linalg.norm(forces, axis=1) / stiffness, _SMOOTH_DEPTH
-    depth = np.where(push < 0.5 * smooth, np.sqrt(2.0 * smooth * push), push + 0.5 * smooth)
-    beyond = np.maximum(depth - smooth, 0.0)
-    cubic = np.minimum(depth, smooth) ** 3 / (6.0 * smooth)
-    return float((stiffness * (cubic + 0.5 * beyond * (depth + smooth) - 0.5 * smooth * beyond)).sum())
-
-
-def press_cylinder(
-    points: NDArray, stiffness: NDArray, centre_x: float, centre_z: float, radius: float
-) -> PenaltyContact:
-    """Press a rigid cylinder, axis along y, on surface points.
-
-    With the penetration d = radius - r the force is stiffness d n (quadratic below 20 um), n from the axis outwards.
-
-    Args:
-        points: deformed positions (p, 3) [m].
-        stiffness: of each point (p,) [N/m].
-        centre_x: of the axis [m].
-        centre_z: of the axis [m].
-        radius: of the cylinder [m].
-    """
-    forces, springs, by_shape = _press_cylinder(points, stiffness, centre_x, centre_z, radius)
-    return PenaltyContact(forces=forces, springs=springs, by_shape=by_shape)
-
-
-@njit(**_OPTIONS)
-def _press_box(points, stiffness, centre_x, centre_z, half_x, half_z, edge):
-    count = len(points)
-    forces, springs = np.zeros((count, 3)), np.zeros((count, 3, 3))
-    for p in range(count):
-        dx, dz = points[p, 0] - centre_x, points[p, 2] - centre_z
-        sx, sz = (1.0 if dx >= 0 else -1.0), (1.0 if dz >= 0 else -1.0)
-        ox, oz = abs(dx) - (half_x - edge), abs(dz) - (half_z - edge)
-        curved = ox > 0 and oz > 0
-        if curved:
-            r = np.sqrt(ox * ox + oz * oz)
-            nx, nz, depth = sx * ox / r, sz * oz / r, edge - r
-        elif ox > oz:
-            r, nx, nz, depth = 1.0, sx, 0.0, edge - ox
-        else:
-            r, nx, nz, depth = 1.0, 0.0, sz, edge - oz
-        if depth <= 0.0:
-            continue
-        push, slope = _resist(depth, stiffness[p])
-        side = push / r if curved else 0.0
-        forces[p, 0], forces[p, 2] = push * nx, push * nz
-        springs[p, 0, 0] = slope * nx * nx - side * nz * nz
-        springs[p, 2, 2] = slope * nz * nz - side * nx * nx
-        springs[p, 0, 2] = springs[p, 2, 0] = (slope + side) * nx * nz
-    return forces, springs
-
-
-def press_box(
-    points: NDArray, stiffness: NDArray, centre: tuple[float, float], half: tuple[float, float], edge: float
-) -> PenaltyContact:
-    """Press a rigid box, endless along y, with rounded edges on surface points; see `press_cylinder`.
-
-    Args:
-        points: deformed positions (p, 3) [m].
-        stiffness: of each point (p,) [N/m].
-        centre: of the box (x, z) [m].
-        half: half sizes along x and z [m].
-        edge: radius of the edges [m], above zero.
-    """
-    forces, springs = _press_box(points, stiffness, *centre, *half, edge)
-    return PenaltyContact(forces=forces, springs=springs, by_shape=np.zeros_like(forces))
-
-
-@njit(**_OPTIONS)
 def touch_field(x, z, stiffness, coefficients, low, cell, origin_x, origin_z, c, s, weights):
-    """Return the `Touch` of an outline turned by (cos, sin) of its tilt; see `press_field`. `weights` is (6, 4)."""
+    """Return the `Touch` of an outline turned by (cos, sin) of its tilt; `weights` is (6, 4).
+
+    With the depth d(p) below the outline the force is -stiffness d grad d, and its springs follow from d's second
+    derivatives. A tilt is positive from x towards z.
+    """
     rx, rz = x - origin_x, z - origin_z
     depth, i, j = read_value(coefficients, low, cell, c * rx + s * rz, c * rz - s * rx, weights)
     if depth <= 0.0:
         return Touch(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     hx, hz, a, b, d = _read_slopes(coefficients, cell, i, j, weights)
-    push, slope = _resist(depth, stiffness)
+    push, slope = resist(depth, stiffness)
     gx, gz = c * hx - s * hz, s * hx + c * hz
     hxx = c * c * a - 2.0 * c * s * b + s * s * d
     hzz = s * s * a + 2.0 * c * s * b + c * c * d
@@ -367,36 +282,3 @@ def touch_field(x, z, stiffness, coefficients, low, cell, origin_x, origin_z, c,
     xx, xz, zz = slope * gx * gx + push * hxx, slope * gx * gz + push * hxz, slope * gz * gz + push * hzz
     # the object turns: its force turns along, and the point slides against it
     return Touch(fx, fz, xx, xz, zz, -fz - xx * rz + xz * rx, fx - xz * rz + zz * rx)
-
-
-@njit(**_OPTIONS)
-def _press_field(points, stiffness, coefficients, low, cell, origin, c, s):
-    count, weights = len(points), np.zeros((6, 4))
-    forces, springs, by_tilt = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 3))
-    for p in range(count):
-        x, z = points[p, 0], points[p, 2]
-        touch = touch_field(x, z, stiffness[p], coefficients, low, cell, origin[0], origin[1], c, s, weights)
-        _write_touch(touch, forces[p], springs[p], by_tilt[p])
-    return forces, springs, by_tilt
-
-
-def press_field(
-    points: NDArray, stiffness: NDArray, field: DistanceField, origin: NDArray, tilt: float
-) -> PenaltyContact:
-    """Press a rigid outline, endless along y, on surface points; see `press_cylinder`.
-
-    With the depth d(p) below the outline the force is -stiffness d grad d, and its springs follow from d's second
-    derivatives; `by_shape` is the derivative by the tilt [N/rad].
-
-    Args:
-        points: deformed positions (p, 3) [m].
-        stiffness: of each point (p,) [N/m].
-        field: of the outline.
-        origin: of the outline (x, z) [m].
-        tilt: turn of the outline about its origin [rad], positive from x towards z.
-    """
-    c, s = np.cos(tilt), np.sin(tilt)
-    forces, springs, by_tilt = _press_field(
-        points, stiffness, field.coefficients, field.low, CELL, np.asarray(origin), c, s
-    )
-    return PenaltyContact(forces=forces, springs=springs, by_shape=by_tilt)

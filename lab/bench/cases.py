@@ -124,8 +124,8 @@ def press_cases(jaw: Jaw, diameters: Sequence[float] = DIAMETERS) -> tuple[Bench
     Raises:
         FinforceError: No solid describes the jaw.
     """
-    from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
     from finforce_ifea.mechanics import build_mechanics
+    from lab.forward_press import RigidCylinder, press_jaw
 
     mesh = "default" if jaw.section is None else "coarse"
     mechanics = build_mechanics(jaw, EstimatorSettings(solver="solid", mesh=mesh))

@@ -16,7 +16,6 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_ifea.contact_mechanics.forward_press import PressState, RigidCylinder, press_jaw
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
 from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.calibration import load_calibration
@@ -24,6 +23,7 @@ from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw, list_shipped_jaws, loa
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 from lab.bench.cases import POISSON_RATIO, YOUNG_MODULUS, BenchCase, load_cases
+from lab.forward_press import PressState, RigidCylinder, press_jaw
 from lab.harness import Figures
 
 SHOWN = (2, 5, 10)  # [mm] of depth

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.sparse.linalg import LinearOperator, onenormest
 
-from finforce_ifea.contact_mechanics.forward_press import PressState, RigidBox, RigidCylinder, RigidObject, press_jaw
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact, measure_penalty_energy
+from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.errors import ContactError
 from finforce_ifea.fem.factorisation import sparse_from_banded
@@ -28,6 +27,7 @@ from finforce_ifea.observation import Solution
 from finforce_ifea.paper_inverse import InverseResult, Problem, solve_inverse, surface_normals
 from finforce_ifea.quadratic_program import UNBOUNDED, ProgramSolution, solve_program
 from finforce_ifea.settings import EstimatorSettings
+from lab.forward_press import PressState, RigidBox, RigidCylinder, RigidObject, measure_penalty_energy, press_jaw
 from lab.stress.session import OWN_MECHANICS, Bench, open_session, update
 from lab.stress.stress import Family, Plan, Trial, attempt
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.forward_press import PressState
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact, build_contact_surface
 from finforce_ifea.fem.locking import warn_of_locking
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.fem.tetrahedra import to_tet10
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, check_connection
+from lab.forward_press import PressState
 from lab.stress.mechanics import Rig, build_jaw, measure_condition
 from lab.stress.stress import Family, Plan, Trial, attempt
 

@@ -13,11 +13,11 @@ from finforce_contact.jaw_contact import ForceLoop
 from finforce_contact.localization.section import cut_outline
 from finforce_contact.mesh.triangles import ObjectMesh
 from finforce_contact.parameters import ContactSettings
-from finforce_ifea.contact_mechanics.forward_press import PressState, press_jaw
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Solution
+from lab.forward_press import PressState, press_jaw
 from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, SessionStep, judge, noise_of, observe
 from lab.stress.stress import Family, Plan, Trial, attempt
 
@@ -39,7 +39,7 @@ class PressedOutline:
         return face_x + self._indenter.field.front - float(self._place(depth, height)[0])
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
-        """See `finforce_ifea.contact_mechanics.forward_press.RigidObject`."""
+        """See `lab.forward_press.RigidObject`."""
         return self._indenter.press(points, stiffness, face_x, self._place(depth, height))
 
     def _place(self, depth: float, height: float) -> NDArray:

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from finforce_ifea.contact_mechanics.forward_press import PressState, RigidCylinder, press_jaw
-from finforce_ifea.contact_mechanics.penalty import measure_penalty_energy
 from finforce_ifea.errors import ContactError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import Calibration
@@ -19,6 +17,7 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation, Solution
 from finforce_ifea.settings import EstimatorSettings
+from lab.forward_press import PressState, RigidCylinder, measure_penalty_energy, press_jaw
 from lab.stress.stress import Plan, Trial, attempt
 
 PERIOD = 1 / 30

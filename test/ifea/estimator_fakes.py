@@ -11,13 +11,13 @@ import numpy as np
 from mechanics_fakes import BENCH, MODULUS, bench_mechanics
 from scipy.interpolate import PchipInterpolator
 
-from finforce_ifea.contact_mechanics.forward_press import press_jaw
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import Calibration
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact, ObjectOutline, Observation, Solution
 from finforce_ifea.settings import EstimatorSettings
+from lab.forward_press import press_jaw
 
 PERIOD = 1 / 30
 TRUTH = np.load(Path(__file__).parents[2] / "lab" / "data" / "pressed_bench.npz")

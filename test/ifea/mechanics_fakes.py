@@ -8,7 +8,6 @@ import meshio
 import numpy as np
 import yaml
 
-from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.contact_mechanics.indenter import flat_profile
 from finforce_ifea.contact_mechanics.pressed_jaw import limit_step
 from finforce_ifea.fem.solid import find_mirror_nodes
@@ -18,6 +17,7 @@ from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.mesh import build_volume_mesh
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
+from lab.forward_press import RigidCylinder, press_jaw
 
 SHIPPED_BENCH = load_jaw("bench")
 

@@ -22,13 +22,13 @@ from estimator_fakes import (
 from mechanics_fakes import BENCH
 
 from finforce.errors import ObservationError
-from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import CalibrationError, ContactError, JawFileError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation, check_observation
 from finforce_ifea.settings import EstimatorSettings
+from lab.forward_press import RigidCylinder, press_jaw
 
 # --- contacts
 

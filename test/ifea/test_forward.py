@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from mechanics_fakes import BENCH, bench_mechanics, bench_press
 
-from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder, press_jaw
 from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface
 from finforce_ifea.errors import ContactError, MeshError
+from lab.forward_press import RigidBox, RigidCylinder, press_jaw
 
 FACE = BENCH.inner_face_x
 STEPS = tuple(np.arange(1, 41) * 0.2)

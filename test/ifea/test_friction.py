@@ -14,8 +14,8 @@ from estimator_fakes import BENCH, PERIOD, circle, contact_with
 from scipy.interpolate import interp1d
 
 from finforce_ifea.contact_mechanics.friction import Friction, apply_traction, constant_traction
-from finforce_ifea.contact_mechanics.indenter import OutlineIndenter
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact, press_cylinder
+from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, RoundIndenter
+from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.mechanics import build_chosen
@@ -86,7 +86,7 @@ class TestCone:
 
         def press(depth=1e-3, height=0.04, turn=0.0, shift=(0.0, 0.0, 0.0)):
             moved = points + shift
-            contact = press_cylinder(moved, stiffness, 0.014 + 0.0125 - depth, height, 0.0125)
+            contact = RoundIndenter().press(moved, stiffness, 0.014, np.array([depth, np.log(0.0125), height]))
             return apply_traction(contact, moved, stiffness, constant_traction(ratio + turn))
 
         there, step = press(), 1e-8

@@ -20,11 +20,11 @@ from estimator_fakes import (
 from mechanics_fakes import BENCH, bench_mechanics
 from test_tracking import settle
 
-from finforce_ifea.contact_mechanics.forward_press import RigidBox, RigidCylinder, press_jaw
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE, OutlineIndenter, RoundIndenter, flat_profile
-from finforce_ifea.contact_mechanics.penalty import CELL, build_distance_field, press_field, read_depth
+from finforce_ifea.contact_mechanics.penalty import CELL, build_distance_field, read_depth
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import ObjectOutline
+from lab.forward_press import RigidBox, RigidCylinder, press_jaw
 
 FACE = BENCH.inner_face_x
 
@@ -83,15 +83,18 @@ def test_thin_plate_pushes_towards_the_jaw_even_past_its_middle():
 @pytest.mark.parametrize("tilt", [0.0, -0.3, 0.7])
 @pytest.mark.parametrize("name", SHAPES)
 def test_springs_and_tilt_derivatives_are_those_of_the_forces(name, tilt):
-    field = build_distance_field(SHAPES[name])
+    indenter = OutlineIndenter(SHAPES[name])
     origin, stiffness = np.array([0.02, 0.04]), np.full(200, 1e4)
     random = np.random.default_rng(1)
     points = np.array([origin[0] - 0.008, 0.0, origin[1]]) + random.uniform(-6e-3, 6e-3, (200, 3))
 
-    def forces(points, tilt):
-        return press_field(points, stiffness, field, origin, tilt).forces
+    def press(points, tilt):
+        return indenter.press(points, stiffness, origin[0] - indenter.field.front, np.array([0.0, tilt, origin[1]]))
 
-    contact = press_field(points, stiffness, field, origin, tilt)
+    def forces(points, tilt):
+        return press(points, tilt).forces
+
+    contact = press(points, tilt)
     pressed = np.linalg.norm(contact.forces, axis=1) > 0.5
     assert pressed.sum() > 20
     for axis in (0, 2):

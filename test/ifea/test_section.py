@@ -9,7 +9,6 @@ import pytest
 import shapely
 from section_fakes import BASE, LENGTH, MILLIMETRE, TPU, draw_keypoints, draw_polygon, make_section, write_section_jaw
 
-from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.fem.plane import PlaneModel
@@ -24,6 +23,7 @@ from finforce_ifea.observation import Contact, Observation
 from finforce_ifea.reduced.build import Face, has_own_rows
 from finforce_ifea.reduced.cache import name_manifold
 from finforce_ifea.settings import EstimatorSettings
+from lab.forward_press import RigidCylinder, press_jaw
 
 DATA = Path(__file__).parents[1] / "data"
 

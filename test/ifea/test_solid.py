@@ -22,12 +22,12 @@ from mechanics_fakes import (
     write_mesh_jaw,
 )
 
-from finforce_ifea.contact_mechanics.forward_press import RigidCylinder, press_jaw
 from finforce_ifea.fem.solid import SolidModel, find_mirror_nodes
 from finforce_ifea.jaw.drawing import MeshDensity
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
+from lab.forward_press import RigidCylinder, press_jaw
 
 
 def on_edge(nodes):

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.penalty import PenaltyContact, measure_penalty_energy, press_box, press_cylinder
+from finforce_ifea.contact_mechanics.indenter import RoundIndenter
+from finforce_ifea.contact_mechanics.penalty import SMOOTH_DEPTH, PenaltyContact, resist
 from finforce_ifea.contact_mechanics.pressed_jaw import ContactSurface, limit_step
 from finforce_ifea.errors import ContactError
 from finforce_ifea.fem.model import JawModel
@@ -38,7 +40,50 @@ class RigidCylinder:
 
     def press(self, points: NDArray, stiffness: NDArray, face_x: float, depth: float, height: float) -> PenaltyContact:
         """See `RigidObject`."""
-        return press_cylinder(points, stiffness, face_x + self.radius - depth, height, self.radius)
+        return RoundIndenter().press(points, stiffness, face_x, np.array([depth, np.log(self.radius), height]))
+
+
+@njit(cache=True, error_model="numpy")
+def _press_box(points, stiffness, centre_x, centre_z, half_x, half_z, edge):
+    count = len(points)
+    forces, springs = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for p in range(count):
+        dx, dz = points[p, 0] - centre_x, points[p, 2] - centre_z
+        sx, sz = (1.0 if dx >= 0 else -1.0), (1.0 if dz >= 0 else -1.0)
+        ox, oz = abs(dx) - (half_x - edge), abs(dz) - (half_z - edge)
+        curved = ox > 0 and oz > 0
+        if curved:
+            r = np.sqrt(ox * ox + oz * oz)
+            nx, nz, depth = sx * ox / r, sz * oz / r, edge - r
+        elif ox > oz:
+            r, nx, nz, depth = 1.0, sx, 0.0, edge - ox
+        else:
+            r, nx, nz, depth = 1.0, 0.0, sz, edge - oz
+        if depth <= 0.0:
+            continue
+        push, slope = resist(depth, stiffness[p])
+        side = push / r if curved else 0.0
+        forces[p, 0], forces[p, 2] = push * nx, push * nz
+        springs[p, 0, 0] = slope * nx * nx - side * nz * nz
+        springs[p, 2, 2] = slope * nz * nz - side * nx * nx
+        springs[p, 0, 2] = springs[p, 2, 0] = (slope + side) * nx * nz
+    return forces, springs
+
+
+def press_box(
+    points: NDArray, stiffness: NDArray, centre: tuple[float, float], half: tuple[float, float], edge: float
+) -> PenaltyContact:
+    """Press a rigid box, endless along y, with rounded edges on surface points.
+
+    Args:
+        points: deformed positions (p, 3) [m].
+        stiffness: of each point (p,) [N/m].
+        centre: of the box (x, z) [m].
+        half: half sizes along x and z [m].
+        edge: radius of the edges [m], above zero.
+    """
+    forces, springs = _press_box(points, stiffness, *centre, *half, edge)
+    return PenaltyContact(forces, springs, np.zeros_like(forces))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +107,19 @@ class RigidBox:
         """See `RigidObject`."""
         half = (0.5 * self.size_x, 0.5 * self.size_z)
         return press_box(points, stiffness, (face_x + half[0] - depth, height), half, self.edge_radius)
+
+
+def measure_penalty_energy(forces: NDArray, stiffness: NDArray) -> float:
+    """Return the energy [J] that the penalty stores where it pushes with forces (p, 3) [N].
+
+    With k = stiffness (p,) [N/m], s = 20 um and d the depth that belongs to a force it is k d^3 / (6 s) up to s, and
+    k (d^2 - s^2) / 2 - k s (d - s) / 2 more beyond.
+    """
+    push, smooth = np.linalg.norm(forces, axis=1) / stiffness, SMOOTH_DEPTH
+    depth = np.where(push < 0.5 * smooth, np.sqrt(2.0 * smooth * push), push + 0.5 * smooth)
+    beyond = np.maximum(depth - smooth, 0.0)
+    cubic = np.minimum(depth, smooth) ** 3 / (6.0 * smooth)
+    return float((stiffness * (cubic + 0.5 * beyond * (depth + smooth) - 0.5 * smooth * beyond)).sum())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
