@@ -38,7 +38,7 @@ from finforce_ifea.tracking.influence import ReachWatch
 __all__ = ["Contact", "JawEstimator", "Observation", "Solution", "TareReport"]
 
 _LONGEST_GAP = 1.0
-_BESIDE = 1e-3
+_TOLERANCE = 1e-3
 _UNTARED = "no tare: the jaw was loaded from the start; key point offsets are unknown"
 # Relative standard deviation of forces without a calibration, at least: a material known by name has its own.
 _UNCALIBRATED = 0.1
@@ -192,7 +192,7 @@ class JawEstimator:
         return self._conclude(state, used)
 
     def learn(self) -> None:
-        """Learn what the last image says beside its force; the next image does it where nobody had time before."""
+        """Learn what the last image tells in addition to its force; the next image does it where there was no time."""
         self._tracked.learn()
 
     def tare(self) -> TareReport:
@@ -230,9 +230,9 @@ class JawEstimator:
         chosen.follow(contact)
 
     def _check_on_surface(self, contact: Contact) -> None:
-        """Refuse contacts beside the inner surface."""
+        """Refuse contacts outside of the inner surface."""
         surface = self.mechanics.contact.surface
-        low, high = surface.low - _BESIDE, surface.high + _BESIDE
+        low, high = surface.low - _TOLERANCE, surface.high + _TOLERANCE
         places = contact.points[:, 1:]
         if ((places < low) | (places > high)).any():
             raise ContactError(
@@ -310,7 +310,7 @@ class JawEstimator:
             torque_stddev=torque_stddev,
             magnitude_stddev=stddev,
             contact_point=point,
-            contact_place=location,
+            contact_location=location,
             normal=normal,
             residual=float(state["residual"]),
             kkt=float(state["kkt"]),

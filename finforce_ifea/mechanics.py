@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from finforce_ifea.contact_mechanics.pressed_jaw import (
     Mechanics,
-    RollingContact,
+    RigidContact,
     build_contact_surface,
     measure_stiffness,
 )
@@ -52,7 +52,7 @@ def build_mechanics(jaw: Jaw, settings: EstimatorSettings) -> Mechanics:
             warn_of_locking(jaw, mesh)
         model = SolidModel(mesh, jaw.material, symmetric=settings.force_axes == "normal")
     surface = build_contact_surface(jaw, mesh, model, across=model.across)
-    return Mechanics(mesh=mesh, model=model, contact=RollingContact(model, surface, jaw.face))
+    return Mechanics(mesh=mesh, model=model, contact=RigidContact(model, surface, jaw.face))
 
 
 def build_plane_model(jaw: Jaw, mesh: VolumeMesh, density: str | None = None) -> JawModel:

@@ -27,7 +27,7 @@ def observation_from_cloud(cloud: Any, frame: str, gravity: NDArray | None = Non
     Args:
         cloud: one row per key point.
         frame: the jaw frame.
-        gravity: its direction (3,) there, None where nobody knows.
+        gravity: its direction (3,) there, None where unknown.
 
     Raises:
         ObservationError: the frame, the height, the fields, a standard deviation or the buffer are wrong.

@@ -29,7 +29,7 @@ class Observation:
         likelihood: (K,) in [0, 1].
         stddev: (K, 3) [m] of each point along the axes of the jaw frame, above zero where there is a point; None when
             the detector states none.
-        gravity: unit vector (3,) along which things fall, jaw frame; None where nobody knows. Who gives it says that
+        gravity: unit vector (3,) along which things fall, jaw frame; None where unknown. Who gives it says that
             next to nothing but its weight, 0.1 N, acts along and across the fingers on what they hold.
     """
 
@@ -47,7 +47,7 @@ class Contact:
     Attributes:
         points: (n, 3) [m], on the undeformed inner surface.
         weights: (n,), shares of the force.
-        touching: whether object and jaw intersect; None when nobody knows.
+        touching: whether object and jaw intersect; None when unknown.
         free: the points say where the object touched first, and the solver follows it from there.
         outline: of the object, whose place the solver finds together with the force; it goes before the points.
     """
@@ -86,7 +86,7 @@ class Solution(NamedTuple):
         torque_stddev: (3,) [N m].
         magnitude_stddev: of the force's magnitude [N].
         contact_point: (3,) [m], pressure centre on the deformed surface; NaN without contact.
-        contact_place: (3,) [m], the same point on the undeformed surface; NaN without contact.
+        contact_location: (3,) [m], the same point on the undeformed surface; NaN without contact.
         normal: (3,), direction of the force; NaN without contact.
         residual: weighted root mean square of the used key points' residuals [m].
         kkt: how far the returned force is from satisfying its optimality conditions, scaled.
@@ -105,7 +105,7 @@ class Solution(NamedTuple):
     torque_stddev: NDArray
     magnitude_stddev: float
     contact_point: NDArray
-    contact_place: NDArray
+    contact_location: NDArray
     normal: NDArray
     residual: float
     kkt: float
@@ -133,7 +133,7 @@ def blank_solution(stamp: float, status: str, message: str, used: NDArray, itera
         torque_stddev=zero,
         magnitude_stddev=0.0,
         contact_point=unknown,
-        contact_place=unknown,
+        contact_location=unknown,
         normal=unknown,
         residual=float("nan"),
         kkt=float("nan"),
@@ -225,7 +225,7 @@ class ObjectOutline:
         tilt: turn of the polygons about the origin [rad]; positive turns x towards z.
         stddev: (3,) of the origin's x and z [m] and of the tilt [rad].
         across: where along y the object stands nearest, and the standard deviation of the pressure there (2,) [m];
-            None where nobody knows.
+            None where unknown.
     """
 
     polygons: tuple[NDArray, ...]

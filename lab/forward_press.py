@@ -132,7 +132,7 @@ class PressState:
         force: on the jaw (3,) [N].
         torque: of the contact forces about the jaw frame's origin (3,) [N m].
         pressure_centre: on the deformed surface (3,) [m]; NaN without contact.
-        pressure_place: the same material point on the undeformed surface (3,) [m].
+        pressure_location: the same material point on the undeformed surface (3,) [m].
         energy: elastic energy [J].
         iterations: Newton iterations since the last returned depth.
     """
@@ -142,7 +142,7 @@ class PressState:
     force: NDArray
     torque: NDArray
     pressure_centre: NDArray
-    pressure_place: NDArray
+    pressure_location: NDArray
     energy: float
     iterations: int
 
@@ -255,7 +255,7 @@ def _describe(setting: _Setting, q: NDArray, depth: float, iterations: int) -> P
         force=forces.sum(0),
         torque=np.cross(points * in_plane, forces).sum(0),
         pressure_centre=(share @ points) * in_plane,
-        pressure_place=(share @ surface.points) * in_plane,
+        pressure_location=(share @ surface.points) * in_plane,
         energy=model.linearize(q, tangent=False).energy,
         iterations=iterations,
     )

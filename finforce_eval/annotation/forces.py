@@ -171,7 +171,7 @@ class _Log:
             return
         forces.force[index], forces.torque[index] = solution.force, solution.torque
         forces.force_stddev[index], forces.torque_stddev[index] = solution.force_stddev, solution.torque_stddev
-        forces.place[index], forces.point[index] = solution.contact_place, solution.contact_point
+        forces.place[index], forces.point[index] = solution.contact_location, solution.contact_point
 
 
 def _contact_columns(contact: Contact) -> dict[str, NDArray]:

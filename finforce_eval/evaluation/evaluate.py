@@ -206,7 +206,7 @@ class StepLog:
         """Keep a trusted estimate."""
         self.force[index] = solution.force
         self.torque[index] = solution.torque
-        self.place[index] = solution.contact_place
+        self.place[index] = solution.contact_location
         self.stddev[index] = solution.magnitude_stddev
         self.axis_stddev[index] = solution.force_stddev
         magnitude = float(np.linalg.norm(solution.force))

@@ -30,8 +30,8 @@ DEPTH, SHAPE, HEIGHT = 0, 1, 2
 _OTHER_SIZE = 3.0
 # Uncertainty of a known outline's tilt in addition to that of its pose [rad].
 _TILT_STDDEV = 0.02
-# What leads by more [m] is beside the heights.
-_BESIDE = 1.0
+# What leads by more [m] is outside of the heights.
+_OUTSIDE = 1.0
 
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
@@ -142,20 +142,20 @@ def find_first_touch(pressed, face, place):
         radius = np.exp(place[1])
         least = 0.0 if face.is_flat else radius
         for p in range(0 if face.is_flat else len(points)):
-            beside = points[p, 1] - place[2]
-            if abs(beside) < radius:
-                least = min(least, face.x + radius - np.sqrt(radius * radius - beside * beside) - points[p, 0])
+            dz = points[p, 1] - place[2]
+            if abs(dz) < radius:
+                least = min(least, face.x + radius - np.sqrt(radius * radius - dz * dz) - points[p, 0])
         return least
     c, s = np.cos(place[1]), np.sin(place[1])
     if face.is_flat:
         low, high = points[0, 1] - place[2], points[-1, 1] - place[2]
         least = find_leading(pressed.segments, c, s, low, high)
-        return least + pressed.front if least < _BESIDE else 0.0
+        return least + pressed.front if least < _OUTSIDE else 0.0
     least = np.inf
     for p in range(len(points)):
         z = points[p, 1] - place[2]
         lead = find_leading(pressed.segments, c, s, z, z)
-        if lead < _BESIDE:
+        if lead < _OUTSIDE:
             least = min(least, face.x + lead - points[p, 0])
     return least + pressed.front if np.isfinite(least) else 0.0
 

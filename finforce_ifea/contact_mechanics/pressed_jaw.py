@@ -66,7 +66,7 @@ class PressedState(NamedTuple):
         force: total contact force on the jaw after `correction` (3,) [N].
         force_modes: its derivatives (3, 3 or 4), columns as in modes.
         pressure_point: pressure centre on the deformed surface (3,) [m]; NaN without contact.
-        pressure_place: the same on the undeformed surface (3,) [m]; NaN without contact.
+        pressure_location: the same on the undeformed surface (3,) [m]; NaN without contact.
         smallest_det: smallest det F of all elements [-].
         size: of the whole Newton step, as a share of the model's reach.
         extrapolation: distance of the shape from those that a model has stored, as a share of what it is good for.
@@ -78,19 +78,19 @@ class PressedState(NamedTuple):
     force: NDArray
     force_modes: NDArray
     pressure_point: NDArray
-    pressure_place: NDArray
+    pressure_location: NDArray
     smallest_det: float
     size: float
     extrapolation: float = 0.0
 
 
-class RollingContact:
+class RigidContact:
     """A model, its contact surface, and the object pressed into it.
 
     Attributes:
         indenter: the object.
         traction_ratio: of tangential to normal force at all points, where friction is not followed.
-        bearable: force beyond which no equilibrium is believed [N], infinite where nobody knows.
+        bearable: force beyond which no equilibrium is believed [N], infinite where unknown.
     """
 
     bearable = np.inf
@@ -142,7 +142,7 @@ class RollingContact:
             return constant_traction(self.traction_ratio)
         return self._friction.describe(_find_origin(place))
 
-    def with_friction(self, friction: Friction) -> RollingContact:
+    def with_friction(self, friction: Friction) -> RigidContact:
         """Return another contact of the same jaw, whose friction is followed."""
         other = copy(self)
         other._friction = friction
@@ -185,7 +185,7 @@ class RollingContact:
             force=contact.forces.sum(0) - relief[:, 0],
             force_modes=contact.changes.sum(0) - relief[:, 1:],
             pressure_point=share @ points,
-            pressure_place=share @ self.surface.points,
+            pressure_location=share @ self.surface.points,
             smallest_det=state.smallest_det,
             size=reached,
         )
@@ -240,7 +240,7 @@ class Mechanics:
 
     mesh: VolumeMesh
     model: JawModel
-    contact: RollingContact
+    contact: RigidContact
     full: Mechanics | None = None
 
 

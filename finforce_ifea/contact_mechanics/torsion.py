@@ -1,6 +1,6 @@
-"""What a force beside the middle of a finger, and one across it, do to the key points, in the linear jaw at rest.
+"""Response of the key points to a force off the middle of a finger and to a lateral one, in the linear jaw at rest.
 
-The mechanics of the jaw's plane know neither. Both are small beside bending, so that they are added to it.
+The mechanics of the jaw's plane know neither. Both are small compared with bending, so that they are added to it.
 """
 
 from dataclasses import dataclass

@@ -15,7 +15,7 @@ from scipy.linalg import eigh
 from scipy.sparse.linalg import splu
 
 from finforce_ifea.contact_mechanics.indenter import RoundIndenter
-from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, PressedState, RollingContact, limit_step
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, PressedState, RigidContact, limit_step
 from finforce_ifea.errors import ContactError
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.reduced.equilibria import STENCIL, Manifold
@@ -226,7 +226,7 @@ class _Grid:
     q: NDArray
 
 
-def _press_everywhere(contact: RollingContact, progress: Callable[[float], None], share: Share) -> _Grid:
+def _press_everywhere(contact: RigidContact, progress: Callable[[float], None], share: Share) -> _Grid:
     """Return the equilibria under rods at all heights."""
     low, high = contact.surface.heights[[0, -1]]
     place = np.linspace(0.0, 1.0, HEIGHTS)
@@ -242,12 +242,12 @@ def _press_everywhere(contact: RollingContact, progress: Callable[[float], None]
     return _Grid(rods=heights, depths=np.array(depths), q=np.array(states).transpose(1, 0, 2))
 
 
-def _press_fully(contact: RollingContact, height: float) -> _Equilibrium:
+def _press_fully(contact: RigidContact, height: float) -> _Equilibrium:
     """Return the deepest equilibrium under a rod at a height [m]."""
     return _Rod(contact, height).press(np.inf)[-1]
 
 
-def _press_rod(contact: RollingContact, hardest: float, height: float) -> tuple[float, list[NDArray]]:
+def _press_rod(contact: RigidContact, hardest: float, height: float) -> tuple[float, list[NDArray]]:
     """Return the largest depth [m] of a rod at one height [m], and the equilibria (T, size) that divide its path.
 
     Raises:
@@ -312,7 +312,7 @@ def has_own_rows(mechanics: Mechanics) -> bool:
 class _Rod:
     """A rod at one height, pressed in deeper and deeper."""
 
-    def __init__(self, contact: RollingContact, height: float) -> None:
+    def __init__(self, contact: RigidContact, height: float) -> None:
         low, high = contact.surface.heights[[0, -1]]
         self._contact, self._height = contact, height
         self._radius, self._deepest = _ROD * (high - low), _DEEPEST * (high - low)

@@ -2,7 +2,7 @@
 
 The unknowns q (2 n + 2,) are the loads on the n rows of the inner face (x and z interleaved) [N], whatever presses, and
 the grid coordinates of the stored equilibrium that is nearest in shape. See `finforce_ifea.reduced.equilibria`. Under a
-rigid object it is the same as `RollingContact`, at the price of a look-up.
+rigid object it is the same as `RigidContact`, at the price of a look-up.
 """
 
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ from finforce_ifea.contact_mechanics.pressed_jaw import (
     TOUCH,
     ContactSurface,
     PressedState,
-    RollingContact,
+    RigidContact,
 )
 from finforce_ifea.fem.factorisation import Factor
 from finforce_ifea.fem.model import LARGEST_MOVE, Across, JawModel, Linearization
@@ -222,7 +222,7 @@ _BEARABLE = 0.5
 _LARGE_STEP, _TOO_FAR, _BISECTIONS = 0.3, 0.5, 6
 
 
-class ReducedContact(RollingContact):
+class ReducedContact(RigidContact):
     """A reduced model, its contact surface, and the object pressed into it.
 
     Attributes:
@@ -262,7 +262,7 @@ class ReducedContact(RollingContact):
         self.packed = tuple(self._jaw)
 
     def place_points(self, q: NDArray) -> NDArray:
-        """See `RollingContact`."""
+        """See `RigidContact`."""
         return place_contact(self._jaw.points, self._jaw.low, self._jaw.share, self.model.moves(q))
 
     def begin(self, height: float) -> NDArray:
@@ -272,12 +272,12 @@ class ReducedContact(RollingContact):
         return q
 
     def linearize(self, q: NDArray, place: NDArray) -> PressedState:
-        """Linearise the equilibrium with the object at a place (depth, shape, height); see `RollingContact`."""
+        """Linearise the equilibrium with the object at a place (depth, shape, height); see `RigidContact`."""
         traction = self._describe_traction(place)
         return linearize_reduced(self.packed, tuple(self.indenter.pressed), tuple(traction), q, place)
 
     def approach(self, q: NDArray, step: NDArray, place: NDArray) -> NDArray:
-        """See `RollingContact`."""
+        """See `RigidContact`."""
         return approach_reduced(self.packed, tuple(self.indenter.pressed), q, step, place)
 
 

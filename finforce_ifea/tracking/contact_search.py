@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, SHAPE
-from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RollingContact, limit_step
+from finforce_ifea.contact_mechanics.pressed_jaw import PressedState, RigidContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_filter import (
     EXPECTATION,
@@ -64,7 +64,7 @@ class ContactSearch:
         self.expectation = np.zeros((), EXPECTATION)
         self.expectation["gate"] = settings.gate
 
-    def begin(self, contact: RollingContact, mean: NDArray) -> None:
+    def begin(self, contact: RigidContact, mean: NDArray) -> None:
         """Begin with the undeformed jaw and an object of expected shape and height (2,) that just touches."""
         self.state = blank_contact_state()
         self.state["x"][1:] = mean
@@ -87,7 +87,7 @@ class ContactSearch:
         self.state["x"][1:] += change
         self._average["count"] *= kept
 
-    def find(self, contact: RollingContact, probe: Any, dt: float, *, is_sudden: bool) -> bool:
+    def find(self, contact: RigidContact, probe: Any, dt: float, *, is_sudden: bool) -> bool:
         """Find the contact in the image of `points`; False, all as it was, where too few key points agree.
 
         Args:
@@ -149,7 +149,7 @@ class ContactSearch:
         state = self.state
         state["by_traction"] = pressed.force_modes[:, 3]
         state["pressing"], state["force_modes"] = pressed.force, pressed.force_modes[:, :3]
-        state["pressure_point"], state["pressure_location"] = pressed.pressure_point, pressed.pressure_place
+        state["pressure_point"], state["pressure_location"] = pressed.pressure_point, pressed.pressure_location
         state["extrapolation"], state["sound"] = pressed.extrapolation, pressed.smallest_det > 0.0
         _complete_state(state, moved, self.q, self.expectation)
 
@@ -164,7 +164,7 @@ class ContactSearch:
         self.state["x_model"][DEPTH] += change
 
 
-def find_x_model(contact: RollingContact, x: NDArray) -> tuple[NDArray, float]:
+def find_x_model(contact: RigidContact, x: NDArray) -> tuple[NDArray, float]:
     """Return the state (3,) at which the mechanics stands for x, never above the surface, and the depth below [m]."""
     x_model, touch = x.copy(), contact.find_touch(x)
     x_model[DEPTH] = max(x[DEPTH], touch + _LEAST_DEPTH)

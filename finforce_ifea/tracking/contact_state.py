@@ -95,7 +95,7 @@ AVERAGE = np.dtype([("residual", float, 2), ("modes", float, (2, 3)), ("count", 
 
 # Half of the friction cone is one standard deviation of an unseen traction ratio.
 UNSEEN_TRACTION = 0.5
-# Standard deviation of a lateral location of which nobody knows [m].
+# Standard deviation of an unknown lateral location [m].
 MIDDLE_STDDEV = 3e-3
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, OutlineIndenter, RoundIndenter, expect_object
-from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact
 from finforce_ifea.contact_mechanics.torsion import Torsion
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE
 from finforce_ifea.observation import Contact
@@ -47,7 +47,7 @@ _WEIGHT, _LEAST_NORMAL = 0.15, 0.1
 class _Fidelity(NamedTuple):
     """One of the mechanics of a jaw: its contact, the probe of the key points, and these at rest (K, 3) [m]."""
 
-    contact: RollingContact
+    contact: RigidContact
     probe: Any
     rest: NDArray
 
@@ -367,7 +367,7 @@ class ContactTracker:
         return sqrt((found.stddev * self.slips.mobilised) ** 2 + (_UNFOLLOWED * found.mean) ** 2 + _TRACTION**2)
 
 
-def _attach(contact: RollingContact, keypoints: NDArray) -> _Fidelity:
+def _attach(contact: RigidContact, keypoints: NDArray) -> _Fidelity:
     """Return the mechanics of a contact with key points (K, 3) [m]; raises MeshError when one is off the jaw."""
     probe = contact.model.attach(keypoints, KEYPOINT_DISTANCE)
     return _Fidelity(contact, probe, contact.model.positions(probe, np.zeros(contact.model.size)))

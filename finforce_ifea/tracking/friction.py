@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from finforce.elimination import eliminate
 from finforce_ifea.contact_mechanics.friction import Friction
 from finforce_ifea.contact_mechanics.indenter import DEPTH, HEIGHT, Indenter
-from finforce_ifea.contact_mechanics.pressed_jaw import RollingContact, limit_step
+from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact, limit_step
 from finforce_ifea.settings import EstimatorSettings
 from finforce_ifea.tracking.contact_state import ContactState
 
@@ -266,7 +266,7 @@ class SlipHistory:
         mobilised: what friction bears over what it could, from -1 to 1.
     """
 
-    def __init__(self, contact: RollingContact) -> None:
+    def __init__(self, contact: RigidContact) -> None:
         """Follow the object on a contact of the same jaw, whose friction is followed."""
         self._friction = Friction(len(contact.surface.points))
         self._contact = contact.with_friction(self._friction)

@@ -1,4 +1,4 @@
-"""Force at a given contact from key points, image after image, and whether they have the load somewhere else."""
+"""Force at a given contact from key points, image after image, and whether they contradict its location."""
 
 from functools import cached_property, lru_cache
 from typing import Any
@@ -31,7 +31,7 @@ _SETTLED = 5e-3
 _FARTHEST_MOVE = 0.2
 # The median of |miss|^2 / variance is this for a normal distribution in three axes.
 _MEDIAN_SQUARE = 2.4
-# A load held at one height leaves more of the shape unexplained than a rolling one does.
+# A load held at one height leaves more of the shape unexplained than a tracked one does.
 _TOLERATED_MISFIT = 2.0
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_ifea.contact_mechanics.indenter import DEPTH
-from finforce_ifea.contact_mechanics.pressed_jaw import RollingContact
+from finforce_ifea.contact_mechanics.pressed_jaw import RigidContact
 from finforce_ifea.observation import Contact
 from finforce_ifea.tare import OFFSET_STDDEV, Tare
 
@@ -91,11 +91,11 @@ class _PointFit:
     stddevs: NDArray
 
 
-def measure_influence(contact: RollingContact, probe: Any, keypoints: int) -> InfluenceCoefficients:
+def measure_influence(contact: RigidContact, probe: Any, keypoints: int) -> InfluenceCoefficients:
     """Return the answers of a contact's model, whose `probe` is that of the key points.
 
     Args:
-        contact: model and contact surface, see `RollingContact`.
+        contact: model and contact surface, see `RigidContact`.
         probe: of the key points.
         keypoints: how many they are.
     """

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RollingContact, build_contact_surface
+from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact, build_contact_surface
 from finforce_ifea.fem.locking import warn_of_locking
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.fem.tetrahedra import to_tet10
@@ -191,7 +191,7 @@ def build_rig(jaw: Jaw, mesh: VolumeMesh) -> Rig:
     """Return a jaw of a given mesh, ready to be pressed."""
     model = SolidModel(mesh, jaw.material)
     surface = build_contact_surface(jaw, mesh, model, across="half" if model.symmetric else "both")
-    contact = RollingContact(model, surface, jaw.face)
+    contact = RigidContact(model, surface, jaw.face)
     return Rig(mechanics=Mechanics(mesh=mesh, model=model, contact=contact), jaw=jaw, height=HEIGHT)
 
 

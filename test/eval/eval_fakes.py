@@ -127,7 +127,7 @@ class FakeSolution:
     magnitude_stddev: float = 0.05
     force_stddev: tuple = (0.05, 0.01, 0.02)
     residual: float = 2e-4
-    contact_place: tuple = (0.014, 0.0, 0.04)
+    contact_location: tuple = (0.014, 0.0, 0.04)
     torque: tuple = (0.0, -0.04, 0.0)
     contact_point: tuple = (0.013, 0.0, 0.04)
 

@@ -70,20 +70,20 @@ def play(name, seed=0, across=None, deepest=None):
 def test_pressure_beside_the_middle_is_found_by_the_twist():
     """The block touches from y = 1 to 9 mm; as the finger twists, its inner edge bears most: 2.5 to 3 mm."""
     solutions, _ = play("block8_z50_y5")
-    places = np.array([s.contact_place[1] for s in solutions[-60:]])
+    places = np.array([s.contact_location[1] for s in solutions[-60:]])
     assert 1.5e-3 < places.mean() < 4.0e-3
     assert places.std() < 0.5e-3
 
 
 def test_a_mesh_that_errs_about_the_width_is_overruled():
     solutions, _ = play("block8_z50_y5", across=(-5e-3, 2.3e-3))
-    assert np.mean([s.contact_place[1] for s in solutions[-60:]]) > 0.5e-3
+    assert np.mean([s.contact_location[1] for s in solutions[-60:]]) > 0.5e-3
 
 
 @pytest.mark.parametrize("name", ["sphere30_z40", "cyl25_z40_tilt15"])
 def test_what_is_pressed_in_the_middle_stays_there(name):
     solutions, _ = play(name)
-    assert abs(np.mean([s.contact_place[1] for s in solutions[-60:]])) < 1.5e-3
+    assert abs(np.mean([s.contact_location[1] for s in solutions[-60:]])) < 1.5e-3
 
 
 @pytest.mark.parametrize(

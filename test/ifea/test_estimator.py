@@ -64,8 +64,8 @@ def test_height_of_first_touch_may_be_a_millimetre_off(shift):
 @pytest.mark.parametrize(("diameter", "height"), [(15, 20), (25, 20), (35, 20), (25, 40), (25, 60), (35, 60)])
 def test_place_of_the_contact_follows_the_object(diameter, height):
     """As the forward problem has it at 5 mm: from 20 down to 19, 18 and 16.5 mm for growing objects, from 60 to 61."""
-    place = solved(height, diameter=diameter)[HELD_5].contact_place
-    expected = bench_press("default", "frame", diameter, height, (2, 4, 5))[-1].pressure_place
+    place = solved(height, diameter=diameter)[HELD_5].contact_location
+    expected = bench_press("default", "frame", diameter, height, (2, 4, 5))[-1].pressure_location
     # a millimetre is what offsets of 0.35 mm and the prior of the radius leave
     assert 1e3 * place[2] == pytest.approx(1e3 * expected[2], abs=1.0)
     assert place[0] == pytest.approx(BENCH.inner_face_x)
@@ -186,7 +186,7 @@ def test_trusted_solutions_are_complete(solver):
 
 def check_loaded(solution):
     """Everything is finite and fits together; the object pushes into the jaw."""
-    vectors = ("force", "torque", "force_stddev", "torque_stddev", "contact_point", "contact_place", "normal")
+    vectors = ("force", "torque", "force_stddev", "torque_stddev", "contact_point", "contact_location", "normal")
     for name in (*vectors, "magnitude_stddev", "residual", "kkt"):
         assert np.isfinite(getattr(solution, name)).all(), name
     np.testing.assert_allclose(solution.torque, np.cross(solution.contact_point, solution.force), atol=1e-12)

@@ -60,7 +60,7 @@ def test_weighted_contacts_share_one_force():
     recording = pressed()
     solutions = run(recording, contact=contact, solver="frame")
     assert rms(errors(recording, solutions)[loaded_frames(recording)]) < 0.08
-    assert solutions[160].contact_place[2] == pytest.approx(0.040, abs=5e-4)
+    assert solutions[160].contact_location[2] == pytest.approx(0.040, abs=5e-4)
 
 
 def test_force_in_three_axes_says_what_it_does_not_know():

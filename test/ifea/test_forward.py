@@ -71,14 +71,14 @@ PLACES = {(15, 20): 20.0, (25, 20): 18.0, (35, 20): 13.8, (25, 40): 40.0, (25, 6
 @pytest.mark.parametrize(("mesh", "solver"), [("default", "solid"), ("default", "frame")])
 @pytest.mark.parametrize(("diameter", "height"), PLACES)
 def test_contact_moves_along_the_finger_to_where_an_independent_program_has_it(mesh, solver, diameter, height):
-    place = 1e3 * bench_press(mesh, solver, diameter, height, DEEP)[-1].pressure_place[2]
+    place = 1e3 * bench_press(mesh, solver, diameter, height, DEEP)[-1].pressure_location[2]
     # 1.5 mm: its mesh has a node every 1.4 mm along the surface
     assert place == pytest.approx(PLACES[diameter, height], abs=1.5)
 
 
 @pytest.mark.parametrize(("mesh", "solver"), MODELS)
 def test_contact_of_a_big_cylinder_moves_down_the_finger_step_by_step(mesh, solver):
-    places = [1e3 * result.pressure_place[2] for result in bench_press(mesh, solver, 35, 20, DEEP)]
+    places = [1e3 * result.pressure_location[2] for result in bench_press(mesh, solver, 35, 20, DEEP)]
     assert (np.diff(places) < -0.5).all()
 
 

@@ -111,7 +111,7 @@ def test_circle_presses_like_the_cylinder_that_it_is():
     by_outline = press_jaw(*args, Pressed(circle(0.0125, 720), 0.0), 0.030, [0.005])[-1]
     by_radius = press_jaw(*args, RigidCylinder(radius=0.0125), 0.030, [0.005])[-1]
     np.testing.assert_allclose(by_outline.force, by_radius.force, atol=0.003 * np.linalg.norm(by_radius.force))
-    assert by_outline.pressure_place[2] == pytest.approx(by_radius.pressure_place[2], abs=0.1e-3)
+    assert by_outline.pressure_location[2] == pytest.approx(by_radius.pressure_location[2], abs=0.1e-3)
 
 
 def test_box_presses_like_a_box_with_slightly_rounded_edges():
@@ -120,7 +120,7 @@ def test_box_presses_like_a_box_with_slightly_rounded_edges():
     by_outline = press_jaw(*args, Pressed(box(0.010, 0.0125), 0.0), 0.040, [0.004])[-1]
     rounded = press_jaw(*args, RigidBox(size_x=0.020, size_z=0.025, edge_radius=0.001), 0.040, [0.004])[-1]
     np.testing.assert_allclose(by_outline.force, rounded.force, atol=0.03 * np.linalg.norm(rounded.force))
-    assert by_outline.pressure_place[2] == pytest.approx(rounded.pressure_place[2], abs=0.5e-3)
+    assert by_outline.pressure_location[2] == pytest.approx(rounded.pressure_location[2], abs=0.5e-3)
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -179,13 +179,13 @@ def test_force_and_place_are_found_with_a_known_outline(name, height, tilt, off)
         solution = estimator.update(observation, contact)
         if force is not None and solution.trusted:
             errors.setdefault(force, []).append(np.linalg.norm(solution.force) - force)
-            places[force] = solution.contact_place[2]
+            places[force] = solution.contact_location[2]
     assert len(errors) == len(results)
     for result, (force, found) in zip(results, sorted(errors.items()), strict=True):
         # also where two corners take turns; a wrong pose is doubted until the averages have forgotten the shape before
         assert len(found) >= 30 - 6 * off
         assert abs(np.mean(found[5:])) < 0.04 + 0.02 * force + 0.06 * off
-        assert places[force] == pytest.approx(result.pressure_place[2], abs=(2.5 + 2.5 * off) * 1e-3)
+        assert places[force] == pytest.approx(result.pressure_location[2], abs=(2.5 + 2.5 * off) * 1e-3)
 
 
 def test_cylinder_of_unknown_radius_misses_the_force_of_a_flat_box():

@@ -165,7 +165,7 @@ def test_no_load_is_lost_between_two_rows(tmp_path, name):
         pressed = press(mechanics, jaw, height)
         load = face.describe(pressed.q).load.reshape(-1, 2)
         np.testing.assert_allclose(load.sum(0), pressed.force[[0, 2]], atol=2e-3 * np.linalg.norm(pressed.force))
-        assert load[:, 0] @ heights[1:] / load[:, 0].sum() == pytest.approx(pressed.pressure_place[2], abs=2e-4)
+        assert load[:, 0] @ heights[1:] / load[:, 0].sum() == pytest.approx(pressed.pressure_location[2], abs=2e-4)
 
 
 TAPER = [0.0, -0.2]

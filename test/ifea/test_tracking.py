@@ -50,7 +50,7 @@ def test_linearisation_finds_the_equilibrium_of_the_forward_problem(pressed):
     assert np.abs(state.correction).max() < 1e-8
     np.testing.assert_allclose(state.force, result.force, atol=1e-6)
     np.testing.assert_allclose(state.pressure_point * [1, 0, 1], result.pressure_centre, atol=1e-8)
-    np.testing.assert_allclose(state.pressure_place * [1, 0, 1], result.pressure_place, atol=1e-8)
+    np.testing.assert_allclose(state.pressure_location * [1, 0, 1], result.pressure_location, atol=1e-8)
 
 
 @pytest.mark.parametrize("which", STEPS)
@@ -149,8 +149,8 @@ def test_frame_rate_does_not_matter(rate):
 def test_height_of_first_touch_is_found_when_it_was_given_wrongly(given, truth):
     """Two millimetres off; the place comes closer to the truth than what was given."""
     recording = record(ramp(6, hold=4.0), height=truth)
-    exact = run(recording, solver="frame")[-1].contact_place[2]
-    found = run(recording, solver="frame", contact=Contact.fixed(BENCH, given))[-1].contact_place[2]
+    exact = run(recording, solver="frame")[-1].contact_location[2]
+    found = run(recording, solver="frame", contact=Contact.fixed(BENCH, given))[-1].contact_location[2]
     assert abs(found - exact) < 0.75 * abs(given - 1e-3 * truth)
 
 
@@ -207,4 +207,4 @@ def test_forward_problem_is_its_own_inverse_on_one_mesh():
     solutions = run(replace(recording, observations=observations), solver="frame")
     assert np.linalg.norm(solutions[-1].force) == pytest.approx(np.linalg.norm(results[-1].force), rel=2e-3)
     assert solutions[-1].residual < 5e-6
-    np.testing.assert_allclose(solutions[-1].contact_place, results[-1].pressure_place, atol=0.3e-3)
+    np.testing.assert_allclose(solutions[-1].contact_location, results[-1].pressure_location, atol=0.3e-3)
