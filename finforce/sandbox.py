@@ -10,7 +10,8 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from finforce.errors import FinforceError, one_line
@@ -27,7 +28,11 @@ class SandboxError(FinforceError, RuntimeError):
 
 
 def run_limited(
-    function: Callable[..., ResultT], *arguments: Any, memory: int = MEMORY, seconds: float = SECONDS
+    function: Callable[..., ResultT],
+    *arguments: Any,
+    memory: int = MEMORY,
+    seconds: float = SECONDS,
+    disk: int = MEMORY,
 ) -> ResultT:
     """Return `function(*arguments)`, computed in another process.
 
@@ -36,13 +41,14 @@ def run_limited(
         arguments: picklable, as the result has to be.
         memory: that the process may take [bytes].
         seconds: that it may take [s].
+        disk: that a file may have that it writes [bytes].
 
     Raises:
         SandboxError: The function failed, the process crashed, or a limit was reached.
         FinforceError: What the function itself raised.
     """
     memory, seconds = raise_budget(memory), raise_budget(seconds)
-    order = pickle.dumps((memory, seconds)) + pickle.dumps((function, arguments))
+    order = pickle.dumps((memory, seconds, raise_budget(disk))) + pickle.dumps((function, arguments))
     paths = os.pathsep.join(os.path.abspath(path) for path in sys.path)
     environment = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     try:
@@ -59,6 +65,32 @@ def run_limited(
     if error is not None:
         raise SandboxError(error)
     return result
+
+
+@contextmanager
+def limit_growth(memory: int, disk: int = MEMORY) -> Iterator[None]:
+    """Let this process take so many more bytes of memory, and write files of so many, within a `with` block.
+
+    Raises:
+        MemoryError: What is done there takes more, unless a library has an error of its own for that.
+    """
+    try:
+        import resource
+
+        with open("/proc/self/statm", "rb") as file:
+            taken = int(file.read().split()[5]) * resource.getpagesize()
+    except (ImportError, OSError):  # not on Linux: no limit is known to work
+        yield
+        return
+    before = {kind: resource.getrlimit(kind) for kind in (resource.RLIMIT_DATA, resource.RLIMIT_FSIZE)}
+    try:
+        for (kind, (soft, hard)), limit in zip(before.items(), (taken + memory, disk), strict=True):
+            wanted = [each for each in (limit, soft, hard) if each != resource.RLIM_INFINITY]
+            resource.setrlimit(kind, (min(wanted), hard))
+        yield
+    finally:
+        for kind, limits in before.items():
+            resource.setrlimit(kind, limits)
 
 
 def _say_how_it_ended(code: int, said: str, memory: int) -> str:
@@ -82,8 +114,9 @@ def _serve() -> None:
 
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    memory, seconds = pickle.load(sys.stdin.buffer)
+    memory, seconds, disk = pickle.load(sys.stdin.buffer)
     limits = {resource.RLIMIT_DATA: memory, resource.RLIMIT_CPU: seconds, resource.RLIMIT_CORE: 0}
+    limits[resource.RLIMIT_FSIZE] = disk
     for kind, limit in limits.items():
         hard = resource.getrlimit(kind)[1]
         limit = int(limit) if hard == resource.RLIM_INFINITY else min(int(limit), hard)

@@ -4,17 +4,28 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from finforce.errors import FinforceError, MissingDependencyError, one_line
+from finforce.files import BUDGET, FileError, parse_yaml, raise_budget, read_text
+from finforce.sandbox import SandboxError, limit_growth, run_limited
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import DamagedError, OutOfBoundsError, RecordingError
-from finforce_eval.recordings.bounded import make_reader
 
 # Of a type that was recorded without its definition nothing is known but its name.
 NO_DIGEST = "RIHS01_" + 64 * "0"
+MEGABYTE = 1 << 20
+# Bytes that opening a recording, and reading one more message of it, may take.
+STEP_MEMORY = 512 * MEGABYTE
+# Bytes that all chunks of a recording may unpack to, and may for each byte of its files.
+LARGEST_ALL, PER_BYTE = 192 * MEGABYTE, 100
+# Messages of our topics, and bytes of a file that let there be one more.
+MOST_MESSAGES, BYTES_PER_MESSAGE = 250_000, 16
+LARGEST_METADATA = 4 * MEGABYTE
+SECONDS, BYTES_PER_SECOND = 20, 5 * MEGABYTE  # of work on a recording in a process of its own
+_HINT = f"{BUDGET}=10 would allow ten times as much"
 
 
 class BagMessage(NamedTuple):
@@ -50,12 +61,21 @@ class BagReader:
     def raw(self, topics: Collection[str]) -> Iterator[RawSample]:
         """Yield the messages of some topics in the order of their receipt."""
         chosen = [connection for connection in self.connections if connection.topic in topics]
-        for connection, time, data in self._reader.messages(connections=chosen) if chosen else ():
+        for connection, time, data in self._walk(chosen) if chosen else ():
             yield RawSample(connection.topic, time, data)
 
     def messages(self) -> Iterator[tuple[Any, int, bytes | memoryview]]:
         """Yield connection (of rosbags), time of receipt [ns] and bytes of all messages, in the order of receipt."""
-        yield from self._reader.messages()
+        yield from self._walk(self.connections)
+
+    def _walk(self, connections: Collection[Any]) -> Iterator[tuple[Any, int, bytes | memoryview]]:
+        messages, memory = self._reader.messages(connections=connections), raise_budget(STEP_MEMORY)
+        while True:
+            with limit_growth(memory):
+                message = next(messages, None)
+            if message is None:
+                return
+            yield message
 
     def decode(self, sample: RawSample) -> Any:
         """Return the message of a sample."""
@@ -95,15 +115,136 @@ def open_bag(source: Path, name: str) -> Iterator[BagReader]:
         MissingDependencyError: rosbags is not installed.
     """
     try:
+        from rosbags.rosbag2 import Reader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise MissingDependencyError("reading a recording needs rosbags: pip install rosbags") from error
     # not AnyReader: it registers every definition in the bag and ends at a foreign one it cannot parse
     types = get_typestore(Stores.ROS2_JAZZY)
-    with damage_reported(name), make_reader(source) as reader:
+    with damage_reported(name), ExitStack() as stack:
+        with limit_growth(raise_budget(STEP_MEMORY), allowed_bytes(source)):
+            _check_bounds(source)
+            reader = stack.enter_context(Reader(source))
         if reader.message_count == 0:
             raise RecordingError(f"{name}: the recording is empty: it holds no messages")
         yield BagReader(reader, types, name)
+
+
+def allowed_bytes(source: Path) -> int:
+    """Return what a recording may unpack to [bytes]; it goes with its size."""
+    return raise_budget(LARGEST_ALL + PER_BYTE * _size_of(source))
+
+
+def allowed_seconds(source: Path) -> float:
+    """Return the time that going through a recording may take [s]; it goes with its size."""
+    return SECONDS + _size_of(source) / BYTES_PER_SECOND
+
+
+def check_messages(count: int, source: Path) -> None:
+    """Refuse a recording with more messages of our topics than its size can hold.
+
+    Raises:
+        OutOfBoundsError: There are more.
+    """
+    most = raise_budget(MOST_MESSAGES + _size_of(source) // BYTES_PER_MESSAGE)
+    if count > most:
+        raise OutOfBoundsError(f"more than {most} messages, in files that hold fewer; {_HINT}")
+
+
+def bag_files(source: Path) -> list[Path]:
+    """Return the files with the messages of a bag, in their order."""
+    if source.is_file():
+        return [source]
+    found = [path for path in source.iterdir() if path.suffix in (".mcap", ".db3")]
+    return sorted(found, key=lambda path: (len(path.name), path.name))
+
+
+def _size_of(source: Path) -> int:
+    """Return the size of a bag [bytes]."""
+    files = [source] if source.is_file() else [path for path in source.iterdir() if path.is_file()]
+    return sum(path.stat().st_size for path in files)
+
+
+def _check_bounds(source: Path) -> None:
+    """Refuse a bag that announces, or takes, more than one of its size does.
+
+    Raises:
+        OutOfBoundsError: It does.
+        Exception: It is damaged; each library has its own classes.
+    """
+    if source.is_dir():
+        try:
+            text = read_text(source / "metadata.yaml", LARGEST_METADATA)
+            if "&" in text or "*" in text or text.count("[") + text.count("{") > _FEW_BRACKETS:
+                parse_yaml(text, text_keys=False)
+        except FileError as error:
+            raise ValueError(f"metadata.yaml: {error}") from error
+    total = 0
+    for path in bag_files(source):
+        if path.suffix == ".mcap":
+            total += sum(_chunk_sizes(path))
+        else:
+            _try_database(path)
+    if total > allowed_bytes(source):
+        limit = allowed_bytes(source) // MEGABYTE
+        raise OutOfBoundsError(f"chunks of {total // MEGABYTE} MB unpacked; expected {limit} of such a file; {_HINT}")
+
+
+_FEW_BRACKETS = 1000
+
+
+def _chunk_sizes(path: Path) -> list[int]:
+    """Return what the chunks of an mcap file say that they unpack to [bytes]."""
+    from mcap.reader import SeekingReader
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        summary = SeekingReader(file, record_size_limit=size).get_summary()
+        if summary is not None and summary.chunk_indexes:
+            return [each.uncompressed_size for each in summary.chunk_indexes]
+        file.seek(0)
+        records = StreamReader(file, emit_chunks=True, record_size_limit=size).records
+        return [record.uncompressed_size for record in records if isinstance(record, Chunk)]
+
+
+_tried: set[tuple[Path, int, int]] = set()
+
+
+def _try_database(path: Path) -> None:
+    """Go through an SQLite file in a process of its own: one that is damaged, or computes, may go on for ever.
+
+    Raises:
+        OutOfBoundsError: It takes more memory or time than one of its size does.
+        ValueError: It cannot be read.
+    """
+    state = path.stat()
+    mark = (path, state.st_size, state.st_mtime_ns)
+    if mark in _tried:
+        return
+    try:
+        error = run_limited(_read_through, path, memory=STEP_MEMORY, seconds=allowed_seconds(path))
+    except SandboxError as ended:
+        raise OutOfBoundsError(str(ended)) from ended
+    if error:
+        raise ValueError(error)
+    _tried.add(mark)
+
+
+def _read_through(path: Path) -> str:
+    """Read all messages of a bag; return what is wrong with it, "" of nothing."""
+    from rosbags.rosbag2 import Reader
+
+    try:
+        with Reader(path) as reader:
+            for _ in reader.messages():
+                pass
+    except MemoryError:
+        raise
+    except Exception as error:  # of apsw and of rosbags
+        return one_line(error)
+    return ""
 
 
 def check_types(connections: Iterable[Any], expected: Mapping[str, Collection[str]], name: str) -> None:
@@ -201,6 +342,9 @@ def damage_reported(name: str) -> Iterator[None]:
         raise OutOfBoundsError(f"{name}: {str(error).removeprefix(f'{name}: ')}") from error
     except (FinforceError, KeyboardInterrupt):
         raise
+    except MemoryError as error:
+        limit = raise_budget(STEP_MEMORY) // MEGABYTE
+        raise OutOfBoundsError(f"{name}: a part of it takes more than {limit} MB of memory; {_HINT}") from error
     except Exception as error:  # struct, sqlite3, zstd, lz4, yaml, ... each has its own classes
         reason = one_line(error)
         raise DamagedError(f"{name}: truncated or damaged: {reason}") from error

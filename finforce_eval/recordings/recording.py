@@ -13,8 +13,7 @@ from finforce.files import FileError, read_json
 from finforce.messages import Keypoints, decode_columns, decode_keypoints
 from finforce.stamps import NANOSECONDS
 from finforce_eval.errors import DamagedError, RecordingError
-from finforce_eval.recordings.bags import BagMessage, bag_source, check_types, open_bag
-from finforce_eval.recordings.bounded import check_messages
+from finforce_eval.recordings.bags import BagMessage, bag_source, check_messages, check_types, open_bag
 from finforce_eval.recordings.images import PAIRED, ImageTrack, find_images
 from finforce_eval.recordings.salvage import SalvagedCopy
 from finforce_eval.recordings.tracks import (

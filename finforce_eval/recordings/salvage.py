@@ -7,40 +7,27 @@ import shutil
 import sqlite3
 import struct
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, NamedTuple
 from zlib import crc32
 
-from finforce.errors import MissingDependencyError
-from finforce.optional import import_library
+from finforce.sandbox import SandboxError, run_limited
 from finforce_eval.errors import OutOfBoundsError, RecordingError
-from finforce_eval.recordings.bags import NO_DIGEST
-from finforce_eval.recordings.bounded import (
-    STEPS,
-    check_chunks,
-    import_zstd,
-    refuse_computed,
-    step_limit,
-    unpack_lz4,
-    unpack_zstd,
-)
+from finforce_eval.recordings.bags import NO_DIGEST, STEP_MEMORY, allowed_bytes, allowed_seconds, bag_files
 
-# No record of an mcap file is longer [bytes]: chunks have megabytes, an uncompressed 4K image 25.
-_LONGEST = 1 << 30
-# Of a record: opcode, length. Of those that are read, that end the data, and of all.
-_MAGIC, _HEAD = 8, struct.Struct("<BQ")
-_READ_OPCODES, _END_OPCODES, _OPCODES = (0x03, 0x04, 0x05), (0x02, 0x0F), range(0x01, 0x10)
-_CHUNK_HEAD = struct.Struct("<QQQII")
+_MAGIC = 8  # bytes before the first record of an mcap file
 # Of a chunk: opcode, length, first and last time, uncompressed size, checksum, length of the compression's name.
-_CHUNK, _CHUNK_OPCODE = struct.Struct("<BQQQQII"), 0x06
-_PIECE = 1 << 12
+_CHUNK, _CHUNK_OPCODE, _PIECE = struct.Struct("<BQQQQII"), 0x06, 1 << 12
 # Of an SQLite file: size of a page, and their number. Messages that may share a page; zeros that end a torn one.
 _SQLITE_HEAD, _NEIGHBOURS, _ENDING = struct.Struct(">16xH10xI"), 8, 256
 _LARGEST_BASE = 1 << 42
+_ROWS = "SELECT rowid, topic_id, timestamp, data FROM messages WHERE rowid >= ? ORDER BY rowid"
+_MOST_ROWS = 1 << 24
 
 
 class _Message(NamedTuple):
@@ -62,21 +49,26 @@ class SalvagedCopy:
     """
 
     def __init__(self, source: Path, reason: str) -> None:
-        """Copy what can be read.
+        """Copy what can be read, in a process of its own.
 
         Args:
             source: as `bag_source` returned it.
             reason: why it is not read as it is.
 
         Raises:
-            RecordingError: not one message of it is whole.
-            MissingDependencyError: the library that reads what was cut off is not installed.
+            RecordingError: Not one message of it is whole.
+            OutOfBoundsError: It takes more memory, time or disk than one of its size does.
         """
         self._folder = TemporaryDirectory(prefix="finforce_")
         self.path = Path(self._folder.name) / source.stem
-        loss = _Loss()
-        count, seconds = _copy_good_part(source, self.path, reason, loss)
-        self.note = f"{reason}; read as far as it is good: {count} messages of {seconds:.1f} s{loss.words()}"
+        limits = {"seconds": allowed_seconds(source), "disk": allowed_bytes(source)}
+        try:
+            found = run_limited(copy_good_part, source, self.path, memory=2 * STEP_MEMORY, **limits)
+        except SandboxError as error:
+            raise OutOfBoundsError(f"{reason}; what is left of it {error}") from error
+        if not found:
+            raise RecordingError(f"{reason}; not one message is whole")
+        self.note = f"{reason}; read as far as it is good: {found}"
 
 
 @dataclass
@@ -105,11 +97,11 @@ class _Loss:
         return f", {parts}{size} lost"
 
 
-def _copy_good_part(source: Path, target: Path, reason: str, loss: _Loss) -> tuple[int, float]:
-    """Write the messages that are whole as a new bag; return their number, and the time that they span [s]."""
+def copy_good_part(source: Path, target: Path) -> str:
+    """Write the messages that are whole as a new bag; return how many there are and what was lost, "" without any."""
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    files = _bag_files(source)
+    files, loss = bag_files(source), _Loss()
     is_sqlite = bool(files) and files[0].suffix == ".db3"
     connections: dict[tuple[str, str], Any] = {}
     times: list[int] = []
@@ -124,106 +116,92 @@ def _copy_good_part(source: Path, target: Path, reason: str, loss: _Loss) -> tup
                 writer.write(connections[key], message.time, message.data)
                 times.append(message.time)
     if not times:
-        raise RecordingError(f"{reason}; not one message is whole")
+        return ""
     if source.is_dir():
         for path in source.iterdir():
             if path.is_file() and path not in files and path.name != "metadata.yaml":
                 shutil.copy2(path, target / path.name)
-    return len(times), 1e-9 * (max(times) - min(times))
-
-
-def _bag_files(source: Path) -> list[Path]:
-    """Return the files of a bag in their order."""
-    if source.is_file():
-        return [source]
-    found = [path for path in source.iterdir() if path.suffix in (".mcap", ".db3")]
-    return sorted(found, key=lambda path: (len(path.name), path.name))
+    return f"{len(times)} messages of {1e-9 * (max(times) - min(times)):.1f} s{loss.words()}"
 
 
 def _read_mcap(path: Path, loss: _Loss) -> Iterator[_Message]:
     """Yield the messages of an mcap file that are whole."""
-    try:
-        from mcap.records import Channel, Message, Schema
-    except ImportError as error:
-        raise MissingDependencyError("reading a recording that was cut off needs mcap: pip install mcap") from error
+    from mcap.reader import SeekingReader
+    from mcap.records import Channel, Message, Schema
+
+    size, summary = path.stat().st_size, None
     with path.open("rb") as file:
-        summary = _read_summary(file, path.stat().st_size)
+        with suppress(Exception):  # the end of the file may be gone, or damaged in any way
+            summary = SeekingReader(file, record_size_limit=size).get_summary()
         schemas: dict[int, Any] = dict(summary.schemas) if summary else {}
         channels: dict[int, Any] = dict(summary.channels) if summary else {}
-        known = sorted(each.chunk_start_offset for each in summary.chunk_indexes) if summary else []
-        for record in _walk_records(file, path.stat().st_size, known, loss):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message) and record.channel_id in channels:
-                channel = channels[record.channel_id]
-                schema = schemas.get(channel.schema_id)
-                if schema is not None:
-                    text = schema.data.decode(errors="replace")
-                    yield _Message(channel.topic, schema.name, text, record.log_time, record.data)
+        known = {each.chunk_start_offset for each in summary.chunk_indexes} if summary else set()
+        for begin, end in pairwise(sorted({_MAGIC, size} | {place for place in known if place < size})):
+            for record in _read_stretch(file, begin, end, loss, is_last=end == size):
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Message) and record.channel_id in channels:
+                    channel = channels[record.channel_id]
+                    schema = schemas.get(channel.schema_id)
+                    if schema is not None:
+                        text = schema.data.decode(errors="replace")
+                        yield _Message(channel.topic, schema.name, text, record.log_time, record.data)
 
 
-def _walk_records(file: BinaryIO, size: int, known: Sequence[int], loss: _Loss) -> Iterator[Any]:
-    """Yield the records of a file that are whole; after what is not, go on with the next of the known chunks."""
-    place, unpacked = _MAGIC, 0
-    while place + _HEAD.size <= size:
-        file.seek(place)
-        head = file.read(_HEAD.size)
-        opcode, length = _HEAD.unpack(head)
-        end = place + _HEAD.size + length
-        after = next((other for other in known if other > place), size)
-        is_torn = end > size or (opcode == _CHUNK_OPCODE and end > after)
-        if is_torn or opcode not in _OPCODES:
-            if opcode == _CHUNK_OPCODE and after == size:  # the last one: its beginning may be good
+def _read_stretch(file: BinaryIO, begin: int, end: int, loss: _Loss, *, is_last: bool) -> Iterator[Any]:
+    """Yield the records between two places of a file that are whole, up to the first that is not."""
+    from mcap.records import Chunk, Footer
+    from mcap.stream_reader import StreamReader
+
+    file.seek(begin)
+    records = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=end - begin).records
+    while (place := file.tell()) < end:
+        record = None
+        with suppress(Exception):  # of a record's fields, anything
+            record = next(records, None) if file.peek(1)[:1] != b"\0" else None  # zeros follow where power was lost
+        if record is None or file.tell() > end:
+            file.seek(place)
+            if file.read(1)[:1] == bytes([_CHUNK_OPCODE]) and is_last:  # its beginning may be good
                 file.seek(place)
-                yield from _parse_records(_read_torn_chunk(file))
-            loss.add(after - place)
-            place = after
-            continue
-        if opcode == _CHUNK_OPCODE:
-            content = _unpack_chunk(file.read(length))
-            unpacked += len(content or b"")
-            check_chunks([unpacked], size)
-            if content is None:
-                loss.add(length)
-            else:
-                yield from _parse_records(content, loss)
-        elif opcode in _READ_OPCODES:
-            yield from _parse_records(head + file.read(length), loss)
-        elif opcode in _END_OPCODES:
+                yield from _parse_records(_unpack_torn(file.read(end - place)))
+            loss.add(end - place)
             return
-        place = end
+        if isinstance(record, Footer):
+            return
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        content = _unpack(record.compression, record.data)
+        checksum = record.uncompressed_crc
+        if len(content) != record.uncompressed_size or (checksum and crc32(content) != checksum):
+            loss.add(len(record.data))
+        else:
+            yield from _parse_records(content, loss)
 
 
-def _read_summary(file: BinaryIO, size: int) -> Any:
-    """Return what the end of a file [bytes] says of its topics, and where chunks begin; None where it is gone."""
-    from mcap.reader import SeekingReader
+def _unpack(compression: str, data: bytes) -> bytes:
+    """Return what a chunk unpacks to, as far as it does."""
+    import lz4.frame
+    from rosbags.rosbag2.storage_mcap import zstd
 
-    try:
-        return SeekingReader(file, record_size_limit=min(size, _LONGEST)).get_summary()
-    except Exception:  # it, too, may be damaged in any way
-        return None
+    if compression not in ("lz4", "zstd"):
+        return data if compression == "" else b""
+    found, file = [], (lz4.frame if compression == "lz4" else zstd).open(io.BytesIO(data))
+    with file, suppress(EOFError, OSError, RuntimeError, zstd.ZstdError):
+        while piece := file.read(_PIECE):
+            found.append(piece)
+    return b"".join(found)
 
 
-def _unpack_chunk(content: bytes) -> bytes | None:
-    """Return the records of a chunk; None where they are not what was written."""
-    if len(content) < _CHUNK_HEAD.size:
-        return None
-    _, _, size, checksum, length = _CHUNK_HEAD.unpack_from(content)
-    begin = _CHUNK_HEAD.size + length + 8
-    compression, data = content[_CHUNK_HEAD.size : begin - 8], content[begin:]
-    check_chunks([size], len(content))
-    unpackers = {b"": lambda plain, _: plain, b"lz4": unpack_lz4, b"zstd": unpack_zstd}
-    if compression not in unpackers:
-        return None
-    try:
-        found = unpackers[compression](data, size)
-    except OutOfBoundsError:
-        raise
-    except Exception:  # each decompressor has its own classes
-        return None
-    return found if len(found) == size and (not checksum or crc32(found) == checksum) else None
+def _unpack_torn(content: bytes) -> bytes:
+    """Return what is left of the records of a chunk of which the end is missing."""
+    if len(content) < _CHUNK.size:
+        return b""
+    length = _CHUNK.unpack_from(content)[-1]
+    name, data = content[_CHUNK.size : _CHUNK.size + length], content[_CHUNK.size + length + 8 :]
+    return _unpack(name.decode(errors="replace"), data)
 
 
 def _parse_records(content: bytes, loss: _Loss | None = None) -> Iterator[Any]:
@@ -231,53 +209,15 @@ def _parse_records(content: bytes, loss: _Loss | None = None) -> Iterator[Any]:
     from mcap.stream_reader import StreamReader
 
     stream = io.BytesIO(content)
-    records = iter(StreamReader(stream, skip_magic=True, record_size_limit=len(content)).records)
-    while True:
-        begin = stream.tell()
+    records = StreamReader(stream, skip_magic=True, record_size_limit=len(content)).records
+    while (begin := stream.tell()) < len(content):
         try:
             record = next(records)
-        except StopIteration:
-            return
         except Exception:  # of a record's fields, anything
-            if loss is not None and begin < len(content):
+            if loss is not None:
                 loss.add(len(content) - begin)
             return
         yield record
-
-
-def _read_torn_chunk(file: BinaryIO) -> bytes:
-    """Return what is left of the records of the chunk at which a file is."""
-    head = file.read(_CHUNK.size)
-    if len(head) < _CHUNK.size:
-        return b""
-    _, _, _, _, size, _, length = _CHUNK.unpack(head)
-    if length > len("none"):
-        return b""
-    compression = file.read(length).decode(errors="replace")
-    file.read(8)
-    check_chunks([size], 0)
-    torn = file.read(min(size, _LONGEST))
-    return torn if compression == "" else _decompress(torn, compression, size)
-
-
-def _decompress(torn: bytes, compression: str, size: int) -> bytes:
-    """Return the beginning of compressed bytes of which the end is missing; of the whole, at most `size` [bytes]."""
-    if compression == "lz4":
-        decompressor = import_library("lz4.frame", "reading a recording", "lz4").LZ4FrameDecompressor()
-    elif compression == "zstd":
-        decompressor = import_zstd().ZstdDecompressor()
-    else:
-        return b""
-    found, left = [], size
-    for begin in range(0, len(torn), _PIECE):
-        try:
-            found.append(decompressor.decompress(torn[begin : begin + _PIECE], max_length=left))
-        except Exception:  # what follows is damaged; each decompressor has its own classes
-            break
-        left -= len(found[-1])
-        if left <= 0 or decompressor.eof:
-            break
-    return b"".join(found)
 
 
 def _read_sqlite(path: Path, loss: _Loss) -> Iterator[_Message]:
@@ -300,11 +240,9 @@ def _read_rows(path: Path, loss: _Loss) -> Iterator[_Message]:
     """Yield the messages of a db3 file in the order in which they were written, without those on damaged pages."""
     with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro&immutable=1", uri=True)) as base:
         try:
-            refuse_computed(path)
             topics = {row[0]: row[1:] for row in base.execute("SELECT id, name, type FROM topics")}
-        except (sqlite3.DatabaseError, ValueError):
+        except sqlite3.DatabaseError:
             return
-        base.set_progress_handler(step_limit(path), STEPS)
         begin, step = -(1 << 62), 1
         while step < _MOST_ROWS:
             try:
@@ -322,10 +260,6 @@ def _read_rows(path: Path, loss: _Loss) -> Iterator[_Message]:
                 if step == 1:
                     loss.add(0)
                 step *= 2
-
-
-_ROWS = "SELECT rowid, topic_id, timestamp, data FROM messages WHERE rowid >= ? ORDER BY rowid"
-_MOST_ROWS = 1 << 24
 
 
 def _pad_sqlite(path: Path, copy: Path) -> Path | None:

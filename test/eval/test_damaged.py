@@ -128,22 +128,23 @@ def test_damaged_recordings_are_annotated_and_evaluated_with_a_word(tmp_path, ca
     assert "read as far as it is good" in capsys.readouterr().err
 
 
-def test_a_chunk_that_says_more_than_it_may_is_refused_and_names_the_way_out(tmp_path, monkeypatch):
-    from finforce_eval.recordings import bounded
+def test_chunks_that_say_more_than_they_may_are_refused_and_names_the_way_out(tmp_path, monkeypatch):
+    from finforce_eval.recordings import bags
 
-    monkeypatch.setattr(bounded, "LARGEST_CHUNK", 1 << 12)
+    monkeypatch.setattr(bags, "LARGEST_ALL", 1 << 12)
+    monkeypatch.setattr(bags, "PER_BYTE", 0)
     _, path = write(tmp_path, "mcap", "zstd")
     with pytest.raises(OutOfBoundsError, match="FINFORCE_BUDGET=10"):
         read_recording(path)
-    monkeypatch.setenv("FINFORCE_BUDGET", "100")
+    monkeypatch.setenv("FINFORCE_BUDGET", "1000")
     assert len(read_recording(path).jaws["left"].keypoints.stamps) == 1500
 
 
 def test_more_messages_than_a_file_can_hold_are_refused(tmp_path, monkeypatch):
-    from finforce_eval.recordings import bounded, recording
+    from finforce_eval.recordings import bags, recording
 
-    monkeypatch.setattr(bounded, "MOST_MESSAGES", 100)
-    monkeypatch.setattr(bounded, "BYTES_PER_MESSAGE", 1 << 20)
+    monkeypatch.setattr(bags, "MOST_MESSAGES", 100)
+    monkeypatch.setattr(bags, "BYTES_PER_MESSAGE", 1 << 20)
     monkeypatch.setattr(recording, "_CHECKED", 50)
     _, path = write(tmp_path)
     with pytest.raises(RecordingError, match="more than 100 messages"):
