@@ -58,6 +58,7 @@ class TrackerSettings:
     points: int = setting(1000, "Object pixels compared per image", "1", 100, 20000)
     noise: float = setting(0.3e-3, "Minimum standard deviation of the depth", "m", 1e-5, 0.01)
     least_fitness: float = setting(0.6, "Minimum share of the visible object that agrees with the depth", "1", 0.1, 1.0)
+    least_visible: float = setting(0.1, "Minimum share of the object in view that nothing hides", "1", 0.01, 1.0)
     speed: float = setting(0.2, "Expected object speed (1 sigma)", "m/s", 0.001, 5.0)
     turn_rate: float = setting(1.0, "Expected object turn rate (1 sigma)", "rad/s", 0.01, 20.0)
 

@@ -19,7 +19,6 @@ from finforce_contact.pose.source import ObjectPose, check_camera_outside
 
 # Depth farther off than this [m] is not the object, at first and in the end.
 _WIDE_GATE, _GATE = 0.006, 0.003
-_LEAST_VISIBLE = 0.1  # share of the object in view that nothing hides
 # Depths farther apart than this [m] disagree altogether.
 _WORST = 0.01
 _COARSE = Effort(gates=(0.03, 0.015), steps=3, points=150, outline=False)
@@ -266,7 +265,7 @@ class PoseTracker:
             return False
         return (
             alignment.seen >= LEAST_PIXELS
-            and alignment.visible >= _LEAST_VISIBLE
+            and alignment.visible >= self._settings.least_visible
             and alignment.fitness >= self._settings.least_fitness
         )
 
