@@ -21,7 +21,7 @@ def build(gripper=None, **parameters):
     """Tasks and grasps of a fake gripper."""
     gripper = gripper or FakeGripper()
     given = DriverParameters(**parameters)
-    session = GraspSession(gripper, given.goal, GraspSettings())
+    session = GraspSession(gripper, GraspGoal(force=given.grasp_force, speed=given.grasp_speed), GraspSettings())
     return gripper, session, GripperTasks(gripper, session, given)
 
 
