@@ -545,8 +545,8 @@ def test_grasps_and_turns_and_shapes_are_put_in_tables(tmp_path):
     found = GraspExperiment(options=RunOptions()).find({"one": row}, tmp_path)
     assert found.tables[0].rows.force.tolist() == ["low", "all"]
     assert found.tables[0].rows["shows after/ms"].tolist() == [100.0, 100.0]
-    one = Wrench(np.eye(3)[:2], np.eye(3)[:2])
-    net = NetForces(stamps=np.arange(2), found=one, true=one, stated=None, answered_pct=100.0)
+    one = np.eye(3)[:2]
+    net = ForceSeries.build("one", "gripper", np.arange(2), force=one, true_force=one)
     turn = score_weight(net) | {"axis": "roll", "light": "dim"}
     found = ManipulationExperiment(options=RunOptions()).find({"one": turn}, tmp_path)
     assert found.tables[0].rows["paper/N"].tolist() == ["0.28 ± 0.02"]
