@@ -16,10 +16,10 @@ from finforce_eval.cli.parser import (
     add_source_options,
     read_engine,
 )
-from finforce_eval.evaluation.many import ManyEvaluated, evaluate_many
 from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
 from finforce_eval.evaluation.tables import evaluation_json, format_table
 from finforce_eval.machine import write_json
+from finforce_eval.many import ManyEvaluated, evaluate_many
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -13,9 +13,9 @@ from finforce_contact.jaw_contact import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results, true_range
-from finforce_eval.evaluation.many import read_evaluations
 from finforce_eval.figures.html_report import write_html
 from finforce_eval.figures.report import write_page
+from finforce_eval.many import read_evaluations
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.table import ForceSeries, read_table, write_table
 
