@@ -54,6 +54,7 @@ setup(
         "matplotlib",  # pictures of the reports
         "tqdm",  # progress bars
         "pandas",  # tables of forces over time and of figures, with named columns
+        "pyarrow",  # these tables in Parquet files
     ],
     extras_require={
         # ROS 2 Jazzy for machines without it; Python 3.10 to 3.13 on x86_64
@@ -65,13 +66,13 @@ setup(
         ],
         "cad": ["cascadio", "ezdxf", "svgelements"],  # fingers from STEP, DXF and SVG files
         "can": ["python-can>=4.3"],  # other CAN adapters than SLCAN ones: SocketCAN and more
-        "lerobot": ["pyarrow", "av"],  # LeRobot datasets: tables and videos, by the libraries that they are made with
+        "lerobot": ["av"],  # videos of LeRobot datasets, by the library that they are made with
         "ray": ["ray"],  # recordings on a cluster
         "view": ["rerun-sdk"],  # a viewer of pictures, shapes and curves over time
         # training of key point networks; without a GPU, torch's own index has a build of a tenth of the size
         "train": ["torch", "onnx"],
         "test": ["pytest", "pytest-xdist", "pytest-timeout", "hypothesis", "onnx", "python-can>=4.3,!=4.6.0", "xacro"]
-        + ["cascadio", "ezdxf", "svgelements", "pyarrow", "av", "ray", "rerun-sdk", "playwright"],
+        + ["cascadio", "ezdxf", "svgelements", "av", "ray", "rerun-sdk", "playwright"],
         "lint": ["ruff", "import-linter"],
     },
     entry_points={

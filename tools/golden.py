@@ -24,7 +24,19 @@ from finforce_eval.machine import write_figures
 ROOT = Path(__file__).parents[1]
 TOLERANCE = 1e-6  # [N, m] below which two series are equal: another order of a sum
 TIMES = ("_ms", "time", "seconds", "clock", "machine", "commit", "version", "processor", "memory")
-SERIES = ("force", "torque", "stddev", "axis_stddev", "place", "status", "used")
+SERIES = {  # name of the file's column -> of the table's
+    "force": "force",
+    "torque": "torque",
+    "stddev": "magnitude_stddev",
+    "axis_stddev": "force_stddev",
+    "place": "contact_location",
+    "status": "status",
+    "used": "used",
+    "stamps": "stamp",
+    "truth": "true_force",
+    "scored": "scored",
+    "contact": "contact_height",
+}
 
 
 def run_tool(*words: str) -> str:
@@ -44,9 +56,7 @@ def freeze_forces(folder: Path, bags: list[str], source: str) -> None:
         setup = make_setup(options)
         for recording in read_keypoints(options):
             for result in evaluate_jaws(recording, setup):
-                columns = {name: getattr(result, name) for name in SERIES}
-                columns |= {"stamps": result.stamps, "truth": result.truth, "scored": result.scored}
-                columns["contact"] = result.contact.given
+                columns = {name: result.column(column) for name, column in SERIES.items()}
                 np.savez_compressed(folder / f"force_{source}_{result.name.replace('/', '_')}.npz", **columns)
 
 

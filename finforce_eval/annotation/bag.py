@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from finforce.errors import FinforceError, one_line
 from finforce.messages import read_stamp
-from finforce_eval.annotation.forces import GraspForces, JawForces
+from finforce_eval.annotation.forces import reasons
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import NO_DIGEST, BagReader, open_bag
 from finforce_eval.recordings.recording import CLOUD, WRENCH
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.recordings.writer import MARKERS, Entry, MessageFactory
+from finforce_eval.table import AXES, ForceSeries
 
 STATUS = "diagnostic_msgs/msg/DiagnosticArray"
 GRIPPER_FRAME = "gripper_base"
@@ -35,61 +36,71 @@ class ForceMessages:
         grasp: of the gripper.
     """
 
-    def __init__(self, jaws: Mapping[str, JawForces], grasp: GraspForces) -> None:
-        self.factory, self._jaws, self._grasp = MessageFactory(), jaws, grasp
-        self._rows = {side: _index(forces.stamps) for side, forces in jaws.items()}
-        self._grasp_rows = _index(grasp.stamps)
+    def __init__(self, jaws: Mapping[str, ForceSeries], grasp: ForceSeries) -> None:
+        self.factory = MessageFactory()
+        self._jaws = {side: _rows(forces, {"reason": reasons(forces)}) for side, forces in jaws.items()}
+        self._grasp = _rows(grasp)
         self._drawn: dict[str, bool] = {}
         names = ("wrench", "wrench_stddev", "wrench_status", "contact", "markers")
         self.topics = {f"/{side}/{name}" for side in jaws for name in names} | {"/grasp_wrench", "/manipulation_wrench"}
 
     def __len__(self) -> int:
         """Images with messages."""
-        return len(self._grasp_rows)
+        return len(self._grasp)
 
     def at(self, stamp: int) -> Iterator[Entry]:
         """Yield the messages of an image [ns]; none of an image that is not known, or was asked for before."""
-        row = self._grasp_rows.pop(stamp, None)
+        row = self._grasp.pop(stamp, None)
         if row is None:
             return
-        for side, rows in self._rows.items():
+        for side, rows in self._jaws.items():
             if stamp in rows:
-                yield from self._of_jaw(self._jaws[side], rows[stamp], stamp)
-        grasp, factory = self._grasp, self.factory
-        torque = np.where(np.isfinite(grasp.grasp[row]), 0.0, np.nan)
-        yield Entry(stamp, "/grasp_wrench", WRENCH, factory.wrench(stamp, GRIPPER_FRAME, grasp.grasp[row], torque))
-        net = factory.wrench(stamp, GRIPPER_FRAME, grasp.manipulation[row], grasp.torque[row])
+                yield from self._of_jaw(side, rows[stamp], stamp)
+        factory = self.factory
+        force = np.array([row["grasp_force"], 0.0, 0.0]) + 0.0 * row["grasp_force"]
+        grasp = factory.wrench(stamp, GRIPPER_FRAME, force, 0.0 * force)
+        yield Entry(stamp, "/grasp_wrench", WRENCH, grasp)
+        net = factory.wrench(stamp, GRIPPER_FRAME, _vector(row, "force"), _vector(row, "torque"))
         yield Entry(stamp, "/manipulation_wrench", WRENCH, net)
 
-    def _of_jaw(self, forces: JawForces, row: int, stamp: int) -> Iterator[Entry]:
+    def _of_jaw(self, side: str, row: Mapping[str, Any], stamp: int) -> Iterator[Entry]:
         """Yield the messages of one jaw in one image."""
-        side, factory = forces.side, self.factory
-        frame = f"{side}_jaw"
-        wrench = factory.wrench(stamp, frame, forces.force[row], forces.torque[row])
+        factory, frame, force = self.factory, f"{side}_jaw", _vector(row, "force")
+        wrench = factory.wrench(stamp, frame, force, _vector(row, "torque"))
         yield Entry(stamp, f"/{side}/wrench", WRENCH, wrench)
-        stddev = factory.wrench(stamp, frame, forces.force_stddev[row], forces.torque_stddev[row])
+        stddev = factory.wrench(stamp, frame, _vector(row, "force_stddev"), _vector(row, "torque_stddev"))
         yield Entry(stamp, f"/{side}/wrench_stddev", WRENCH, stddev)
-        level = _OK if forces.is_answered(row) else _WARN
-        status = str(forces.status[row])
-        text = forces.reason[row] or status
-        message = factory.status(stamp, level, f"finforce: {side} jaw", text, {"status": status})
+        level = _OK if np.isfinite(force).all() else _WARN
+        text, values = row["reason"] or row["status"], {"status": row["status"]}
+        message = factory.status(stamp, level, f"finforce: {side} jaw", text, values)
         yield Entry(stamp, f"/{side}/wrench_status", STATUS, message)
-        if forces.contact[row] is not None:
-            yield Entry(stamp, f"/{side}/contact", CLOUD, factory.cloud(stamp, frame, forces.contact[row]))
-        if self._is_drawn(forces, row):
-            markers = factory.force_markers(stamp, frame, forces.point[row], forces.force[row])
+        if row["points_x"] is not None:
+            yield Entry(stamp, f"/{side}/contact", CLOUD, factory.cloud(stamp, frame, _contact_cloud(row)))
+        if self._is_drawn(side, force):
+            markers = factory.force_markers(stamp, frame, _vector(row, "contact_point"), force)
             yield Entry(stamp, f"/{side}/markers", MARKERS, markers)
 
-    def _is_drawn(self, forces: JawForces, row: int) -> bool:
+    def _is_drawn(self, side: str, force: NDArray[np.float64]) -> bool:
         """Say whether an image has another picture than the one before: there is a force, or one has gone."""
-        pressed = bool(np.isfinite(forces.force[row]).all() and forces.force[row].any())
-        before, self._drawn[forces.side] = self._drawn.get(forces.side, False), pressed
+        pressed = bool(np.isfinite(force).all() and force.any())
+        before, self._drawn[side] = self._drawn.get(side, False), pressed
         return pressed or before
 
 
-def _index(stamps: NDArray[np.int64]) -> dict[int, int]:
-    """Return the row of each stamp [ns]."""
-    return {stamp: row for row, stamp in enumerate(stamps.tolist())}
+def _rows(forces: ForceSeries, more: Mapping[str, Any] | None = None) -> dict[int, dict[str, Any]]:
+    """Return the rows of a table, and columns more, by their stamps [ns]."""
+    return {row["stamp"]: row for row in forces.table.assign(**(more or {})).to_dict("records")}
+
+
+def _vector(row: Mapping[str, Any], name: str) -> NDArray[np.float64]:
+    """Return a vector (3,) of a row."""
+    return np.array([row[f"{name}_{axis}"] for axis in AXES])
+
+
+def _contact_cloud(row: Mapping[str, Any]) -> dict[str, NDArray]:
+    """Return the columns of the cloud of a contact."""
+    columns = {axis: np.asarray(row[f"points_{axis}"], np.float32) for axis in (*AXES, "weight")}
+    return columns | {"touching": np.full(len(columns["x"]), row["points_touching"], np.uint8)}
 
 
 def write_annotated(

@@ -12,16 +12,18 @@ from typing import Any
 import numpy as np
 
 from finforce_eval.annotation.bag import ForceMessages, new_folder, write_annotated
-from finforce_eval.annotation.forces import JawForces, combine_forces, estimate_forces
+from finforce_eval.annotation.forces import estimate_forces
 from finforce_eval.engine.settings import sides_of
 from finforce_eval.engine.tasks import OK, Task, hash_settings, make_line
 from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.manipulation import combine_jaws
 from finforce_eval.evaluation.setup import EvaluationSetup
 from finforce_eval.evaluation.warm import open_warm
 from finforce_eval.machine import version
 from finforce_eval.recordings.bags import bag_source, list_files
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
+from finforce_eval.table import ForceSeries
 
 NOTE = "annotation.json"
 
@@ -61,7 +63,7 @@ def annotate_bag(source: str, target: str, options: Mapping[str, Any], settings:
     recording = read_recording(source, keypoints.pairing, sides_of(chosen), strict=keypoints.strict)
     recording = keypoints.apply(replace(recording, name=Path(source).stem))
     jaws = estimate_forces(recording, warm.setup, build=warm.estimator)
-    grasp = combine_forces(recording, jaws)
+    grasp = combine_jaws(jaws)
     figures = _figures(recording, jaws, list(recording.notes))
     note = {"key": key, "status": OK, "figures": figures, "settings": _settings(warm.setup), "version": version()}
     with new_folder(Path(target)) as folder:
@@ -75,17 +77,17 @@ def _settings(setup: EvaluationSetup) -> dict[str, str]:
     return {name: str(value) for name, value in setup.about.items()}
 
 
-def _figures(recording: Recording, jaws: Mapping[str, JawForces], notes: list[str]) -> dict[str, Any]:
+def _figures(recording: Recording, jaws: Mapping[str, ForceSeries], notes: list[str]) -> dict[str, Any]:
     """Return what is said of a recording in the manifest."""
     sides = {}
     for side, forces in jaws.items():
-        reasons, counts = np.unique(forces.status[~forces.answered], return_counts=True)
-        magnitude = np.linalg.norm(forces.force, axis=1)
+        solved = forces.solved
+        words, counts = np.unique(forces.column("status")[~solved], return_counts=True)
         sides[side] = {
-            "images": len(forces.stamps),
-            "answered": int(forces.answered.sum()),
-            "unanswered": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
-            "largest_N": float(np.nanmax(magnitude)) if forces.answered.any() else float("nan"),
+            "images": len(forces),
+            "answered": int(solved.sum()),
+            "unanswered": dict(zip(words.tolist(), counts.tolist(), strict=True)),
+            "largest_N": float(np.nanmax(forces.magnitude)) if solved.any() else float("nan"),
         }
     stamps = np.concatenate([forces.stamps for forces in jaws.values()])
     span = 1e-9 * float(stamps.max() - stamps.min()) if len(stamps) else 0.0

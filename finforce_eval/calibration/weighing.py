@@ -6,17 +6,13 @@ and clamp stay as they were. Knows no files and no options.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_contact.jaw_contact import ContactSource, ForceLoop
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.evaluate import Estimator
-from finforce_eval.recordings.tracks import Recording
 
 GRAVITY = 9.80665  # [m/s^2] by which kitchen scales turn weight into grams
 LEAST_HOLD = 1.5  # [s]
@@ -59,24 +55,6 @@ class Weighing:
     holds: tuple[Hold, ...]
     weights: NDArray[np.float64]
     misfit: float
-
-
-def estimate_pressing(
-    recording: Recording,
-    side: str,
-    estimator: Estimator,
-    source: ContactSource,
-    progress: Callable[[int], Any] = lambda frames: None,
-) -> NDArray[np.float64]:
-    """Return the estimated force along the closing direction of every image (n,) [N], NaN where there is none."""
-    track, loop = recording.jaw(side).keypoints, ForceLoop(source, estimator)
-    pressing = np.full(len(track.stamps), np.nan)
-    for index in range(len(pressing)):
-        solution = loop.update(track.observation(index))
-        if solution.trusted:
-            pressing[index] = abs(solution.force[0])
-        progress(1)
-    return pressing
 
 
 def find_holds(times: NDArray[np.float64], pressing: NDArray[np.float64]) -> list[Hold]:

@@ -16,10 +16,10 @@ from finforce_eval.cli.parser import (
     add_source_options,
     read_engine,
 )
-from finforce_eval.evaluation.many import ManyEvaluated, evaluate_many
 from finforce_eval.evaluation.setup import EvaluationSetup, make_setup
 from finforce_eval.evaluation.tables import evaluation_json, format_table
 from finforce_eval.machine import write_json
+from finforce_eval.many import ManyEvaluated, evaluate_many
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -31,8 +31,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_set(parser)
     parser.add_argument("--json", metavar="OUT", help="write the scores as JSON")
     parser.add_argument("--report", metavar="DIR", help="write pictures and a page that shows them")
-    text = "keep the series of every recording there, and manifest.jsonl: a run that was killed goes on where it was, "
-    text += "and finforce report shows them"
+    text = (
+        "write a table of every recording there (Parquet: a row for each image and jaw), and manifest.jsonl, by which "
+    )
+    text += "a run that was killed goes on where it was; finforce report shows the tables"
     parser.add_argument("--out", metavar="DIR", help=text)
     add_engine_options(parser)
 
@@ -56,13 +58,6 @@ def _write(found: ManyEvaluated, setup: EvaluationSetup, options: argparse.Names
         failed = {"failed": dict(found.failed)} if found.failed else {}
         write_json(options.json, evaluation_json(found.evaluation, **failed, **setup.about))
     if options.report:
-        from finforce_eval.figures.report import write_report
+        from finforce_eval.figures.report import write_overview
 
-        page = write_report(
-            found.evaluation,
-            options.report,
-            keypoint_names=setup.jaw.keypoint_names,
-            about=setup.about,
-            recordings=found.recordings,
-        )
-        print(f"Report: {page}")
+        print(f"Report: {write_overview(found.evaluation, options.report, about=setup.about)}")

@@ -20,9 +20,7 @@ from finforce_eval.replay.replay import Playing, Replay, replay
 def format_replay(result: Replay) -> str:
     """Return the table of the score, with the state of the nodes below."""
     lines = [format_table(result.evaluation), ""]
-    began = (
-        "images" if any(case.detector_ms is not None for case in result.evaluation.results.values()) else "key points"
-    )
+    began = "images" if any(case.has("detector_ms") for case in result.evaluation.results.values()) else "key points"
     lines.append(f"Step times are from {began} out to wrench in, over the middleware and back.")
     lines.append(f"grasp_wrench: {len(result.grasp)} messages, largest {_largest(result.grasp):.2f} N{_shown(result)}.")
     for name, state in result.health.items():

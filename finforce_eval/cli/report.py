@@ -6,12 +6,11 @@ import argparse
 from pathlib import Path
 
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.evaluate import score_results
-from finforce_eval.evaluation.kept import load_kept
 from finforce_eval.figures.html_report import write_html
 from finforce_eval.figures.recorded_forces import read_forces
 from finforce_eval.figures.report import write_page
 from finforce_eval.machine import version
+from finforce_eval.many import read_evaluations
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -31,18 +30,16 @@ def run(options: argparse.Namespace) -> None:
     page = Path(options.output)
     if page.suffix not in (".html", ".htm"):
         raise OptionError(f"--output {page}: expected a name that ends in .html")
-    kept, courses = [], []
+    tables, recorded = [], []
     for source in map(Path, options.sources):
-        files = sorted(source.glob("*.npz")) if source.is_dir() else []
-        kept += [load_kept(file) for file in files]
-        courses += [] if files else read_forces(source)
-    if kept and courses:
+        files = sorted(source.glob("*.parquet")) if source.is_dir() else []
+        tables += files
+        recorded += [] if files else read_forces(source)
+    if tables and recorded:
         raise OptionError("recordings and folders of evaluations: expected the one or the other")
-    if kept:
-        evaluation = score_results(
-            [result for each in kept for result in each.results], [each.recording for each in kept]
-        )
-        write_page(evaluation, page, about=kept[0].about, title=options.title)
+    if tables:
+        evaluation, about = read_evaluations(tables)
+        write_page(evaluation, page, about=about, title=options.title)
     else:
-        write_html(courses, page, title=options.title, about={"version": version()})
-    print(f"Page: {page}: {len(courses) or len(evaluation.results)} plots")
+        write_html(recorded, page, title=options.title, about={"version": version()})
+    print(f"Page: {page}: {len(recorded) or len(evaluation.results)} plots")

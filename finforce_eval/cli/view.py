@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from finforce_eval.annotation.forces import combine_forces, estimate_forces
+from finforce_eval.annotation.forces import estimate_forces
 from finforce_eval.cli.parser import add_calibration, add_jaw_options, add_set, add_source_options
 from finforce_eval.errors import OptionError
+from finforce_eval.evaluation.manipulation import combine_jaws
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_eval.recordings.tracks import JAWS
 
@@ -42,7 +43,7 @@ def run(options: argparse.Namespace) -> None:
         jaws = estimate_forces(recording, setup, bar.update, view.show_shape)
     view.show_images(recording)
     view.show_poses(recording)
-    view.show_forces(jaws, combine_forces(recording, jaws), recording)
+    view.show_forces(jaws, combine_jaws(jaws), recording)
     view.close()
     if options.save:
         print(f"{options.save}: {frames} images of {', '.join(jaws)}; open it with: rerun {options.save}")

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from finforce_eval.calibration.weighing import estimate_pressing, find_holds, format_weighing, weigh
+from finforce_eval.calibration.weighing import find_holds, format_weighing, weigh
 from finforce_eval.cli.parser import add_jaw_options, add_set, add_source_options
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.evaluate import check_keypoint_count
+from finforce_eval.evaluation.evaluate import check_keypoint_count, find_forces
 from finforce_eval.evaluation.setup import make_setup, read_keypoints
 from finforce_ifea.jaw.calibration import Calibration, name_mechanics, save_calibration
 
@@ -40,10 +40,9 @@ def run(options: argparse.Namespace) -> None:
     check_keypoint_count(recording, options.side, setup.jaw)
     stamps = recording.jaw(options.side).keypoints.stamps
     with tqdm(total=len(stamps), unit="frame", desc=recording.name, disable=None, leave=False) as bar:
-        pressing = estimate_pressing(
-            recording, options.side, setup.estimator(), setup.source(recording), progress=bar.update
-        )
-    holds = find_holds((stamps - stamps[0]) * 1e-9, pressing)
+        estimator, source = setup.estimator(), setup.source(recording)
+        forces = find_forces(recording, options.side, setup.jaw, estimator, source, progress=bar.update)
+    holds = find_holds((stamps - stamps[0]) * 1e-9, np.abs(forces.force[:, 0]))
     if not options.grams:
         for number, hold in enumerate(holds, 1):
             print(f"hold {number}: {hold.start:.1f} to {hold.end:.1f} s, estimated {hold.force:.3f} N")

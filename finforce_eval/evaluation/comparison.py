@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from finforce.files import FileError, read_json
 from finforce_eval.errors import OptionError
-from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.table import ForceSeries
 
 BETTER, WORSE, SAME, UNSURE, GAINED, LOST = "better", "worse", "same", "unsure", "new", "gone"
 # A difference smaller than this [N] matters to nobody, however sure it is; a surer one than so many deviations counts.
@@ -54,10 +54,10 @@ class Change:
         return self.after - self.before
 
 
-def error_blocks(result: CaseResult) -> list[list[float]]:
+def error_blocks(result: ForceSeries) -> list[list[float]]:
     """Return second, mean squared error [N^2] and number of its frames, of every second with counted frames."""
     counted = result.counted
-    seconds = (result.stamps[counted] - result.stamps[0]) // _SECOND if len(result.stamps) else np.zeros(0, np.int64)
+    seconds = (result.stamps[counted] - result.stamps[0]) // _SECOND if len(result) else np.zeros(0, np.int64)
     squares = result.error[counted] ** 2
     return [
         [int(second), float(squares[seconds == second].mean()), int((seconds == second).sum())]

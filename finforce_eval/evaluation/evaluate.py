@@ -14,9 +14,10 @@ from finforce_contact.jaw_contact import ContactSource, ForceLoop
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.manipulation import ManipulationStats, score_manipulation
 from finforce_eval.evaluation.places import InnerSurface, true_lines
-from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_detection
-from finforce_eval.evaluation.scoring import CaseScore, force_range, match_samples, match_truth, score_case
-from finforce_eval.recordings.tracks import Recording, WrenchTrack
+from finforce_eval.evaluation.results import compare_detection
+from finforce_eval.evaluation.scoring import CaseScore, match_samples, match_truth, score_case
+from finforce_eval.recordings.tracks import Recording
+from finforce_eval.table import AXES, ForceSeries, Snapshot
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.observation import Contact, Observation
 
@@ -25,7 +26,7 @@ from finforce_ifea.observation import Contact, Observation
 class Evaluation:
     """Scores and time series of one call; `manipulation` has those recordings of which both jaws were evaluated."""
 
-    results: Mapping[str, CaseResult]
+    results: Mapping[str, ForceSeries]
     scores: Mapping[str, CaseScore]
     total: CaseScore
     span: float
@@ -40,7 +41,7 @@ def evaluate_recording(
     side: str = "left",
     factory: Callable[[], Estimator] | None = None,
     progress: Callable[[int], Any] = lambda steps: None,
-) -> CaseResult:
+) -> ForceSeries:
     """Run an estimator over all frames of one jaw of a recording.
 
     Deterministic: the same recording gives the same estimates.
@@ -57,20 +58,10 @@ def evaluate_recording(
         RecordingError: no ground truth, another number of key points than the jaw's, or not one frame solved.
         ObservationError: the estimator refuses a frame.
     """
-    track = recording.jaw(side).keypoints
-    truth = recording.truth(side)
+    recording.truth(side)
     check_keypoint_count(recording, side, jaw)
     estimator = factory() if factory else JawEstimator(jaw)
-    log = StepLog(recording, side, jaw, estimator, source)
-    for index in range(len(track.stamps)):
-        try:
-            log.step(index)
-        except ObservationError as error:
-            raise ObservationError(f"{recording.name}: frame {index}: {error}") from error
-        except RecordingError as error:
-            raise RecordingError(f"{recording.name}: {error}") from error
-        progress(1)
-    result = log.result(truth)
+    result = find_forces(recording, side, jaw, estimator, source, progress=progress)
     _check_solved(result, recording)
     return result
 
@@ -92,7 +83,7 @@ def check_keypoint_count(recording: Recording, side: str, jaw: Any) -> None:
             )
 
 
-def _check_solved(result: CaseResult, recording: Recording) -> None:
+def _check_solved(result: ForceSeries, recording: Recording) -> None:
     """Refuse a recording of which nothing can be said."""
     if not result.scored.any():
         raise RecordingError(f"{result.name}: {_why_unscored(result, recording)}")
@@ -100,15 +91,16 @@ def _check_solved(result: CaseResult, recording: Recording) -> None:
         unmatched = result.scored & result.solved & ~np.isfinite(result.true_magnitude)
         if unmatched.any():
             raise RecordingError(f"{result.name}: no ground truth at the stamps of the key points")
-        words, counts = np.unique(result.status[result.scored], return_counts=True)
+        words, counts = np.unique(result.column("status")[result.scored], return_counts=True)
         statuses = ", ".join(f"{count} {word}" for word, count in zip(words, counts, strict=True))
-        reason = f" ({statuses}): {result.message}" if result.message else f" ({statuses})"
+        message = result.column("message")[~result.solved][-1]
+        reason = f" ({statuses}): {message}" if message else f" ({statuses})"
         raise RecordingError(f"{result.name}: none of the frames to be scored was solved{reason}")
 
 
-def _why_unscored(result: CaseResult, recording: Recording) -> str:
+def _why_unscored(result: ForceSeries, recording: Recording) -> str:
     """Return why no frame of a recording is to be scored."""
-    count, phases = len(result.stamps), recording.phases
+    count, phases = len(result), recording.phases
     if not count:
         return "there are no frames to be scored: no image has key points"
     none = f"none of the {count} frames is to be scored: "
@@ -117,7 +109,7 @@ def _why_unscored(result: CaseResult, recording: Recording) -> str:
     return f"{none}its 'record' phases lie at none of their stamps (two clocks?)"
 
 
-def score_results(results: Sequence[CaseResult], recordings: Sequence[Recording]) -> Evaluation:
+def score_results(results: Sequence[ForceSeries], recordings: Sequence[Recording]) -> Evaluation:
     """Score the cases of one call together.
 
     Args:
@@ -127,18 +119,35 @@ def score_results(results: Sequence[CaseResult], recordings: Sequence[Recording]
     Raises:
         FinforceError: two cases have the same name.
     """
+    ranges = [limits for recording in recordings for limits in [true_range(recording)] if limits]
+    return score_series(results, ranges)
+
+
+def true_range(recording: Recording) -> tuple[float, float] | None:
+    """Return the least and the largest norm of the true forces of a recording [N]; None without any."""
+    tracks = [jaw.truth for jaw in recording.jaws.values() if jaw.truth is not None]
+    norms = np.concatenate([np.zeros(0), *(np.linalg.norm(track.force, axis=1) for track in tracks)])
+    norms = norms[np.isfinite(norms)]
+    return (float(norms.min()), float(norms.max())) if norms.size else None
+
+
+def score_series(results: Sequence[ForceSeries], ranges: Sequence[tuple[float, float]]) -> Evaluation:
+    """Score the cases of one call together, with the ranges of the true forces of its recordings [N].
+
+    Raises:
+        FinforceError: two cases have the same name.
+    """
     names = [result.name for result in results]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise FinforceError(f"two recordings are called {', '.join(sorted(twice))}; give each once")
-    tracks = [jaw.truth for recording in recordings for jaw in recording.jaws.values()]
-    span = force_range(track.force for track in tracks if track is not None)
+    span = max(high for _, high in ranges) - min(low for low, _ in ranges) if ranges else 0.0
     return Evaluation(
         results={result.name: result for result in results},
         scores={result.name: score_case(result, span) for result in results},
         total=score_case(results, span),
         span=span,
-        manipulation=score_manipulation(results, recordings),
+        manipulation=score_manipulation(results),
     )
 
 
@@ -154,154 +163,190 @@ class Estimator(Protocol):
         """Return the deformed vertices (n, 3) [m]."""
 
 
-class StepLog:
-    """Runs the steps of one case and keeps what they said.
+class _JawRun:
+    """Runs the steps of one jaw and keeps a row for each.
 
     Args:
-        recording: with key points and ground truth of that side.
+        recording: with key points.
         side: "left" or "right".
         jaw: the jaw of that side.
         estimator: a fresh one.
         source: where the contact comes from.
+        strict: an image that is refused ends the run, else it has no force.
     """
 
-    def __init__(self, recording: Recording, side: str, jaw: Any, estimator: Estimator, source: ContactSource) -> None:
-        """Make room for every image."""
-        self.name, self.side, self.jaw, self.estimator = recording.name, side, jaw, estimator
-        self._jaw_track = recording.jaw(side)
-        self.track = track = self._jaw_track.keypoints
-        self.phases = recording.phases_at(track.stamps)
-        frames = len(track.stamps)
-        self.force = np.full((frames, 3), np.nan)
-        self.torque = np.full((frames, 3), np.nan)
-        self.place = np.full((frames, 3), np.nan)
-        self.stddev = np.full(frames, np.nan)
-        self.axis_stddev = np.full((frames, 3), np.nan)
-        self.residual = np.full(frames, np.nan)
-        self.used = np.zeros((frames, track.count), dtype=bool)
-        self.status = np.full(frames, "", dtype="U32")
-        self.step_ms = np.zeros(frames)
-        self.surface0 = np.array(estimator.surface())
-        self.loop = ForceLoop(source, estimator)
-        self.contacts = ContactLog(recording, side, self.loop, InnerSurface(self.surface0, jaw.face))
+    def __init__(
+        self, recording: Recording, side: str, jaw: Any, estimator: Estimator, source: ContactSource, *, strict: bool
+    ) -> None:
+        self._jaw, self._strict, self.loop = jaw, strict, ForceLoop(source, estimator)
+        self._track = recording.jaw(side).keypoints
+        self._scored = recording.phases_at(self._track.stamps).scored
+        self._surface0 = np.array(estimator.surface())
+        self._lines = None
+        if recording.jaw(side).truth is not None:
+            self._face = InnerSurface(self._surface0, jaw.face)
+            self._lines = true_lines(recording, side, self._track.stamps, self._face.face_x)
+        self.rows: list[dict[str, Any]] = []
         self.snapshot: Snapshot | None = None
-        self.largest = 0.0
-        self.message = ""
 
     def step(self, index: int) -> None:
         """Let the loop answer image `index`, and keep what it said."""
-        solution = self.loop.update(self.track.observation(index))
-        contact = self.loop.given
-        self.step_ms[index] = self.loop.force_ms
-        self.status[index] = solution.status
-        self.used[index] = solution.keypoints_used
-        self.residual[index] = solution.residual
-        self.contacts.keep(index)
+        row: dict[str, Any] = {"used": np.zeros(self._track.count, dtype=bool), "status": "refused", "message": ""}
+        self.rows.append(row)
+        try:
+            solution = self.loop.update(self._track.observation(index))
+        except (ObservationError, RecordingError) as error:
+            if self._strict:
+                raise
+            row |= _contact_columns(self.loop.given) | {"message": str(error)}
+            return
+        row |= {"step_ms": self.loop.force_ms, "contact_ms": self.loop.contact_ms}
+        row |= {"status": solution.status, "used": solution.keypoints_used, "residual": solution.residual}
+        row |= _contact_columns(self.loop.given)
+        estimate = self.loop.contact.estimate
+        if estimate is not None:
+            row |= {"touching": bool(estimate.touching), "contact_status": estimate.status}
+        if self._lines is not None:
+            surface = self.loop.force.surface()
+            row["true_height"] = self._face.cut(surface, self._lines.points[index], self._lines.directions[index])
         if solution.trusted:
-            self._keep(index, solution, contact)
+            row |= _force_columns(solution)
+            if self._scored[index]:
+                self._look(index, solution)
         else:
-            self.message = solution.message
+            row["message"] = solution.message
 
-    def _keep(self, index: int, solution: Any, contact: Contact | None) -> None:
-        """Keep a trusted estimate."""
-        self.force[index] = solution.force
-        self.torque[index] = solution.torque
-        self.place[index] = solution.contact_location
-        self.stddev[index] = solution.magnitude_stddev
-        self.axis_stddev[index] = solution.force_stddev
-        magnitude = float(np.linalg.norm(solution.force))
-        # two per cent: the surface is copied now and then, not on every frame of a rising force
-        if self.phases.scored[index] and magnitude > 1.02 * self.largest:
-            self.largest = magnitude
-            self.snapshot = self._picture(index, solution, contact)
-
-    def _picture(self, index: int, solution: Any, contact: Contact | None) -> Snapshot:
-        """Keep the jaw and the object as they are now."""
+    def _look(self, index: int, solution: Any) -> None:
+        """Keep jaw and object as they are now where the force is the largest so far."""
+        largest = 0.0 if self.snapshot is None else float(np.linalg.norm(self.snapshot.force))
+        # two per cent: the surface is copied now and then, not on every image of a rising force
+        if float(np.linalg.norm(solution.force)) <= 1.02 * largest:
+            return
+        contact, estimator = self.loop.given, self.loop.force
         known = contact is not None and contact.outline is not None
-        return Snapshot(
-            stamp=int(self.track.stamps[index]),
-            surface0=self.surface0,
-            surface=np.array(self.estimator.surface()),
-            triangles=np.asarray(self.estimator.surface_triangles),
-            keypoints0=np.asarray(self.jaw.keypoints),
-            keypoints=self.track.points[index],
+        self.snapshot = Snapshot(
+            stamp=int(self._track.stamps[index]),
+            surface0=self._surface0,
+            surface=np.array(estimator.surface()),
+            triangles=np.asarray(estimator.surface_triangles),
+            keypoints0=np.asarray(self._jaw.keypoints),
+            keypoints=self._track.points[index],
             used=np.array(solution.keypoints_used),
             contact_point=np.array(solution.contact_point),
             force=np.array(solution.force),
             outline=contact.outline.placed() if known else (),
         )
 
-    def result(self, truth: WrenchTrack) -> CaseResult:
-        """Return the time series, with the true wrenches."""
-        stamps = self.track.stamps
-        return CaseResult(
-            name=self.name,
-            side=self.side,
-            stamps=stamps,
-            truth=match_truth(truth, stamps),
-            true_torque=match_samples(truth.stamps, truth.torque, stamps),
-            force=self.force,
-            torque=self.torque,
-            place=self.place,
-            stddev=self.stddev,
-            axis_stddev=self.axis_stddev,
-            residual=self.residual,
-            used=self.used,
-            status=self.status,
-            step_ms=self.step_ms,
-            cycle=self.phases.cycle,
-            direction=self.phases.direction,
-            scored=self.phases.scored,
-            snapshot=self.snapshot,
-            message=self.message,
-            contact=self.contacts.series(),
-            **self._seen(),
-        )
 
-    def _seen(self) -> dict[str, Any]:
-        """Return how the key points were seen, where this call has found them in images."""
-        detection, sight = self._jaw_track.detection, self._jaw_track.sight
-        if detection is None:
-            return {}
-        return {
-            "sight": None if sight is None else compare_detection(detection, sight),
-            "detector_ms": detection.step_ms,
-            "latency_ms": self.step_ms + detection.step_ms,
-        }
+def _contact_columns(contact: Contact | None) -> dict[str, Any]:
+    """Return the columns of a contact as it was given to the solver; none without."""
+    if contact is None:
+        return {}
+    points = np.asarray(contact.points, dtype=np.float64)
+    known = {f"points_{axis}": points[:, number] for number, axis in enumerate(AXES)}
+    known |= {"points_weight": np.asarray(contact.weights, np.float64), "points_touching": bool(contact.touching)}
+    return known | ({"contact_height": np.average(points[:, 2], weights=contact.weights)} if len(points) else {})
 
 
-class ContactLog:
-    """Keeps what the loop said of the contact, and where the truth was."""
+def _force_columns(solution: Any) -> dict[str, Any]:
+    """Return the columns of a trusted solution."""
+    return {
+        "force": solution.force,
+        "torque": solution.torque,
+        "force_stddev": solution.force_stddev,
+        "torque_stddev": solution.torque_stddev,
+        "magnitude_stddev": solution.magnitude_stddev,
+        "contact_location": solution.contact_location,
+        "contact_point": solution.contact_point,
+    }
 
-    def __init__(self, recording: Recording, side: str, loop: ForceLoop, surface: InnerSurface) -> None:
-        """Make room for every image."""
-        self._loop, self._surface = loop, surface
-        self._stamps = recording.jaw(side).keypoints.stamps
-        self._lines = true_lines(recording, side, self._stamps, surface.face_x)
-        frames = len(self._stamps)
-        self._given, self._truth, self._ms = (np.full(frames, np.nan) for _ in range(3))
-        self._touching = np.zeros(frames, dtype=bool)
-        self._status = np.full(frames, "", dtype="U16")
 
-    def keep(self, index: int) -> None:
-        """Keep the contact of image `index`, and find the true place on the deformed surface."""
-        contact, estimate = self._loop.given, self._loop.contact.estimate
-        if contact is not None and len(contact.points):
-            self._given[index] = np.average(contact.points[:, 2], weights=contact.weights)
-        self._ms[index] = self._loop.contact_ms
-        if estimate is not None:
-            self._touching[index], self._status[index] = estimate.touching, estimate.status
-        surface = self._loop.force.surface()
-        self._truth[index] = self._surface.cut(surface, self._lines.points[index], self._lines.directions[index])
+_FOUND = ("force", "torque", "force_stddev", "torque_stddev", "contact_location", "contact_point")
+_NUMBERS = ("magnitude_stddev", "residual", "step_ms", "contact_height")
+_OBJECTS = ("used", "points_x", "points_y", "points_z", "points_weight", "points_touching")
 
-    def series(self) -> ContactSeries:
-        """Return the time series."""
-        is_estimated = self._loop.contact.estimate is not None
-        return ContactSeries(
-            source=self._loop.contact.name,
-            given=self._given,
-            truth=self._truth,
-            touching=self._touching if is_estimated else None,
-            status=self._status,
-            step_ms=self._ms if is_estimated else np.full(len(self._stamps), np.nan),
-        )
+
+def find_forces(
+    recording: Recording,
+    side: str,
+    jaw: Any,
+    estimator: Estimator,
+    source: ContactSource,
+    *,
+    strict: bool = True,
+    progress: Callable[[int], Any] = lambda steps: None,
+    watch: Callable[[int, Estimator], Any] | None = None,
+) -> ForceSeries:
+    """Return the force on one jaw in every image that has key points, and where it was measured, the true one.
+
+    Args:
+        recording: with key points.
+        side: "left" or "right".
+        jaw: the jaw of that side.
+        estimator: a fresh one.
+        source: where the contact of each image comes from; a fresh one.
+        strict: an image that is refused ends the run, else it has no force and says why.
+        progress: called with the number of images done since its last call.
+        watch: called with stamp [ns] and estimator after every image.
+
+    Raises:
+        RecordingError: a pose or an image is refused.
+        ObservationError: the estimator refuses an image.
+    """
+    stamps = recording.jaw(side).keypoints.stamps
+    run = _JawRun(recording, side, jaw, estimator, source, strict=strict)
+    for index, stamp in enumerate(stamps.tolist()):
+        try:
+            run.step(index)
+        except ObservationError as error:
+            raise ObservationError(f"{recording.name}: frame {index}: {error}") from error
+        except RecordingError as error:
+            raise RecordingError(f"{recording.name}: {error}") from error
+        if watch is not None:
+            watch(stamp, estimator)
+        progress(1)
+    nothing, phases = np.full(3, np.nan), recording.phases_at(stamps)
+    columns: dict[str, Any] = {name: [row.get(name, nothing) for row in run.rows] for name in _FOUND}
+    columns |= {name: [row.get(name, np.nan) for row in run.rows] for name in _NUMBERS}
+    columns |= {name: [row.get(name) for row in run.rows] for name in _OBJECTS}
+    columns |= {name: np.array([row[name] for row in run.rows], dtype=str) for name in ("status", "message")}
+    columns |= {"cycle": phases.cycle, "direction": phases.direction, "scored": phases.scored}
+    columns |= _truth_columns(recording, side) | _estimate_columns(source, run.rows) | sight_columns(recording, side)
+    series = ForceSeries.build(recording.name, side, stamps, **columns)
+    if "detector_ms" in columns:
+        series = series.with_columns(latency_ms=series.column("step_ms") + columns["detector_ms"])
+    return series.with_snapshot(run.snapshot)
+
+
+def _truth_columns(recording: Recording, side: str) -> dict[str, Any]:
+    """Return the measured wrenches at the stamps of the key points, none without any."""
+    truth, stamps = recording.jaw(side).truth, recording.jaw(side).keypoints.stamps
+    if truth is None:
+        return {}
+    return {
+        "true_force": match_truth(truth, stamps),
+        "true_torque": match_samples(truth.stamps, truth.torque, stamps),
+    }
+
+
+def _estimate_columns(source: ContactSource, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return what a contact source said of each image, and where the measured force pressed."""
+    columns: dict[str, Any] = {"contact_source": source.name}
+    columns["true_height"] = np.array([row.get("true_height", np.nan) for row in rows])
+    columns["contact_status"] = np.array([row.get("contact_status", "") for row in rows], dtype=str)
+    if source.estimate is not None:
+        columns["touching"] = np.array([row.get("touching", False) for row in rows], dtype=bool)
+        columns["contact_ms"] = np.array([row.get("contact_ms", np.nan) for row in rows])
+    return columns
+
+
+def sight_columns(recording: Recording, side: str) -> dict[str, Any]:
+    """Return how the key points were seen, where they were found in images."""
+    track = recording.jaw(side)
+    if track.detection is None:
+        return {}
+    columns: dict[str, Any] = {"detector_ms": track.detection.step_ms}
+    if track.sight is not None:
+        errors = compare_detection(track.detection, track.sight).set_index("stamp")
+        columns |= dict(errors.reindex(track.keypoints.stamps).items())
+    return columns

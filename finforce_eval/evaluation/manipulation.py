@@ -6,14 +6,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
 from finforce.transforms import pose_from_quaternion
-from finforce_eval.evaluation.results import CaseResult
 from finforce_eval.evaluation.scoring import compare_torques, compare_vectors
 from finforce_eval.recordings.tracks import Recording
-from finforce_ifea.grasp_force import JawDistance, Wrench, combine_wrenches
+from finforce_eval.table import ForceSeries
+from finforce_ifea.grasp_force import Grasp, JawDistance, Wrench, combine_wrenches, single_jaw_grasp
 
 _SAME = 0.2  # [s] within which a jaw's pose is still that of an image
 
@@ -41,84 +42,111 @@ class ManipulationStats:
     torque_rmse_Nm: float | None = None
 
 
-def score_manipulation(
-    results: Iterable[CaseResult], recordings: Iterable[Recording] = ()
-) -> dict[str, ManipulationStats]:
+def score_manipulation(results: Iterable[ForceSeries]) -> dict[str, ManipulationStats]:
     """Return the score of every recording of which both jaws were evaluated, by its name."""
-    pairs: dict[str, dict[str, CaseResult]] = {}
+    pairs: dict[str, dict[str, ForceSeries]] = {}
     for result in results:
         pairs.setdefault(result.name.removesuffix(f"/{result.side}"), {})[result.side] = result
-    known = {recording.name: recording for recording in recordings}
+    return {name: score_net(join_net(pair)) for name, pair in pairs.items() if len(pair) == 2}
+
+
+def with_distances(jaws: Mapping[str, ForceSeries], recording: Recording) -> dict[str, ForceSeries]:
+    """Return the series of both jaws with the distance between them, as it was seen and as it was."""
     return {
-        name: score_pair(pair["left"], pair["right"], known.get(name)) for name, pair in pairs.items() if len(pair) == 2
+        side: series.with_columns(
+            jaw_distance=find_distances(recording, series.stamps),
+            true_jaw_distance=find_distances(recording, series.stamps, true=True),
+        )
+        for side, series in jaws.items()
     }
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class NetForces:
-    """The net wrenches of both jaws in the n images of the record phases in which both are answered and measured.
-
-    Attributes:
-        stamps: (n,) [ns].
-        found: force and torque (n, 3) in the gripper's frame, of the estimates; a torque that is not known is NaN.
-        true: the same, as measured.
-        stated: (n, 3) standard deviation of the found force [N]; None where nobody states it.
-        answered_pct: share of the images with both truths in which both jaws were answered [%]; None without any.
-    """
-
-    stamps: NDArray
-    found: Wrench
-    true: Wrench
-    stated: NDArray | None
-    answered_pct: float | None
-
-
-def join_net(left: CaseResult, right: CaseResult, recording: Recording | None = None) -> NetForces:
-    """Return the net wrenches of two jaws of one recording, image by image with equal stamps.
+def combine_jaws(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
+    """Return what the gripper feels, in its frame, in every image of one of its jaws.
 
     Args:
-        left: of the left jaw.
-        right: of the right jaw.
-        recording: with the jaws' poses, without which no torque is known.
+        jaws: by side; both, or the only one. Where both have distances, see `with_distances`, torques are known.
+
+    Returns:
+        Net force and torque about the gripper's origin, their truth, and the grasp force; NaN where a jaw has none.
     """
-    stamps, mine, theirs = np.intersect1d(left.stamps, right.stamps, return_indices=True)
-    counted = left.scored[mine] & right.scored[theirs]
-    counted &= np.isfinite(left.truth[mine, 0]) & np.isfinite(right.truth[theirs, 0])
-    stamps, mine, theirs = stamps[counted], mine[counted], theirs[counted]
-    both = np.isfinite(left.force[mine, 0]) & np.isfinite(right.force[theirs, 0])
-    answered = 100.0 * float(both.mean()) if len(both) else None
-    stamps, mine, theirs = stamps[both], mine[both], theirs[both]
-    jaws = ((left, mine), (right, theirs))
-    ways = find_distances(recording, stamps)
-    found = _combine(*((jaw.force[rows], _rows_of(jaw.torque, rows)) for jaw, rows in jaws), ways)
-    ways = find_distances(recording, stamps, true=True)
-    true = _combine(*((jaw.truth[rows], _rows_of(jaw.true_torque, rows)) for jaw, rows in jaws), ways)
-    stated = None
-    if left.axis_stddev is not None and right.axis_stddev is not None:
+    stamps = np.unique(np.concatenate([each.stamps for each in jaws.values()]))
+    rows = {side: pd.Index(each.stamps).get_indexer(stamps) for side, each in jaws.items()}
+    found, true = _combine(jaws, rows), _combine(jaws, rows, "true_")
+    stated = [_take(each.column("force_stddev"), rows[side]) for side, each in jaws.items()]
+    scored = [_take(each.scored.astype(float), rows[side]) == 1.0 for side, each in jaws.items()]
+    first = next(iter(jaws.values()))
+    return ForceSeries.build(
+        first.name.removesuffix(f"/{first.side}"),
+        "gripper",
+        stamps,
+        force=found["manipulation"],
+        torque=found["torque"],
+        grasp_force=found["grasp"][:, 0],
+        true_force=true["manipulation"],
+        true_torque=true["torque"],
         # the jaws' frames are turned about z by half a turn: their axes are those of the gripper
-        stated = np.hypot(left.axis_stddev[mine], right.axis_stddev[theirs])
-    return NetForces(stamps=stamps, found=found, true=true, stated=stated, answered_pct=answered)
-
-
-def score_pair(left: CaseResult, right: CaseResult, recording: Recording | None = None) -> ManipulationStats:
-    """Return the score of two jaws of one recording; see `join_net`."""
-    net = join_net(left, right, recording)
-    if not len(net.stamps):
-        return ManipulationStats(n=0, answered_pct=net.answered_pct)
-    known = np.isfinite(net.found.torque - net.true.torque).all(axis=1)
-    is_measured = known.any() and net.true.torque.any()
-    torque = compare_torques(net.found.torque[known], net.true.torque[known]) if is_measured else {}
-    return ManipulationStats(
-        n=len(net.stamps),
-        answered_pct=net.answered_pct,
-        torque_rmse_Nm=torque.get("torque_rmse_Nm"),
-        **compare_vectors(net.found.force - net.true.force, net.stated),
+        force_stddev=np.sqrt(np.sum(np.square(stated), axis=0)),
+        scored=np.all(scored, axis=0),
     )
 
 
-def _rows_of(torque: NDArray | None, rows: NDArray) -> NDArray:
-    """Return the torques in some images (n, 3) [N m], NaN where none were kept."""
-    return np.full((len(rows), 3), np.nan) if torque is None else torque[rows]
+def join_net(jaws: Mapping[str, ForceSeries]) -> ForceSeries:
+    """Return what `combine_jaws` does, in the images of the record phases in which both jaws were measured."""
+    net = combine_jaws(jaws)
+    return net.at(net.scored & np.isfinite(net.true_force).all(axis=1))
+
+
+def score_net(net: ForceSeries) -> ManipulationStats:
+    """Return the score of the net force on the gripper; see `join_net`."""
+    answered = 100.0 * float(net.solved.mean()) if len(net) else None
+    net = net.at(net.solved)
+    if not len(net):
+        return ManipulationStats(n=0, answered_pct=answered)
+    found, true = net.column("torque"), net.column("true_torque")
+    known = np.isfinite(found - true).all(axis=1)
+    torque = compare_torques(found[known], true[known]) if known.any() and np.nan_to_num(true).any() else {}
+    stated = net.column("force_stddev")
+    return ManipulationStats(
+        n=len(net),
+        answered_pct=answered,
+        torque_rmse_Nm=torque.get("torque_rmse_Nm"),
+        **compare_vectors(net.force - net.true_force, stated if np.isfinite(stated).any() else None),
+    )
+
+
+def _take(values: NDArray, rows: NDArray) -> NDArray[np.float64]:
+    """Return the values of some rows, NaN where the row is -1."""
+    taken = np.full((len(rows), *values.shape[1:]), np.nan)
+    taken[rows >= 0] = values[rows[rows >= 0]]
+    return taken
+
+
+def _combine(jaws: Mapping[str, ForceSeries], rows: Mapping[str, NDArray], prefix: str = "") -> dict[str, NDArray]:
+    """Return grasp, net force and torque (n, 3) of the columns with a prefix, NaN where a jaw has no force."""
+    wrenches = [
+        [_take(each.column(f"{prefix}{name}"), rows[side]) for name in ("force", "torque")]
+        for side, each in jaws.items()
+    ]
+    ways = [_take(each.column(f"{prefix}jaw_distance").astype(float), rows[side]) for side, each in jaws.items()]
+    out = {name: np.full((len(ways[0]), 3), np.nan) for name in ("grasp", "manipulation", "torque")}
+    way = np.where(np.isnan(ways[0]), ways[-1], ways[0])
+    for row in range(len(way)):
+        each = dict(zip(jaws, (Wrench(force[row], torque[row]) for force, torque in wrenches), strict=True))
+        if not all(np.isfinite(wrench.force).all() for wrench in each.values()):
+            continue
+        distance = None if np.isnan(way[row]) else float(way[row])
+        grasp = combine_wrenches(each["left"], each["right"], distance) if len(each) == 2 else _single(each)
+        out["grasp"][row], out["manipulation"][row] = grasp.grasp, grasp.manipulation
+        if grasp.torque is not None:
+            out["torque"][row] = grasp.torque
+    return out
+
+
+def _single(wrenches: Mapping[str, Wrench]) -> Grasp:
+    """Return the grasp of the only jaw."""
+    ((side, wrench),) = wrenches.items()
+    return single_jaw_grasp(wrench, side)
 
 
 def find_distances(recording: Recording | None, stamps: NDArray, *, true: bool = False) -> list[float | None]:
@@ -138,15 +166,6 @@ def find_distances(recording: Recording | None, stamps: NDArray, *, true: bool =
                 distance.take(side, stamp, poses[stamp])
         found.append(distance.at(stamp))
     return found
-
-
-def _combine(left: tuple[NDArray, NDArray], right: tuple[NDArray, NDArray], ways: Iterable[float | None]) -> Wrench:
-    """Return the net wrenches (n, 3) in the gripper's frame; a torque that is not known is NaN."""
-    rows = zip(*left, *right, ways, strict=True)
-    grasps = [combine_wrenches(Wrench(f, t), Wrench(g, u), way) for f, t, g, u, way in rows]
-    nothing = np.full(3, np.nan)
-    torques = [nothing if grasp.torque is None else grasp.torque for grasp in grasps]
-    return Wrench(np.array([grasp.manipulation for grasp in grasps]).reshape(-1, 3), np.array(torques).reshape(-1, 3))
 
 
 def format_manipulation(scores: Mapping[str, ManipulationStats]) -> list[str]:

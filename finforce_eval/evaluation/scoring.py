@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_eval.evaluation.results import (
-    CaseResult,
+    Delay,
     DelayStats,
     DetectionStats,
     delay_stats,
@@ -18,6 +18,7 @@ from finforce_eval.evaluation.results import (
     force_delays,
 )
 from finforce_eval.recordings.tracks import Recording, WrenchTrack
+from finforce_eval.table import ForceSeries
 
 # Below it the pressure centre hardly matters; from it on the object is in contact [N].
 LEAST_FORCE, ONSET_FORCE = 0.2, 0.02
@@ -72,41 +73,39 @@ def place_stats(distances: NDArray[np.float64]) -> PlaceStats:
     return PlaceStats(n=known.size, median_mm=median, p95_mm=p95, max_mm=largest)
 
 
-def given_distance(result: CaseResult) -> NDArray[np.float64]:
+def given_distance(result: ForceSeries) -> NDArray[np.float64]:
     """Return how far from the pressure centre the contact was that each loaded image was solved with (n,) [m]."""
-    return _loaded_distance(result, None if result.contact is None else result.contact.given)
+    return _loaded_distance(result, result.column("contact_height"))
 
 
-def solved_distance(result: CaseResult) -> NDArray[np.float64]:
+def solved_distance(result: ForceSeries) -> NDArray[np.float64]:
     """Return how far from the pressure centre the estimator's own place was on each loaded image (n,) [m]."""
-    return _loaded_distance(result, result.place[:, 2])
+    return _loaded_distance(result, result.column("contact_location")[:, 2])
 
 
-def _loaded_distance(result: CaseResult, heights: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def _loaded_distance(result: ForceSeries, heights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distance of heights (n,) from the truth, NaN where it is unknown or hardly anything presses."""
-    if result.contact is None or heights is None:
-        return np.full(len(result.stamps), np.nan)
-    return np.where(result.true_magnitude > LEAST_FORCE, np.abs(heights - result.contact.truth), np.nan)
+    return np.where(result.true_magnitude > LEAST_FORCE, np.abs(heights - result.column("true_height")), np.nan)
 
 
-def onset_delays(result: CaseResult) -> list[int | None]:
+def onset_delays(result: ForceSeries) -> list[int | None]:
     """Return for each loading cycle the frames from first true force to the `touching` that stays; None if missed.
 
     A `touching` that was never let go since the cycle before is early by the whole pause.
     """
-    if result.contact is None or result.contact.touching is None:
+    if not result.has("touching"):
         return []
     loaded = _loaded(result)
-    delays = []
-    for cycle in np.unique(result.cycle):
-        rows = np.flatnonzero(result.cycle == cycle)
+    delays, cycles, touching = [], result.column("cycle"), result.column("touching").astype(bool)
+    for cycle in np.unique(cycles):
+        rows = np.flatnonzero(cycles == cycle)
         pressed = rows[loaded[rows]]
         if pressed.size and pressed[0] > 0 and not loaded[pressed[0] - 1]:
-            delays.append(_delay(result.contact.touching, loaded, int(pressed[0]), int(rows[-1])))
+            delays.append(_delay(touching, loaded, int(pressed[0]), int(rows[-1])))
     return delays
 
 
-def _loaded(result: CaseResult) -> NDArray[np.bool_]:
+def _loaded(result: ForceSeries) -> NDArray[np.bool_]:
     """Return on which frames (n,) something truly presses."""
     return np.nan_to_num(result.true_magnitude) > ONSET_FORCE
 
@@ -122,16 +121,14 @@ def _delay(touching: NDArray[np.bool_], loaded: NDArray[np.bool_], onset: int, l
     return begin - onset if begin <= end else None
 
 
-def _false_share(results: Sequence[CaseResult]) -> float | None:
+def _false_share(results: Sequence[ForceSeries]) -> float | None:
     """Return the share [%] of frames without true force that were said to touch."""
-    said = [
-        r.contact.touching[~_loaded(r)] for r in results if r.contact is not None and r.contact.touching is not None
-    ]
+    said = [each.column("touching")[~_loaded(each)].astype(float) for each in results if each.has("touching")]
     frames = np.concatenate(said) if said else np.zeros(0)
     return 100.0 * float(frames.mean()) if frames.size else None
 
 
-def onset_stats(results: Sequence[CaseResult]) -> OnsetStats:
+def onset_stats(results: Sequence[ForceSeries]) -> OnsetStats:
     """Return the delays of all loading cycles of several cases."""
     delays = [delay for result in results for delay in onset_delays(result)]
     known = [delay for delay in delays if delay is not None]
@@ -249,13 +246,6 @@ class CaseScore:
     detector_ms: StepTimes
 
 
-def force_range(truths: Iterable[NDArray[np.float64]]) -> float:
-    """Return the range of the norm of the true forces, each (n, 3) [N], over all recordings of a call."""
-    norms = [np.linalg.norm(truth, axis=1) for truth in truths]
-    finite = np.concatenate([norm[np.isfinite(norm)] for norm in norms] or [np.zeros(0)])
-    return float(np.ptp(finite)) if finite.size else 0.0
-
-
 def match_truth(truth: WrenchTrack, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the true force at the given stamps (n, 3) [N], matched as by `match_samples`.
 
@@ -316,7 +306,7 @@ def compute_stats(errors: NDArray[np.float64], span: float) -> Stats:
     )
 
 
-def _vector_stats(cases: Sequence[CaseResult], phase: str) -> dict[str, Any]:
+def _vector_stats(cases: Sequence[ForceSeries], phase: str) -> dict[str, Any]:
     """Return what `Stats` says of the force as a vector, and how often there was one.
 
     A truth that is along x throughout is a magnitude that was written there, and says nothing of the vector.
@@ -326,20 +316,20 @@ def _vector_stats(cases: Sequence[CaseResult], phase: str) -> dict[str, Any]:
     found: dict[str, Any] = {"answered_pct": 100.0 * answered / asked if asked else None}
     chosen = [_selected(case, phase) for case in cases]
     differences = np.concatenate(
-        [case.force[rows] - case.truth[rows] for case, rows in zip(cases, chosen, strict=True)]
+        [(case.force - case.true_force)[rows] for case, rows in zip(cases, chosen, strict=True)]
     )
-    if not any(np.nan_to_num(case.truth[:, 1:]).any() for case in cases) or not len(differences):
+    if not any(np.nan_to_num(case.true_force[:, 1:]).any() for case in cases) or not len(differences):
         return found
     stated = None
-    if all(case.axis_stddev is not None for case in cases):
-        stated = np.concatenate([case.axis_stddev[rows] for case, rows in zip(cases, chosen, strict=True)])
+    if all(case.has("force_stddev") for case in cases):
+        stated = np.concatenate([case.column("force_stddev")[rows] for case, rows in zip(cases, chosen, strict=True)])
     return found | compare_vectors(differences, stated) | _torque_stats(cases, chosen)
 
 
-def _torque_stats(cases: Sequence[CaseResult], chosen: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
+def _torque_stats(cases: Sequence[ForceSeries], chosen: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
     """Return what `Stats` says of the torque; nothing where a case has none, or its truth is zero throughout."""
-    pairs = [(case.torque, case.true_torque) for case in cases]
-    if any(found is None or true is None or not np.nan_to_num(true).any() for found, true in pairs):
+    pairs = [(case.column("torque"), case.column("true_torque")) for case in cases]
+    if not all(case.has("torque") for case in cases) or not all(np.nan_to_num(true).any() for _, true in pairs):
         return {}
     parts = [(found[rows], true[rows]) for (found, true), rows in zip(pairs, chosen, strict=True)]
     found, true = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -367,8 +357,8 @@ def compare_vectors(differences: NDArray[np.float64], stated: NDArray[np.float64
     return found
 
 
-def _is_phase(result: CaseResult, phase: str) -> NDArray[np.bool_]:
-    return np.ones(len(result.stamps), dtype=bool) if phase == "all" else result.direction == phase
+def _is_phase(result: ForceSeries, phase: str) -> NDArray[np.bool_]:
+    return np.ones(len(result), dtype=bool) if phase == "all" else result.column("direction") == phase
 
 
 def _spread(values: Sequence[float | None]) -> Spread:
@@ -379,23 +369,23 @@ def _spread(values: Sequence[float | None]) -> Spread:
     return Spread(mean=float(np.mean(numbers)), std=float(np.std(numbers, ddof=1)) if numbers[1:] else None)
 
 
-def _selected(result: CaseResult, phase: str) -> NDArray[np.bool_]:
+def _selected(result: ForceSeries, phase: str) -> NDArray[np.bool_]:
     """Return the frames (n,) that count for "all", "load" or "unload"."""
     return result.counted & _is_phase(result, phase)
 
 
-def _errors(results: Sequence[CaseResult], phase: str) -> NDArray[np.float64]:
+def _errors(results: Sequence[ForceSeries], phase: str) -> NDArray[np.float64]:
     """Return the errors of a phase over all results (n,) [N]."""
     return np.concatenate([result.error[_selected(result, phase)] for result in results])
 
 
-def _cycle_stats(results: Sequence[CaseResult], phase: str, span: float) -> CycleStats:
+def _cycle_stats(results: Sequence[ForceSeries], phase: str, span: float) -> CycleStats:
     """Score every loading cycle for itself."""
     cycles = []
     for result in results:
         chosen = _selected(result, phase)
-        numbers = np.unique(result.cycle[chosen])
-        cycles += [compute_stats(result.error[chosen & (result.cycle == k)], span) for k in numbers]
+        numbers, error = result.column("cycle"), result.error
+        cycles += [compute_stats(error[chosen & (numbers == k)], span) for k in np.unique(numbers[chosen])]
     return CycleStats(
         n=len(cycles),
         rmse_N=_spread([cycle.rmse_N for cycle in cycles]),
@@ -403,10 +393,10 @@ def _cycle_stats(results: Sequence[CaseResult], phase: str, span: float) -> Cycl
     )
 
 
-def _detector_times(cases: Sequence[CaseResult]) -> list[NDArray[np.float64]]:
+def _detector_times(cases: Sequence[ForceSeries]) -> list[NDArray[np.float64]]:
     """Return the times of the detector, once for each recording: it sees both jaws in one pass."""
-    times = {case.detector_ms.tobytes(): case.detector_ms for case in cases if case.detector_ms is not None}
-    return list(times.values())
+    times = [case.column("detector_ms") for case in cases if case.has("detector_ms")]
+    return list({each.tobytes(): each for each in times}.values())
 
 
 def _step_times(steps: NDArray[np.float64]) -> StepTimes:
@@ -418,15 +408,20 @@ def _step_times(steps: NDArray[np.float64]) -> StepTimes:
     return StepTimes(p50=p50, p95=p95, p99=p99, max=longest)
 
 
-def score_case(results: CaseResult | Sequence[CaseResult], span: float) -> CaseScore:
+def case_delays(case: ForceSeries) -> list[Delay]:
+    """Return what the estimate took to show after each onset of the true force."""
+    return force_delays(case.stamps * 1e-9, case.true_magnitude, case.magnitude, case.lag)
+
+
+def score_case(results: ForceSeries | Sequence[ForceSeries], span: float) -> CaseScore:
     """Score one case, or several together.
 
     Args:
         results: the time series.
-        span: range of the true force over the call's recordings [N], see `force_range`.
+        span: range of the true force over the call's recordings [N].
     """
-    cases = [results] if isinstance(results, CaseResult) else list(results)
-    frames = sum(len(case.stamps) for case in cases)
+    cases = [results] if isinstance(results, ForceSeries) else list(results)
+    frames = sum(len(case) for case in cases)
     solved = sum(int(case.solved.sum()) for case in cases)
     stats = {
         phase: replace(compute_stats(_errors(cases, phase), span), **_vector_stats(cases, phase))
@@ -439,15 +434,15 @@ def score_case(results: CaseResult | Sequence[CaseResult], span: float) -> CaseS
         skipped=frames - solved,
         record_frames=sum(int(case.scored.sum()) for case in cases),
         record_skipped=sum(int((case.scored & ~case.solved).sum()) for case in cases),
-        step_ms=_step_times(np.concatenate([case.step_ms for case in cases])),
+        step_ms=_step_times(np.concatenate([case.column("step_ms") for case in cases])),
         cycles={phase: _cycle_stats(cases, phase, span) for phase in stats},
         mean_rmse_N=_spread(each).mean,
-        contact_ms=_step_times(np.concatenate([np.zeros(0), *(c.contact.step_ms for c in cases if c.contact)])),
+        contact_ms=_step_times(np.concatenate([np.zeros(0), *(case.column("contact_ms") for case in cases)])),
         place=place_stats(np.concatenate([given_distance(case) for case in cases])),
         solved_place=place_stats(np.concatenate([solved_distance(case) for case in cases])),
         onset=onset_stats(cases),
-        delay=delay_stats([delay for case in cases for delay in case.delays]),
-        sight=detection_stats([case.sight for case in cases if case.sight is not None]),
+        delay=delay_stats([delay for case in cases for delay in case_delays(case)]),
+        sight=detection_stats([case.table for case in cases]),
         detector_ms=_step_times(np.concatenate([np.zeros(0), *_detector_times(cases)])),
         **stats,
     )

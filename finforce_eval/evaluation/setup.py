@@ -14,12 +14,14 @@ from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.contact_source import ContactChoice, build_source, parse_contacts
 from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results
 from finforce_eval.evaluation.keypoint_source import parse_source
-from finforce_eval.evaluation.results import CaseResult, parse_changes
+from finforce_eval.evaluation.manipulation import with_distances
+from finforce_eval.evaluation.results import parse_changes
 from finforce_eval.machine import version
 from finforce_eval.recordings.bags import name_recordings
 from finforce_eval.recordings.images import PAIRED
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import JAWS, Recording
+from finforce_eval.table import ForceSeries
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import Calibration, load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
@@ -159,7 +161,7 @@ def evaluate_jaws(
     build: Callable[[str, bool], JawEstimator] | None = None,
     *,
     shown: bool = True,
-) -> tuple[CaseResult, ...]:
+) -> tuple[ForceSeries, ...]:
     """Evaluate every jaw with ground truth of a recording.
 
     Args:
@@ -190,8 +192,8 @@ def evaluate_jaws(
                 factory=partial(build, side, both) if build else partial(own.estimator, both),
                 progress=bar.update,
             )
-            results.append(replace(result, name=f"{recording.name}/{side}") if both else result)
-    return tuple(results)
+            results.append(result.renamed(f"{recording.name}/{side}") if both else result)
+    return tuple(with_distances(dict(zip(sides, results, strict=True)), recording).values() if both else results)
 
 
 def truth_sides(recording: Recording) -> list[str]:

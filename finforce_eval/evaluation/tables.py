@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from finforce_eval.evaluation.comparison import error_blocks
 from finforce_eval.evaluation.evaluate import Evaluation
 from finforce_eval.evaluation.manipulation import format_manipulation
 from finforce_eval.evaluation.scoring import CaseScore, Spread, Stats
+from finforce_eval.table import ForceSeries
 
 PHASES = ("all", "load", "unload")
 HEADER = ("RMSE/N", "NRMSD/%", "max/N")
@@ -87,7 +88,7 @@ def contact_rows(evaluation: Evaluation) -> list[list[str]]:
     rows = []
     for name, score in [*evaluation.scores.items(), ("all", evaluation.total)]:
         result = evaluation.results.get(name)
-        source = "" if result is None or result.contact is None else result.contact.source
+        source = "" if result is None else _contact_source(result)
         places = [
             format_number(value)
             for place in (score.place, score.solved_place)
@@ -99,7 +100,7 @@ def contact_rows(evaluation: Evaluation) -> list[list[str]]:
         false = format_number(onset.false_pct, 1)
         times = [format_number(score.contact_ms.p50), format_number(score.contact_ms.p99)]
         rows.append([name, source, *places, *frames, missed, false, *times])
-    return rows if any(result.contact is not None for result in evaluation.results.values()) else []
+    return rows if any(map(_contact_source, evaluation.results.values())) else []
 
 
 def format_contact_table(evaluation: Evaluation) -> str:
@@ -190,12 +191,14 @@ def evaluation_json(evaluation: Evaluation, **about: Any) -> dict[str, Any]:
 
 def _contact_name(evaluation: Evaluation, name: str) -> dict[str, str]:
     """Return where the contact of a case came from."""
-    contact = evaluation.results[name].contact
-    return {} if contact is None else {"contact": contact.source}
+    source = _contact_source(evaluation.results[name])
+    return {"contact": source} if source else {}
 
 
-if TYPE_CHECKING:
-    from finforce_eval.evaluation.evaluate import Evaluation
+def _contact_source(result: ForceSeries) -> str:
+    """Return what gave the contact of a case, "" where nobody says."""
+    return str(result.column("contact_source")[0]) if result.has("contact_source") and len(result) else ""
+
 
 SIGHT_HEADER = (
     "pixels: median/px", "p95/px", "points: median/mm", "p95/mm", "hidden accepted/%", "visible lost/%",
@@ -214,7 +217,7 @@ MEANING = (
 
 def sight_rows(evaluation: Evaluation) -> list[list[str]]:
     """Return one row per case and one for all; none where no detector ran."""
-    if all(result.detector_ms is None for result in evaluation.results.values()):
+    if not any(result.has("detector_ms") for result in evaluation.results.values()):
         return []
     return [[name, *_cells(score)] for name, score in [*evaluation.scores.items(), ("all", evaluation.total)]]
 

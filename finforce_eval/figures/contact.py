@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from finforce_eval.evaluation.results import CaseResult
 from finforce_eval.evaluation.scoring import LEAST_FORCE, ONSET_FORCE
 from finforce_eval.figures.figures import (
     BLACK,
@@ -20,9 +19,10 @@ from finforce_eval.figures.figures import (
     shade_phases,
     style_axes,
 )
+from finforce_eval.table import ForceSeries
 
 
-def draw_contact(result: CaseResult) -> Figure:
+def draw_contact(result: ForceSeries) -> Figure:
     """Draw the heights of given and found contact with the true one, their errors, and when they touch.
 
     Args:
@@ -38,30 +38,30 @@ def draw_contact(result: CaseResult) -> Figure:
     _draw_touching(touch, result)
     figure.legend(loc="outside upper right", ncols=6, frameon=False, fontsize=9)
     place.set(ylabel="height on the\nundeformed surface [mm]")
-    place.set_title(f"{result.name}, contact: {result.contact.source}", loc="left", fontsize=11)
+    place.set_title(f"{result.name}, contact: {result.column('contact_source')[0]}", loc="left", fontsize=11)
     error.set(ylabel="off the pressure\ncentre [mm]")
     touch.set(xlabel="time [s]", xlim=(time[0], max(time[-1], 1e-3)))
     return figure
 
 
-def _draw_places(place: Any, error: Any, result: CaseResult) -> None:
+def _draw_places(place: Any, error: Any, result: ForceSeries) -> None:
     """Draw the heights, and their distance from the truth where the truth presses."""
-    contact, time = result.contact, result.seconds
+    time, given, solved = result.seconds, result.column("contact_height"), result.column("contact_location")[:, 2]
     pressed = result.true_magnitude > LEAST_FORCE
-    truth = np.where(pressed, contact.truth, np.nan)
-    place.plot(time, 1e3 * contact.given, color=ORANGE, linewidth=0.9, label="contact given to the solver")
-    place.plot(time, 1e3 * result.place[:, 2], color=GREEN, linewidth=0.9, label="found by the solver")
+    truth = np.where(pressed, result.column("true_height"), np.nan)
+    place.plot(time, 1e3 * given, color=ORANGE, linewidth=0.9, label="contact given to the solver")
+    place.plot(time, 1e3 * solved, color=GREEN, linewidth=0.9, label="found by the solver")
     place.plot(time, 1e3 * truth, color=BLACK, linewidth=1.3, dashes=(4, 1.5), label="pressure centre of the truth")
     error.axhline(0.0, color=BLACK, linewidth=0.8)
-    for heights, colour in ((contact.given, ORANGE), (result.place[:, 2], GREEN)):
+    for heights, colour in ((given, ORANGE), (solved, GREEN)):
         error.plot(time, 1e3 * (heights - truth), color=colour, linewidth=0.8)
 
 
-def _draw_touching(axes: Any, result: CaseResult) -> None:
+def _draw_touching(axes: Any, result: ForceSeries) -> None:
     """Draw bars for the true contact and for the one said."""
     rows = [("measured", np.nan_to_num(result.true_magnitude) > ONSET_FORCE, BLACK)]
-    if result.contact.touching is not None:
-        rows.append(("touching", result.contact.touching, BLUE))
+    if result.has("touching"):
+        rows.append(("touching", result.column("touching").astype(bool), BLUE))
     for line, (_, mask, colour) in enumerate(rows):
         time = np.r_[result.seconds, 2 * result.seconds[-1] - result.seconds[-2 if len(mask) > 1 else -1]]
         bars = [(time[run[0]], time[run[-1] + 1] - time[run[0]]) for run in find_runs(mask)]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import MissingDependencyError
-from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.table import ForceSeries
 
 try:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -47,16 +47,16 @@ def find_runs(mask: NDArray[np.bool_]) -> list[NDArray[np.integer]]:
     return np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
 
 
-def shade_phases(axes: Any, result: CaseResult, *, labelled: bool) -> None:
+def shade_phases(axes: Any, result: ForceSeries, *, labelled: bool) -> None:
     """Shade the record phases of loading and unloading, with entries for the legend if `labelled`."""
     time = result.seconds
     for direction, colour in COLOURS.items():
-        for count, run in enumerate(find_runs(result.scored & (result.direction == direction))):
+        for count, run in enumerate(find_runs(result.scored & (result.column("direction") == direction))):
             label = f"record, {LABELS[direction]}" if labelled and count == 0 else None
             axes.axvspan(time[run[0]], time[run[-1]], color=colour, alpha=0.13, linewidth=0, label=label)
 
 
-def draw_force(result: CaseResult) -> Figure:
+def draw_force(result: ForceSeries) -> Figure:
     """Draw estimate and truth over time, with twice the standard deviation and the error below."""
     figure = new_figure(11, 5.4)
     force, error = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
@@ -64,7 +64,8 @@ def draw_force(result: CaseResult) -> Figure:
     for axes in (force, error):
         style_axes(axes)
         shade_phases(axes, result, labelled=axes is force)
-    low, high = result.magnitude - 2 * result.stddev, result.magnitude + 2 * result.stddev
+    stddev = result.column("magnitude_stddev")
+    low, high = result.magnitude - 2 * stddev, result.magnitude + 2 * stddev
     force.fill_between(
         time, np.maximum(low, 0), high, color=GREEN, alpha=0.3, linewidth=0, label="± 2 standard deviations"
     )
@@ -79,12 +80,12 @@ def draw_force(result: CaseResult) -> Figure:
     return figure
 
 
-def _draw_error(axes: Any, result: CaseResult) -> None:
+def _draw_error(axes: Any, result: ForceSeries) -> None:
     """Draw the error of the scored frames, and a mark for each frame without an estimate."""
     time = result.seconds
     axes.axhline(0.0, color=BLACK, linewidth=0.8)
     for direction, colour in [*COLOURS.items(), ("", GREY)]:
-        chosen = result.counted & (result.direction == direction)
+        chosen = result.counted & (result.column("direction") == direction)
         axes.plot(time[chosen], result.error[chosen], ".", markersize=2, color=colour)
     lost = time[~result.solved]
     if lost.size:
@@ -92,7 +93,7 @@ def _draw_error(axes: Any, result: CaseResult) -> None:
         axes.plot(lost, np.zeros(lost.size), "|", color=GREY, markersize=7, label="no estimate", **place)
 
 
-def draw_unity(results: Sequence[CaseResult]) -> Figure:
+def draw_unity(results: Sequence[ForceSeries]) -> Figure:
     """Draw estimate against truth, one panel per case, loading and unloading apart."""
     columns = min(len(results), 3)
     rows = -(-len(results) // columns)
@@ -104,7 +105,7 @@ def draw_unity(results: Sequence[CaseResult]) -> Figure:
         limit = 1.06 * float(counted.max(initial=0.1))
         axes.plot([0, limit], [0, limit], color=GREY, linewidth=1.0, dashes=(4, 2))
         for direction, colour in [*COLOURS.items(), ("", BLUE)]:
-            chosen = result.counted & (result.direction == direction)
+            chosen = result.counted & (result.column("direction") == direction)
             style = {"color": colour, "alpha": 0.35, "markersize": 3, "markeredgewidth": 0}
             axes.plot(result.true_magnitude[chosen], result.magnitude[chosen], "o", **style)
         axes.set(xlim=(0, limit), ylim=(0, limit), aspect="equal")
@@ -118,14 +119,14 @@ def draw_unity(results: Sequence[CaseResult]) -> Figure:
     return figure
 
 
-def _phase_legend(figure: Figure, results: Sequence[CaseResult]) -> None:
+def _phase_legend(figure: Figure, results: Sequence[ForceSeries]) -> None:
     """Explain the colours of loading and unloading, if there are any."""
-    if any((result.direction != "").any() for result in results):
+    if any((result.column("direction") != "").any() for result in results):
         patches = [Patch(color=colour, label=LABELS[key]) for key, colour in COLOURS.items()]
         figure.legend(handles=patches, loc="outside upper right", ncols=2, frameon=False, fontsize=9)
 
 
-def draw_violins(results: Sequence[CaseResult]) -> Figure:
+def draw_violins(results: Sequence[ForceSeries]) -> Figure:
     """Draw the distribution of the error per case: loading to the left, unloading to the right."""
     figure = new_figure(max(4.2, 1.15 * len(results) + 1.4), 4.4)
     axes = figure.subplots()
@@ -133,7 +134,7 @@ def draw_violins(results: Sequence[CaseResult]) -> Figure:
     axes.axhline(0.0, color=BLACK, linewidth=0.8)
     for place, result in enumerate(results):
         for direction, colour in [*COLOURS.items(), ("", BLUE)]:
-            errors = result.error[result.counted & (result.direction == direction)]
+            errors = result.error[result.counted & (result.column("direction") == direction)]
             if errors.size > 1 and np.ptp(errors) > 0:
                 _draw_violin(axes, errors, place, direction, colour)
     axes.set(ylabel="estimate - measured [N]", xlim=(-0.6, len(results) - 0.4))
@@ -157,7 +158,7 @@ def _draw_violin(axes: Any, errors: NDArray, place: int, direction: str, colour:
     axes.plot([x], [middle], "o", color="white", markeredgecolor=colour, markersize=4)
 
 
-def draw_keypoints(result: CaseResult, names: Sequence[str]) -> Figure:
+def draw_keypoints(result: ForceSeries, names: Sequence[str]) -> Figure:
     """Draw which key points entered the estimate, over time.
 
     Args:
@@ -167,13 +168,14 @@ def draw_keypoints(result: CaseResult, names: Sequence[str]) -> Figure:
     figure = new_figure(11, 0.6 + 0.24 * len(names) + 0.8)
     axes = figure.subplots()
     time = result.seconds
-    picture = np.where(result.used, 1, 0).T
+    used = result.column("used")
+    picture = np.where(used, 1, 0).T
     extent = (time[0], max(time[-1], 1e-3), len(names) - 0.5, -0.5)
     colours = ListedColormap(["#e9e9e9", BLUE])
     axes.imshow(picture, aspect="auto", extent=extent, cmap=colours, vmin=0, vmax=1, interpolation="nearest")
     for line in range(1, len(names)):
         axes.axhline(line - 0.5, color="white", linewidth=1.5)
-    shares = 100 * result.used.mean(axis=0)
+    shares = 100 * used.mean(axis=0)
     labels = [f"{name}  {share:3.0f} %" for name, share in zip(names, shares, strict=True)]
     axes.set_yticks(range(len(names)), labels, fontsize=8)
     axes.spines[:].set_visible(False)

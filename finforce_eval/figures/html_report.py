@@ -5,60 +5,22 @@ from __future__ import annotations
 import json
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from finforce_eval.evaluation.results import CaseResult
 from finforce_eval.recordings.tracks import DIRECTIONS
+from finforce_eval.table import ForceSeries
 
 TEMPLATE = Path(__file__).parents[1] / "data" / "page" / "report.html"
 _PLACE = "@DATA@"
 _MOST_WORDS = 255
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ForceCourse:
-    """The force on one jaw over time.
-
-    Attributes:
-        name: of the recording, and of the jaw where there are two.
-        stamps: of the images (n,) [ns].
-        force: (n, 3) [N], NaN where there was no answer.
-        stddev: of its magnitude (n,) [N].
-        truth: (n, 3) measured [N]; None where nothing was.
-        status: (n,) a word for each image.
-        phase: (n,) 0, in a record phase of loading (or without direction) 1, of unloading 2.
-    """
-
-    name: str
-    stamps: NDArray[np.int64]
-    force: NDArray[np.float64]
-    stddev: NDArray[np.float64]
-    status: NDArray[np.str_]
-    phase: NDArray[np.uint8]
-    truth: NDArray[np.float64] | None = None
-
-    @classmethod
-    def of_result(cls, result: CaseResult) -> ForceCourse:
-        """Return what an evaluation found."""
-        phase = np.where(result.direction == DIRECTIONS[1], 2, np.where(result.direction == DIRECTIONS[0], 1, 0))
-        return cls(
-            name=result.name,
-            stamps=result.stamps,
-            force=result.force,
-            stddev=result.stddev,
-            truth=result.truth,
-            status=result.status,
-            phase=np.where(result.scored, phase, 0).astype(np.uint8),
-        )
-
-
 def write_html(
-    courses: Sequence[ForceCourse],
+    courses: Sequence[ForceSeries],
     path: Path,
     *,
     title: str,
@@ -98,39 +60,45 @@ def write_html(
     return path
 
 
-def _count_answers(courses: Sequence[ForceCourse]) -> tuple[list[str], list[list[str]]]:
+def _count_answers(courses: Sequence[ForceSeries]) -> tuple[list[str], list[list[str]]]:
     """Return columns and rows that tell of images, answers and the largest force."""
     rows = []
     for course in courses:
-        magnitude = np.linalg.norm(course.force, axis=1)
-        known = magnitude[np.isfinite(magnitude)]
-        answered = f"{100.0 * len(known) / max(len(magnitude), 1):.1f}"
+        known = course.magnitude[course.solved]
+        answered = f"{100.0 * len(known) / max(len(course), 1):.1f}"
         largest = f"{known.max():.2f}" if len(known) else "-"
-        rows.append([course.name, str(len(magnitude)), answered, largest])
+        rows.append([course.name, str(len(course)), answered, largest])
     return ["recording", "images", "answered/%", "largest force/N"], rows
 
 
-def _describe(course: ForceCourse) -> dict[str, Any]:
-    """Return what the page's script reads of a course."""
-    words, status = np.unique(course.status, return_inverse=True)
-    magnitude = np.linalg.norm(course.force, axis=1)
+def _describe(course: ForceSeries) -> dict[str, Any]:
+    """Return what the page's script reads of a series."""
+    words, status = np.unique(course.column("status"), return_inverse=True)
     columns = {
-        "time": 1e-9 * (course.stamps - course.stamps[0]) if len(course.stamps) else np.zeros(0),
-        "found": magnitude,
-        "stddev": np.where(np.isfinite(magnitude), course.stddev, np.nan),
+        "time": course.seconds if len(course) else np.zeros(0),
+        "found": course.magnitude,
+        "stddev": np.where(course.solved, course.column("magnitude_stddev"), np.nan),
         **dict(zip("xyz", course.force.T, strict=True)),
     }
-    if course.truth is not None:
-        columns["truth"] = np.linalg.norm(course.truth, axis=1)
+    if course.has("true_force"):
+        columns["truth"] = course.true_magnitude
     return {
         "name": course.name,
-        "images": len(course.stamps),
-        "lost": int((~np.isfinite(magnitude)).sum()),
+        "images": len(course),
+        "lost": int((~course.solved).sum()),
         "words": words[:_MOST_WORDS].tolist(),
         "status": _encode(np.minimum(status, _MOST_WORDS - 1), np.uint8),
-        "phase": _encode(course.phase, np.uint8),
+        "phase": _encode(_phase(course), np.uint8),
         **{name: _encode(values, np.float32) for name, values in columns.items()},
     }
+
+
+def _phase(course: ForceSeries) -> NDArray[np.uint8]:
+    """Return 0, in a record phase of loading (or without direction) 1, of unloading 2, of each image (n,)."""
+    if not course.has("direction"):
+        return np.zeros(len(course), np.uint8)
+    load, unload = (course.column("direction") == direction for direction in DIRECTIONS)
+    return np.where(course.scored, np.where(unload, 2, np.where(load, 1, 0)), 0).astype(np.uint8)
 
 
 def _encode(values: ArrayLike, kind: type) -> str:

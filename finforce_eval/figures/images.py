@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.evaluation.results import CaseResult, compare_detection
+from finforce_eval.evaluation.results import compare_detection
 from finforce_eval.figures.figures import BLUE, GREEN, GREY, ORANGE, new_figure, style_axes
 from finforce_eval.recordings.tracks import DetectionTrack, JawTrack, Recording
+from finforce_eval.table import ForceSeries
 from finforce_keypoints.diagnostics import COLORS, draw_keypoints
 
 COUNT, COLUMNS = 6, 2
@@ -77,7 +78,7 @@ def find_region(pixels: NDArray[np.float64], width: int, height: int) -> Region:
     return Region(*first.tolist(), *(last - first).tolist())
 
 
-def draw_images(recording: Recording, results: Sequence[CaseResult], skeleton: Sequence[Sequence[int]] = ()) -> Any:
+def draw_images(recording: Recording, results: Sequence[ForceSeries], skeleton: Sequence[Sequence[int]] = ()) -> Any:
     """Draw six images where the jaws are, with the key points found, the true ones, and the forces.
 
     Args:
@@ -168,14 +169,14 @@ def _draw_truth(axes: Any, track: JawTrack, stamp: int, place: tuple[Region, int
             )
 
 
-def describe_image(recording: Recording, results: Sequence[CaseResult], stamp: int, is_largest: bool = False) -> str:
+def describe_image(recording: Recording, results: Sequence[ForceSeries], stamp: int, is_largest: bool = False) -> str:
     """Return the time of an image in its recording, and the forces that were estimated and measured then."""
     seconds = (stamp - int(recording.images.stamps[0])) * 1e-9
     words = [f"t = {seconds:.2f} s", *(_describe_force(result, stamp, len(results) > 1) for result in results)]
     return ",  ".join(word for word in words if word) + ("  (largest)" if is_largest else "")
 
 
-def _describe_force(result: CaseResult, stamp: int, is_named: bool) -> str:
+def _describe_force(result: ForceSeries, stamp: int, is_named: bool) -> str:
     """Return the force on one jaw in words."""
     rows = np.flatnonzero(result.stamps == stamp)
     if not rows.size:
@@ -241,7 +242,7 @@ def _draw_pixel_error(axes: Any, track: JawTrack, begin: int) -> None:
     if track.sight is None:
         return
     times = np.intersect1d(track.detection.stamps, track.sight.stamps)
-    error = compare_detection(track.detection, track.sight).pixel_error
+    error = np.stack(compare_detection(track.detection, track.sight)["pixel_error"])
     for percent, color, label in ((95, ORANGE, "95th percentile"), (50, BLUE, "median of the visible")):
         axes.plot((times - begin) * 1e-9, _percentile(error, percent), color=color, linewidth=1.0, label=label)
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_eval.evaluation.results import Snapshot
 from finforce_eval.figures.figures import BLACK, BLUE, GREY, ORANGE, new_figure
+from finforce_eval.table import Snapshot
 
 SIDE = (0, 2)  # seen along y: x to the right, z upwards
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.results import CaseResult
 from finforce_eval.figures.figures import BLACK, BLUE, ORANGE, new_figure, style_axes
 from finforce_eval.figures.images import (
     RADIUS,
@@ -23,6 +22,7 @@ from finforce_eval.figures.images import (
     moved,
 )
 from finforce_eval.recordings.tracks import Recording
+from finforce_eval.table import ForceSeries
 from finforce_keypoints.diagnostics import draw_keypoints
 
 RATE = 10.0  # images a second
@@ -40,7 +40,7 @@ class _Curve(NamedTuple):
 
 
 def write_movie(
-    recording: Recording, results: Sequence[CaseResult], path: str | Path, skeleton: Sequence[Sequence[int]] = ()
+    recording: Recording, results: Sequence[ForceSeries], path: str | Path, skeleton: Sequence[Sequence[int]] = ()
 ) -> None:
     """Write what a detector and the solvers made of a recording as an animated WebP or GIF, in its own time.
 
@@ -63,7 +63,7 @@ def write_movie(
     first.save(path, save_all=True, append_images=others, duration=round(1e3 / RATE), loop=0, quality=QUALITY, method=6)
 
 
-def _draw(recording: Recording, results: Sequence[CaseResult], skeleton: Sequence[Sequence[int]]) -> list:
+def _draw(recording: Recording, results: Sequence[ForceSeries], skeleton: Sequence[Sequence[int]]) -> list:
     """Return the pictures of the movie."""
     from PIL import Image
     from tqdm import tqdm
@@ -90,7 +90,7 @@ def _draw(recording: Recording, results: Sequence[CaseResult], skeleton: Sequenc
     return pictures
 
 
-def _prepare_curves(force: Any, results: Sequence[CaseResult], stamps: NDArray[np.int64]) -> list[_Curve]:
+def _prepare_curves(force: Any, results: Sequence[ForceSeries], stamps: NDArray[np.int64]) -> list[_Curve]:
     """Draw the true forces and return the curves that will grow."""
     start, curves = stamps[0], []
     for result in results:

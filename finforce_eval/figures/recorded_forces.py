@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.scoring import match_samples, match_truth
-from finforce_eval.figures.html_report import ForceCourse
 from finforce_eval.recordings.bags import bag_source, check_types, open_bag
 from finforce_eval.recordings.recording import WRENCH
 from finforce_eval.recordings.tracks import JAWS, WrenchTrack
+from finforce_eval.table import ForceSeries
 
 STATUS = "diagnostic_msgs/msg/DiagnosticArray"
 _FORCE, _STDDEV, _STATUS, _TRUTH = KINDS = ("wrench", "wrench_stddev", "wrench_status", "ground_truth_wrench")
 
 
-def read_forces(path: Path) -> list[ForceCourse]:
+def read_forces(path: Path) -> list[ForceSeries]:
     """Return the forces on the jaws of a recording.
 
     Args:
@@ -39,11 +39,11 @@ def read_forces(path: Path) -> list[ForceCourse]:
     sides = [side for side in JAWS if f"/{side}/{_FORCE}" in samples]
     if not sides:
         raise RecordingError(f"{path.stem}: no forces: /left/wrench and /right/wrench have no messages; see annotate")
-    return [_make_course(f"{path.stem}/{side}" if len(sides) > 1 else path.stem, side, samples) for side in sides]
+    return [_make_series(f"{path.stem}/{side}" if len(sides) > 1 else path.stem, side, samples) for side in sides]
 
 
-def _make_course(name: str, side: str, samples: Mapping[str, list[Any]]) -> ForceCourse:
-    """Return the course of one jaw."""
+def _make_series(name: str, side: str, samples: Mapping[str, list[Any]]) -> ForceSeries:
+    """Return the series of one jaw."""
     found, stated, true = (_stack(samples.get(f"/{side}/{kind}", [])) for kind in (_FORCE, _STDDEV, _TRUTH))
     stddev = match_samples(stated.stamps, stated.force, found.stamps) if len(stated.stamps) else np.nan
     magnitude = np.linalg.norm(found.force, axis=1)
@@ -52,14 +52,15 @@ def _make_course(name: str, side: str, samples: Mapping[str, list[Any]]) -> Forc
     along = np.sqrt(np.sum((direction * stddev) ** 2, axis=1))
     words = {_stamp(each): each.status[0].values[0].value for each in samples.get(f"/{side}/{_STATUS}", [])}
     status = [words.get(stamp, "") for stamp in found.stamps.tolist()]
-    return ForceCourse(
-        name=name,
-        stamps=found.stamps,
+    return ForceSeries.build(
+        name,
+        side,
+        found.stamps,
         force=found.force,
-        stddev=along,
-        truth=match_truth(true, found.stamps) if len(true.stamps) else None,
+        torque=found.torque,
+        magnitude_stddev=along,
+        true_force=match_truth(true, found.stamps) if len(true.stamps) else None,
         status=np.array(status, dtype="U32"),
-        phase=np.zeros(len(found.stamps), np.uint8),
     )
 
 

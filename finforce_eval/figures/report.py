@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from finforce_eval.evaluation.evaluate import Evaluation
-from finforce_eval.evaluation.results import CaseResult
 from finforce_eval.evaluation.tables import (
     markdown_contact_table,
     markdown_sight,
@@ -16,8 +15,11 @@ from finforce_eval.evaluation.tables import (
     table_head,
     table_rows,
 )
-from finforce_eval.figures.html_report import ForceCourse, write_html
+from finforce_eval.figures.html_report import write_html
 from finforce_eval.recordings.tracks import Recording
+from finforce_eval.table import ForceSeries
+
+TITLE = "Force from key points"
 
 
 def write_report(
@@ -27,7 +29,7 @@ def write_report(
     keypoint_names: Sequence[str],
     about: Mapping[str, str],
     recordings: Sequence[Recording] = (),
-    title: str = "Force from key points",
+    title: str = TITLE,
 ) -> Path:
     """Write pictures, README.md and report.html of an evaluation.
 
@@ -46,6 +48,39 @@ def write_report(
         MissingDependencyError: matplotlib is not installed.
         RecordingError: an image is damaged.
     """
+    results = list(evaluation.results.values())
+    draw_results(results, Path(folder), keypoint_names=keypoint_names, recordings=recordings)
+    return write_overview(evaluation, folder, about=about, title=title)
+
+
+def draw_results(
+    results: Sequence[ForceSeries],
+    folder: Path,
+    *,
+    keypoint_names: Sequence[str],
+    recordings: Sequence[Recording] = (),
+) -> None:
+    """Draw recordings and the series of their jaws, in the folder of a report; see `write_report`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for recording in recordings:
+        own = [result for result in results if _recording_of(result) == recording.name]
+        _draw_images(recording, own, folder, keypoint_names)
+    for result in results:
+        _draw_case(result, folder, keypoint_names)
+
+
+def write_overview(evaluation: Evaluation, folder: str | Path, *, about: Mapping[str, str], title: str = TITLE) -> Path:
+    """Write the pages of a report, and the pictures of all cases together; those of each are there already.
+
+    Args:
+        evaluation: scores and time series.
+        folder: where `draw_results` has drawn.
+        about: what was run: solver, jaw, contact, ...
+        title: heading of the page.
+
+    Returns:
+        README.md, which shows the pictures.
+    """
     from finforce_eval.figures.figures import draw_unity, draw_violins
 
     folder = Path(folder)
@@ -53,15 +88,38 @@ def write_report(
     results = list(evaluation.results.values())
     draw_unity(results).savefig(folder / "unity.png")
     draw_violins(results).savefig(folder / "violins.png")
-    sections = [_write_images(recording, results, folder, keypoint_names) for recording in recordings]
-    sections += [_write_case(result, folder, keypoint_names) for result in results]
     page = folder / "README.md"
     zooming = ["The same over time, to zoom: [report.html](report.html)", ""]
     head = [f"# {title}", "", *(f"- {key}: {value}" for key, value in about.items()), "", *zooming]
-    lines = [*head, *_overview(evaluation), *(line for section in sections for line in section)]
+    lines = [*head, *_overview(evaluation)]
+    for name in dict.fromkeys(map(_recording_of, results)):
+        lines += _show_pictures(folder, f"Images of {name}", _stem(name), IMAGES)
+    for name in evaluation.results:
+        lines += _show_pictures(folder, name, _stem(name), PICTURES)
     page.write_text("\n".join(lines) + "\n", encoding="utf-8")
     write_page(evaluation, folder / "report.html", about=about, title=title)
     return page
+
+
+# Pictures of a recording and of a case by the ends of their names, with what they show.
+IMAGES = {"images": "Key points in the images", "detection": "Key points found, over time"}
+PICTURES = {
+    "force": "Force over time",
+    "jaw": "The jaw at the largest force",
+    "contact": "Contact over time",
+    "keypoints": "Key points used",
+}
+
+
+def _show_pictures(folder: Path, name: str, stem: str, pictures: Mapping[str, str]) -> list[str]:
+    """Return a section of the page with those pictures that are there; no line without any."""
+    shown = {text: f"{stem}_{end}.png" for end, text in pictures.items() if (folder / f"{stem}_{end}.png").exists()}
+    return ["", f"## {name}", "", *(f"![{text}]({file})" for text, file in shown.items())] if shown else []
+
+
+def _recording_of(result: ForceSeries) -> str:
+    """Return the name of the recording of a series."""
+    return result.name.removesuffix(f"/{result.side}")
 
 
 def write_page(evaluation: Evaluation, path: Path, *, about: Mapping[str, str], title: str) -> Path:
@@ -76,8 +134,14 @@ def write_page(evaluation: Evaluation, path: Path, *, about: Mapping[str, str], 
     Raises:
         OSError: it cannot be written.
     """
-    courses = [ForceCourse.of_result(result) for result in evaluation.results.values()]
-    return write_html(courses, path, title=title, about=about, columns=table_head(), rows=table_rows(evaluation))
+    return write_html(
+        list(evaluation.results.values()),
+        path,
+        title=title,
+        about=about,
+        columns=table_head(),
+        rows=table_rows(evaluation),
+    )
 
 
 def _overview(evaluation: Evaluation) -> list[str]:
@@ -101,44 +165,40 @@ def _stem(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name)
 
 
-def _write_images(
-    recording: Recording, results: Sequence[CaseResult], folder: Path, keypoint_names: Sequence[str]
-) -> list[str]:
-    """Write the pictures of what the detector made of a recording's images and return their section of the page."""
+def _draw_images(
+    recording: Recording, results: Sequence[ForceSeries], folder: Path, keypoint_names: Sequence[str]
+) -> None:
+    """Draw what the detector made of a recording's images, where it did."""
+    stem = _forget_pictures(folder, recording.name, IMAGES)
     if recording.images is None or all(track.detection is None for track in recording.jaws.values()):
-        return []
+        return
     from finforce_eval.figures.images import draw_detection, draw_images
     from finforce_keypoints.diagnostics import build_skeleton
 
-    name, stem = recording.name, _stem(recording.name)
-    own = [result for result in results if result.name in (name, f"{name}/{result.side}")]
-    draw_images(recording, own, build_skeleton(keypoint_names)).savefig(folder / f"{stem}_images.png")
+    draw_images(recording, results, build_skeleton(keypoint_names)).savefig(folder / f"{stem}_images.png")
     draw_detection(recording).savefig(folder / f"{stem}_detection.png")
-    return [
-        "",
-        f"## Images of {name}",
-        "",
-        f"![Key points in the images]({stem}_images.png)",
-        f"![Key points found, over time]({stem}_detection.png)",
-    ]
 
 
-def _write_case(result: CaseResult, folder: Path, keypoint_names: Sequence[str]) -> list[str]:
-    """Write the pictures of one case and return its section of the page."""
+def _draw_case(result: ForceSeries, folder: Path, keypoint_names: Sequence[str]) -> None:
+    """Draw one case."""
     from finforce_eval.figures.contact import draw_contact
     from finforce_eval.figures.figures import draw_force, draw_keypoints
     from finforce_eval.figures.jaw import draw_jaw
 
-    stem = _stem(result.name)
+    stem = _forget_pictures(folder, result.name, PICTURES)
     draw_force(result).savefig(folder / f"{stem}_force.png")
     draw_keypoints(result, keypoint_names).savefig(folder / f"{stem}_keypoints.png")
-    lines = ["", f"## {result.name}", "", f"![Force over time]({stem}_force.png)"]
     if result.snapshot is not None:
         seconds = (result.snapshot.stamp - int(result.stamps[0])) * 1e-9
         title = f"{result.name}, largest force, t = {seconds:.1f} s"
         draw_jaw(result.snapshot, title).savefig(folder / f"{stem}_jaw.png")
-        lines.append(f"![The jaw at the largest force]({stem}_jaw.png)")
-    if result.contact is not None:
+    if result.has("contact_height"):
         draw_contact(result).savefig(folder / f"{stem}_contact.png")
-        lines.append(f"![Place of the contact over time]({stem}_contact.png)")
-    return [*lines, f"![Key points used]({stem}_keypoints.png)"]
+
+
+def _forget_pictures(folder: Path, name: str, pictures: Mapping[str, str]) -> str:
+    """Remove the pictures of an earlier report, and return the beginning of their names."""
+    stem = _stem(name)
+    for end in pictures:
+        (folder / f"{stem}_{end}.png").unlink(missing_ok=True)
+    return stem

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from finforce.optional import import_cv2, import_library
 from finforce.stamps import NANOSECONDS
-from finforce_eval.annotation.forces import GraspForces, JawForces, Shape
+from finforce_eval.annotation.forces import Shape
 from finforce_eval.recordings.tracks import JawTrack, Recording
+from finforce_eval.table import ForceSeries
 from finforce_ifea.messages import ARROW, CONTACT, CONTACT_DIAMETER, FORCE, NEWTONS_PER_METRE
 
 TIMELINE = "recording"
@@ -102,25 +103,25 @@ class RerunView:
                 place = self._rr.Transform3D(translation=pose.position[row], quaternion=pose.quaternion[row])
                 self._stream.log(f"jaws/{side}", place)
 
-    def show_forces(self, jaws: Mapping[str, JawForces], grasp: GraspForces, recording: Recording) -> None:
+    def show_forces(self, jaws: Mapping[str, ForceSeries], grasp: ForceSeries, recording: Recording) -> None:
         """Send contact and force in the jaws, and all forces over time."""
         for side, forces in jaws.items():
             self._draw_force(forces)
-            magnitude = np.linalg.norm(forces.force, axis=1)
-            stated = np.linalg.norm(forces.force_stddev, axis=1)
+            magnitude = forces.magnitude
+            stated = np.linalg.norm(forces.column("force_stddev"), axis=1)
             self._plot(f"forces/{side}", forces.stamps, magnitude, _COLOURS[side], f"{side} [N]")
             self._plot(f"deviations/{side}", forces.stamps, stated, _COLOURS[side], f"{side}, standard deviation [N]")
             truth = recording.jaw(side).truth
             if truth is not None:
                 true = np.linalg.norm(truth.force, axis=1)
                 self._plot(f"forces/{side}_true", truth.stamps, true, _COLOURS["truth"], f"{side}, measured [N]")
-        self._plot("forces/grasp", grasp.stamps, grasp.grasp[:, 0], _COLOURS["grasp"], "grasp [N]")
+        self._plot("forces/grasp", grasp.stamps, grasp.column("grasp_force"), _COLOURS["grasp"], "grasp [N]")
 
-    def _draw_force(self, forces: JawForces) -> None:
+    def _draw_force(self, forces: ForceSeries) -> None:
         """Send where the object presses on a jaw, and how hard; nothing where that is not known."""
         rr, side = self._rr, forces.side
-        for row, stamp in enumerate(forces.stamps.tolist()):
-            force, point = forces.force[row], forces.point[row]
+        rows = zip(forces.stamps.tolist(), forces.force, forces.column("contact_point"), strict=True)
+        for stamp, force, point in rows:
             known = np.isfinite(force).all() and np.isfinite(point).all() and force.any()
             self._at(stamp)
             if not known:

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from finforce.messages import decode_columns, decode_keypoints, pose_from_message
 from finforce.stamps import NANOSECONDS
+from finforce_eval.evaluation.evaluate import sight_columns
 from finforce_eval.evaluation.keypoint_source import SideLog
 from finforce_eval.evaluation.places import InnerSurface, true_lines
-from finforce_eval.evaluation.results import CaseResult, ContactSeries, Snapshot, compare_detection
 from finforce_eval.evaluation.scoring import match_truth
 from finforce_eval.recordings.tracks import Recording
+from finforce_eval.table import ForceSeries, Snapshot
 from finforce_ifea.messages import contact_from_cloud, outline_from_cloud
 from finforce_keypoints.geometry.jaw_localizer import REASONS
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC
@@ -161,7 +162,7 @@ class ReplayLog:
 
 def live_result(
     recording: Recording, side: str, log: JawLog, *, likelihood_threshold: float, estimator: Any
-) -> CaseResult:
+) -> ForceSeries:
     """Return the answers of one solver as the time series of an offline run.
 
     The solver's own place, its residual and the key points used do not travel; the first two stay open, and the key
@@ -174,38 +175,34 @@ def live_result(
         likelihood_threshold: of the solver.
         estimator: a fresh one of the same jaw, for the undeformed surface and its triangles.
     """
-    jaw_track = recording.jaw(side)
-    track, detection = jaw_track.keypoints, jaw_track.detection
-    stamps, frames = track.stamps, len(track.stamps)
-    force = _rows(log.force, stamps)
+    track = recording.jaw(side).keypoints
+    stamps = track.stamps
+    force, stddev = _rows(log.force, stamps), _rows(log.stddev, stamps)
     norm = np.linalg.norm(force, axis=1, keepdims=True)
     along = np.divide(force, norm, out=np.zeros_like(force), where=norm > 0.0)
     phases = recording.phases_at(stamps)
     seen = np.isfinite(track.points).all(axis=2) & (track.likelihood >= likelihood_threshold)
-    return CaseResult(
-        name=recording.name,
-        side=side,
-        stamps=stamps,
-        truth=match_truth(recording.truth(side), stamps),
+    return ForceSeries.build(
+        recording.name,
+        side,
+        stamps,
+        true_force=match_truth(recording.truth(side), stamps),
         force=force,
-        place=np.full((frames, 3), np.nan),
-        stddev=np.linalg.norm(along * _rows(log.stddev, stamps), axis=1),
-        axis_stddev=_rows(log.stddev, stamps) if log.stddev else None,
-        residual=np.full(frames, np.nan),
+        magnitude_stddev=np.linalg.norm(along * stddev, axis=1),
+        force_stddev=stddev if log.stddev else None,
         used=seen,
         status=np.where(np.isfinite(force).all(axis=1), "ok", "no wrench"),
+        message="",
         step_ms=1e3 * np.array([log.latency.get(int(stamp), np.nan) for stamp in stamps]),
         cycle=phases.cycle,
         direction=phases.direction,
         scored=phases.scored,
-        snapshot=_snapshot(recording, side, log, seen, estimator),
-        contact=_contact_series(recording, side, log, estimator) if log.touching else None,
-        sight=compare_detection(detection, jaw_track.sight) if detection and jaw_track.sight else None,
-        detector_ms=None if detection is None else detection.step_ms,
-    )
+        **(_contact_columns(recording, side, log, estimator) if log.touching else {}),
+        **sight_columns(recording, side),
+    ).with_snapshot(_snapshot(recording, side, log, seen, estimator))
 
 
-def _contact_series(recording: Recording, side: str, log: JawLog, estimator: Any) -> ContactSeries:
+def _contact_columns(recording: Recording, side: str, log: JawLog, estimator: Any) -> dict[str, Any]:
     """Return where the contact was said to be, and where it was."""
     stamps = recording.jaw(side).keypoints.stamps
     surface = InnerSurface(np.array(estimator.surface()), estimator.jaw.face)
@@ -214,14 +211,13 @@ def _contact_series(recording: Recording, side: str, log: JawLog, estimator: Any
         surface.cut(log.surface[int(stamp)], point, direction) if int(stamp) in log.surface else np.nan
         for stamp, point, direction in zip(stamps, lines.points, lines.directions, strict=True)
     ]
-    return ContactSeries(
-        source="live",
-        given=np.array([log.place.get(int(stamp), np.nan) for stamp in stamps]),
-        truth=np.array(truth),
-        touching=np.array([log.touching.get(int(stamp), False) for stamp in stamps]),
-        status=np.where([int(stamp) in log.touching for stamp in stamps], "live", ""),
-        step_ms=np.full(len(stamps), np.nan),
-    )
+    return {
+        "contact_source": "live",
+        "contact_height": np.array([log.place.get(int(stamp), np.nan) for stamp in stamps]),
+        "true_height": np.array(truth),
+        "touching": np.array([log.touching.get(int(stamp), False) for stamp in stamps]),
+        "contact_status": np.where([int(stamp) in log.touching for stamp in stamps], "live", ""),
+    }
 
 
 def _snapshot(recording: Recording, side: str, log: JawLog, seen: NDArray[np.bool_], estimator: Any) -> Snapshot | None:

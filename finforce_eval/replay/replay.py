@@ -21,17 +21,18 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import FIXED, ContactChoice
 from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, score_results
 from finforce_eval.evaluation.keypoint_source import IMAGES, TRUTH, KeypointSource, awaiting_keypoints, with_detections
-from finforce_eval.evaluation.results import CaseResult
+from finforce_eval.evaluation.manipulation import with_distances
 from finforce_eval.evaluation.scoring import GraspScore, score_grasp
 from finforce_eval.evaluation.setup import EvaluationSetup, truth_sides
 from finforce_eval.recordings.objects import find_mesh, require_mesh
-from finforce_eval.recordings.tracks import Recording
+from finforce_eval.recordings.tracks import JAWS, Recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_eval.replay.live import ReplayLog, live_result
 from finforce_eval.replay.node_run import await_listeners, awaited_topics
 from finforce_eval.replay.playback import Playback, RawMessage, read_playback
 from finforce_eval.replay.processes import ProcessGroup
 from finforce_eval.replay.synthetic_stream import OBJECT_TOPIC
+from finforce_eval.table import ForceSeries
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 
@@ -278,7 +279,7 @@ def _score(recording: Recording, setup: EvaluationSetup, log: ReplayLog) -> Eval
     Raises:
         RecordingError: there are none.
     """
-    results: list[CaseResult] = []
+    results: list[ForceSeries] = []
     sides = truth_sides(recording)
     for side in sides:
         if not log.jaws[side].force:
@@ -286,7 +287,9 @@ def _score(recording: Recording, setup: EvaluationSetup, log: ReplayLog) -> Eval
         estimator = setup.side(side).estimator()
         threshold = setup.settings.likelihood_threshold
         result = live_result(recording, side, log.jaws[side], likelihood_threshold=threshold, estimator=estimator)
-        results.append(result if len(sides) == 1 else replace(result, name=f"{recording.name}/{side}"))
+        results.append(result if len(sides) == 1 else result.renamed(f"{recording.name}/{side}"))
+    if len(sides) == len(JAWS):
+        results = list(with_distances(dict(zip(sides, results, strict=True)), recording).values())
     return score_results(results, [recording])
 
 

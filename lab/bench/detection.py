@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from finforce.camera import ImageError, project
 from finforce.transforms import pose_from_quaternion
 from finforce_eval.evaluation.keypoint_source import Detector, KeypointSource, SideLog, build_records, with_detections
-from finforce_eval.evaluation.results import DetectionErrors, compare_detection, detection_stats
+from finforce_eval.evaluation.results import compare_detection, detection_stats
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import JawTrack, Recording
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
@@ -110,7 +110,7 @@ def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int |
     """
     seconds: dict[str, list[float]] = {way.name: [] for way in ways}
     cpu: dict[str, list[float]] = {way.name: [] for way in ways}
-    series: dict[str, list[DetectionErrors]] = {way.name: [] for way in ways}
+    series: dict[str, list[pd.DataFrame]] = {way.name: [] for way in ways}
     yardstick: list[float] = []
     for scene in scenes:
         recording = read_recording(find_scene(scene))

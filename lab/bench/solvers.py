@@ -367,7 +367,8 @@ def measure_recordings(
     if not results:
         return
     total = score_results(results, recordings).total
-    step = percentiles(1e-3 * np.concatenate([result.step_ms[result.status == "ok"] for result in results]), "step")
+    steps = [result.column("step_ms")[result.column("status") == "ok"] for result in results]
+    step = percentiles(1e-3 * np.concatenate(steps), "step")
     yield {
         "tier": tier.name,
         "step p50/ms": step["step p50/ms"],

@@ -79,7 +79,7 @@ def join_jaws(evaluation: Evaluation, name: str) -> GraspCourse:
         stamps=left.stamps[mine],
         truth=truths.min(axis=0),
         found=forces.min(axis=0),
-        stddev=np.maximum(left.stddev[mine], right.stddev[theirs]),
+        stddev=np.maximum(left.column("magnitude_stddev")[mine], right.column("magnitude_stddev")[theirs]),
         delay=np.maximum(left.lag[mine], right.lag[theirs]),
     )
 

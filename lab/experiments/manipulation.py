@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
-from finforce_eval.evaluation.manipulation import NetForces, join_net
+from finforce_eval.evaluation.manipulation import join_net
 from finforce_eval.evaluation.scoring import rms
 from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
 from finforce_eval.figures.figures import BLACK, BLUE, new_figure
 from finforce_eval.recordings.tracks import Recording
+from finforce_eval.table import ForceSeries
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
@@ -116,7 +117,7 @@ COLUMNS = {"case": "turn", "axis": "axis", "light": "light", "told_along_rmse_N"
 def score_turn(recording: Recording, setup: EvaluationSetup) -> dict[str, Any]:
     """Return the figures of a recording of both jaws; see `score_weight`."""
     results = evaluate_all([recording], setup).results
-    return score_weight(join_net(*(results[f"{recording.name}/{side}"] for side in SIDES), recording))
+    return score_weight(join_net({side: results[f"{recording.name}/{side}"] for side in SIDES}))
 
 
 def true_gravity(settings: Mapping[str, Any]) -> dict[int, NDArray]:
@@ -134,26 +135,28 @@ def tell_gravity(recording: Recording, gravity: Mapping[int, NDArray]) -> Record
     return replace(recording, jaws=jaws)
 
 
-def score_weight(net: NetForces) -> dict[str, Any]:
+def score_weight(net: ForceSeries) -> dict[str, Any]:
     """Return errors of a net force along the true one and across it, and what is drawn."""
-    size = np.linalg.norm(net.true.force, axis=1)
+    answered, net = 100.0 * float(net.solved.mean()) if len(net) else None, net.at(net.solved)
+    size = net.true_magnitude
     held = size > LEAST
-    down = net.true.force[held] / size[held, None]
-    error = (net.found.force - net.true.force)[held]
+    down = net.true_force[held] / size[held, None]
+    error = (net.force - net.true_force)[held]
     along = np.einsum("ij,ij->i", error, down)
-    known = net.stated is not None and bool(held.any())
-    sigma = np.sqrt(np.einsum("ij,ij->i", net.stated[held] ** 2, down**2)) if known else None
+    stated = net.column("force_stddev")[held]
+    known = bool(np.isfinite(stated).any())
+    sigma = np.sqrt(np.einsum("ij,ij->i", stated**2, down**2)) if known else None
     # the plane in which gravity turns: the two main directions of what it was
     plane = np.linalg.svd(down, full_matrices=False)[2][:2] if held.any() else np.zeros((2, 3))
     angle = np.unwrap(np.arctan2(*(down @ plane.T).T[::-1])) if held.any() else np.zeros(0)
-    found = np.einsum("ij,ij->i", net.found.force[held], down)
+    found = np.einsum("ij,ij->i", net.force[held], down)
     return {
         "along_rmse_N": rms(along),
         "along_bias_N": float(along.mean()) if held.any() else float("nan"),
         "across_rmse_N": rms(np.linalg.norm(error - along[:, None] * down, axis=1)),
         **{f"{axis}_rmse_N": rms(error[:, row]) for row, axis in enumerate("xyz")},
         "within_3_sigma_pct": 100.0 * float((np.abs(along) <= 3.0 * sigma).mean()) if known else float("nan"),
-        "answered_pct": net.answered_pct,
+        "answered_pct": answered,
         "drawn": {
             "angle": np.round(angle, 4).tolist(),
             "truth": np.round(size[held], 4).tolist(),

@@ -126,6 +126,7 @@ class FakeSolution:
     message: str = ""
     magnitude_stddev: float = 0.05
     force_stddev: tuple = (0.05, 0.01, 0.02)
+    torque_stddev: tuple = (0.0, 0.002, 0.0)
     residual: float = 2e-4
     contact_location: tuple = (0.014, 0.0, 0.04)
     torque: tuple = (0.0, -0.04, 0.0)

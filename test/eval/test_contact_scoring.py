@@ -4,25 +4,25 @@ import numpy as np
 import pytest
 from test_scoring import make_result
 
-from finforce_eval.evaluation.results import ContactSeries
 from finforce_eval.evaluation.scoring import given_distance, onset_delays, onset_stats, place_stats, solved_distance
 
 
 def contact_result(truth, *, touching=None, given=None, place=None, cycle=None, pressure=0.040):
     frames = len(truth)
     nothing = np.full(frames, np.nan)
-    series = ContactSeries(
-        source="estimate",
-        given=nothing if given is None else np.asarray(given, float),
-        truth=np.full(frames, pressure),
-        touching=None if touching is None else np.asarray(touching, bool),
-        status=np.full(frames, ""),
-        step_ms=nothing,
-    )
     places = np.full((frames, 3), np.nan)
     places[:, 2] = nothing if place is None else place
     cycles = np.zeros(frames, int) if cycle is None else np.asarray(cycle)
-    return make_result(truth=truth, force=truth, contact=series, place=places, cycle=cycles)
+    return make_result(
+        truth=truth,
+        force=truth,
+        contact_source="estimate",
+        contact_height=nothing if given is None else np.asarray(given, float),
+        true_height=np.full(frames, pressure),
+        touching=None if touching is None else np.asarray(touching, bool),
+        contact_location=places,
+        cycle=cycles,
+    )
 
 
 def test_places_are_compared_where_something_presses():

@@ -74,20 +74,20 @@ def test_nothing_is_given_to_the_solver_before_the_first_pose():
     result, solver, _ = run(make_track(10))
     assert solver.contacts[:10] == [None] * 10
     assert solver.contacts[10] is not None
-    assert result.contact.status[9:11].tolist() == ["no_pose", "touching"]
-    assert np.isnan(result.contact.given[:10]).all()
-    assert np.isfinite(result.contact.given[10:]).all()
+    assert result.column("contact_status")[9:11].tolist() == ["no_pose", "touching"]
+    assert np.isnan(result.column("contact_height")[:10]).all()
+    assert np.isfinite(result.column("contact_height")[10:]).all()
 
 
 def test_touching_is_that_of_the_contact_found_on_the_image():
     result, *_ = run(make_track(0), touching=lambda update: update > 20)
-    assert result.contact.touching.tolist() == [False] * 21 + [True] * 39
+    assert result.column("touching").tolist() == [False] * 21 + [True] * 39
 
 
 def test_times_of_solver_and_contact_are_kept_apart():
     result, *_ = run(make_track(0))
-    assert (result.contact.step_ms > 0).all()
-    assert (result.step_ms > 0).all()
+    assert (result.column("contact_ms") > 0).all()
+    assert (result.column("step_ms") > 0).all()
 
 
 def test_late_poses_are_taken_in_their_place():

@@ -55,8 +55,8 @@ def test_true_estimate_has_no_error_and_a_bias_shows_with_its_sign():
 def test_phases_decide_what_is_scored():
     result, _ = run(make_recording(), truth_of(make_recording()))
     assert result.scored.tolist() == ([False] * 5 + [True] * 5) * 6
-    assert result.cycle.tolist() == [0] * 30 + [1] * 30
-    assert result.direction[[0, 19, 20, 29, 59]].tolist() == ["load", "load", "unload", "unload", "unload"]
+    assert result.column("cycle").tolist() == [0] * 30 + [1] * 30
+    assert result.column("direction")[[0, 19, 20, 29, 59]].tolist() == ["load", "load", "unload", "unload", "unload"]
 
 
 def test_every_frame_is_scored_without_phases():
@@ -72,7 +72,7 @@ def test_frames_before_the_first_phase_are_not_scored():
     late = replace(recording, phases=replace(recording.phases, stamps=recording.phases.stamps + 20 * PERIOD))
     result, _ = run(late, truth_of(recording))
     assert not result.scored[:25].any()
-    assert result.direction[0] == ""
+    assert result.column("direction")[0] == ""
 
 
 def test_without_a_frame_to_be_scored_the_phases_are_named():
@@ -92,8 +92,8 @@ def test_untrusted_steps_are_skipped_and_keep_their_status():
     score = score_results([result], [recording]).total
     assert (score.frames, score.solved, score.skipped) == (60, 40, 20)
     assert np.isnan(result.force[0]).all()
-    assert result.status[:2].tolist() == ["not_enough_points", "ok"]
-    assert not result.used[0].any()
+    assert result.column("status")[:2].tolist() == ["not_enough_points", "ok"]
+    assert not result.column("used")[0].any()
 
 
 def test_snapshot_is_taken_near_the_largest_force():
@@ -113,8 +113,8 @@ def test_truth_sampled_at_other_stamps_is_matched():
     shifted = replace(recording, jaws={"left": replace(track, truth=truth)})
     result, _ = run(shifted, truth.force)
     expected = 0.5 * (truth.force[:-1] + truth.force[1:])
-    np.testing.assert_allclose(result.truth[1:], expected, atol=1e-6)
-    assert np.isnan(result.truth[0]).all()
+    np.testing.assert_allclose(result.true_force[1:], expected, atol=1e-6)
+    assert np.isnan(result.true_force[0]).all()
     assert score_results([result], [shifted]).total.all.n == 59
 
 
@@ -261,7 +261,7 @@ def test_contact_table_has_a_row_per_case_and_one_for_all():
 def test_table_of_a_case_without_counted_frames_has_dashes():
     recording = make_recording()
     result, _ = run(recording, truth_of(recording))
-    nothing = replace(result, truth=np.full_like(result.truth, np.nan), step_ms=np.full_like(result.step_ms, np.nan))
+    nothing = result.with_columns(true_force=np.full_like(result.true_force, np.nan), step_ms=np.nan)
     text = format_table(score_results([nothing], [recording]))
     assert "worst - N (case)" in text
     assert "p50 -" in text

@@ -4,17 +4,20 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from eval_fakes import FakeEstimator, FakeJaw, make_recording
 
 from finforce_contact.jaw_contact import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
-from finforce_eval.evaluation.kept import Kept, load_kept, save_kept
-from finforce_eval.figures.html_report import ForceCourse, write_html
+from finforce_eval.evaluation.evaluate import evaluate_recording, score_results, true_range
+from finforce_eval.figures.html_report import write_html
 from finforce_eval.figures.report import write_page
+from finforce_eval.many import read_evaluations
 from finforce_eval.recordings.writer import write_recording
+from finforce_eval.table import ForceSeries, read_table, write_table
 
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 INKED = """(() => {
@@ -52,14 +55,16 @@ def make_course(name="pressed", count=600, truth=True):
     stamps = 10**18 + np.arange(count) * 33_333_333
     force = np.column_stack([-3.0 + 2.0 * np.cos(np.arange(count) / 40), np.zeros(count), np.full(count, 0.5)])
     force[:20] = np.nan
-    return ForceCourse(
-        name=name,
-        stamps=stamps,
+    return ForceSeries.build(
+        name,
+        "left",
+        stamps,
         force=force,
-        stddev=np.full(count, 0.1),
+        magnitude_stddev=np.full(count, 0.1),
         status=np.where(np.isnan(force[:, 0]), "taring", "ok"),
-        phase=np.where(np.arange(count) % 200 > 150, 1 + (np.arange(count) > 300), 0).astype(np.uint8),
-        truth=np.nan_to_num(force) * 1.1 if truth else None,
+        scored=np.arange(count) % 200 > 150,
+        direction=np.where(np.arange(count) > 300, "unload", "load"),
+        true_force=np.nan_to_num(force) * 1.1 if truth else None,
     )
 
 
@@ -108,13 +113,14 @@ def test_numbers_arrive_as_they_are(browser, tmp_path):
     page, *_ = look_at(browser, write_html([course], tmp_path / "r.html", title="T", about={"jaw": "bench"}))
     found = np.array([np.nan if v is None else v for v in page.evaluate("Array.from(plots[0].x)")], dtype=float)
     assert np.allclose(found, course.force[:, 0].astype(np.float32), equal_nan=True)
-    assert page.evaluate("Array.from(plots[0].phase)") == course.phase.tolist()
+    phases = np.where(course.scored, np.where(course.column("direction") == "unload", 2, 1), 0)
+    assert page.evaluate("Array.from(plots[0].phase)") == phases.tolist()
     assert "bench" in page.locator("#about").inner_text()
     page.close()
 
 
 def test_names_are_words_never_markup(browser, tmp_path):
-    courses = [replace(make_course(), name=EVIL, status=np.full(600, EVIL))]
+    courses = [make_course(EVIL).with_columns(status=np.full(600, EVIL))]
     page, asked, said = look_at(browser, write_html(courses, tmp_path / "r.html", title=EVIL, about={EVIL: EVIL}))
     assert page.title() == EVIL and page.locator("img").count() == 0
     assert page.locator("#table tbody a").inner_text() == EVIL
@@ -157,31 +163,43 @@ def test_the_page_of_an_evaluation_has_its_scores(browser, tmp_path):
     page.close()
 
 
-def test_what_is_kept_comes_back_as_it_was(tmp_path):
+def keep(path, recording, result):
+    write_table(path, [result], {"about": {"jaw": "x"}, "true_range_N": true_range(recording)})
+
+
+def test_a_table_comes_back_as_it_was_written(tmp_path):
     recording, result = evaluated()
-    file = tmp_path / "pressed.npz"
-    save_kept(file, Kept(recording=recording, results=(result,), about={"jaw": "x"}, keypoint_names=("a", "b")))
-    kept = load_kept(file)
-    assert kept.about == {"jaw": "x"} and kept.keypoint_names == ("a", "b")
-    assert np.array_equal(kept.results[0].force, result.force, equal_nan=True)
-    assert kept.results[0].status.tolist() == result.status.tolist()
-    assert kept.recording.path == recording.path and kept.recording.case == recording.case
-    again, before = score_results(kept.results, [kept.recording]), score_results([result], [recording])
-    assert again.total == before.total
+    keep(tmp_path / "pressed.parquet", recording, result)
+    (again,), about = read_table(tmp_path / "pressed.parquet")
+    assert about["about"] == {"jaw": "x"} and again.name == result.name and again.side == "left"
+    for name in ("force", "true_force", "used", "status", "stamp", "scored", "contact_source"):
+        assert np.array_equal(again.column(name), result.column(name), equal_nan=name.endswith("force")), name
+    evaluation, _ = read_evaluations([tmp_path / "pressed.parquet"])
+    assert evaluation.total == score_results([result], [recording]).total
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b'{"a": 1}'])
+def test_pandas_reads_a_table_by_the_names_of_its_columns(tmp_path):
+    recording, result = evaluated()
+    keep(tmp_path / "pressed.parquet", recording, result)
+    table = pd.read_parquet(tmp_path / "pressed.parquet")
+    assert len(table) == len(result) and {"case", "side", "stamp", "force_x", "true_force_z", "status"} <= set(table)
+    assert np.array_equal(table["force_x"], result.force[:, 0], equal_nan=True)
+    units = {field.name: field.metadata[b"unit"] for field in pq.read_schema(tmp_path / "pressed.parquet")}
+    assert units["force_x"] == b"N" and units["torque_y"] == b"N m" and units["stamp"] == b"ns"
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b'{"a": 1}', b"PAR1" + bytes(40) + b"PAR1"])
 def test_a_file_that_is_none_of_ours_is_refused(content, tmp_path):
-    (tmp_path / "odd.npz").write_bytes(content)
-    with pytest.raises(RecordingError, match=r"odd\.npz"):
-        load_kept(tmp_path / "odd.npz")
+    (tmp_path / "odd.parquet").write_bytes(content)
+    with pytest.raises(RecordingError, match=r"odd\.parquet"):
+        read_table(tmp_path / "odd.parquet")
 
 
 def test_report_takes_annotated_recordings_and_kept_evaluations(tmp_path, capsys, browser):
     recording, result = evaluated()
     kept = tmp_path / "kept"
     kept.mkdir()
-    save_kept(kept / "pressed.npz", Kept(recording=recording, results=(result,), about={}, keypoint_names=()))
+    keep(kept / "pressed.parquet", recording, result)
     page_file = tmp_path / "kept.html"
     assert main(["report", str(kept), "-o", str(page_file), "--title", "Mine"]) == 0
     page, *_ = look_at(browser, page_file)
@@ -205,8 +223,8 @@ def test_forces_of_an_annotated_recording_are_read_as_they_were_written(tmp_path
     assert main(["annotate", str(bag), "--out", str(out), "--contact", "fixed:42", "--calibration", "bench"]) == 0
     (course,) = read_forces(out / "short")
     answered = np.isfinite(course.force).all(axis=1)
-    assert 0.3 < answered.mean() < 1.0 and course.truth is not None
-    assert set(course.status[answered]) <= {"ok", "unloaded"} and "waiting" in set(course.status)
-    error = np.linalg.norm(course.force - course.truth, axis=1)[answered]
+    assert 0.3 < answered.mean() < 1.0 and course.true_force is not None
+    assert set(course.column("status")[answered]) <= {"ok", "unloaded"} and "waiting" in set(course.column("status"))
+    error = np.linalg.norm(course.force - course.true_force, axis=1)[answered]
     assert np.nanmax(error) < 0.5
-    assert np.isfinite(course.stddev[answered & (np.linalg.norm(course.force, axis=1) > 0)]).all()
+    assert np.isfinite(course.column("magnitude_stddev")[answered & (np.linalg.norm(course.force, axis=1) > 0)]).all()

@@ -1,6 +1,5 @@
 """The net force on the gripper is scored against the truth of both jaws."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +8,13 @@ from test_scoring import make_result
 
 from finforce.gripper_frames import ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import quaternion_from_pose
-from finforce_eval.evaluation.manipulation import format_manipulation, score_manipulation, score_pair
+from finforce_eval.evaluation.manipulation import (
+    format_manipulation,
+    join_net,
+    score_manipulation,
+    score_net,
+    with_distances,
+)
 from finforce_eval.recordings.tracks import PoseTrack
 
 
@@ -18,9 +23,14 @@ def jaws(count=10):
     force = np.tile([-3.0, 0.25, 0.0], (count, 1))
     other = np.tile([-3.0, -0.25, 0.0], (count, 1))
     stated = np.full((count, 3), 0.1)
-    blank = make_result(truth=np.ones(count), force=np.ones(count), axis_stddev=stated)
-    left = replace(blank, name="turn/left", force=force.copy(), truth=force.copy())
-    return left, replace(blank, name="turn/right", side="right", force=other.copy(), truth=other.copy())
+    blank = make_result(truth=np.ones(count), force=np.ones(count), force_stddev=stated)
+    left = blank.with_columns(case="turn/left", force=force, true_force=force)
+    return left, blank.with_columns(case="turn/right", side="right", force=other, true_force=other)
+
+
+def score_pair(left, right, recording=None):
+    both = {"left": left, "right": right}
+    return score_net(join_net(both if recording is None else with_distances(both, recording)))
 
 
 def test_jaws_that_are_right_make_a_net_force_that_is():
@@ -32,8 +42,8 @@ def test_jaws_that_are_right_make_a_net_force_that_is():
 
 def test_errors_of_both_jaws_add_in_the_frame_of_the_gripper():
     left, right = jaws()
-    left.force[:, 0] += 0.3  # x of the left jaw is that of the gripper, of the right jaw against it
-    right.force[:, 0] += 0.1
+    left = left.with_columns(force=left.force + [0.3, 0.0, 0.0])  # x of the gripper; of the right jaw against it
+    right = right.with_columns(force=right.force + [0.1, 0.0, 0.0])
     score = score_pair(left, right)
     assert score.axis_rmse_N == pytest.approx((0.2, 0.0, 0.0))
     assert score.vector_rmse_N == pytest.approx(0.2)
@@ -41,16 +51,16 @@ def test_errors_of_both_jaws_add_in_the_frame_of_the_gripper():
 
 def test_images_without_one_of_the_jaws_count_as_unanswered():
     left, right = jaws()
-    right.force[:4] = np.nan
+    right = right.with_columns(force=np.where(np.arange(10)[:, None] < 4, np.nan, right.force))
     score = score_pair(left, right)
     assert (score.n, score.answered_pct) == (6, 60.0)
-    right.force[:] = np.nan
+    right = right.with_columns(force=np.full((10, 3), np.nan))
     assert score_pair(left, right).vector_rmse_N is None
 
 
 def test_recordings_of_one_jaw_have_no_score():
     left, right = jaws()
-    assert score_manipulation([replace(left, name="a")]) == {}
+    assert score_manipulation([left.renamed("a")]) == {}
     both = score_manipulation([left, right])
     assert list(both) == ["turn"]
     assert "0.000 N" in format_manipulation(both)[0]
@@ -59,15 +69,15 @@ def test_recordings_of_one_jaw_have_no_score():
 def test_the_torque_is_scored_where_the_jaws_places_are_known():
     left, right = jaws()
     torque = np.tile([0.0, -0.12, 0.01], (len(left.stamps), 1))
-    left, right = (replace(jaw, torque=torque.copy(), true_torque=torque.copy()) for jaw in (left, right))
+    left, right = (jaw.with_columns(torque=torque, true_torque=torque) for jaw in (left, right))
     assert score_pair(left, right).torque_rmse_Nm is None
     recording = SimpleNamespace(jaw=lambda side: SimpleNamespace(pose=poses[side], true_pose=None))
     poses = {side: track(left.stamps, x) for side, x in (("left", -0.03), ("right", 0.03))}
     assert score_pair(left, right, recording).torque_rmse_Nm == pytest.approx(0.0, abs=1e-12)
-    left.torque[:, 1] += 0.006
+    left = left.with_columns(torque=torque + [0.0, 0.006, 0.0])
     assert score_pair(left, right, recording).torque_rmse_Nm == pytest.approx(0.006)
     # another force of the right jaw along z turns about y by its lever
-    right.force[:, 2] += 0.1
+    right = right.with_columns(force=right.force + [0.0, 0.0, 0.1])
     assert score_pair(left, right, recording).torque_rmse_Nm == pytest.approx(abs(0.006 - 0.003))
 
 

@@ -156,9 +156,9 @@ def test_the_time_series_has_a_gap_where_no_wrench_came():
         log.stddev[int(stamp)], log.latency[int(stamp)] = np.array([0.1, 0.5, 0.5]), 0.002
     result = live_result(recording, "left", log, likelihood_threshold=0.6, estimator=FakeEstimator())
     assert result.solved[::2].all() and not result.solved[1::2].any()
-    np.testing.assert_allclose(result.stddev[::2], 0.1)
-    np.testing.assert_allclose(result.step_ms[::2], 2.0)
-    assert np.isnan(result.step_ms[1::2]).all()
+    np.testing.assert_allclose(result.column("magnitude_stddev")[::2], 0.1)
+    np.testing.assert_allclose(result.column("step_ms")[::2], 2.0)
+    assert np.isnan(result.column("step_ms")[1::2]).all()
     assert result.scored.any() and not result.scored.all()
 
 

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from eval_fakes import make_recording
 
-from finforce_eval.evaluation.results import CaseResult
-from finforce_eval.evaluation.scoring import compute_stats, force_range, match_truth, score_case
+from finforce_eval.evaluation.evaluate import score_series, true_range
+from finforce_eval.evaluation.scoring import compute_stats, match_truth, score_case
 from finforce_eval.recordings.tracks import WrenchTrack
+from finforce_eval.table import ForceSeries
 
 
 def make_result(name="case", *, truth, force, **changes):
@@ -15,11 +17,10 @@ def make_result(name="case", *, truth, force, **changes):
     frames = len(truth)
     direction = np.array([-1.0, 0.0, 0.0])
     values = {
-        "stamps": np.arange(frames) * 33_333_333,
-        "truth": np.asarray(truth, float)[:, None] * direction,
+        "true_force": np.asarray(truth, float)[:, None] * direction,
         "force": np.asarray(force, float)[:, None] * direction,
-        "stddev": np.zeros(frames),
-        "place": np.zeros((frames, 3)),
+        "magnitude_stddev": np.zeros(frames),
+        "contact_location": np.zeros((frames, 3)),
         "residual": np.zeros(frames),
         "used": np.ones((frames, 4), dtype=bool),
         "status": np.full(frames, "ok"),
@@ -28,7 +29,8 @@ def make_result(name="case", *, truth, force, **changes):
         "direction": np.full(frames, "load"),
         "scored": np.ones(frames, dtype=bool),
     }
-    return CaseResult(name=name, side="left", **(values | changes))
+    stamps = changes.pop("stamps", np.arange(frames) * 33_333_333)
+    return ForceSeries.build(name, "left", stamps, **(values | changes))
 
 
 def test_errors_are_estimate_minus_truth():
@@ -48,7 +50,7 @@ def test_estimate_that_is_too_small_has_negative_bias_and_positive_maximum():
 
 def test_only_magnitudes_are_compared():
     result = make_result(truth=[2.0], force=[2.0])
-    turned = replace(result, force=np.array([[0.0, 0.0, 2.0]]))
+    turned = result.with_columns(force=np.array([[0.0, 0.0, 2.0]]))
     assert score_case(turned, span=1.0).all.rmse_N == 0.0
 
 
@@ -129,9 +131,14 @@ def test_steps_that_were_not_timed_are_left_out():
 
 
 def test_range_is_that_of_all_recordings_of_the_call():
-    truths = [np.array([[0.0, 0, 0], [-3, 0, 4]]), np.array([[0, 0, -6.0], [np.nan, 0, 0]])]
-    assert force_range(truths) == pytest.approx(6.0)
-    assert force_range([]) == 0.0
+    case = make_result(truth=[3.0], force=[4.0])
+    assert score_series([case], [(0.0, 5.0), (1.0, 6.0)]).span == 6.0
+    assert score_series([case], []).span == 0.0
+    recording = make_recording()
+    force = np.array([[0.0, 0, 0], [-3, 0, 4], [np.nan, 0, 0]])
+    truth = WrenchTrack(stamps=np.arange(3), force=force, torque=force)
+    jaws = {"left": replace(recording.jaws["left"], truth=truth)}
+    assert true_range(replace(recording, jaws=jaws)) == (0.0, 5.0)
 
 
 def truth_at(stamps, magnitudes):
@@ -161,8 +168,8 @@ def test_single_truth_matches_only_its_own_stamp():
 
 def vectors(**changes):
     truth = np.array([[-3.0, 0.0, 0.4], [-2.0, 0.0, 0.2]])
-    given = {"force": truth + [[0.3, 0.0, -0.4], [-0.3, 0.0, 0.0]], "axis_stddev": np.array([[0.2, 0.0, 0.1]] * 2)}
-    return replace(make_result(truth=[3.0, 2.0], force=[3.0, 2.0]), truth=truth, **{**given, **changes})
+    given = {"force": truth + [[0.3, 0.0, -0.4], [-0.3, 0.0, 0.0]], "force_stddev": np.array([[0.2, 0.0, 0.1]] * 2)}
+    return make_result(truth=[3.0, 2.0], force=[3.0, 2.0]).with_columns(true_force=truth, **{**given, **changes})
 
 
 def test_the_force_is_compared_as_a_vector_axis_by_axis():
@@ -174,7 +181,7 @@ def test_the_force_is_compared_as_a_vector_axis_by_axis():
 
 
 def test_without_stated_deviations_nothing_is_said_of_them():
-    stats = score_case(vectors(axis_stddev=None), span=1.0).all
+    stats = score_case(vectors(force_stddev=None), span=1.0).all
     assert stats.within_3_sigma_pct is None and stats.vector_rmse_N is not None
 
 

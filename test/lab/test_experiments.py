@@ -21,14 +21,14 @@ from finforce_eval.cli.main import main
 from finforce_eval.engine.tasks import Manifest
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import RecordedContact
-from finforce_eval.evaluation.manipulation import NetForces
 from finforce_eval.machine import describe_sources
 from finforce_eval.recordings.image_files import read_generated_pose
 from finforce_eval.recordings.images import StampedImage
 from finforce_eval.recordings.objects import ObjectTrack
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
-from finforce_ifea.grasp_force import R_GRIPPER_JAW, Wrench
+from finforce_eval.table import ForceSeries
+from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_sim.objects import build_object
 from lab.experiments import grasp_world
 from lab.experiments.chip import ChipExperiment
@@ -235,13 +235,8 @@ def test_a_weight_is_scored_along_gravity():
     angles = np.linspace(0.0, 2.0 * np.pi, 50)
     true = np.column_stack((np.sin(angles), np.zeros(50), np.cos(angles)))
     found = 1.1 * true + (0.0, 0.3, 0.0)
-    blank = np.full((50, 3), np.nan)
-    net = NetForces(
-        stamps=np.arange(50),
-        found=Wrench(found, blank),
-        true=Wrench(true, blank),
-        stated=np.full((50, 3), 0.1),
-        answered_pct=100.0,
+    net = ForceSeries.build(
+        "turn", "gripper", np.arange(50), force=found, true_force=true, force_stddev=np.full((50, 3), 0.1)
     )
     score = score_weight(net)
     assert score["along_rmse_N"] == pytest.approx(0.1)
@@ -550,8 +545,8 @@ def test_grasps_and_turns_and_shapes_are_put_in_tables(tmp_path):
     found = GraspExperiment(options=RunOptions()).find({"one": row}, tmp_path)
     assert found.tables[0].rows.force.tolist() == ["low", "all"]
     assert found.tables[0].rows["shows after/ms"].tolist() == [100.0, 100.0]
-    one = Wrench(np.eye(3)[:2], np.eye(3)[:2])
-    net = NetForces(stamps=np.arange(2), found=one, true=one, stated=None, answered_pct=100.0)
+    one = np.eye(3)[:2]
+    net = ForceSeries.build("one", "gripper", np.arange(2), force=one, true_force=one)
     turn = score_weight(net) | {"axis": "roll", "light": "dim"}
     found = ManipulationExperiment(options=RunOptions()).find({"one": turn}, tmp_path)
     assert found.tables[0].rows["paper/N"].tolist() == ["0.28 ± 0.02"]

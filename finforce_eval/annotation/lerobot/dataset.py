@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.files import parse_json, read_json
-from finforce_eval.annotation.forces import JawForces, combine_forces, estimate_forces
+from finforce_eval.annotation.forces import estimate_forces, reasons
 from finforce_eval.annotation.lerobot.features import (
     FeatureNames,
     add_columns,
@@ -39,9 +39,11 @@ from finforce_eval.engine.settings import describe_options, sides_of
 from finforce_eval.engine.tasks import Task, hash_settings, make_line
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.keypoint_source import parse_source
+from finforce_eval.evaluation.manipulation import combine_jaws
 from finforce_eval.evaluation.warm import open_warm
 from finforce_eval.recordings.image_files import read_intrinsics
 from finforce_eval.recordings.tracks import JawTrack, KeypointTrack, Recording
+from finforce_eval.table import ForceSeries
 
 _NO_KEYPOINTS = "no key points in"
 Columns = dict[str, NDArray]
@@ -166,7 +168,7 @@ def _find_forces(dataset: Dataset, episode: Episode, options: argparse.Namespace
     try:
         seen = keypoints.apply(recording)
         found = estimate_forces(seen, warm.setup, build=warm.estimator)
-        grasp = combine_forces(seen, found).grasp[:, :1]
+        grasp = combine_jaws(found).column("grasp_force")[:, None]
     except RecordingError as error:
         if _NO_KEYPOINTS not in str(error):
             raise
@@ -174,14 +176,14 @@ def _find_forces(dataset: Dataset, episode: Episode, options: argparse.Namespace
     return _columns(found, grasp)
 
 
-def _columns(found: Mapping[str, JawForces], grasp: NDArray) -> Columns:
+def _columns(found: Mapping[str, ForceSeries], grasp: NDArray) -> Columns:
     """Return the columns of an episode's forces."""
     columns: Columns = {"grasp": grasp, "valid": np.isfinite(grasp)}
-    reasons = []
+    words = []
     for side, forces in found.items():
-        columns[side], columns[f"{side}.stddev"] = forces.force, forces.force_stddev
-        reasons.append([f"{side}: {reason}" if reason else "" for reason in forces.reason])
-    columns["reason"] = np.array(["; ".join(filter(None, words)) for words in zip(*reasons, strict=True)])[:, None]
+        columns[side], columns[f"{side}.stddev"] = forces.force, forces.column("force_stddev")
+        words.append([f"{side}: {reason}" if reason else "" for reason in reasons(forces)])
+    columns["reason"] = np.array(["; ".join(filter(None, row)) for row in zip(*words, strict=True)])[:, None]
     return columns
 
 

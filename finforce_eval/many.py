@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,13 @@ from finforce_eval.engine.engines import SEQUENTIAL, EngineOptions, run_tasks
 from finforce_eval.engine.settings import describe_options
 from finforce_eval.engine.tasks import OK, Manifest, Task, choose_shard, hash_settings
 from finforce_eval.errors import RecordingError
-from finforce_eval.evaluation.evaluate import Evaluation, score_results
-from finforce_eval.evaluation.kept import Kept, load_kept, save_kept
+from finforce_eval.evaluation.evaluate import Evaluation, score_results, score_series, true_range
 from finforce_eval.evaluation.keypoint_source import parse_source
 from finforce_eval.evaluation.setup import evaluate_jaws
 from finforce_eval.evaluation.warm import open_warm
 from finforce_eval.recordings.bags import list_files, name_recordings
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.tracks import Recording
+from finforce_eval.table import read_table, write_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,12 +29,10 @@ class ManyEvaluated:
 
     Attributes:
         evaluation: scores and time series of those that could be evaluated.
-        recordings: these.
         failed: why each of the others could not, by its name.
     """
 
     evaluation: Evaluation
-    recordings: Sequence[Recording]
     failed: Mapping[str, str]
 
 
@@ -45,12 +42,14 @@ def evaluate_many(options: argparse.Namespace, engine: EngineOptions, folder: Pa
     Args:
         options: of the command `evaluate`.
         engine: where they are evaluated.
-        folder: of a manifest and a file for each recording, see `Kept`; made if need be.
+        folder: of a manifest and a table for each recording; made if need be.
 
     Raises:
         FinforceError: not one could be evaluated.
     """
-    settings, manifest = describe_options(options), Manifest(folder, options.shard)
+    # pictures are drawn with each recording: where they are missing, it is not done
+    settings = describe_options(options) | {"report": options.report}
+    manifest = Manifest(folder, options.shard)
     named = choose_shard(name_recordings(options.bags, "/"), options.shard)
     shown = engine.engine == SEQUENTIAL
     tasks = [_make_task(name, path, folder, options, settings, shown=shown) for name, path in named]
@@ -62,10 +61,19 @@ def evaluate_many(options: argparse.Namespace, engine: EngineOptions, folder: Pa
             print(f"note: {line['name']}: {note}", file=sys.stderr)
     if len(failed) == len(lines):
         raise RecordingError(next(iter(failed.values()), f"--shard {options.shard}: no recording is left for it"))
-    kept = [load_kept(Path(task.output)) for task in tasks if task.name not in failed]
-    recordings = [each.recording for each in kept]
-    results = [result for each in kept for result in each.results]
-    return ManyEvaluated(evaluation=score_results(results, recordings), recordings=recordings, failed=failed)
+    evaluation, _ = read_evaluations(Path(task.output) for task in tasks if task.name not in failed)
+    return ManyEvaluated(evaluation=evaluation, failed=failed)
+
+
+def read_evaluations(paths: Iterable[Path]) -> tuple[Evaluation, dict[str, Any]]:
+    """Return the scores of the tables of some recordings together, and what the first of them says was run.
+
+    Raises:
+        FinforceError: a file is damaged or another program's, or two have the same name.
+    """
+    tables = [read_table(path) for path in paths]
+    ranges = [about["true_range_N"] for _, about in tables if about["true_range_N"]]
+    return score_series([each for series, _ in tables for each in series], ranges), tables[0][1]["about"]
 
 
 def _make_task(
@@ -73,7 +81,7 @@ def _make_task(
 ) -> Task:
     """Return the task of evaluating a recording; `shown`: with a bar of its images."""
     key = hash_settings(settings, list_files(path))
-    target = folder / f"{name.replace('/', '_')}.npz"
+    target = folder / f"{name.replace('/', '_')}.parquet"
     given = {
         "name": name,
         "path": str(path),
@@ -111,8 +119,13 @@ def evaluate_task(
         text = str(error)
         raise RecordingError(text if name in text or path in text else f"{name}: {text}") from error
     setup = warm.setup
-    names = tuple(setup.jaw.keypoint_names)
-    save_kept(Path(target), Kept(recording=recording, results=results, about=setup.about, keypoint_names=names))
+    if chosen.report:
+        from finforce_eval.figures.report import draw_results
+
+        names = setup.jaw.keypoint_names
+        draw_results(results, Path(chosen.report), keypoint_names=names, recordings=[recording])
+    about = {"about": dict(setup.about), "path": path, "true_range_N": true_range(recording)}
+    write_table(Path(target), results, about | {"keypoint_names": list(setup.jaw.keypoint_names)})
     scores = score_results(results, [recording])
     return {
         "cases": {case: asdict(score) for case, score in scores.scores.items()},
