@@ -127,10 +127,10 @@ def test_evaluate_goes_on_where_it_was_and_counts_parts_once(capsys, bag, tmp_pa
     kept, scores, again = tmp_path / "kept", tmp_path / "scores.json", tmp_path / "again.json"
     for part in ("1/2", "2/2"):
         assert main(["evaluate", str(bag), str(other), "--out", str(kept), "--shard", part]) == 0
-    times = {path: path.stat().st_mtime_ns for path in kept.glob("*.npz")}
+    times = {path: path.stat().st_mtime_ns for path in kept.glob("*.parquet")}
     assert len(times) == 2
     assert main(["evaluate", str(bag), str(other), "--out", str(kept), "--json", str(scores)]) == 0
-    assert {path: path.stat().st_mtime_ns for path in kept.glob("*.npz")} == times
+    assert {path: path.stat().st_mtime_ns for path in kept.glob("*.parquet")} == times
     assert main(["evaluate", str(bag), str(other), "--json", str(again)]) == 0
     resumed, fresh = (json.loads(path.read_text()) for path in (scores, again))
     assert list(resumed["cases"]) == list(fresh["cases"]) == [Path(bag).name, "other"]
@@ -138,7 +138,7 @@ def test_evaluate_goes_on_where_it_was_and_counts_parts_once(capsys, bag, tmp_pa
         assert resumed["cases"][name]["all"] == case["all"]
     next(iter(times)).unlink()  # what is lost is done again
     assert main(["evaluate", str(bag), str(other), "--out", str(kept)]) == 0
-    assert len(list(kept.glob("*.npz"))) == 2
+    assert len(list(kept.glob("*.parquet"))) == 2
 
 
 def test_same_recording_twice_is_refused(capsys, bag):
