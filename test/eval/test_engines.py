@@ -56,7 +56,7 @@ def test_evaluations_agree(engine, bags, tmp_path, capsys):
 
 def test_an_experiment_goes_to_processes(tmp_path):
     findings = run_experiment(Counting(), tmp_path, EngineOptions(engine="processes", workers=2))
-    assert findings.figures["total"] == 11
+    assert findings.tables[0].rows["letters"].sum() == 11
 
 
 def write_number(number, path):
