@@ -459,7 +459,7 @@ def test_the_bench_runs_on_the_recording_in_the_package(tmp_path, capsys):
     command = ["experiment", "bench", "--on", bag, "--calibration", "bench", "--report", str(tmp_path)]
     assert main(command) == 0
     figures = json.loads((tmp_path / "bench" / "bench.json").read_text())
-    assert figures["figures"]["cyl25_middle"]["contacts"]["estimate"]["rmse_N"] < 0.2
+    assert figures["figures"]["bench_cyl25_middle"]["contacts"]["estimate"]["rmse_N"] < 0.2
     assert "(0.28)" in capsys.readouterr().out
     assert bag not in (tmp_path / "bench" / "README.md").read_text()
 
