@@ -144,7 +144,8 @@ def measure(quick: bool, folder: Path | str | None = None, jaw: str = "bench") -
         notes=notes,
         picture=Tradeoff(
             table="tiers",
-            method=("tier", "key points"),
+            method=("tier",),
+            text="key points",
             time="step p50/ms",
             slow="step p99/ms",
             error="RMSE/N",
