@@ -45,13 +45,13 @@ class Skips:
         self._counts: Counter[str] = Counter()
 
     def allows(self, rule: str) -> bool:
-        """Returns whether a rule may be applied."""
+        """Say whether a rule may be applied."""
         return rule not in self._off
 
     def count(self, rule: str, times: int = 1) -> None:
-        """Notes that a rule has saved its work."""
+        """Note that a rule has saved its work."""
         self._counts[rule] += times
 
     def describe(self) -> dict[str, str]:
-        """Returns, for the diagnostics, how often each rule saved its work, or that it is off."""
+        """Return, for the diagnostics, how often each rule saved its work, or that it is off."""
         return {f"skipped: {rule}": str(self._counts[rule]) if self.allows(rule) else "off" for rule in self._rules}

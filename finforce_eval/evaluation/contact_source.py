@@ -34,7 +34,8 @@ class RecordedContact(ContactLoop):
 
     def __init__(self, estimator: Any, track: ObjectTrack, delay: int = 0, name: str = "estimate") -> None:
         super().__init__(estimator)
-        self.name, self._delay, self._track, self._next = name, delay, track, 0
+        self.name, self._track, self._next = name, track, 0
+        self._arrivals = track.stamps + delay
 
     def contact_at(self, stamp: int) -> Contact | None:
         """Give the poses that have arrived by an image [ns] to the estimator, and return its contact.
@@ -42,8 +43,7 @@ class RecordedContact(ContactLoop):
         Raises:
             RecordingError: the estimator refuses a pose.
         """
-        arrivals, now = self._track.stamps + self._delay, stamp + ROUNDING
-        while self._next < len(arrivals) and arrivals[self._next] <= now:
+        while self._next < len(self._arrivals) and self._arrivals[self._next] <= stamp + ROUNDING:
             self._take_recorded(self._next)
             self._next += 1
         return super().contact_at(stamp)
