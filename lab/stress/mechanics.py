@@ -1,42 +1,31 @@
-"""Stress of the mechanics and of the quadratic program: energy weight, stiffness, nu near 0.5, buckling."""
+"""Stress of the mechanics: energy weight, presses of any size, buckling."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 from scipy.sparse.linalg import LinearOperator, onenormest
 
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.errors import ContactError
 from finforce_ifea.fem.factorisation import sparse_from_banded
-from finforce_ifea.fem.locking import warn_of_locking
 from finforce_ifea.fem.model import JawModel
-from finforce_ifea.fem.solid import SolidModel
-from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw, load_jaw
 from finforce_ifea.jaw.jaw_file import Material
-from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.mechanics import build_mechanics
-from finforce_ifea.observation import Solution
 from finforce_ifea.paper_inverse import InverseResult, Problem, solve_inverse, surface_normals
-from finforce_ifea.quadratic_program import UNBOUNDED, ProgramSolution, solve_program
 from finforce_ifea.settings import EstimatorSettings
 from lab.forward_press import PressState, RigidBox, RigidCylinder, RigidObject, measure_penalty_energy, press_jaw
-from lab.stress.session import OWN_MECHANICS, Bench, open_session, update
+from lab.stress.session import OWN_MECHANICS
 from lab.stress.stress import Family, Plan, Trial, attempt
 
 FORMS = ("paper", "sofa")
 WEIGHTS = (0.0, *10.0 ** np.arange(-6, 7))
-MODULI = tuple(float(f"1e{power}") for power in range(3, 13))
-RATIOS = (0.0, 0.3, 0.45, 0.48, 0.49, 0.495, 0.499)
-# What a force may be off by where only rounding is left, and where the elements of a mesh are what they are.
-ROUNDING, LOCKED = 1e-6, 0.2
+ROUNDING = 1e-6  # of a force, where nothing else is left
 # Standard deviation of key points [m] where a load is to be found through a limit point.
 SIGHT = 5e-5
 DEPTHS = (1e-6, 1e-5, 1e-4, 1e-3, 5e-3, 1e-2, 1.5e-2, 2e-2, 3e-2)
@@ -105,118 +94,6 @@ def judge_inverse(result: InverseResult, pushed: Pushed) -> Trial:
         condition=result.condition,
         energy_balance=(work - left) / max(abs(work), 1e-300),
         nan=not np.isfinite([*force, error, noise, bias]).all(),
-    )
-
-
-def run_modulus(plan: Plan) -> Iterator[Trial]:
-    """Yield presses and estimates of jaws from 1e3 to 1e12 Pa, whose forces go with Young's modulus to rounding."""
-    for height in (0.02, 0.04, 0.06):
-        expected = None
-        for modulus in (MODULUS, *MODULI):
-            jaw = build_jaw(modulus)
-            rig = Rig(mechanics=build_own_mechanics(plan, jaw), jaw=jaw, height=height)
-            expected = rig.press(4e-3)[1].force / modulus if expected is None else expected
-            yield attempt(
-                plan.seed,
-                lambda r=rig: r.press(4e-3),
-                lambda got, r=rig, f=modulus * expected: r.judge(got, f, ROUNDING),
-                level=f"{modulus:.0e} Pa, pressed",
-            )
-    for seed in range(plan.share(2)):
-        yield from _scale_estimates(plan, seed)
-
-
-def _scale_estimates(plan: Plan, seed: int) -> Iterator[Trial]:
-    """Yield the same noisy press, estimated with one modulus after the other."""
-    first = estimate_press(plan, seed, MODULUS)
-    for modulus in MODULI:
-        yield attempt(
-            seed,
-            lambda m=modulus: estimate_press(plan, seed, m),
-            lambda got, m=modulus: _judge_scaled(got, first, m / MODULUS),
-            level=f"{modulus:.0e} Pa, estimated",
-        )
-
-
-def estimate_press(plan: Plan, seed: int, modulus: float) -> Solution:
-    """Return what an estimator of a jaw of some modulus [Pa] says at the end of a press with noise."""
-    bench = Bench(plan, jaw=build_jaw(modulus))
-    history = bench.history(height=0.04, radius=0.0125, depth=3e-3)
-    session = open_session(bench, plan.random("modulus", seed), history=history)
-    return [update(bench, step) for step in session.press()][-1]
-
-
-def _judge_scaled(solution: Solution, first: Solution, ratio: float) -> Trial:
-    error = float(np.linalg.norm(solution.force - ratio * first.force))
-    return Trial(
-        converged=solution.converged,
-        sure=solution.trusted,
-        residual=solution.residual,
-        kkt=solution.kkt,
-        force_error=error,
-        stddev=ROUNDING * ratio * float(np.linalg.norm(first.force)),
-        step_time=np.nan,
-        nan=not np.isfinite(solution.force).all(),
-        note=solution.status,
-    )
-
-
-def run_poisson(plan: Plan) -> Iterator[Trial]:
-    """Yield the stiffness of every kind of element from nu = 0 to 0.499: right within 20 %, or warned of."""
-    for ratio in RATIOS:
-        jaw = build_jaw(ratio=ratio)
-        expected = measure_compliance(jaw, jaw.build_mesh("fine"))
-        for name, change in (("hexahedra", lambda m: m), ("10-node", to_tet10), ("4-node", to_tet4)):
-            for density in ("coarse", "default")[: 1 if name == "4-node" else 2]:
-                mesh = change(jaw.build_mesh(density))
-                yield attempt(
-                    plan.seed,
-                    lambda m=mesh, j=jaw: measure_warned(j, m),
-                    lambda got, e=expected: _judge_compliance(got, e),
-                    level=f"{name} {density}, nu {ratio:g}",
-                )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Compliance:
-    """Motion per force [m/N], what is left of the equations, a condition number, whether locking is warned of."""
-
-    value: float
-    residual: float
-    condition: float
-    warned: bool = False
-
-
-def measure_compliance(jaw: Jaw, mesh: VolumeMesh) -> Compliance:
-    """Return the compliance of a mesh against a force along -x at the middle of its inner surface."""
-    model = SolidModel(mesh, jaw.material)
-    rest, point = np.zeros(model.size), np.array([[jaw.inner_face_x, 0.0, 0.04]])
-    probe, state = model.attach(point, 1e-3), model.linearize(rest)
-    load = model.load(probe, rest, np.array([[-1.0, 0.0, 0.0]]))
-    motion = model.factorise(state.tangent).solve(load)
-    left = np.abs(model.sparse_tangent(state.tangent) @ motion - load).max() / np.abs(load).max()
-    return Compliance(value=float(load @ motion), residual=float(left), condition=measure_condition(model, rest))
-
-
-def measure_warned(jaw: Jaw, mesh: VolumeMesh) -> Compliance:
-    """Return the compliance and whether this mesh's locking would be warned of, were it a file."""
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        warn_of_locking(replace(jaw, drawing=None), mesh)
-    return replace(measure_compliance(jaw, mesh), warned=bool(said))
-
-
-def _judge_compliance(found: Compliance, expected: Compliance) -> Trial:
-    force = expected.value / found.value
-    return Trial(
-        converged=True,
-        sure=not found.warned,
-        residual=found.residual,
-        force_error=abs(force - 1.0),
-        stddev=LOCKED / 3.0,
-        condition=found.condition,
-        nan=not np.isfinite(force),
-        note=f"{force:.3f} times as stiff as fine hexahedra" + ", warned of" * found.warned,
     )
 
 
@@ -448,94 +325,8 @@ def measure_condition(model: JawModel, q: NDArray) -> float:
     return float(onenormest(matrix) * onenormest(inverse))
 
 
-KINDS = ("plain", "badly scaled", "nearly singular", "two forces nearly at one place", "tiny or huge", "on its bounds")
-MOST = 42
-# Objectives agree to this share of their size; forming H = A^T A adds its rounding times its condition.
-AGREED, EPSILON = 1e-9, 1e-15
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Program:
-    """min |A x + b|^2 / 2 over x >= lower: A (k, m), b (k,), lower (m,)."""
-
-    A: NDArray
-    b: NDArray
-    lower: NDArray
-
-    def measure(self, x: NDArray) -> float:
-        """Return the objective less its constant part, |A x|^2 / 2 + b A x."""
-        moved = self.A @ x
-        return float(0.5 * moved @ moved + self.b @ moved)
-
-
-def draw_program(random: np.random.Generator, kind: str) -> Program:
-    """Draw a program with 1 to 42 unknowns of which none, some or all are bounded."""
-    m = int(random.integers(1, MOST + 1))
-    rows = int(random.integers(m, 3 * m + 3))
-    A, b = random.normal(size=(rows, m)), random.normal(size=rows)
-    if kind == "badly scaled":
-        A = A * 10.0 ** random.uniform(-6, 6, m)
-    elif kind == "nearly singular":
-        U, _, V = np.linalg.svd(A, full_matrices=False)
-        A = U @ np.diag(np.logspace(0, -random.uniform(0, 6), m)) @ V
-    elif kind == "two forces nearly at one place":
-        A[:, -1] = A[:, 0] + 10.0 ** random.uniform(-6, -1) * A[:, -1]
-    elif kind == "tiny or huge":
-        A, b = A * 10.0 ** random.uniform(-9, 9), b * 10.0 ** random.uniform(-8, 8)
-    elif kind == "on its bounds":
-        b = -A @ np.where(random.random(m) < 0.5, 0.0, np.abs(random.normal(size=m)))
-    lower = np.where(random.random(m) < random.choice([0.0, 0.3, 1.0]), -UNBOUNDED, 0.0)
-    return Program(A=A, b=b, lower=lower)
-
-
-def solve_second(program: Program) -> NDArray:
-    """Return what SciPy's bounded-variable least squares finds (m,)."""
-    scale = np.linalg.norm(program.A, axis=0)
-    bounds = (np.where(program.lower <= -UNBOUNDED, -np.inf, 0.0), np.inf)
-    return lsq_linear(program.A / scale, -program.b, bounds, tol=1e-14, method="bvls").x / scale
-
-
-def judge_program(solution: ProgramSolution, program: Program) -> Trial:
-    """Return a trial whose error is that of the objective, relative to its size, beside the second solver's."""
-    x, other = solution.multipliers, solve_second(program)
-    scale = np.linalg.norm(program.A, axis=0)
-    condition = float(np.linalg.cond(program.A / scale)) ** 2
-    ours, theirs = program.measure(x), program.measure(other)
-    worse = max(0.0, ours - theirs) / max(0.5 * float(program.b @ program.b), 1e-300)
-    feasible = bool((x >= program.lower).all())
-    return Trial(
-        converged=True,
-        sure=True,
-        kkt=solution.kkt,
-        force_error=worse if feasible and solution.kkt <= 1e-8 else np.inf,
-        stddev=(AGREED + EPSILON * condition) / 3.0,
-        condition=condition,
-        nan=not np.isfinite(x).all(),
-    )
-
-
-def run_programs(plan: Plan) -> Iterator[Trial]:
-    """Yield programs of every kind; the KKT residual of each answer is below 1e-8 and its objective is the least."""
-    for seed in range(plan.share(3000)):
-        kind = KINDS[seed % len(KINDS)]
-        program = draw_program(plan.random("programs", seed), kind)
-        hessian, gradient = program.A.T @ program.A, program.A.T @ program.b
-        trial = attempt(
-            seed,
-            lambda H=hessian, g=gradient, p=program: solve_program(H, g, p.lower),
-            lambda got, p=program: judge_program(got, p),
-            level=kind,
-        )
-        yield replace(trial, level=kind)
-
-
 FAMILIES = (
     Family(name="epsilon", what="the energy weight from 0 to 1e6 in both its forms", run=run_epsilon, timed=False),
-    Family(name="modulus", what="Young's modulus from 1e3 to 1e12 Pa", run=run_modulus, least_sure=0.9, timed=False),
-    Family(
-        name="poisson", what="Poisson's ratio from 0 to 0.499 in every kind of element", run=run_poisson, timed=False
-    ),
     Family(name="pressing", what="presses from 1e-4 to 1e3 N and into buckling", run=run_pressing, timed=False),
     Family(name="buckling", what="loads through the finger's limit points", run=run_buckling, timed=False),
-    Family(name="programs", what="quadratic programs of 1 to 42 forces", run=run_programs, least_sure=0.9, timed=False),
 )

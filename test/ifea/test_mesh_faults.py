@@ -1,27 +1,22 @@
-"""Stress of volume meshes: slivers, inverted and repeated elements, loose parts, wrong units, single precision."""
-
-from __future__ import annotations
+"""Claims about volume meshes with faults: refused in our words, warned of, or right."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, RigidContact, build_contact_surface
-from finforce_ifea.fem.locking import warn_of_locking
+from finforce.errors import FinforceError
+from finforce_ifea.contact_mechanics.pressed_jaw import build_contact_surface
+from finforce_ifea.errors import MeshError
+from finforce_ifea.fem.locking import LockingWarning, measure_shape, warn_of_locking
 from finforce_ifea.fem.solid import SolidModel
 from finforce_ifea.fem.tetrahedra import to_tet10
-from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.jaw.mesh import VolumeMesh, build_volume_mesh, check_connection
-from lab.forward_press import PressState
-from lab.stress.mechanics import Rig, build_jaw, measure_condition
-from lab.stress.stress import Family, Plan, Trial, attempt
-
-# What elements of any accepted shape may be off by, and what single precision may: 80 mm have 4e-9 m of rounding.
-RIGHT, SINGLE = 0.10, 1e-4
-DEPTH, HEIGHT = 0.5e-3, 0.04
+from lab.forward_press import RigidCylinder, press_jaw
+from lab.stress.mechanics import build_jaw
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,9 +120,16 @@ def _clamp_line(parts: Parts, random: np.random.Generator) -> Parts:
     return replace(parts, clamped=parts.clamped[np.abs(at[:, 0] - at[0, 0]) < 1e-9])
 
 
+def _permute(parts: Parts, random: np.random.Generator) -> Parts:
+    order = random.permutation(len(parts.nodes))
+    place = np.argsort(order)
+    rows = random.permutation(len(parts.elements))
+    return Parts(nodes=parts.nodes[order], elements=place[parts.elements[rows]], clamped=place[parts.clamped])
+
+
 CHANGES: dict[str, Change] = {
     "as it is": lambda parts, random: parts,
-    "nodes in another order": lambda parts, random: _permute(parts, random),
+    "nodes in another order": _permute,
     "aspect ratio 1e2": thin_layer(5e-5),
     "aspect ratio 1e4": thin_layer(5e-7),
     "aspect ratio 1e6": thin_layer(5e-9),
@@ -159,122 +161,89 @@ CHANGES: dict[str, Change] = {
 }
 
 
-def _permute(parts: Parts, random: np.random.Generator) -> Parts:
-    order = random.permutation(len(parts.nodes))
-    place = np.argsort(order)
-    rows = random.permutation(len(parts.elements))
-    return Parts(nodes=parts.nodes[order], elements=place[parts.elements[rows]], clamped=place[parts.clamped])
-
-
 SHAPES = tuple(change for name, change in CHANGES.items() if name.startswith(("aspect", "skewed")))
 
 
-def split_parts(parts: Parts) -> Parts:
-    """Return hexahedra as 10-node tetrahedra."""
-    return parts_of(to_tet10(parts.build()))
-
-
-def keep_parts(parts: Parts) -> Parts:
-    """Return hexahedra as they are."""
-    return parts
-
-
-KINDS = {"hexahedra": keep_parts, "10-node": split_parts}
-
-
-def parts_of(mesh: VolumeMesh) -> Parts:
-    """Return what a mesh was built from."""
+def parts_of(mesh):
     return Parts(nodes=mesh.nodes, elements=mesh.elements, clamped=mesh.clamped)
 
 
-def build_rig(jaw: Jaw, mesh: VolumeMesh) -> Rig:
-    """Return a jaw of a given mesh, ready to be pressed."""
-    model = SolidModel(mesh, jaw.material)
-    surface = build_contact_surface(jaw, mesh, model, across="half" if model.symmetric else "both")
-    contact = RigidContact(model, surface, jaw.face)
-    return Rig(mechanics=Mechanics(mesh=mesh, model=model, contact=contact), jaw=jaw, height=HEIGHT)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Tried:
-    """A mesh that was accepted: its presses, and whether it is warned of."""
-
-    rig: Rig
-    presses: list[PressState]
-    warned: bool
-
-
-def try_mesh(jaw: Jaw, parts: Parts) -> Tried:
-    """Return what becomes of a mesh; raises what the package says of a bad one."""
+def press(jaw, parts):
+    """The force [N] of a mesh that is pressed half a millimetre deep, and whether the mesh is warned of."""
     mesh = parts.build()
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         warn_of_locking(replace(jaw, drawing=None), mesh)
-    rig = build_rig(jaw, mesh)
-    return Tried(rig=rig, presses=rig.press(DEPTH), warned=bool(said))
+    model = SolidModel(mesh, jaw.material)
+    surface = build_contact_surface(jaw, mesh, model, across="half" if model.symmetric else "both")
+    (state,) = press_jaw(model, surface, jaw.inner_face_x, RigidCylinder(radius=0.0125), 0.04, [0.5e-3])
+    return state.force, bool(said)
 
 
-def run_meshes(plan: Plan) -> Iterator[Trial]:
-    """Yield meshes with one fault each: refused in our words, or with the force of the mesh without it."""
-    for kind in KINDS:
-        yield from run_kind(plan, kind)
-
-
-def run_kind(plan: Plan, kind: str) -> Iterator[Trial]:
-    """Yield the faulty meshes of one kind of element."""
-    # at this ratio no element locks by its volume, so that only shape is at stake
-    jaw, into = build_jaw(ratio=0.3), KINDS[kind]
-    boxes = parts_of(jaw.build_mesh("coarse"))
-    right = try_mesh(jaw, into(boxes)).presses[1].force
-    for seed in range(plan.share(1)):
-        random = plan.random("meshes", seed)
-        for name, change in CHANGES.items():
-            # 10-node tetrahedra are skewed as hexahedra, or their middle nodes would stay behind
-            order = (change, into) if change in SHAPES else (into, change)
-            yield attempt(
-                seed,
-                lambda o=order, r=random: try_mesh(jaw, _apply(o, boxes, r)),
-                lambda got: _judge(got, right, RIGHT),
-                level=f"{kind}: {name}",
-            )
-
-
-def _apply(order: tuple, parts: Parts, random: np.random.Generator) -> Parts:
-    """Return parts after two steps, of which a change takes random numbers and a split does not."""
-    for step in order:
-        parts = step(parts) if step in KINDS.values() else step(parts, random)
-    return parts
-
-
-def _judge(tried: Tried, right: NDArray, tolerance: float) -> Trial:
-    trial = tried.rig.judge(tried.presses, right, tolerance)
-    press = tried.presses[1]
-    return replace(
-        trial,
-        sure=not tried.warned,
-        stddev=tolerance * float(np.linalg.norm(right)) / 3.0,
-        condition=measure_condition(tried.rig.mechanics.model, press.q),
-        note=trial.note + ", warned of" * tried.warned,
-    )
-
-
-def run_single(plan: Plan) -> Iterator[Trial]:
-    """Yield meshes in single precision, whose forces are those of double precision to its rounding."""
-    jaw = build_jaw()
-    for density in ("coarse", "default"):
-        for kind, change in (("hexahedra", lambda m: m), ("10-node", to_tet10))[: 2 if density == "coarse" else 1]:
-            parts = parts_of(change(jaw.build_mesh(density)))
-            right = try_mesh(jaw, parts).presses[1].force
-            single = replace(parts, nodes=parts.nodes.astype(np.float32), elements=parts.elements.astype(np.int32))
-            yield attempt(
-                plan.seed,
-                lambda p=single: try_mesh(jaw, p),
-                lambda got, f=right: _judge(replace(got, warned=False), f, SINGLE),
-                level=f"{kind} {density}",
-            )
-
-
-FAMILIES = (
-    Family(name="meshes", what="volume meshes with one fault each", run=run_meshes, least_sure=0.2, timed=False),
-    Family(name="single", what="meshes in single precision", run=run_single, least_sure=1.0, timed=False),
+@pytest.mark.parametrize(
+    "split", [lambda parts: parts, lambda parts: parts_of(to_tet10(parts.build()))], ids=["hexahedra", "10-node"]
 )
+def test_every_faulty_mesh_is_refused_or_right(split):
+    """One fault each; right within a tenth, or warned of. At this ratio no element locks by its volume."""
+    jaw = build_jaw(ratio=0.3)
+    boxes, random = parts_of(jaw.build_mesh("coarse")), np.random.default_rng(2)
+    right, _ = press(jaw, split(boxes))
+    kept = set()
+    for name, change in CHANGES.items():
+        try:
+            # 10-node tetrahedra are skewed as hexahedra, or their middle nodes would stay behind
+            parts = split(change(boxes, random)) if change in SHAPES else change(split(boxes), random)
+            force, warned = press(jaw, parts)
+        except FinforceError:
+            continue
+        kept.add(name)
+        assert warned or np.linalg.norm(force - right) <= 0.1 * np.linalg.norm(right), name
+    assert {"as it is", "aspect ratio 1e4", "nodes in another order"} <= kept
+
+
+@pytest.mark.parametrize("split", [lambda mesh: mesh, to_tet10], ids=["hexahedra", "10-node"])
+def test_a_mesh_in_single_precision_has_the_force_of_double(split):
+    """1e-4: 80 mm have 4e-9 m of rounding."""
+    parts = parts_of(split(build_jaw().build_mesh("coarse")))
+    single = replace(parts, nodes=parts.nodes.astype(np.float32), elements=parts.elements.astype(np.int32))
+    right, _ = press(build_jaw(), parts)
+    assert np.linalg.norm(press(build_jaw(), single)[0] - right) <= 1e-4 * np.linalg.norm(right)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("element twice", "occur twice"),
+        ("loose element", "falls into 2 pieces"),
+        ("element on one edge", "nodes on one line"),
+        ("clamped along a line", "lie on one line"),
+        ("clamped by a mask", "got bool"),
+        ("index not whole", "not whole"),
+        ("node twice", "duplicate"),
+        ("millimetres", "millimetres"),
+        ("nearly inverted", "inverted"),
+    ],
+)
+def test_a_fault_is_called_by_its_name(fault, words):
+    parts = parts_of(build_jaw().build_mesh("coarse"))
+    with pytest.raises(MeshError, match=words):
+        CHANGES[fault](parts, np.random.default_rng(0)).build()
+
+
+def test_distorted_hexahedra_are_warned_of():
+    parts = parts_of(build_jaw().build_mesh("coarse"))
+    skewed = CHANGES["skewed by 0.95"](parts, np.random.default_rng(0)).build()
+    assert measure_shape(skewed) < 0.8 < measure_shape(parts.build())
+    with pytest.warns(LockingWarning, match="distorted hexahedra"):
+        warn_of_locking(replace(build_jaw(ratio=0.3), drawing=None), skewed)
+
+
+def test_refusals_are_ours():
+    """Whatever is done to a mesh, nothing but this package's errors comes out."""
+    parts, random = parts_of(build_jaw().build_mesh("coarse")), np.random.default_rng(7)
+    for _ in range(40):
+        elements = parts.elements.copy()
+        rows = random.integers(len(elements), size=3)
+        elements[rows] = random.integers(len(parts.nodes), size=(3, 8))
+        with pytest.raises(FinforceError):
+            replace(parts, elements=elements).build()
