@@ -22,8 +22,7 @@ from finforce_contact.localization.outline_localizer import (
 from finforce_contact.localization.section import Section, SectionKeeper, count_inside
 from finforce_contact.localization.slip import Slip, SlipWatch, TouchedFace, face_at
 from finforce_contact.localization.touch import SURELY_BENT, StillnessWatch, TouchBelief, describe_conflict
-from finforce_contact.mesh.object_mesh import surrounds
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh, surrounds
 from finforce_contact.paper_contact import IntersectionLocalizer
 from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.filter import FilteredPose, PoseFilter

@@ -16,7 +16,7 @@ from finforce.errors import FinforceError
 from finforce.stamps import SECOND, Stamped, Synchronizer
 from finforce.transforms import invert_pose
 from finforce_contact.estimator import ContactEstimate, ContactEstimator
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.observation import Contact, Observation, Solution
 from finforce_ifea.tracking.influence import is_out_of_reach

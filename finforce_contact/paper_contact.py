@@ -1,16 +1,13 @@
-"""The contact place by the paper's Algorithm 1 and Eq. 2: the intersection of deformed jaw and object."""
+"""The contact location by the paper's Algorithm 1 and Eq. 2: the intersection of deformed jaw and object."""
 
-from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.optional import import_manifold3d
-from finforce.transforms import invert_pose
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.localization.outline_localizer import ContactPatch, ContactScene, InnerFace, Place
-from finforce_contact.mesh.triangles import ObjectMesh, solid_from_triangles, to_manifold, triangles_of_solid
+from finforce_contact.mesh.object_mesh import ObjectMesh, solid_from_triangles, to_manifold, triangles_of_solid
 from finforce_ifea.jaw.jaw import Jaw
 
 if TYPE_CHECKING:
@@ -18,7 +15,6 @@ if TYPE_CHECKING:
 
 
 OFFSET = 1e-3  # [m] by which the object is pushed into the surface before contact (Eq. 2)
-MARGIN = 5e-3  # [m] kept around the jaw's box when the object is cut to it
 
 
 class IntersectionLocalizer:
@@ -27,8 +23,8 @@ class IntersectionLocalizer:
     While status S is false the object is brought along x into slight contact (Eq. 2); the intersection's centre leads
     to the nearest deformed vertex, from there to the undeformed one, its projection on the inner surface and the
     nearest candidate. S is true after an intersection and false after none, so that before contact every other
-    image keeps the last place, as in the paper. An object that is deeper than slight contact stays where it is: to draw
-    it back to the surface as it was before it bent would part the two for good.
+    image keeps the last location, as in the paper. An object that is deeper than slight contact stays where it is: to
+    draw it back to the surface as it was before it bent would part the two for good.
     """
 
     def __init__(self, jaw: Jaw, face: InnerFace, mesh: ObjectMesh) -> None:
@@ -38,9 +34,15 @@ class IntersectionLocalizer:
             ObjectMeshError: The mesh is not watertight.
             MissingDependencyError: manifold3d is not installed.
         """
+        solid = to_manifold(mesh)
+        if solid is None:
+            raise ObjectMeshError(
+                f"the mesh of {mesh.name} is not watertight, and mode 'paper' intersects solids; repair it, or choose "
+                "mode 'estimate'"
+            )
         self._candidates = jaw.candidates[:, 1:]
         self._mesh, self._face = face.mesh, face
-        self._object = NearSolid(mesh, MARGIN)
+        self._object = solid
         self._vertices = np.ascontiguousarray(mesh.vertices)
         self.reset()
 
@@ -50,11 +52,11 @@ class IntersectionLocalizer:
         self._last: ContactPatch | None = None
 
     def locate(self, scene: ContactScene) -> Place | None:
-        """Return the place, None before any was found."""
+        """Return the contact, None before any was found."""
         shift = self._slight_contact(scene.T) - scene.T[0, 3] if not self._status else 0.0
         T = scene.T.copy()
         T[0, 3] += min(shift, 0.0)
-        centre = intersect(self._object.near(T, scene.surface), T, scene.surface, self._mesh.surface)
+        centre = intersect(self._object, T, scene.surface, self._mesh.surface)
         self._status = centre is not None
         if centre is not None:
             self._last = self._candidate_of(centre, scene.surface)
@@ -76,53 +78,6 @@ class IntersectionLocalizer:
         projected = self._mesh.nodes[nearest, 1:]
         chosen = int(((self._candidates - projected) ** 2).sum(axis=1).argmin())
         return ContactPatch(heights=self._candidates[chosen, 1:], weights=np.ones(1))
-
-
-class NearSolid:
-    """The part of an object's solid near the jaw, cut once and kept while the jaw's box stays within it.
-
-    Attributes:
-        whole: the object's solid, object frame.
-        cuts: how often it was cut.
-    """
-
-    def __init__(self, mesh: ObjectMesh, margin: float) -> None:
-        """Build the solid; `margin` [m] is kept around the jaw's box.
-
-        Raises:
-            ObjectMeshError: The mesh is not watertight.
-            MissingDependencyError: manifold3d is not installed.
-        """
-        whole = to_manifold(mesh)
-        if whole is None:
-            raise ObjectMeshError(
-                f"the mesh of {mesh.name} is not watertight, and mode 'paper' intersects solids; repair it, or choose "
-                "mode 'estimate'"
-            )
-        self.whole, self.cuts = whole, 0
-        self._margin = margin
-        self._part: Manifold | None = None
-
-    def near(self, T: NDArray, surface: NDArray) -> "Manifold":
-        """Return the part, object frame, for a pose T_jaw_object (4, 4) and the jaw's vertices (n, 3) [m]."""
-        low, high = surface.min(axis=0), surface.max(axis=0)
-        corners = np.array(list(product(*zip(low, high, strict=True))))
-        if self._part is not None:
-            T_cut_now = self._T_jaw_object @ invert_pose(T)
-            moved = corners @ T_cut_now[:3, :3].T + T_cut_now[:3, 3]
-            if (moved >= self._low).all() and (moved <= self._high).all():
-                return self._part
-        self._cut(T, low, high)
-        return self._part
-
-    def _cut(self, T: NDArray, low: NDArray, high: NDArray) -> None:
-        """Cut the object by the jaw's box widened by the margin."""
-        self._T_jaw_object, self._low, self._high = T.copy(), low - self._margin, high + self._margin
-        box = import_manifold3d().Manifold.cube(self._high - self._low).translate(self._low)
-        part = self.whole ^ box.transform(invert_pose(T)[:3])
-        part.num_tri()  # booleans are lazy, and would be done again for every image
-        self._part = part
-        self.cuts += 1
 
 
 def intersect(solid: "Manifold", T: NDArray, surface: NDArray, triangles: NDArray) -> NDArray | None:

@@ -13,14 +13,13 @@ from finforce.ros import node as ros
 from finforce.skipping import Skips
 from finforce.stamps import SECOND
 from finforce.transforms import pose_numbers
-from finforce_contact.mesh.object_mesh import describe_mesh
+from finforce_contact.mesh.object_mesh import ObjectMesh, describe_mesh
 from finforce_ifea.messages import columns_from_outline
 
 if TYPE_CHECKING:
     from finforce_contact.estimator import ContactEstimate
     from finforce_contact.jaw_contact import JawContact, TimedEstimate
     from finforce_contact.localization.slip import Slip
-    from finforce_contact.mesh.triangles import ObjectMesh
     from finforce_contact.parameters import ContactParameters
     from finforce_contact.pose.source import ObjectPose
     from finforce_contact.session import ContactSession, StampedPose

@@ -29,8 +29,7 @@ from finforce.stamps import SECOND, Synchronizer
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.jaw_contact import JawContact, TimedEstimate
-from finforce_contact.mesh.object_mesh import describe_mesh, load_object_mesh
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh, describe_mesh, load_object_mesh
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings, load_generated, load_jaws
 from finforce_contact.pose.source import ExternalPoseSource, ObjectPose
 from finforce_contact.pose.tracker import PoseTracker

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from finforce.optional import import_manifold3d
 from finforce_contact.errors import ObjectMeshError
-from finforce_contact.mesh.object_mesh import FORMATS, load_object_mesh
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import FORMATS, ObjectMesh, load_object_mesh
 from finforce_sim.scenarios import Scenario
 
 SEGMENTS = 96  # around a full turn: the chords stay within 0.02 mm of a circle of 40 mm radius

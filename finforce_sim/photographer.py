@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import jaw_in_camera
 from finforce.transforms import invert_pose
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_sim.gripper import TwinState
 from finforce_sim.render import (

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, compute_rays
 from finforce.optional import import_trimesh
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import MeshView, compute_chamfer
 from finforce_contact.reconstruction.evidence import GeneratedMesh
 from finforce_sim.render import smooth_field

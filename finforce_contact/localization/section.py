@@ -12,8 +12,7 @@ from scipy.spatial.distance import cdist
 
 from finforce.errors import PoseError
 from finforce.optional import import_manifold3d
-from finforce_contact.mesh.repair import chain_loops
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh, chain_loops
 
 _OPTIONS = {"cache": True, "error_model": "numpy"}
 # A wall whose far side lies no deeper than this in the jaw is still taken for what the jaw touches [m].

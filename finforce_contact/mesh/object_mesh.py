@@ -1,27 +1,25 @@
-"""Object meshes from files and arrays: checked, repaired, and with few enough triangles for contact."""
+"""Object meshes: a record of triangles and their edges, read from a file or arrays, checked, repaired and decimated."""
 
-from dataclasses import replace
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from finforce.files import FileError
-from finforce.optional import import_open3d
+from finforce.optional import import_manifold3d, import_open3d
 from finforce.surfaces import read_surface
 from finforce_contact.errors import ObjectMeshError, to_floats
-from finforce_contact.mesh.repair import crosses_itself, repair
-from finforce_contact.mesh.triangles import (
-    ObjectMesh,
-    compute_areas,
-    solid_from_triangles,
-    to_manifold,
-    triangles_of_solid,
-)
 
-__all__ = ["FORMATS", "UNITS", "ObjectMesh", "load_object_mesh", "prepare_object_mesh", "read_triangles"]
+if TYPE_CHECKING:
+    from manifold3d import Manifold
 
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
 FORMATS = (".stl", ".obj", ".ply", ".glb")
@@ -29,8 +27,186 @@ SMALLEST, LARGEST = 0.005, 0.6  # [m], largest extent of what a gripper of 50 mm
 THINNEST = 1e-4  # [m], a mesh that is thinner is a sheet, and has no inside
 FARTHEST = 1.0  # [m], of a vertex from the origin of its frame; poses are of that origin, and turn about it
 TRIANGLE_BOUND = 2_000_000  # a closed mesh of so many takes some ten seconds, an open one a minute
-_CROSSING_LIMIT = 30_000  # triangles, whose pairs are compared in a fraction of a second
 _COMMON = 0.1  # [m], the size that tells which unit is the likely one
+CRACK = 1e-5  # [m], vertices of an open mesh this close are one; below what contact can tell
+HOLE_SHARE = 0.1  # [-], radius of the holes that are filled, of the largest extent; an opening to grasp into is larger
+MOST_OPEN = 0.75  # [-], share of edges with one triangle only; a closed surface has none
+_GRID_BITS = 21  # three coordinates in one integer of 64 bits
+_MOST_BODIES = 1000  # beyond, the mesh is fragments and its bodies mean nothing
+DEVIATION_LIMIT = 1e-4  # [m], a fifth of the error of a good pose; more is said in the note
+RUIN = 0.1  # [-], deviation of the largest extent; what deviates by more is another object
+_FIRST_TOLERANCE = 1e-5  # [m]
+_SAMPLES = 50_000  # points at which the deviation is measured
+_INSIDE = 0.5  # turns of a surface around a point, above which that is inside
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EdgeTable:
+    """The edges of a triangle mesh and the triangles along each.
+
+    Attributes:
+        ends: (e, 2) vertex indices, the smaller first.
+        of_triangles: (m, 3) edge index; edge k of a triangle runs from its corner k to the next.
+        directions: (m, 3) int8, +1 where a triangle runs along an edge from its smaller to its larger end, else -1.
+    """
+
+    ends: NDArray
+    of_triangles: NDArray
+    directions: NDArray
+
+    @cached_property
+    def is_balanced(self) -> bool:
+        """Each edge is run along as often one way as the other, so that the triangles bound solids."""
+        return not self.surplus.any()
+
+    @cached_property
+    def is_branching(self) -> bool:
+        """More than two triangles meet at some edge."""
+        return bool(np.bincount(self.of_triangles.ravel()).max(initial=0) > 2)
+
+    @cached_property
+    def open_share(self) -> float:
+        """Share [-] of the edges that belong to one triangle only, 1 where no two triangles are neighbours."""
+        uses = np.bincount(self.of_triangles.ravel(), minlength=len(self.ends))
+        return float((uses == 1).mean()) if len(uses) else 0.0
+
+    @cached_property
+    def is_consistent(self) -> bool:
+        """Neighbours run along their common edge in opposite ways; holes do not matter."""
+        return bool(np.abs(self.surplus).max(initial=0.0) <= 1.0)
+
+    @cached_property
+    def surplus(self) -> NDArray:
+        """How often (e,) triangles run along each edge, less how often against it."""
+        return self.sum_along(np.ones(len(self.of_triangles)))
+
+    def sum_along(self, weights: NDArray) -> NDArray:
+        """Return the same with each triangle counted by a weight (m,)."""
+        signed = self.directions * weights[:, None]
+        return np.bincount(self.of_triangles.ravel(), weights=signed.ravel(), minlength=len(self.ends))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectMesh:
+    """The surface of an object in its own frame.
+
+    Attributes:
+        vertices: (n, 3) [m], object frame.
+        triangles: (m, 3) int32, counterclockwise seen from outside.
+        watertight: the triangles bound solids without a gap.
+        name: what messages call the object.
+        notes: what was repaired or decimated, a sentence each.
+    """
+
+    vertices: NDArray
+    triangles: NDArray
+    watertight: bool
+    name: str
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def edges(self) -> EdgeTable:
+        """The edges of the triangles, found once."""
+        return build_edge_table(self.triangles)
+
+    @cached_property
+    def bounds(self) -> NDArray:
+        """Least and greatest coordinates (2, 3) [m]."""
+        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    @property
+    def middle(self) -> NDArray:
+        """The middle of the bounding box (3,) [m]."""
+        return 0.5 * (self.bounds[0] + self.bounds[1])
+
+    def with_triangles(self, vertices: NDArray, triangles: NDArray, note: str = "") -> ObjectMesh:
+        """Return the object with other triangles (m, 3), on those of the vertices (n, 3) that they use, and a note."""
+        used, compact = np.unique(triangles, return_inverse=True)
+        return replace(
+            self,
+            vertices=np.ascontiguousarray(vertices[used]),
+            triangles=compact.reshape(-1, 3).astype(np.int32),
+            notes=(*self.notes, note) if note else self.notes,
+        )
+
+
+def build_edge_table(triangles: NDArray) -> EdgeTable:
+    """Return the edges of triangles (m, 3), each edge once."""
+    starts = triangles.astype(np.int64)
+    stops = np.roll(starts, -1, axis=1)
+    low, high = np.minimum(starts, stops), np.maximum(starts, stops)
+    base = int(high.max(initial=0)) + 1
+    keys, of_triangles = np.unique(low * base + high, return_inverse=True)
+    return EdgeTable(
+        ends=np.stack([keys // base, keys % base], axis=1),
+        of_triangles=of_triangles.reshape(-1, 3),
+        directions=np.where(starts < stops, 1, -1).astype(np.int8),
+    )
+
+
+def compute_areas(vertices: NDArray, triangles: NDArray) -> NDArray:
+    """Return the areas (m,) [m^2] of triangles (m, 3) on vertices (n, 3) [m]."""
+    first, second, third = vertices[triangles].transpose(1, 0, 2)
+    return 0.5 * np.linalg.norm(np.cross(second - first, third - first), axis=1)
+
+
+def compute_volumes(vertices: NDArray, triangles: NDArray) -> NDArray:
+    """Return the volumes (m,) [m^3] from the mean vertex to the triangles, det(a, b, c) / 6; inward ones negative."""
+    first, second, third = (vertices - vertices.mean(axis=0))[triangles].transpose(1, 0, 2)
+    return np.einsum("ij,ij->i", first, np.cross(second, third)) / 6.0
+
+
+def to_manifold(mesh: ObjectMesh) -> Manifold | None:
+    """Return the solid that a mesh bounds, in metres and in the object frame; None where it is not watertight.
+
+    Building it takes some 0.7 ms per thousand triangles: keep it.
+
+    Raises:
+        MissingDependencyError: manifold3d is not installed.
+    """
+    return solid_from_triangles(mesh.vertices, mesh.triangles) if mesh.watertight else None
+
+
+def solid_from_triangles(vertices: NDArray, triangles: NDArray) -> Manifold | None:
+    """Return the solid that triangles (m, 3) on vertices (n, 3) [m] bound, or None where they bound none."""
+    manifold3d = import_manifold3d()
+    corners = np.ascontiguousarray(vertices, dtype=np.float64)
+    solid = manifold3d.Manifold(manifold3d.Mesh64(corners, np.ascontiguousarray(triangles, dtype=np.uint64)))
+    sound = solid.status() == manifold3d.Error.NoError and not solid.is_empty()
+    return solid if sound else None
+
+
+def triangles_of_solid(solid: Manifold) -> tuple[NDArray, NDArray]:
+    """Return the vertices (n, 3) [m] and the triangles (m, 3) int32 of a solid."""
+    mesh = solid.to_mesh64()
+    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int32)
+
+
+def surrounds(mesh: ObjectMesh, point: NDArray) -> bool:
+    """Return whether a mesh, watertight or not, surrounds a point (3,) [m, object frame].
+
+    The generalised winding number, the triangles' solid angles over 4 pi, exceeds a half (Jacobson et al. 2013).
+    """
+    low, high = mesh.bounds
+    if ((point <= low) | (point >= high)).any():
+        return False
+    corners = np.ascontiguousarray(mesh.vertices[mesh.triangles] - point, dtype=float)
+    return abs(_sum_solid_angles(corners)) / (4.0 * np.pi) > _INSIDE
+
+
+@njit(cache=True, error_model="numpy")
+def _sum_solid_angles(corners):
+    """Return the sum of the solid angles of triangles (m, 3, 3) seen from the origin (Van Oosterom, Strackee 1983)."""
+    total = 0.0
+    for m in range(len(corners)):
+        a, b, c = corners[m, 0], corners[m, 1], corners[m, 2]
+        la, lb, lc = np.sqrt((a * a).sum()), np.sqrt((b * b).sum()), np.sqrt((c * c).sum())
+        volume = (
+            a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+        )
+        below = la * lb * lc + (a * b).sum() * lc + (b * c).sum() * la + (c * a).sum() * lb
+        total += 2.0 * np.arctan2(volume, below)
+    return total
 
 
 def load_object_mesh(path: Path | str, *, unit: str = "m", triangle_limit: int = 20000) -> ObjectMesh:
@@ -52,10 +228,7 @@ def load_object_mesh(path: Path | str, *, unit: str = "m", triangle_limit: int =
     path = Path(path)
     if unit not in UNITS:
         raise ObjectMeshError(f"{path.name}: got unit {unit!r}, expected one of {', '.join(UNITS)}")
-    vertices, triangles = read_triangles(path)
-    _check_triangles(vertices, triangles, path.name)
-    _check_size(vertices, triangles, path.name, unit)
-    return prepare_object_mesh(vertices * UNITS[unit], triangles, name=path.name, triangle_limit=triangle_limit)
+    return prepare_object_mesh(*read_triangles(path), name=path.name, unit=unit, triangle_limit=triangle_limit)
 
 
 def read_triangles(path: Path | str) -> tuple[NDArray, NDArray]:
@@ -86,14 +259,20 @@ def _is_file(path: Path) -> bool:
 
 
 def prepare_object_mesh(
-    vertices: ArrayLike, triangles: ArrayLike, *, name: str = "object", triangle_limit: int = 20000
+    vertices: ArrayLike,
+    triangles: ArrayLike,
+    *,
+    name: str = "object",
+    unit: str = "m",
+    triangle_limit: int = 20000,
 ) -> ObjectMesh:
     """Return a mesh that contact can be computed with: merged, closed where possible, turned outward, decimated.
 
     Args:
-        vertices: (n, 3) [m], object frame.
+        vertices: (n, 3), object frame.
         triangles: (m, 3) vertex indices from 0.
         name: what messages call the object.
+        unit: of the vertices, one of `UNITS`.
         triangle_limit: the most triangles that are kept.
 
     Raises:
@@ -103,16 +282,15 @@ def prepare_object_mesh(
     """
     vertices, triangles = to_floats(vertices, f"{name}: vertices", ObjectMeshError), np.asarray(triangles)
     _check_triangles(vertices, triangles, name)
-    _check_size(vertices, triangles, name, "m")
+    _check_size(vertices, triangles, name, unit)
+    vertices = vertices * UNITS[unit]
     _check_origin(vertices, triangles, name)
     if not triangle_limit >= 100:
         raise ObjectMeshError(f"{name}: got triangle_limit {triangle_limit}, expected 100 at least; 20000 is usual")
     raw = ObjectMesh(vertices=vertices, triangles=triangles, watertight=False, name=name)
     mesh = repair(raw.with_triangles(vertices, triangles))
     _check_body(mesh)
-    if len(mesh.triangles) > triangle_limit:
-        mesh = decimate(mesh, triangle_limit)
-    return _note_crossings(mesh)
+    return decimate(mesh, triangle_limit) if len(mesh.triangles) > triangle_limit else mesh
 
 
 def _check_triangles(vertices: NDArray, triangles: NDArray, name: str) -> None:
@@ -137,12 +315,12 @@ def _check_size(vertices: NDArray, triangles: NDArray, name: str, unit: str) -> 
     extent = float(np.ptp(vertices[triangles].reshape(-1, 3), axis=0).max())
     if SMALLEST <= extent * UNITS[unit] <= LARGEST:
         return
-    likely = sorted(_sizes_by_unit(extent).items(), key=lambda item: abs(np.log(item[1] / _COMMON)))
+    sizes = {other: extent * factor for other, factor in UNITS.items() if SMALLEST <= extent * factor <= LARGEST}
+    likely = sorted(sizes.items(), key=lambda item: abs(np.log(item[1] / _COMMON)))
+    advice = "no unit makes it so; scale it, or remove what lies far from the object"
     if likely:
         named = ", or ".join(f'unit="{other}" ({size * 1e3:.0f} mm)' for other, size in likely)
         advice = f"the file is likely in another unit: {named}"
-    else:
-        advice = "no unit makes it so; scale it, or remove what lies far from the object"
     raise ObjectMeshError(
         f"{name}: got a largest extent of {extent * UNITS[unit] * 1e3:.6g} mm in unit {unit!r}, "
         f"expected {SMALLEST * 1e3:g} to {LARGEST * 1e3:g} mm for a graspable object; {advice}"
@@ -159,12 +337,6 @@ def _check_origin(vertices: NDArray, triangles: NDArray, name: str) -> None:
         )
 
 
-def _sizes_by_unit(extent: float) -> dict[str, float]:
-    """Return the units in which a bare number is the extent of a graspable object, with that extent [m]."""
-    sizes = {unit: extent * factor for unit, factor in UNITS.items()}
-    return {unit: size for unit, size in sizes.items() if SMALLEST <= size <= LARGEST}
-
-
 def _check_body(mesh: ObjectMesh) -> None:
     """Refuse a mesh without area, or thin as a sheet in some direction."""
     area = float(compute_areas(mesh.vertices, mesh.triangles).sum())
@@ -179,14 +351,11 @@ def _check_body(mesh: ObjectMesh) -> None:
     raise ObjectMeshError(f"{mesh.name}: {problem}; export the whole object")
 
 
-def _note_crossings(mesh: ObjectMesh) -> ObjectMesh:
-    """Return the mesh, with a note if its surface crosses itself; not looked for in open or very fine ones."""
-    if not mesh.watertight or len(mesh.triangles) > _CROSSING_LIMIT:
-        return mesh
-    if not crosses_itself(mesh.vertices, mesh.triangles):
-        return mesh
-    note = "The surface crosses itself; what is inside twice counts as inside."
-    return replace(mesh, notes=(*mesh.notes, note))
+def _open3d_mesh(mesh: ObjectMesh) -> Any:
+    """Return a mesh as an open3d.geometry.TriangleMesh."""
+    open3d = import_open3d()
+    vectors = open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.triangles)
+    return open3d.geometry.TriangleMesh(*vectors)
 
 
 def describe_mesh(mesh: ObjectMesh) -> str:
@@ -195,40 +364,173 @@ def describe_mesh(mesh: ObjectMesh) -> str:
     return " ".join([f"{mesh.name}: {len(mesh.triangles)} triangles, {kind}.", *mesh.notes])
 
 
-_INSIDE = 0.5
+def repair(mesh: ObjectMesh) -> ObjectMesh:
+    """Return the mesh with its vertices merged, closed where its holes are small, and its triangles facing outward.
 
+    `watertight` of the result is what manifold3d says; a mesh that stays open is kept and noted.
 
-def surrounds(mesh: ObjectMesh, point: NDArray) -> bool:
-    """Return whether a mesh, watertight or not, surrounds a point (3,) [m, object frame].
-
-    The generalised winding number, the triangles' solid angles over 4 pi, exceeds a half (Jacobson et al. 2013).
+    Raises:
+        ObjectMeshError: The triangles are fragments.
+        MissingDependencyError: manifold3d is not installed, or the mesh is open and open3d is not.
     """
-    low, high = mesh.bounds
-    if ((point <= low) | (point >= high)).any():
-        return False
-    corners = np.ascontiguousarray(mesh.vertices[mesh.triangles] - point, dtype=float)
-    return abs(_sum_solid_angles(corners)) / (4.0 * np.pi) > _INSIDE
+    mesh = merge_vertices(mesh)
+    if not mesh.edges.is_balanced:
+        mesh = close(mesh)
+    if not len(mesh.triangles):
+        return mesh
+    mesh = turn_outward(mesh)
+    solid = solid_from_triangles(mesh.vertices, mesh.triangles) if mesh.edges.is_balanced else None
+    if solid is not None:
+        return unite_bodies(replace(mesh, watertight=True), solid)
+    note = "The surface is not closed: its outline bridges the gaps, and booleans of solids are not possible."
+    return replace(mesh, watertight=False, notes=(*mesh.notes, note))
 
 
-@njit(cache=True, error_model="numpy")
-def _sum_solid_angles(corners):
-    """Return the sum of the solid angles of triangles (m, 3, 3) seen from the origin (Van Oosterom, Strackee 1983)."""
-    total = 0.0
-    for m in range(len(corners)):
-        a, b, c = corners[m, 0], corners[m, 1], corners[m, 2]
-        la, lb, lc = np.sqrt((a * a).sum()), np.sqrt((b * b).sum()), np.sqrt((c * c).sum())
-        volume = (
-            a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+def merge_vertices(mesh: ObjectMesh) -> ObjectMesh:
+    """Return the mesh with equal vertices as one, without the triangles that have a corner twice."""
+    low = mesh.vertices.min(axis=0)
+    # An even number of cells: the middle, where symmetric objects have their poles, is no rounding boundary.
+    cell = np.ptp(mesh.vertices, axis=0).max() / (2**_GRID_BITS - 2)
+    x, y, z = np.round((mesh.vertices - low) / cell).astype(np.int64).T
+    _, first, place = np.unique((x << 2 * _GRID_BITS) | (y << _GRID_BITS) | z, return_index=True, return_inverse=True)
+    merged = place[mesh.triangles]
+    merged = merged[(merged != np.roll(merged, 1, axis=1)).all(axis=1)]
+    dropped = len(mesh.triangles) - len(merged)
+    note = f"{dropped} triangles without area were removed." if dropped else ""
+    return mesh.with_triangles(mesh.vertices[first], merged, note)
+
+
+def close(mesh: ObjectMesh) -> ObjectMesh:
+    """Return an open mesh with cracks merged, repeated triangles removed, in one sense, its small holes filled.
+
+    Raises:
+        ObjectMeshError: The triangles are fragments, of which hardly any have neighbours.
+    """
+    geometry = _open3d_mesh(mesh)
+    geometry.merge_close_vertices(CRACK)
+    geometry.remove_degenerate_triangles()
+    geometry.remove_duplicated_triangles()
+    before = len(mesh.triangles)
+    triangles = np.asarray(geometry.triangles)
+    note = f"Vertices within {CRACK * 1e3:g} mm were merged; {before - len(triangles)} of {before} triangles fell away."
+    merged = mesh.with_triangles(np.asarray(geometry.vertices), triangles, note)
+    if len(triangles) > 1 and merged.edges.open_share > MOST_OPEN:
+        share = 100.0 * merged.edges.open_share
+        raise ObjectMeshError(
+            f"{mesh.name}: got {len(triangles)} triangles with no neighbour at {share:.0f} % of their edges, expected "
+            "a connected surface; merge its vertices in a mesh editor"
         )
-        below = la * lb * lc + (a * b).sum() * lc + (b * c).sum() * la + (c * a).sum() * lb
-        total += 2.0 * np.arctan2(volume, below)
-    return total
+    if merged.edges.is_branching:
+        note = "More than two triangles meet at an edge; their sense was left and holes were not filled."
+        return replace(merged, notes=(*merged.notes, note))
+    if not merged.edges.is_consistent:
+        if not geometry.orient_triangles():
+            return replace(merged, notes=(*merged.notes, "The surface has one side only, and so no outside."))
+        merged = merged.with_triangles(np.asarray(geometry.vertices), np.asarray(geometry.triangles))
+    return merged if merged.edges.is_balanced else fill_holes(merged)
 
 
-DEVIATION_LIMIT = 1e-4  # [m], a fifth of the error of a good pose; more is said in the note
-RUIN = 0.1  # [-], deviation of the largest extent; what deviates by more is another object
-_FIRST_TOLERANCE = 1e-5  # [m]
-_SAMPLES = 50_000  # points at which the deviation is measured
+def fill_holes(mesh: ObjectMesh) -> ObjectMesh:
+    """Return the mesh with a fan of triangles in each hole that a small sphere about its middle covers."""
+    surplus = mesh.edges.surplus
+    ends = mesh.edges.ends[surplus != 0.0]
+    # A fan runs against its neighbour, whose sense is the sign of the surplus.
+    ends = np.where(surplus[surplus != 0.0, None] > 0.0, ends[:, ::-1], ends)
+    vertices, fans, left = [mesh.vertices], [mesh.triangles], 0
+    limit = HOLE_SHARE * np.ptp(mesh.vertices, axis=0).max()
+    for loop in chain_loops(ends[:, 0], ends[:, 1]):
+        middle = mesh.vertices[loop].mean(axis=0)
+        if np.linalg.norm(mesh.vertices[loop] - middle, axis=1).max() > limit:
+            left += 1
+            continue
+        apex = np.full(len(loop), len(mesh.vertices) + len(vertices) - 1)
+        vertices.append(middle[None])
+        fans.append(np.stack([loop, np.roll(loop, -1), apex], axis=1))
+    note = f"{len(fans) - 1} holes up to {limit * 1e3:.1f} mm in radius were filled, {left} larger ones were left."
+    return mesh.with_triangles(np.concatenate(vertices), np.concatenate(fans), note)
+
+
+def turn_outward(mesh: ObjectMesh) -> ObjectMesh:
+    """Return the mesh with inside-out bodies turned, each together with the cavities in it."""
+    body = label_bodies(mesh)
+    count = int(body.max()) + 1
+    volumes = np.bincount(body, weights=compute_volumes(mesh.vertices, mesh.triangles), minlength=count)
+    turned = (volumes[_find_containers(mesh, body, count)] < 0.0)[body]
+    if not turned.any():
+        return mesh
+    triangles = np.where(turned[:, None], mesh.triangles[:, ::-1], mesh.triangles)
+    note = f"{turned.sum()} of {len(turned)} triangles were inside-out and were turned."
+    return mesh.with_triangles(mesh.vertices, triangles, note)
+
+
+def label_bodies(mesh: ObjectMesh) -> NDArray:
+    """Return for each triangle the number (m,) of its connected body; one body for mere fragments."""
+    ends, count = mesh.edges.ends, len(mesh.vertices)
+    graph = coo_array((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    bodies, label = connected_components(graph, directed=False)
+    return label[mesh.triangles[:, 0]] if bodies <= _MOST_BODIES else np.zeros(len(mesh.triangles), dtype=int)
+
+
+def unite_bodies(mesh: ObjectMesh, solid: Manifold) -> ObjectMesh:
+    """Return a watertight mesh, given as solid too, with overlapping bodies made one; their number is noted."""
+    bodies = solid.decompose()
+    if len(bodies) == 1:
+        return mesh
+    mesh = replace(mesh, notes=(*mesh.notes, f"The object consists of {len(bodies)} separate surfaces."))
+    if len(bodies) > _MOST_BODIES or any(body.volume() < 0.0 for body in bodies):
+        return mesh  # a union would fill the cavities
+    manifold3d = import_manifold3d()
+    union = manifold3d.Manifold.batch_boolean(bodies, manifold3d.OpType.Add)
+    if union.volume() > (1.0 - 1e-6) * solid.volume():
+        return mesh
+    return mesh.with_triangles(*triangles_of_solid(union), "Bodies that overlap were united.")
+
+
+def _find_containers(mesh: ObjectMesh, body: NDArray, count: int) -> NDArray:
+    """Return for each body the one (count,) whose box is the largest around its own, or itself."""
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    corners = mesh.vertices[mesh.triangles]
+    np.minimum.at(low, body, corners.min(axis=1))
+    np.maximum.at(high, body, corners.max(axis=1))
+    contains = (low[:, None] <= low[None]).all(axis=2) & (high[:, None] >= high[None]).all(axis=2)
+    return np.argmax(contains * np.linalg.norm(high - low, axis=1)[:, None], axis=0)
+
+
+def chain_loops(starts: NDArray, stops: NDArray) -> list[NDArray]:
+    """Return closed loops that together run along each edge once.
+
+    Edges that do not close are left out; where every node has as many edges in as out, none is.
+
+    Args:
+        starts: (e,) node at which each edge begins.
+        stops: (e,) node at which it ends.
+
+    Returns:
+        Node indices (n,) of each loop in its order; the last is joined to the first.
+    """
+    ways: dict[int, list[int]] = {}
+    for start, stop in zip(starts.tolist(), stops.tolist(), strict=True):
+        ways.setdefault(start, []).append(stop)
+    loops = []
+    for start in list(ways):
+        while ways[start]:
+            loop = _follow(ways, start)
+            if loop:
+                loops.append(np.array(loop))
+    return loops
+
+
+def _follow(ways: dict[int, list[int]], start: int) -> list[int]:
+    """Take edges from the ways until back at the start; nothing when the way ends before."""
+    loop, node = [], start
+    while True:
+        loop.append(node)
+        onward = ways.get(node)
+        if not onward:
+            return []
+        node = onward.pop()
+        if node == start:
+            return loop
 
 
 def decimate(mesh: ObjectMesh, triangle_limit: int) -> ObjectMesh:
@@ -243,62 +545,46 @@ def decimate(mesh: ObjectMesh, triangle_limit: int) -> ObjectMesh:
     """
     solid = to_manifold(mesh)
     if solid is None:
-        thinned = thin_by_quadric(mesh.vertices, mesh.triangles, triangle_limit)
+        thinned = _thin_by_quadric(mesh, triangle_limit)
     else:
-        thinned = triangles_of_solid(solid.simplify(_FIRST_TOLERANCE))
-        if len(thinned[1]) > triangle_limit:
-            thinned = thin_by_quadric(*thinned, triangle_limit)
-        if solid_from_triangles(*thinned) is None:
-            thinned = _simplify_within(solid, triangle_limit)
-    note = _describe(mesh, thinned)
-    return mesh.with_triangles(*thinned, note)
+        thinned = mesh.with_triangles(*triangles_of_solid(solid.simplify(_FIRST_TOLERANCE)))
+        if len(thinned.triangles) > triangle_limit:
+            thinned = _thin_by_quadric(thinned, triangle_limit)
+        if solid_from_triangles(thinned.vertices, thinned.triangles) is None:
+            thinned = _simplify_within(mesh, solid, triangle_limit)
+    count, left = len(mesh.triangles), len(thinned.triangles)
+    deviation = _measure_deviation(mesh, thinned) if left else np.inf
+    if deviation > RUIN * np.ptp(mesh.vertices, axis=0).max():
+        raise ObjectMeshError(
+            f"{mesh.name}: got {count} triangles, of which {left} are left that deviate by {deviation * 1e3:.1f} mm, "
+            "expected one object of connected parts; remove fragments in a mesh editor"
+        )
+    warning = "" if deviation <= DEVIATION_LIMIT else ", more than contact should have: is this one object?"
+    note = f"Decimated from {count} to {left} triangles; the surface deviates by {deviation * 1e3:.3f} mm at most"
+    return replace(thinned, notes=(*thinned.notes, f"{note}{warning}."))
 
 
-def thin_by_quadric(vertices: NDArray, triangles: NDArray, triangle_limit: int) -> tuple[NDArray, NDArray]:
-    """Return vertices and triangles after edges were collapsed in the order of their quadric error."""
-    open3d = import_open3d()
-    geometry = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(triangles)
-    )
-    stages = np.ceil(np.log2(len(triangles) / triangle_limit)).astype(int)
-    # One stage each time the number is halved, so that seconds of work show how far they are.
-    for stage in tqdm(range(stages)[::-1], desc="decimating", disable=True if stages < 4 else None, leave=False):
-        geometry = geometry.simplify_quadric_decimation(triangle_limit << int(stage))
-    return np.asarray(geometry.vertices).copy(), np.asarray(geometry.triangles).copy()
+def _thin_by_quadric(mesh: ObjectMesh, triangle_limit: int) -> ObjectMesh:
+    """Return the mesh after edges were collapsed in the order of their quadric error."""
+    thinned = _open3d_mesh(mesh).simplify_quadric_decimation(triangle_limit)
+    return mesh.with_triangles(np.asarray(thinned.vertices), np.asarray(thinned.triangles))
 
 
-def measure_deviation(mesh: ObjectMesh, vertices: NDArray, triangles: NDArray) -> float:
-    """Return the largest distance [m] of a vertex of a mesh or of other triangles to the other's surface."""
-    ways = ((vertices, mesh.vertices, mesh.triangles), (mesh.vertices, vertices, triangles))
-    return max(_largest_distance(points, *surface) for points, *surface in ways)
-
-
-def _largest_distance(points: NDArray, vertices: NDArray, triangles: NDArray) -> float:
-    open3d = import_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(vertices.astype(np.float32), triangles.astype(np.uint32))
-    some = points[:: max(1, len(points) // _SAMPLES)].astype(np.float32)
-    return float(scene.compute_distance(some, nthreads=1).numpy().max())
-
-
-def _simplify_within(solid, triangle_limit: int) -> tuple[NDArray, NDArray]:
-    """Return the triangles of the solid, simplified in growing steps that never open it."""
+def _simplify_within(mesh: ObjectMesh, solid: Manifold, triangle_limit: int) -> ObjectMesh:
+    """Return the mesh, given as solid too, simplified in growing steps that never open it."""
     tolerance = _FIRST_TOLERANCE
     while solid.num_tri() > triangle_limit:
         tolerance *= 2.0
         solid = solid.simplify(tolerance)
-    return triangles_of_solid(solid)
+    return mesh.with_triangles(*triangles_of_solid(solid))
 
 
-def _describe(mesh: ObjectMesh, thinned: tuple[NDArray, NDArray]) -> str:
-    deviation = measure_deviation(mesh, *thinned) if len(thinned[1]) else np.inf
-    if deviation > RUIN * np.ptp(mesh.vertices, axis=0).max():
-        raise ObjectMeshError(
-            f"{mesh.name}: got {len(mesh.triangles)} triangles, of which {len(thinned[1])} are left that deviate by "
-            f"{deviation * 1e3:.1f} mm, expected one object of connected parts; remove fragments in a mesh editor"
-        )
-    warning = "" if deviation <= DEVIATION_LIMIT else ", more than contact should have: is this one object?"
-    return (
-        f"Decimated from {len(mesh.triangles)} to {len(thinned[1])} triangles; "
-        f"the surface deviates by {deviation * 1e3:.3f} mm at most{warning}."
-    )
+def _measure_deviation(one: ObjectMesh, other: ObjectMesh) -> float:
+    """Return the largest distance [m] of a vertex of either mesh to the other's surface."""
+    open3d, largest = import_open3d(), 0.0
+    for mesh, points in ((one, other.vertices), (other, one.vertices)):
+        scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+        scene.add_triangles(mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32))
+        some = points[:: max(1, len(points) // _SAMPLES)].astype(np.float32)
+        largest = max(largest, float(scene.compute_distance(some, nthreads=1).numpy().max()))
+    return largest

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from finforce.camera import CameraIntrinsics, compute_rays, project
 from finforce.optional import import_open3d
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 
 MARGIN = 2  # pixels around the projected box, for what distortion and rounding do to it
 

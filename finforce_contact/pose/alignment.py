@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, check_depth, check_mask, compute_rays, project, rays_from_pixels
 from finforce.transforms import invert_pose
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.parameters import TrackerSettings
 

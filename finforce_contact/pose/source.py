@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from finforce.errors import PoseError
 from finforce.transforms import check_pose, invert_pose, pose_from_quaternion
-from finforce_contact.mesh.object_mesh import surrounds
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh, surrounds
 from finforce_contact.parameters import ORIGINS
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from finforce.transforms import rotation_between
 from finforce_contact.errors import ContactError
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import sample_with_normals
 
 AUTO, NONE, FULL = "auto", "none", "full"

@@ -12,7 +12,7 @@ from finforce.camera import CameraIntrinsics, project
 from finforce.errors import PoseError
 from finforce.transforms import move_pose, rotation_between
 from finforce_contact.errors import PoseLostError
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.alignment import LEAST_PIXELS, Alignment, DepthImage, Effort, MeshAligner
 from finforce_contact.pose.source import ObjectPose, check_camera_outside

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from finforce.camera import CameraIntrinsics, check_depth, check_mask, compute_rays
 from finforce_contact.errors import ReconstructionError
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 
 EDGE_BAND = 2  # [px] along the mask's edge and around holes, where pixels fly between object and background

@@ -14,8 +14,7 @@ from finforce.errors import PoseError
 from finforce.optional import import_open3d
 from finforce.surfaces import LARGEST
 from finforce_contact.errors import ObjectMeshError, ReconstructionError
-from finforce_contact.mesh.object_mesh import prepare_object_mesh, read_triangles
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh, prepare_object_mesh, read_triangles
 from finforce_contact.mesh.views import MeshView, sample_surface
 from finforce_contact.reconstruction.evidence import ImageEvidence
 

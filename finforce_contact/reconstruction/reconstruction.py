@@ -10,8 +10,7 @@ from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt
 
 from finforce.camera import compute_rays
 from finforce_contact.errors import ReconstructionError
-from finforce_contact.mesh.object_mesh import prepare_object_mesh
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh, prepare_object_mesh
 from finforce_contact.mesh.views import MeshView
 from finforce_contact.reconstruction.evidence import (
     EDGE_BAND,

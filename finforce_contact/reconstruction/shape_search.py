@@ -11,7 +11,7 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import MeshView, RenderedMesh
 from finforce_contact.reconstruction.evidence import ImageEvidence, Reconstruction, Report, ShapeScore, score_shape
 

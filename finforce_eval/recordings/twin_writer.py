@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from finforce.optional import import_trimesh
 from finforce.transforms import pose_numbers, quaternion_from_pose
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_eval.recordings.images import (
     CAMERA_INFO,
     COMPRESSED,

@@ -25,9 +25,8 @@ from finforce_contact.localization.outline_localizer import (
     build_inner_face,
 )
 from finforce_contact.localization.section import SectionKeeper
-from finforce_contact.mesh.object_mesh import load_object_mesh
-from finforce_contact.mesh.triangles import ObjectMesh
-from finforce_contact.paper_contact import MARGIN, NearSolid, intersect
+from finforce_contact.mesh.object_mesh import ObjectMesh, load_object_mesh, to_manifold
+from finforce_contact.paper_contact import intersect
 from finforce_contact.parameters import ContactSettings
 from finforce_eval.evaluation.places import InnerSurface, true_lines
 from finforce_eval.evaluation.scoring import match_truth
@@ -244,15 +243,14 @@ def _by_localizer(setup: MethodSetup, localizer: Localizer, *, with_wrench: bool
     return locate
 
 
-def by_intersection(setup: MethodSetup, *, cut_down: bool) -> Method:
-    """Return the centre of the intersection with the whole object, or with what of it is near the jaw."""
+def by_intersection(setup: MethodSetup) -> Method:
+    """Return the centre of the intersection with the object."""
     settings = ContactSettings()
     jaw = setup.jaw.build_mesh(settings.mesh)
-    solid = NearSolid(setup.mesh, MARGIN)
+    solid = to_manifold(setup.mesh)
 
     def locate(T: NDArray, surface: NDArray, wrench: Wrench) -> float | None:
-        part = solid.near(T, surface) if cut_down else solid.whole
-        centre = intersect(part, T, surface, jaw.surface)
+        centre = intersect(solid, T, surface, jaw.surface)
         return None if centre is None else _height_of(centre, surface, jaw.nodes)
 
     return locate
@@ -279,8 +277,7 @@ def by_whole_estimator(setup: MethodSetup) -> Method:
 METHODS: dict[str, Callable[[MethodSetup], Method]] = {
     "outline and line of action": lambda setup: by_outline(setup, with_wrench=True),
     "outline alone": lambda setup: by_outline(setup, with_wrench=False),
-    "manifold3d, whole object": lambda setup: by_intersection(setup, cut_down=False),
-    "manifold3d, cut to the jaw": lambda setup: by_intersection(setup, cut_down=True),
+    "manifold3d": by_intersection,
     "closest point, undeformed": by_closest,
     "the whole estimator": by_whole_estimator,
 }

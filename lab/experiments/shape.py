@@ -17,7 +17,7 @@ from finforce.camera import deproject
 from finforce.errors import one_line
 from finforce.optional import import_trimesh
 from finforce_contact.errors import ReconstructionError
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import compute_chamfer, sample_surface
 from finforce_contact.reconstruction.evidence import GeneratedMesh, collect_evidence
 from finforce_contact.reconstruction.generated import (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.jaw_contact import ForceLoop
 from finforce_contact.localization.section import cut_outline
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.parameters import ContactSettings
 from finforce_ifea.contact_mechanics.indenter import OutlineIndenter, flat_profile
 from finforce_ifea.contact_mechanics.penalty import PenaltyContact

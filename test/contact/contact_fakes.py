@@ -7,8 +7,7 @@ import manifold3d
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from finforce_contact.mesh.object_mesh import prepare_object_mesh
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh, prepare_object_mesh
 from finforce_contact.mesh.views import compute_chamfer
 from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_ifea.jaw.jaw import load_jaw

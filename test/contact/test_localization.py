@@ -29,8 +29,8 @@ from finforce_contact.localization.section import (
     place_edges,
     split_turn,
 )
-from finforce_contact.mesh.object_mesh import surrounds
-from finforce_contact.paper_contact import MARGIN, OFFSET, IntersectionLocalizer, NearSolid, centre_of_volume, intersect
+from finforce_contact.mesh.object_mesh import surrounds, to_manifold
+from finforce_contact.paper_contact import OFFSET, IntersectionLocalizer, centre_of_volume, intersect
 from finforce_ifea.errors import MeshError
 
 INNER = build_inner_face(JAW, "default")
@@ -305,7 +305,7 @@ class TestIntersection:
 
     def test_intersection_of_boxes_has_the_centre_of_what_they_share(self):
         pytest.importorskip("manifold3d")
-        jaw, solid = box((2.0, 2.0, 2.0)), NearSolid(box((2.0, 2.0, 2.0)), 1.0).whole
+        jaw, solid = box((2.0, 2.0, 2.0)), to_manifold(box((2.0, 2.0, 2.0)))
         centre = intersect(solid, pose(1.0, 0.5), jaw.vertices, jaw.triangles)
         np.testing.assert_allclose(centre, [0.5, 0.0, 0.25], atol=1e-6)
         assert intersect(solid, pose(3.0, 0.0), jaw.vertices, jaw.triangles) is None
@@ -340,19 +340,6 @@ class TestIntersection:
         localizer.locate(scene_of(cylinder(), pose(FACE + 0.0125 - 4.8 * MM, 0.0412), surface))
         assert localizer._status is False
         assert localizer.locate(scene_of(cylinder(), pose(FACE + 0.0125 - 5.2 * MM, 0.0412), surface)).touching is True
-
-    def test_object_cut_to_the_jaw_gives_the_same_centre_and_is_cut_once(self):
-        pytest.importorskip("manifold3d")
-        near = NearSolid(cylinder(), MARGIN)
-        for shift in (0.0, 0.5 * MM, 1 * MM):
-            T = pose(FACE + 0.0125 - 1 * MM, 0.04 + shift)
-            whole = intersect(near.whole, T, NODES, INNER.mesh.surface)
-            part = intersect(near.near(T, NODES), T, NODES, INNER.mesh.surface)
-            np.testing.assert_allclose(part, whole, atol=1e-6)
-        assert near.cuts == 1
-        near.near(pose(FACE + 0.0125, 0.05), NODES)
-        assert near.cuts == 2
-        assert near.near(T, NODES).num_tri() < near.whole.num_tri()
 
     def test_open_mesh_is_refused_and_the_way_out_named(self):
         pytest.importorskip("manifold3d")

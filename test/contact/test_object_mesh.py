@@ -11,8 +11,14 @@ import trimesh
 from finforce.errors import FinforceError, MissingDependencyError
 from finforce_contact.errors import ObjectMeshError
 from finforce_contact.mesh import object_mesh
-from finforce_contact.mesh.object_mesh import UNITS, load_object_mesh, prepare_object_mesh, read_triangles
-from finforce_contact.mesh.triangles import compute_volumes, to_manifold
+from finforce_contact.mesh.object_mesh import (
+    UNITS,
+    compute_volumes,
+    load_object_mesh,
+    prepare_object_mesh,
+    read_triangles,
+    to_manifold,
+)
 
 CYLINDER_VOLUME = np.pi * 0.03**2 * 0.08
 # 256 facets leave out 1 - sin(t)/t of a circle, t = 2 pi / 256; STL adds single precision.
@@ -295,13 +301,6 @@ def test_overlapping_bodies_with_a_cavity_are_not_united_over_it():
 
 def test_mesh_that_is_said_to_be_open_gives_no_solid():
     assert to_manifold(replace(prepare_object_mesh(*BOX), watertight=False)) is None
-
-
-def test_surface_that_crosses_itself_is_kept_and_noted():
-    """The profile of the body crosses itself, so that a ring of it is inside twice."""
-    crossed = fakes.revolve([(0.0, -0.04), (0.02, -0.04), (0.02, 0.01), (0.03, -0.01), (0.01, 0.0), (0.0, 0.04)], 48)
-    assert says(prepare_object_mesh(*crossed), "crosses itself")
-    assert not says(fakes.build_mug(), "crosses itself")
 
 
 def test_decimated_sphere_stays_within_a_tenth_of_a_millimetre():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from finforce.errors import PoseError
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.pose.source import ExternalPoseSource, check_camera_outside
 from finforce_sim.objects import build_object
 

@@ -5,7 +5,7 @@ import pytest
 from contact_fakes import distance_mm, make_case
 
 from finforce.optional import import_manifold3d
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.reconstruction import reconstruction
 from finforce_contact.reconstruction.evidence import collect_evidence
 from finforce_contact.reconstruction.reconstruction import complete_surface, reconstruct

@@ -11,7 +11,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, jaw_in_camera
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import MeshView
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.detector import KeypointDetector

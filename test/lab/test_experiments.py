@@ -13,7 +13,7 @@ from eval_fakes import FakeContactEstimator, make_recording
 from finforce.errors import FinforceError
 from finforce.transforms import pose_from_quaternion
 from finforce_contact.errors import ObjectMeshError
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import compute_chamfer
 from finforce_contact.reconstruction.evidence import GeneratedMesh
 from finforce_contact.reconstruction.generated import read_generated

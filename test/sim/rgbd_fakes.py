@@ -8,7 +8,7 @@ import numpy as np
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.gripper_frames import BENCH_CAMERA, ROBOT_CAMERA, jaw_in_camera
-from finforce_contact.mesh.triangles import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.images import ImageWatch
 from finforce_sim.footage import Footage
