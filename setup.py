@@ -37,6 +37,7 @@ setup(
         "scipy",  # sparse matrices, factorisations, least squares
         "numba",  # compiles the element loops: a step in milliseconds
         "pyyaml",  # jaw files, calibrations
+        "pydantic>=2",  # their form, checked with a message for every key
         "meshio",  # volume mesh files of jaws
         "pillow",  # picture files
         "rosbags>=0.11,<0.12",  # recordings, without ROS

@@ -20,7 +20,7 @@ from finforce_ifea.contact_mechanics.indenter import DEPTH, ExpectedObject, expe
 from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics, limit_step
 from finforce_ifea.errors import CalibrationError, JawFileError, MeshError
 from finforce_ifea.estimator import JawEstimator, KeypointGate
-from finforce_ifea.jaw.calibration import Calibration
+from finforce_ifea.jaw.calibration import Calibration, make_calibration
 from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw
 from finforce_ifea.mechanics import build_mechanics, choose_full
 from finforce_ifea.observation import Contact, Observation
@@ -121,15 +121,14 @@ def fit_calibration(
         error = float(np.clip(max(rough.calibration.force_error, _PLACES_DIFFER / len(cases)), 0.005, 0.5))
         known = {name: value for name, value in rough.uncertainty.items() if name not in _NAMES[5:]}
         return replace(
-            rough, calibration=replace(rough.calibration, relaxation=(), force_error=error), uncertainty=known
+            rough, calibration=rough.calibration.changed(relaxation=(), force_error=error), uncertainty=known
         )
     # magnitudes are compared; friction is looked for once they are known
     smooth = replace(settings, smooth_share=1.0)
     history = fit_force_history(jaw, cases, smooth, rough.calibration, progress)
     return replace(
         rough,
-        calibration=replace(
-            rough.calibration,
+        calibration=rough.calibration.changed(
             young_modulus=rough.calibration.young_modulus * history.scale,
             relaxation=history.terms,
             force_error=float(np.clip(max(history.relative, _PLACES_DIFFER / len(cases)), 0.005, 0.5)),
@@ -171,7 +170,7 @@ class _Fit:
 
     def calibration(self, x: NDArray) -> Calibration:
         """Return the parameters as a calibration."""
-        return Calibration(
+        return make_calibration(
             young_modulus=float(self.jaw.material.young_modulus * np.exp(x[0])),
             inner_thickness_factor=float(x[1]),
             outer_thickness_factor=float(x[2]),
@@ -226,7 +225,7 @@ class _Fit:
         Raises:
             CalibrationError: No finger can look like that; the recordings are of another one.
         """
-        calibration = replace(self.calibration(x), young_modulus=self.jaw.material.young_modulus)
+        calibration = self.calibration(x).changed(young_modulus=self.jaw.material.young_modulus)
         try:
             return build_mechanics(calibration.apply(self.jaw), choose_full(self.settings))
         except (JawFileError, MeshError) as error:
@@ -543,7 +542,7 @@ def _track_force(
     jaw: Jaw, case: CalibrationCase, settings: EstimatorSettings, calibration: Calibration
 ) -> _ForceHistory:
     """Estimate the elastic force of every frame."""
-    estimator = JawEstimator(jaw, settings=settings, calibration=replace(calibration, relaxation=()))
+    estimator = JawEstimator(jaw, settings=settings, calibration=calibration.changed(relaxation=()))
     solutions = [estimator.update(observation, case.contact) for observation in case.observations]
     trusted = [solution for solution in solutions if solution.trusted]
     if sum(solution.status == "ok" for solution in trusted) < _CORRELATED_FRAMES:

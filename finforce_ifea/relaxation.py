@@ -5,19 +5,20 @@ h_i' = -h_i / tau_i + g_i F_e' (generalised Maxwell model, Simo and Hughes, Comp
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from pydantic import Field
+
+from finforce.typed_yaml import FileModel, Number
 
 
-@dataclass(frozen=True, kw_only=True)
-class RelaxationTerm:
-    """One branch: share g of the elastic stiffness [-] that relaxes with time constant tau [s]."""
+class RelaxationTerm(FileModel):
+    """One branch of the relaxation."""
 
-    share: float
-    time_constant: float
+    share: Number = Field(ge=0.0, le=10.0, description="Share g of the elastic stiffness that relaxes [-]")
+    time_constant: Number = Field(ge=1e-3, le=1e6, description="Time constant tau [s]")
 
 
 class Relaxation:

@@ -102,7 +102,7 @@ def _build_whole_image_detector(jaws: Mapping[str, Jaw], parameters: DetectorPar
             "folder of a DeepLabCut network as `model`, or detection_method network"
         )
     model = KeypointModel(parameters.model, threads=parameters.threads)
-    if "plane" in model.metadata.extra:
+    if model.metadata.finforce.plane is not None:
         raise ModelError(
             f"detection_method frame: {model.path.parent} holds a network of rectified side planes (finforce: plane in "
             "its metadata); expected one that sees the image, or detection_method network"

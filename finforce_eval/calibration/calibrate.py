@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -72,13 +72,13 @@ def calibrate(cases: Sequence[CalibrationCase], jaw: Jaw, settings: EstimatorSet
     rough = identify_friction(jaw, fit.calibration, cases, settings)
     if rough is None:
         return fit
-    known = replace(fit.calibration, friction=rough.mean, friction_stddev=rough.stddev)
+    known = fit.calibration.changed(friction=rough.mean, friction_stddev=rough.stddev)
     return replace(fit, calibration=known, uncertainty={**fit.uncertainty, "friction": rough.stddev})
 
 
 def fitted_values(fit: CalibrationFit) -> dict[str, float]:
     """Return what was identified under the names of its uncertainties, in SI units."""
-    values = asdict(fit.calibration)
+    values = dict(fit.calibration)
     for number, term in enumerate(fit.calibration.relaxation, 1):
         values[f"share_{number}"] = term.share
         values[f"time_constant_{number}"] = term.time_constant

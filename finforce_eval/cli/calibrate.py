@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 from finforce_eval.cli.parser import add_jaw_options, add_set, add_source_options
@@ -34,6 +33,6 @@ def run(options: argparse.Namespace) -> None:
     Path(options.output).parent.mkdir(parents=True, exist_ok=True)
     fit = calibrate(cases, jaw, setup.settings)
     print(format_fit(fit, cases))
-    named = replace(fit.calibration, solver=name_mechanics(jaw, setup.settings.solver))
-    save_calibration(named, options.output, uncertainty=fit.uncertainty)
+    solver = name_mechanics(jaw, setup.settings.solver)
+    save_calibration(fit.calibration.changed(solver=solver, uncertainty=fit.uncertainty), options.output)
     print(f"Calibration: {options.output}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,17 +50,13 @@ def run(options: argparse.Namespace) -> None:
     weighing = weigh(holds, options.grams, recording.name)
     print(format_weighing(weighing))
     base = setup.calibration or Calibration(young_modulus=setup.jaw.material.young_modulus, jaw=setup.jaw.name)
-    scaled = replace(
-        base,
+    scaled = base.changed(
         solver=name_mechanics(setup.jaw, setup.settings.solver),
         young_modulus=base.young_modulus * weighing.factor,
         force_error=float(np.clip(max(weighing.misfit, base.force_error), 0.005, 0.5)),
     )
     if options.output:
         Path(options.output).parent.mkdir(parents=True, exist_ok=True)
-        save_calibration(
-            scaled,
-            options.output,
-            uncertainty={"young_modulus": scaled.young_modulus * weighing.stddev / weighing.factor},
-        )
+        stddev = scaled.young_modulus * weighing.stddev / weighing.factor
+        save_calibration(scaled.changed(uncertainty={"young_modulus": stddev}), options.output)
         print(f"Calibration: {options.output}")

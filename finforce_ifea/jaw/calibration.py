@@ -1,102 +1,62 @@
 """What was identified on one finger, and its file."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
+from pydantic import BeforeValidator, Field
 
-from finforce.files import FileError, read_yaml
+from finforce.typed_yaml import FileModel, Number, parse_model, read_model
 from finforce_ifea.errors import CalibrationError
 from finforce_ifea.jaw.drawing import Band, Drawing
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_ifea.relaxation import RelaxationTerm
 
-_KEYS = {
-    "young_modulus",
-    "inner_thickness_factor",
-    "outer_thickness_factor",
-    "rib_thickness_factor",
-    "clamped_z",
-    "relaxation",
-    "force_error",
-    "friction",
-    "friction_stddev",
-    "jaw",
-    "finger",
-    "solver",
-    "comment",
-    "uncertainty",
-}
 _MECHANICS = ("solid", "frame", "plane", "paper")
 # Forces of the solid and the frame of one finger differ by 1 to 3 % up to 10 mm.
 _MODELS_DIFFER = 0.03
 
+Factor = Annotated[Number, Field(ge=0.3, le=3.0)]
 
-@dataclass(frozen=True, kw_only=True)
-class Calibration:
-    """A printed finger as it is, beside its drawing.
 
-    Attributes:
-        young_modulus: [Pa].
-        inner_thickness_factor: effective over drawn thickness of the inner band.
-        outer_thickness_factor: the same of the outer band.
-        rib_thickness_factor: the same of the ribs.
-        clamped_z: effective height of the clamp [m].
-        relaxation: branches of the material's relaxation.
-        force_error: relative standard deviation of forces that is left [-].
-        friction: coefficient of the objects that the finger was calibrated on, 0 where they showed none.
-        friction_stddev: standard deviation of that [-].
-        jaw: name of the jaw that it belongs to, empty for any.
-        finger: digest of that jaw's shape, empty where nobody knows; see `Jaw.digest`.
-        solver: mechanics that it was identified with, "solid", "frame", "plane" or "paper"; empty where nobody knows.
-    """
+def _none_is_empty(value: Any) -> Any:
+    return () if value is None else value
 
-    young_modulus: float
-    inner_thickness_factor: float = 1.0
-    outer_thickness_factor: float = 1.0
-    rib_thickness_factor: float = 1.0
-    clamped_z: float = 0.0
-    relaxation: tuple[RelaxationTerm, ...] = ()
-    force_error: float = 0.02
-    friction: float = 0.0
-    friction_stddev: float = 0.02
-    jaw: str = ""
-    finger: str = ""
-    solver: str = ""
 
-    def __post_init__(self) -> None:
-        """Refuses numbers that no finger has.
+Terms = Annotated[tuple[RelaxationTerm, ...], BeforeValidator(_none_is_empty)]
+
+
+class Calibration(FileModel):
+    """A printed finger as it is, beside its drawing."""
+
+    young_modulus: Number = Field(ge=1e3, le=1e12, description="Young's modulus [Pa]")
+    inner_thickness_factor: Factor = Field(1.0, description="Effective over drawn thickness of the inner band [-]")
+    outer_thickness_factor: Factor = Field(1.0, description="Effective over drawn thickness of the outer band [-]")
+    rib_thickness_factor: Factor = Field(1.0, description="Effective over drawn thickness of the ribs [-]")
+    clamped_z: Number = Field(0.0, ge=0.0, le=0.05, description="Effective height of the clamp [m]")
+    relaxation: Terms = Field((), description="Branches of the material's relaxation: share [-], time_constant [s]")
+    force_error: Number = Field(0.02, ge=0.0, le=1.0, description="Relative standard deviation of forces left [-]")
+    friction: Number = Field(0.0, ge=0.0, le=2.0, description="Coefficient of the objects pressed, 0 without any [-]")
+    friction_stddev: Number = Field(0.02, ge=1e-3, le=2.0, description="Standard deviation of the friction [-]")
+    jaw: str = Field("", description="Name of the jaw that it belongs to; empty: any")
+    finger: str = Field("", description="Digest of that jaw's shape; empty: not known")
+    solver: Literal["", "solid", "frame", "plane", "paper"] = Field("", description="Mechanics identified with")
+    comment: str = Field("", description="Remark for people")
+    uncertainty: dict[str, float] = Field({}, description="Standard deviations, for people")
+
+    def changed(self, **values: Any) -> "Calibration":
+        """Return a calibration with other values.
 
         Raises:
-            CalibrationError: A number is not finite or out of bounds; the message names it.
+            CalibrationError: One of them no finger has.
         """
-        bounds = {
-            "young_modulus": (1e3, 1e12),
-            "inner_thickness_factor": (0.3, 3.0),
-            "outer_thickness_factor": (0.3, 3.0),
-            "rib_thickness_factor": (0.3, 3.0),
-            "clamped_z": (0.0, 0.05),
-            "force_error": (0.0, 1.0),
-            "friction": (0.0, 2.0),
-            "friction_stddev": (1e-3, 2.0),
-        }
-        for name, (low, high) in bounds.items():
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and np.isfinite(value) and low <= value <= high):
-                raise CalibrationError(f"calibration: {name} = {value!r}, expected a number from {low:g} to {high:g}")
-        for name in ("jaw", "finger"):
-            if not isinstance(getattr(self, name), str):
-                raise CalibrationError(f"calibration: {name} = {getattr(self, name)!r}, expected a text")
-        if self.solver not in ("", *_MECHANICS):
-            raise CalibrationError(f"calibration: solver = {self.solver!r}, expected one of {', '.join(_MECHANICS)}")
-        for term in self.relaxation:
-            if not (0.0 <= term.share <= 10.0 and 1e-3 <= term.time_constant <= 1e6):
-                raise CalibrationError(f"calibration: {term}, expected a share from 0 to 10 and 1e-3 to 1e6 s")
+        return make_calibration(**{**dict(self), **values})
 
     def apply(self, jaw: Jaw) -> Jaw:
-        """Returns the jaw as it is.
+        """Return the jaw as it is.
 
         Raises:
             CalibrationError: The calibration belongs to another jaw.
@@ -121,7 +81,7 @@ class Calibration:
         return replace(jaw, drawing=drawing, material=material)
 
     def expect_error(self, jaw: Jaw, solver: str) -> float:
-        """Returns the relative standard deviation of forces that is left with a solver.
+        """Return the relative standard deviation of forces that is left with a solver.
 
         Another model than the one that was identified is off by what the two differ.
 
@@ -139,39 +99,33 @@ class Calibration:
         return float(np.hypot(self.force_error, _MODELS_DIFFER))
 
 
+def make_calibration(**values: Any) -> Calibration:
+    """Return a calibration; raises CalibrationError where no finger has one of its numbers."""
+    return parse_model(values, Calibration, CalibrationError)
+
+
 def name_mechanics(jaw: Jaw, solver: str) -> str:
-    """Returns the model behind the name of a solver: "solid", "frame", "plane" or "paper"."""
+    """Return the model behind the name of a solver: "solid", "frame", "plane" or "paper"."""
     return solver if solver in _MECHANICS else jaw.model
 
 
 def _thicken(band: Band, factor: float, drawing: Drawing) -> Band:
-    """Returns a thicker band with its outer face where it was; where a rigid tip joins centre lines, those stay."""
+    """Return a thicker band with its outer face where it was; where a rigid tip joins centre lines, those stay."""
     shift = 0.5 * band.inward * band.thickness * (1.0 - factor) if drawing.tip_z is None else 0.0
     base, tip = (band.base[0] + shift, band.base[1]), (band.tip[0] + shift, band.tip[1])
     return replace(band, base=base, tip=tip, thickness=band.thickness * factor)
 
 
 def load_calibration(name_or_path: str | Path) -> Calibration:
-    """Loads a calibration from its YAML file or a shipped one by its name.
+    """Load a calibration from its YAML file or a shipped one by its name.
 
     Raises:
         CalibrationError: The file is missing, is no calibration, or has unknown keys.
     """
     path = _find_file(name_or_path)
     try:
-        table = read_yaml(path)
-    except FileError as error:
-        raise CalibrationError(f"{path.name}: {error}") from error
-    if not isinstance(table, dict) or "young_modulus" not in table:
-        raise CalibrationError(f"{path.name}: expected a mapping with young_modulus, as `finforce calibrate` writes it")
-    unknown = set(table) - _KEYS
-    if unknown:
-        raise CalibrationError(f"{path.name}: unknown key {sorted(unknown)[0]!r}; expected {', '.join(sorted(_KEYS))}")
-    values = {key: value for key, value in table.items() if key not in ("comment", "uncertainty")}
-    try:
-        terms = tuple(RelaxationTerm(**term) for term in values.pop("relaxation", None) or ())
-        return Calibration(relaxation=terms, **values)
-    except (TypeError, CalibrationError) as error:
+        return read_model(path, Calibration, CalibrationError)
+    except CalibrationError as error:
         raise CalibrationError(f"{path.name}: {error}") from error
 
 
@@ -184,12 +138,8 @@ def _find_file(name_or_path: str | Path) -> Path:
     return path
 
 
-def save_calibration(
-    calibration: Calibration, path: str | Path, *, uncertainty: dict[str, float] | None = None
-) -> None:
-    """Writes a calibration as YAML, with the standard deviations of its numbers."""
-    table = asdict(calibration)
-    table["relaxation"] = [asdict(term) for term in calibration.relaxation]
-    if uncertainty:
-        table["uncertainty"] = {name: float(value) for name, value in uncertainty.items()}
+def save_calibration(calibration: Calibration, path: str | Path) -> None:
+    """Write a calibration as YAML."""
+    unsaid = {name for name in ("comment", "uncertainty") if not getattr(calibration, name)}
+    table = calibration.model_dump(mode="json", exclude=unsaid)
     Path(path).write_text(yaml.safe_dump(table, sort_keys=False), encoding="utf-8")

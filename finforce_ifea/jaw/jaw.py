@@ -10,22 +10,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from finforce.typed_yaml import read_model
 from finforce_ifea.errors import JawFileError, MeshError
 from finforce_ifea.jaw.attachment import attach_points, attach_surface_points
 from finforce_ifea.jaw.drawing import Drawing, MeshDensity, mesh_drawing
 from finforce_ifea.jaw.face import FaceLine, find_face
-from finforce_ifea.jaw.jaw_file import (
-    Material,
-    MeshFile,
-    Table,
-    parse_candidates,
-    parse_drawing,
-    parse_keypoints,
-    parse_material,
-    parse_mesh_file,
-    parse_section,
-    read_table,
-)
+from finforce_ifea.jaw.jaw_file import CandidateRule, JawEntry, JunctionRule, Material, MeshFile
 from finforce_ifea.jaw.mesh import VolumeMesh
 from finforce_ifea.jaw.mesh_file import read_volume_mesh
 from finforce_ifea.jaw.section import Section
@@ -36,18 +26,6 @@ __all__ = ["Jaw", "Material", "list_shipped_jaws", "load_jaw"]
 # How far a key point may lie outside the jaw, and a candidate off its surface [m].
 KEYPOINT_DISTANCE = 3e-3
 _CANDIDATE_DISTANCE = 1e-4
-_KEYS = (
-    "name",
-    "model",
-    "drawing",
-    "section",
-    "mesh",
-    "inner_face_x",
-    "material",
-    "keypoints",
-    "reference_point",
-    "candidates",
-)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -180,7 +158,7 @@ def load_jaw(name_or_path: str | Path, side: Literal["left", "right"] = "left") 
         raise JawFileError(f"side: got {side!r}, expected 'left' or 'right'")
     path = _find_file(name_or_path)
     try:
-        jaw = _parse_jaw(read_table(path), path)
+        jaw = _build_jaw(read_model(path, JawEntry, JawFileError), path)
     except (JawFileError, MeshError) as error:
         raise type(error)(f"{path.name}: {error}") from error
     return jaw if side == "left" else jaw.mirrored()
@@ -200,51 +178,51 @@ def _find_file(name_or_path: str | Path) -> Path:
     return path
 
 
-def _parse_jaw(table: Table, path: Path) -> Jaw:
+def _build_jaw(entry: JawEntry, path: Path) -> Jaw:
     """Build the jaw from the content of its file."""
-    table.expect_keys((), _KEYS)
-    source = table.expect_one_of("drawing", "section", "mesh")
-    face = ("inner_face_x",) if source == "mesh" else ()
-    own = ("inner_face_x",) if source == "section" else ()
-    required = (source, *face, "material", "keypoints", "candidates")
-    table.expect_keys(required, ("name", "model", "reference_point", *own))
-    drawing = parse_drawing(table.table("drawing")) if source == "drawing" else None
-    section = parse_section(table.table("section"), path.parent) if source == "section" else None
-    shape = drawing or section
-    given = table.length("inner_face_x") if "inner_face_x" in table else None
-    inner_face_x = shape.inner_face_x if given is None else given
-    keypoints = parse_keypoints(table.table("keypoints"), drawing)
+    drawing = entry.drawing and entry.drawing.build()
+    section = entry.section and entry.section.build(path.parent)
+    inner_face_x = entry.inner_face_x
+    if inner_face_x is None:
+        inner_face_x = (drawing or section).inner_face_x
+    points, candidates = entry.keypoints, entry.candidates
+    if isinstance(points, JunctionRule):
+        points = points.build(drawing)
+    if isinstance(candidates, CandidateRule):
+        candidates = candidates.build(
+            FaceLine.flat(inner_face_x) if section is None else find_face(section, inner_face_x)
+        )
+    material = entry.material
     jaw = Jaw(
-        name=table.text("name", path.stem),
+        name=entry.name or path.stem,
         path=path,
         drawing=drawing,
         section=section,
-        mesh_file=parse_mesh_file(table.table("mesh"), path.parent) if source == "mesh" else None,
-        material=parse_material(table),
-        keypoint_names=tuple(keypoints),
-        keypoints=np.array(list(keypoints.values())),
-        reference_point=table.point("reference_point", (0.0, 0.0, 0.0)),
-        candidates=parse_candidates(
-            table, FaceLine.flat(inner_face_x) if section is None else find_face(section, inner_face_x)
+        mesh_file=entry.mesh and entry.mesh.build(path.parent),
+        material=Material(
+            young_modulus=material.young_modulus, poisson_ratio=material.poisson_ratio, spread=material.spread
         ),
+        keypoint_names=tuple(points),
+        keypoints=np.array(list(points.values())),
+        reference_point=entry.reference_point,
+        candidates=np.array(candidates),
         inner_face_x=inner_face_x,
-        model=_parse_model(table, drawing, section),
+        model=_choose_model(entry, drawing),
     )
     _check_candidates(jaw)
     _check_points(jaw)
     return jaw
 
 
-def _parse_model(table: Table, drawing: Drawing | None, section: Section | None) -> Literal["solid", "frame", "plane"]:
+def _choose_model(entry: JawEntry, drawing: Drawing | None) -> Literal["solid", "frame", "plane"]:
     """Return the recommended model, and refuse one that cannot describe the jaw."""
-    if section is not None:
-        return table.choice("model", ("plane", "solid"), "plane")
-    is_solid = drawing is None or drawing.is_solid
-    model = table.choice("model", ("solid", "frame"), "solid" if is_solid else "frame")
-    if model == "frame" and drawing is None:
-        raise JawFileError("model: got frame, which needs a drawing; expected solid for a mesh file")
-    if model == "solid" and not is_solid:
-        raise JawFileError("model: got solid, expected frame: this drawing has hinges, rigid bars or a rigid tip")
+    valid = ("plane", "solid") if entry.section else ("frame",) if drawing and not drawing.is_solid else ("solid",)
+    if drawing and drawing.is_solid:
+        valid = ("solid", "frame")
+    model = entry.model or valid[0]
+    if model not in valid:
+        which = "a section" if entry.section else "a mesh file" if drawing is None else "this drawing"
+        raise JawFileError(f"model: got {model}, expected {' or '.join(valid)} for {which}")
     return model
 
 

@@ -1,231 +1,31 @@
-"""Typed reading of a jaw file's YAML into the parts of a jaw, with errors that say what would do."""
+"""The jaw file: what may stand in it, and the parts of a jaw that it stands for."""
 
-import contextlib
-import difflib
-import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, StrictBool, StrictInt, Tag, model_validator
 
-from finforce.files import FileError, read_yaml
+from finforce.typed_yaml import TAGS, Count, FileModel, Length, Number, Point, Thickness
 from finforce_ifea.errors import JawFileError
 from finforce_ifea.jaw.drawing import Band, Drawing, Rib
 from finforce_ifea.jaw.face import FaceLine
 from finforce_ifea.jaw.mesh_file import ClampRule
 from finforce_ifea.jaw.section import Section, join_loops, order_rings, read_loops
 
-_LARGEST_COUNT = 10_000
+LIST, MAPPING = TAGS
+Text = Annotated[str, Field(pattern=r"\S")]
 
 
-def read_table(path: Path) -> "Table":
-    """Read a YAML file whose content is a mapping.
-
-    Raises:
-        JawFileError: The file is missing, empty, no YAML, or no mapping.
-    """
-    try:
-        content = read_yaml(path, text_keys=False)
-    except FileError as error:
-        raise JawFileError(str(error)) from error
-    if content is None:
-        raise JawFileError("is empty, expected drawing or mesh, material, keypoints, candidates")
-    if not isinstance(content, dict):
-        raise JawFileError(f"got {_describe(content)} at the top, expected a mapping")
-    return Table(prefix="", values=content)
+def _list_one(value: Any) -> Any:
+    """Return a single number as a list of one."""
+    return value if isinstance(value, list | tuple) else [value]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """A mapping of the file.
-
-    Attributes:
-        prefix: the full name of its key, such as "drawing.ribs"; empty at the top.
-        values: its content.
-    """
-
-    prefix: str
-    values: dict[str, Any]
-
-    def __contains__(self, key: str) -> bool:
-        """Whether a key is given."""
-        return key in self.values
-
-    def name(self, key: str) -> str:
-        """Return the full name of a key."""
-        return f"{self.prefix}.{key}" if self.prefix else str(key)
-
-    def expect_keys(self, required: Iterable[str], optional: Iterable[str] = ()) -> None:
-        """Refuse missing and unknown keys, suggesting the nearest valid key.
-
-        Raises:
-            JawFileError: A key is missing or unknown.
-        """
-        required, valid = list(required), [*required, *optional]
-        for key in self.values:
-            if key not in valid:
-                near = difflib.get_close_matches(str(key), valid, n=1, cutoff=0.5)
-                hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(valid)}"
-                raise JawFileError(f"unknown key {self.name(key)!r}; {hint}")
-        for key in required:
-            if key not in self.values:
-                raise JawFileError(f"{self.name(key)} is missing; expected {', '.join(required)}")
-
-    def expect_one_of(self, *keys: str) -> str:
-        """Return which one of some keys is given.
-
-        Raises:
-            JawFileError: None or several are given.
-        """
-        given = [key for key in keys if key in self.values]
-        if len(given) != 1:
-            found = " and ".join(given) or "none"
-            table = self.prefix or "the file"
-            raise JawFileError(f"{table}: got {found}, expected exactly one of {', '.join(keys)}")
-        return given[0]
-
-    def table(self, key: str) -> "Table":
-        """Return the mapping under a key.
-
-        Raises:
-            JawFileError: Something else stands there.
-        """
-        value = self.values[key]
-        if not isinstance(value, dict):
-            raise JawFileError(f"{self.name(key)}: got {_describe(value)}, expected a mapping")
-        return Table(prefix=self.name(key), values=value)
-
-    def choice(self, key: str, options: tuple[str, ...], default: str) -> str:
-        """Return the word under a key, one of some options.
-
-        Raises:
-            JawFileError: Something else stands there.
-        """
-        value = self.values.get(key, default)
-        if value not in options:
-            raise JawFileError(f"{self.name(key)}: got {_describe(value)}, expected {' or '.join(options)}")
-        return value
-
-    def text(self, key: str, default: str) -> str:
-        """Return the text under a key.
-
-        Raises:
-            JawFileError: Something else stands there.
-        """
-        value = self.values.get(key, default)
-        if not isinstance(value, str) or not value.strip():
-            raise JawFileError(f"{self.name(key)}: got {_describe(value)}, expected a text")
-        return value
-
-    def switch(self, key: str, default: bool) -> bool:
-        """Return the true or false under a key.
-
-        Raises:
-            JawFileError: Something else stands there.
-        """
-        value = self.values.get(key, default)
-        if not isinstance(value, bool):
-            raise JawFileError(f"{self.name(key)}: got {_describe(value)}, expected true or false")
-        return value
-
-    def count(self, key: str) -> int:
-        """Return the whole number from 1 to 10000 under a key.
-
-        Raises:
-            JawFileError: Something else stands there.
-        """
-        value = self.values[key]
-        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _LARGEST_COUNT:
-            raise JawFileError(
-                f"{self.name(key)}: got {_describe(value)}, expected a whole number >= 1 and <= {_LARGEST_COUNT}"
-            )
-        return value
-
-    def number(self, key: str, default: float | None = None) -> float:
-        """Return the finite number under a key.
-
-        Raises:
-            JawFileError: Something else stands there.
-        """
-        return _parse_number(self.values.get(key, default), self.name(key))
-
-    def length(self, key: str, default: float | None = None, largest: float = 1.0) -> float:
-        """Return the length [m] under a key.
-
-        Raises:
-            JawFileError: Something else stands there, or more than the largest that makes sense.
-        """
-        return _parse_length(self.values.get(key, default), self.name(key), largest)
-
-    def lengths(self, key: str, largest: float = 1.0) -> list[float]:
-        """Return the list of lengths [m] under a key; a single one is a list of one.
-
-        Raises:
-            JawFileError: Something else stands there, or more than the largest that makes sense.
-        """
-        value = self.values[key]
-        if not isinstance(value, list):
-            return [_parse_length(value, self.name(key), largest)]
-        return [_parse_length(item, f"{self.name(key)}[{i}]", largest) for i, item in enumerate(value)]
-
-    def point(self, key: str, default: tuple[float, float, float] | None = None) -> NDArray:
-        """Return the point (3,) [m] under a key.
-
-        Raises:
-            JawFileError: Something else stands there.
-        """
-        return parse_point(self.values.get(key, default), self.name(key))
-
-
-def parse_point(value: Any, name: str) -> NDArray:
-    """Return a point (3,) [m] from a list of three lengths.
-
-    Raises:
-        JawFileError: It is something else.
-    """
-    if not isinstance(value, (list, tuple)) or len(value) != 3:
-        raise JawFileError(f"{name}: got {_describe(value)}, expected a point [x, y, z] in metres")
-    return np.array([_parse_length(item, f"{name}[{axis}]") for item, axis in zip(value, "xyz", strict=True)])
-
-
-def _parse_number(value: Any, name: str) -> float:
-    """Return a finite number; texts such as 26e6, which YAML does not take for numbers, are read too."""
-    number = value
-    if isinstance(value, str):
-        with contextlib.suppress(ValueError):
-            number = float(value)
-    if not isinstance(number, (int, float)) or isinstance(number, bool):
-        raise JawFileError(f"{name}: got {_describe(value)}, expected a number")
-    if not math.isfinite(number):
-        raise JawFileError(f"{name}: got {number}, expected a finite number")
-    return float(number)
-
-
-def _parse_length(value: Any, name: str, largest: float = 1.0) -> float:
-    """Return a length [m] that is not larger than makes sense."""
-    length = _parse_number(value, name)
-    if abs(length) > largest:
-        raise JawFileError(
-            f"{name}: got {length:g}, which looks like millimetres; expected metres, such as {length / 1000:g}"
-        )
-    return length
-
-
-def _describe(value: Any) -> str:
-    """Return a short description of a value that was not expected."""
-    if value is None:
-        return "nothing"
-    kinds = {dict: "a mapping", list: "a list", str: "the text", bool: "the switch"}
-    text = repr(value)
-    text = text if len(text) <= 60 else text[:57] + "..."
-    return f"{kinds.get(type(value), 'the ' + type(value).__name__)} {text}"
-
-
-# A thicker band or rib [m] was given in millimetres.
-_LARGEST_THICKNESS = 0.1
+Lengths = Annotated[tuple[Length, ...], BeforeValidator(_list_one)]
+Thicknesses = Annotated[tuple[Thickness, ...], BeforeValidator(_list_one)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,6 +58,178 @@ MATERIALS = {
 }
 
 
+def _look_up(value: Any) -> Any:
+    """Return the numbers of a material that is given by its name."""
+    if not isinstance(value, str):
+        return value
+    known = MATERIALS.get(value.lower())
+    if known is None:
+        raise ValueError(f"got {value!r}, expected one of {', '.join(MATERIALS)}, or young_modulus [Pa]")
+    return MaterialEntry(young_modulus=known.young_modulus, poisson_ratio=known.poisson_ratio, spread=known.spread)
+
+
+def _refuse_megapascals(modulus: float) -> float:
+    if 0.0 < modulus < 1e4:
+        raise ValueError(f"got {modulus:g}, which looks like MPa; expected Pa, such as {modulus * 1e6:.3e}")
+    return modulus
+
+
+class MaterialEntry(FileModel):
+    """A material: a name in `MATERIALS`, or these numbers."""
+
+    young_modulus: Annotated[Number, AfterValidator(_refuse_megapascals)] = Field(
+        gt=0.0, description="Young's modulus [Pa]"
+    )
+    poisson_ratio: Number = Field(gt=-1.0, lt=0.5, description="Poisson's ratio [-]")
+    spread: Number = Field(
+        0.0, ge=0.0, le=1.0, description="Relative standard deviation of the modulus among parts [-]"
+    )
+    name: Text = Field("", description="What it is called, for people")
+
+
+class BandEntry(FileModel):
+    """A band by its outer face or its centre line: one number, or one at the base and one at the tip."""
+
+    face_x: Lengths | None = Field(None, min_length=1, max_length=2, description="Outer face [m]")
+    centre_x: Lengths | None = Field(None, min_length=1, max_length=2, description="Centre line [m]")
+    thickness: Thickness = Field(description="Thickness along x [m]")
+
+    @model_validator(mode="after")
+    def _check(self) -> "BandEntry":
+        self.expect_one_of("face_x", "centre_x")
+        return self
+
+    def build(self, length: float, inward: int) -> Band:
+        """Return the band of a finger of some length [m] whose inner side is to +x (1) or -x (-1)."""
+        shift = 0.0 if self.centre_x is None else -0.5 * inward * self.thickness
+        ends = self.face_x or self.centre_x
+        base, tip = ends[0] + shift, ends[-1] + shift
+        return Band(base=(base, 0.0), tip=(tip, length), thickness=self.thickness, inward=inward)
+
+
+class RibsEntry(FileModel):
+    """Ribs by common heights, by heights on either band, or by arc lengths on either band."""
+
+    z: Lengths | None = Field(None, description="Heights of straight ribs [m]")
+    inner_z: Lengths | None = Field(None, description="Heights of their ends on the inner band [m]")
+    outer_z: Lengths | None = Field(None, description="Heights of their ends on the outer band [m]")
+    inner_arc: Lengths | None = Field(
+        None, description="Distances of their ends from the base along the inner band [m]"
+    )
+    outer_arc: Lengths | None = Field(
+        None, description="Distances of their ends from the base along the outer band [m]"
+    )
+    thickness: Thicknesses | None = Field(
+        None, description="Thickness, one for all or one each [m]; rigid ones need none"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> "RibsEntry":
+        self.expect_one_of("z", "inner_z", "inner_arc")
+        self.expect_one_of("z", "outer_z", "outer_arc")
+        if (self.inner_z is None) != (self.outer_z is None):
+            raise ValueError("expected inner_z with outer_z, or inner_arc with outer_arc")
+        return self
+
+    def build(self, inner: Band, outer: Band, bars: str) -> tuple[Rib, ...]:
+        """Return the ribs between two bands."""
+        inner_z, outer_z = (np.array(self.z or ends or ()) for ends in (self.inner_z, self.outer_z))
+        if self.inner_arc is not None:
+            inner_z, outer_z = inner.z_from_arc(np.array(self.inner_arc)), outer.z_from_arc(np.array(self.outer_arc))
+        if self.thickness is None and bars == "elastic":
+            raise JawFileError("drawing.ribs.thickness is missing; only rigid bars need none")
+        thickness = np.array(self.thickness or [0.0])
+        if len(thickness) == 1:
+            thickness = np.repeat(thickness, len(inner_z))
+        if not len(inner_z) == len(outer_z) == len(thickness):
+            raise JawFileError(
+                f"drawing.ribs: got {len(inner_z)} inner ends, {len(outer_z)} outer ends and {len(thickness)} "
+                "thicknesses, expected as many of each (or one thickness for all)"
+            )
+        rows = zip(inner_z.tolist(), outer_z.tolist(), thickness.tolist(), strict=True)
+        return tuple(Rib(inner_z=low, outer_z=high, thickness=t) for low, high, t in rows)
+
+
+class SolidTip(FileModel):
+    """A tip that is solid."""
+
+    solid_from_z: Length = Field(description="Height from which it is [m]")
+
+
+def _refuse_other_tips(value: Any) -> Any:
+    if value == "rigid":
+        return None
+    if not isinstance(value, dict):
+        raise ValueError(f"got {value!r}, expected rigid or {{solid_from_z: ...}}")
+    return value
+
+
+class DrawingEntry(FileModel):
+    """A finger of two bands, ribs and a tip."""
+
+    length: Length = Field(gt=0.0, description="From the base to the end of the tip [m]")
+    width: Length = Field(description="Along y [m]")
+    clamped_z: Length = Field(0.0, description="Height up to which the finger is clamped [m]")
+    inner_band: BandEntry = Field(description="Band whose outer face touches objects")
+    outer_band: BandEntry = Field(description="Slanted band")
+    ribs: RibsEntry | None = Field(None, description="Ribs between the bands")
+    tip: Annotated[SolidTip | None, BeforeValidator(_refuse_other_tips)] = Field(
+        description="rigid, or where it is solid"
+    )
+    joints: Literal["stiff", "hinged"] = Field("stiff", description="How ribs are joined to bands")
+    bars: Literal["elastic", "rigid"] = Field("elastic", description="Whether ribs bend")
+
+    def build(self) -> Drawing:
+        """Return the finger.
+
+        Raises:
+            JawFileError: It cannot be drawn.
+        """
+        inner, outer = self.inner_band.build(self.length, -1), self.outer_band.build(self.length, 1)
+        return Drawing(
+            length=self.length,
+            width=self.width,
+            inner=inner,
+            outer=outer,
+            ribs=() if self.ribs is None else self.ribs.build(inner, outer, self.bars),
+            tip_z=None if self.tip is None else self.tip.solid_from_z,
+            clamped_z=self.clamped_z,
+            joints=self.joints,
+            bars=self.bars,
+        )
+
+
+class ClampEntry(FileModel):
+    """Which nodes of a mesh are clamped, by one rule of three."""
+
+    z_below: Length | None = Field(None, description="All up to this height [m]")
+    box: Annotated[list[Point], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="All between two corners [[x, y, z], [x, y, z]], the lowest first [m]"
+    )
+    nodes: Annotated[tuple[StrictInt, ...], Field(min_length=1)] | None = Field(None, description="Indices from 0")
+
+    @model_validator(mode="after")
+    def _check(self) -> "ClampEntry":
+        self.expect_one_of("z_below", "box", "nodes")
+        if self.box is not None and (self.box[0] > self.box[1]).any():
+            raise ValueError("box: got the highest corner first, expected the lowest corner first")
+        return self
+
+
+class MeshEntry(FileModel):
+    """A volume mesh file."""
+
+    file: Text = Field(description="Its path, relative to the folder of the jaw file")
+    scale: Number = Field(1.0, gt=0.0, description="Factor on its coordinates [-]; 0.001 for millimetres")
+    clamped: ClampEntry = Field(description="Which of its nodes are clamped")
+
+    def build(self, folder: Path) -> "MeshFile":
+        """Return the file and how to read it."""
+        box = None if self.clamped.box is None else np.array(self.clamped.box)
+        clamp = ClampRule(z_below=self.clamped.z_below, box=box, nodes=self.clamped.nodes)
+        return MeshFile(path=folder / self.file, scale=self.scale, clamp=clamp)
+
+
 @dataclass(frozen=True, kw_only=True)
 class MeshFile:
     """A volume mesh file and how to read it.
@@ -273,223 +245,127 @@ class MeshFile:
     clamp: ClampRule
 
 
-def parse_material(top: Table) -> Material:
-    """Read `material`: a name, or its numbers.
+class SectionClamp(FileModel):
+    """What the holder keeps from moving: all below a height, circles about bolts, or both."""
 
-    Raises:
-        JawFileError: The name is unknown, or a number is missing or cannot belong to a material.
-    """
-    name = top.values["material"]
-    if isinstance(name, str):
-        if name.lower() not in MATERIALS:
-            raise JawFileError(f"material: got {name!r}, expected one of {', '.join(MATERIALS)}, or young_modulus [Pa]")
-        return MATERIALS[name.lower()]
-    table = top.table("material")
-    table.expect_keys(("young_modulus", "poisson_ratio"), ("name",))
-    modulus, ratio = table.number("young_modulus"), table.number("poisson_ratio")
-    name = table.name("young_modulus")
-    if modulus <= 0.0:
-        raise JawFileError(f"{name}: got {modulus:g}, expected a positive number of Pa")
-    if modulus < 1e4:
-        raise JawFileError(f"{name}: got {modulus:g}, which looks like MPa; expected Pa, such as {modulus * 1e6:.3e}")
-    if not -1.0 < ratio < 0.5:
-        raise JawFileError(f"{table.name('poisson_ratio')}: got {ratio:g}, expected more than -1 and less than 0.5")
-    return Material(young_modulus=modulus, poisson_ratio=ratio)
+    z_below: Length | None = Field(None, description="All up to this height [m]")
+    circles: tuple[Point, ...] = Field((), description="Circles [x, z, radius] [m]")
+
+    @model_validator(mode="after")
+    def _check(self) -> "SectionClamp":
+        if self.z_below is None and not self.circles:
+            raise ValueError("expected z_below, or circles, a list of [x, z, radius]")
+        return self
 
 
-def parse_drawing(table: Table) -> Drawing:
-    """Read the table `drawing`.
-
-    Raises:
-        JawFileError: It does not describe a finger.
-    """
-    table.expect_keys(("length", "width", "inner_band", "outer_band", "tip"), ("ribs", "clamped_z", "joints", "bars"))
-    length = table.length("length")
-    if length <= 0.0:
-        raise JawFileError(f"{table.name('length')}: got {length:g}, expected a positive length in metres")
-    inner = _parse_band(table.table("inner_band"), length, -1)
-    outer = _parse_band(table.table("outer_band"), length, 1)
-    bars = table.choice("bars", ("elastic", "rigid"), "elastic")
-    return Drawing(
-        length=length,
-        width=table.length("width"),
-        inner=inner,
-        outer=outer,
-        ribs=_parse_ribs(table.table("ribs"), inner, outer, bars) if "ribs" in table else (),
-        tip_z=_parse_tip(table),
-        clamped_z=table.length("clamped_z", 0.0),
-        joints=table.choice("joints", ("stiff", "hinged"), "stiff"),
-        bars=bars,
-    )
+Taper = Annotated[Number, Field(gt=-1.0, lt=1.0)]
 
 
-def _parse_band(table: Table, length: float, inward: int) -> Band:
-    """Read a band, given by `face_x` or `centre_x`: one number, or one at the base and one at the tip."""
-    table.expect_keys(("thickness",), ("face_x", "centre_x"))
-    key = table.expect_one_of("face_x", "centre_x")
-    ends = table.lengths(key)
-    if len(ends) not in (1, 2):
-        raise JawFileError(f"{table.name(key)}: got {len(ends)} numbers, expected one, or [at base, at tip]")
-    thickness = table.length("thickness", largest=_LARGEST_THICKNESS)
-    shift = -0.5 * inward * thickness if key == "centre_x" else 0.0
-    base, tip = ends[0] + shift, ends[-1] + shift
-    return Band(base=(base, 0.0), tip=(tip, length), thickness=thickness, inward=inward)
+class SectionEntry(FileModel):
+    """A finger of one section all along its width."""
 
+    file: Text = Field(description="Path of the section's loops, relative to the folder of the jaw file")
+    width: Length | None = Field(None, gt=0.0, description="Width at x = z = 0 [m]; that of the file without")
+    taper: tuple[Taper, Taper] = Field((0.0, 0.0), description="Change of the width by x and by z [-]")
+    size: Thickness | None = Field(None, gt=0.0, description="Size of elements [m]")
+    clamped: SectionClamp = Field(description="What the holder keeps from moving")
 
-def _parse_tip(table: Table) -> float | None:
-    """Read the tip: the word rigid, or the height from which it is solid."""
-    if table.values["tip"] == "rigid":
-        return None
-    if not isinstance(table.values["tip"], dict):
-        raise JawFileError(f"{table.name('tip')}: got {table.values['tip']!r}, expected rigid or {{solid_from_z: ...}}")
-    tip = table.table("tip")
-    tip.expect_keys(("solid_from_z",))
-    return tip.length("solid_from_z")
+    def build(self, folder: Path) -> Section:
+        """Return the section.
 
-
-def _parse_ribs(table: Table, inner: Band, outer: Band, bars: str) -> tuple[Rib, ...]:
-    """Read the ribs, given by common heights, by heights on either band, or by arc lengths on either band."""
-    table.expect_keys((), ("z", "inner_z", "outer_z", "inner_arc", "outer_arc", "thickness"))
-    key = table.expect_one_of("z", "inner_z", "inner_arc")
-    other = {"z": "z", "inner_z": "outer_z", "inner_arc": "outer_arc"}[key]
-    table.expect_keys((key, other), ("thickness",))
-    inner_z, outer_z = np.array(table.lengths(key)), np.array(table.lengths(other))
-    if key == "inner_arc":
-        inner_z, outer_z = inner.z_from_arc(inner_z), outer.z_from_arc(outer_z)
-    if "thickness" not in table and bars == "elastic":
-        raise JawFileError(f"{table.name('thickness')} is missing; only rigid bars need none")
-    thickness = np.array(table.lengths("thickness", _LARGEST_THICKNESS) if "thickness" in table else [0.0])
-    if len(thickness) == 1:
-        thickness = np.repeat(thickness, len(inner_z))
-    if not len(inner_z) == len(outer_z) == len(thickness):
-        raise JawFileError(
-            f"{table.prefix}: got {len(inner_z)} inner ends, {len(outer_z)} outer ends and {len(thickness)} "
-            "thicknesses, expected as many of each (or one thickness for all)"
+        Raises:
+            JawFileError: Its file is missing or describes none.
+        """
+        path = folder / self.file
+        loops, width = read_loops(path)
+        try:
+            rings = order_rings(join_loops(loops))
+        except JawFileError as error:
+            raise JawFileError(f"{path.name}: {error}") from error
+        width = self.width or width
+        if not (width and width > 0.0):
+            raise JawFileError(f"section.width: got {width}, expected a positive length in metres")
+        section = Section(
+            rings=rings,
+            width=width,
+            taper=np.array(self.taper),
+            clamped_z=self.clamped.z_below,
+            clamped_circles=np.array(self.clamped.circles).reshape(-1, 3),
+            size=self.size,
         )
-    rows = zip(inner_z.tolist(), outer_z.tolist(), thickness.tolist(), strict=True)
-    return tuple(Rib(inner_z=low, outer_z=high, thickness=t) for low, high, t in rows)
+        least = float(section.read_width(rings[0]).min())
+        if not least > 0.0:
+            raise JawFileError(f"section.taper: leaves a width of {1e3 * least:.3g} mm somewhere, expected any")
+        return section
 
 
-def parse_mesh_file(table: Table, folder: Path) -> MeshFile:
-    """Read the table `mesh`; its path is relative to the folder of the jaw file.
+class JunctionRule(FileModel):
+    """Key points at the rib ends on the inner band, then on the outer band, base to tip, then at the tip."""
 
-    Raises:
-        JawFileError: It does not describe a mesh file.
-    """
-    table.expect_keys(("file", "clamped"), ("scale",))
-    scale = table.number("scale", 1.0)
-    if scale <= 0.0:
-        raise JawFileError(f"{table.name('scale')}: got {scale:g}, expected a positive number")
-    clamp = _parse_clamp(table.table("clamped"))
-    return MeshFile(path=folder / table.text("file", ""), scale=scale, clamp=clamp)
+    rule: Literal["rib_junctions"] = Field(description="Where ribs of a drawing meet bands")
+    side_y: Length = Field(description="Their y [m], on the side that the camera sees")
+    tip: StrictBool | None = Field(None, description="Whether the tip is one; without, that of a solid tip")
 
-
-def parse_section(table: Table, folder: Path) -> Section:
-    """Read the table `section`; its path is relative to the folder of the jaw file.
-
-    Raises:
-        JawFileError: It does not describe a section.
-    """
-    table.expect_keys(("file", "clamped"), ("width", "taper", "size"))
-    path = folder / table.text("file", "")
-    loops, width = read_loops(path)
-    try:
-        rings = order_rings(join_loops(loops))
-    except JawFileError as error:
-        raise JawFileError(f"{path.name}: {error}") from error
-    width = table.length("width") if "width" in table else width
-    if not (width and width > 0.0):
-        raise JawFileError(f"{table.name('width')}: got {width}, expected a positive length in metres")
-    taper = np.array(table.values.get("taper", [0.0, 0.0]), dtype=object)
-    if taper.shape != (2,) or not all(isinstance(value, int | float) and abs(value) < 1.0 for value in taper):
-        raise JawFileError(f"{table.name('taper')}: got {taper.tolist()}, expected [by x, by z], each -1 to 1")
-    size = table.length("size", largest=_LARGEST_THICKNESS) if "size" in table else None
-    if size is not None and size <= 0.0:
-        raise JawFileError(f"{table.name('size')}: got {size:g}, expected a positive length in metres")
-    clamp = table.table("clamped")
-    clamp.expect_keys((), ("z_below", "circles"))
-    circles = clamp.values.get("circles", [])
-    if not isinstance(circles, list) or not ("z_below" in clamp or circles):
-        raise JawFileError(f"{clamp.prefix}: expected z_below, or circles, a list of [x, z, radius]")
-    circles = np.array([parse_point(circle, f"{clamp.name('circles')}[{i}]") for i, circle in enumerate(circles)])
-    section = Section(
-        rings=rings,
-        width=width,
-        taper=taper.astype(float),
-        clamped_z=clamp.length("z_below") if "z_below" in clamp else None,
-        clamped_circles=circles.reshape(-1, 3),
-        size=size,
-    )
-    least = float(section.read_width(rings[0]).min())
-    if not least > 0.0:
-        raise JawFileError(f"{table.name('taper')}: leaves a width of {1e3 * least:.3g} mm somewhere, expected any")
-    return section
+    def build(self, drawing: Drawing | None) -> dict[str, NDArray]:
+        """Return the points of a drawing: name -> (3,) [m]."""
+        if drawing is None:
+            raise JawFileError("keypoints.rule: rib_junctions needs a drawing; list the points as name: [x, y, z]")
+        points = {}
+        for name, ends in zip(("inner", "outer"), drawing.junctions, strict=True):
+            for number, (x, z) in enumerate(ends, start=1):
+                points[f"{name}_{number}"] = np.array([x, self.side_y, z])
+        if drawing.tip_z is not None if self.tip is None else self.tip:
+            x, z = drawing.tip_point
+            points["tip"] = np.array([x, self.side_y, z])
+        if not points:
+            raise JawFileError("keypoints: rib_junctions gives none, because the drawing has no ribs")
+        return points
 
 
-def _parse_clamp(table: Table) -> ClampRule:
-    """Read which nodes are clamped: `z_below`, `box` or `nodes`."""
-    table.expect_keys((), ("z_below", "box", "nodes"))
-    rule = table.expect_one_of("z_below", "box", "nodes")
-    if rule == "z_below":
-        return ClampRule(z_below=table.length(rule))
-    value = table.values[rule]
-    if rule == "box":
-        if not isinstance(value, list) or len(value) != 2:
-            raise JawFileError(f"{table.name(rule)}: expected two corners [[x, y, z], [x, y, z]], lowest first")
-        corners = np.array([parse_point(corner, f"{table.name(rule)}[{i}]") for i, corner in enumerate(value)])
-        if (corners[0] > corners[1]).any():
-            raise JawFileError(f"{table.name(rule)}: got {value}, expected the lowest corner first")
-        return ClampRule(box=corners)
-    whole = isinstance(value, list) and all(isinstance(n, int) and not isinstance(n, bool) for n in value)
-    if not whole or not value:
-        raise JawFileError(f"{table.name(rule)}: expected a list of node indices from 0")
-    return ClampRule(nodes=tuple(value))
+class CandidateRule(FileModel):
+    """Contact candidates on the inner face at even heights."""
+
+    first_z: Length = Field(description="Height of the lowest [m]")
+    step_z: Length = Field(description="Distance to the next [m]")
+    count: Count = Field(description="Their number")
+    y: Length = Field(0.0, description="Their y [m]")
+
+    def build(self, face: FaceLine) -> NDArray:
+        """Return the candidates (C, 3) [m]."""
+        z = self.first_z + self.step_z * np.arange(self.count)
+        return np.column_stack([face.read(z), np.full(self.count, self.y), z])
 
 
-def parse_keypoints(table: Table, drawing: Drawing | None) -> dict[str, NDArray]:
-    """Read the key points (name -> (3,) [m]): listed by name, or by `rule: rib_junctions`.
-
-    Raises:
-        JawFileError: A point is none, or the rule does not fit the jaw.
-    """
-    if "rule" not in table:
-        if not table.values:
-            raise JawFileError(f"{table.prefix}: got none, expected at least one name: [x, y, z]")
-        return {str(name): parse_point(value, table.name(name)) for name, value in table.values.items()}
-    table.expect_keys(("rule", "side_y"), ("tip",))
-    table.choice("rule", ("rib_junctions",), "rib_junctions")
-    if drawing is None:
-        raise JawFileError(f"{table.name('rule')}: rib_junctions needs a drawing; list the points as name: [x, y, z]")
-    return _junction_points(drawing, table.length("side_y"), table.switch("tip", drawing.tip_z is not None))
+KeypointsEntry = Annotated[
+    Annotated[dict[Annotated[str, BeforeValidator(str)], Point], Field(min_length=1), Tag(LIST)]
+    | Annotated[JunctionRule, Tag(MAPPING)],
+    Discriminator(lambda value: MAPPING if isinstance(value, dict) and "rule" in value else LIST),
+]
+CandidatesEntry = Annotated[
+    Annotated[tuple[Point, ...], Field(min_length=1), Tag(LIST)] | Annotated[CandidateRule, Tag(MAPPING)],
+    Discriminator(lambda value: LIST if isinstance(value, list) else MAPPING),
+]
 
 
-def _junction_points(drawing: Drawing, side_y: float, tip: bool) -> dict[str, NDArray]:
-    """Return the rib ends on the inner band, then on the outer band, base to tip, then the tip."""
-    points = {}
-    for name, ends in zip(("inner", "outer"), drawing.junctions, strict=True):
-        for number, (x, z) in enumerate(ends, start=1):
-            points[f"{name}_{number}"] = np.array([x, side_y, z])
-    if tip:
-        x, z = drawing.tip_point
-        points["tip"] = np.array([x, side_y, z])
-    if not points:
-        raise JawFileError("keypoints: rib_junctions gives none, because the drawing has no ribs")
-    return points
+class JawEntry(FileModel):
+    """A jaw file. Lengths in metres, in the jaw frame."""
 
+    name: Text | None = Field(None, description="What the finger is called; without, as its file")
+    model: Literal["solid", "frame", "plane"] | None = Field(None, description="Recommended mechanics")
+    drawing: DrawingEntry | None = Field(None, description="Finger of bands, ribs and a tip")
+    section: SectionEntry | None = Field(None, description="Finger of one section all along its width")
+    mesh: MeshEntry | None = Field(None, description="Finger as a volume mesh")
+    inner_face_x: Length | None = Field(None, description="Plane of the inner face [m]; of a section or a mesh")
+    material: Annotated[MaterialEntry, BeforeValidator(_look_up)] = Field(description="Name in MATERIALS, or numbers")
+    keypoints: KeypointsEntry = Field(description="Points by name: [x, y, z] [m], or rule: rib_junctions")
+    reference_point: Point = Field(np.zeros(3), description="Dot on the rigid holder [m]")
+    candidates: CandidatesEntry = Field(description="Contact candidates: points [m], or first_z, step_z, count")
 
-def parse_candidates(table: Table, face: FaceLine) -> NDArray:
-    """Read the contact candidates (C, 3) [m]: a list of points, or first_z, step_z, count on the inner face.
-
-    Raises:
-        JawFileError: They are neither.
-    """
-    value = table.values["candidates"]
-    if isinstance(value, list):
-        if not value:
-            raise JawFileError("candidates: got none, expected at least one point [x, y, z]")
-        return np.array([parse_point(point, f"candidates[{i}]") for i, point in enumerate(value)])
-    rule = table.table("candidates")
-    rule.expect_keys(("first_z", "step_z", "count"), ("y",))
-    count = rule.count("count")
-    z = rule.length("first_z") + rule.length("step_z") * np.arange(count)
-    return np.column_stack([face.read(z), np.full(count, rule.length("y", 0.0)), z])
+    @model_validator(mode="after")
+    def _check(self) -> "JawEntry":
+        source = self.expect_one_of("drawing", "section", "mesh")
+        if source == "drawing" and self.inner_face_x is not None:
+            raise ValueError("inner_face_x: a drawing has its own, expected none")
+        if source == "mesh" and self.inner_face_x is None:
+            raise ValueError("inner_face_x is missing; a mesh does not tell it")
+        return self

@@ -246,7 +246,7 @@ class OneFinger:
 
     def __init__(self, model: KeypointModel, jaws: Mapping[str, Jaw]) -> None:
         self._model, self.name, self.sha256 = model, model.path.parent.name, model.sha256
-        self.grids = dict.fromkeys(jaws, grid_from_metadata(model.metadata.extra))
+        self.grids = dict.fromkeys(jaws, grid_from_metadata(model.metadata.finforce.plane))
         self._rows = {side: _order_names(model, jaw) for side, jaw in jaws.items()}
 
     def locate(self, pictures: NDArray, sides: Sequence[str], starts: Sequence[NDArray | None] = ()) -> Places:
@@ -276,13 +276,12 @@ def _order_names(model: KeypointModel, jaw: Jaw) -> NDArray:
     return np.array([model.names.index(name) for name in wanted])
 
 
-def grid_from_metadata(extra: Mapping[str, Any]) -> PlaneGrid:
-    """Return the grid that stands as `plane` in a network's own section of its metadata.
+def grid_from_metadata(plane: Mapping[str, Any] | None) -> PlaneGrid:
+    """Return the grid that a network's metadata tell.
 
     Raises:
         ModelError: there is none, or it is incomplete.
     """
-    plane = extra.get("plane")
     names = [entry.name for entry in fields(PlaneGrid)]
     if not isinstance(plane, Mapping) or any(not isinstance(plane.get(name), (int, float)) for name in names):
         raise ModelError(

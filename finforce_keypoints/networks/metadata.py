@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import prod
-from numbers import Real
 from pathlib import Path
-from reprlib import Repr
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, ConfigDict, Field, StrictBool, field_validator, model_validator
 
 from finforce.files import FileError, read_yaml
+from finforce.typed_yaml import FileModel, Number, describe, parse_model
 from finforce_ifea.jaw.jaw import Jaw
 from finforce_keypoints.errors import ModelError, NamingError
 from finforce_keypoints.images import REFERENCE
@@ -22,102 +22,183 @@ from finforce_keypoints.images import REFERENCE
 METADATA_FILE = "pytorch_config.yaml"
 LOCREF_STD = 7.2801  # DeepLabCut's default scale of its offset channels [px]
 _PREDICTOR = "HeatmapPredictor"
-_BEYOND = 1e30  # no number of a configuration is so large; NaN is not below it
-_HEAD = "model.heads.bodypart"
 LARGEST_SIDE = 4096  # px of a picture: more is a mistake, and takes gigabytes
+Side = Annotated[int, Field(strict=True, ge=1, le=LARGEST_SIDE)]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ModelMetadata:
-    """What a DeepLabCut configuration says of its network.
+class _Table(FileModel):
+    """A table of DeepLabCut's configuration, of which a few keys are read; an empty value stands for its default."""
 
-    Attributes:
-        bodyparts: (K,) names, in the order of the heatmaps.
-        colormode: "RGB" or "BGR", the order that the network was trained on.
-        normalize: whether ImageNet's mean and standard deviation are taken off.
-        divisors: height and width are padded to multiples of these [px]; (1, 1) for none.
-        stride: input pixels per heatmap cell, None where the file does not tell.
-        locref_std: scale of the offset channels [px].
-        apply_sigmoid: whether scores are logits.
-        location_refinement: whether offsets are used.
-        has_locref: whether the head has offset channels.
-        extra: this package's own section, `finforce`.
-    """
+    model_config = ConfigDict(extra="ignore")
 
-    bodyparts: tuple[str, ...]
-    colormode: str = "RGB"
-    normalize: bool = True
-    divisors: tuple[int, int] = (1, 1)
-    stride: float | None = None
-    locref_std: float = LOCREF_STD
-    apply_sigmoid: bool = False
-    location_refinement: bool = True
-    has_locref: bool = False
-    extra: Mapping[str, Any] = field(default_factory=dict)
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_empty(cls, values: Any) -> Any:
+        return {k: v for k, v in values.items() if v is not None} if isinstance(values, Mapping) else values
+
+
+class Predictor(_Table):
+    """How heatmaps are decoded."""
+
+    type: str = Field(_PREDICTOR, description="Kind of decoding")
+    apply_sigmoid: StrictBool = Field(False, description="Whether scores are logits")
+    location_refinement: StrictBool = Field(True, description="Whether offsets are used")
+    locref_std: Number = Field(LOCREF_STD, gt=0.0, lt=1e30, description="Scale of the offset channels [px]")
+
+    @field_validator("type")
+    @classmethod
+    def _check_type(cls, kind: str) -> str:
+        if kind != _PREDICTOR:
+            raise ValueError(
+                f"got {kind}, expected {_PREDICTOR}; train a single-animal network with heatmaps (resnet_50, "
+                "hrnet_w18, hrnet_w32), RTMPose's SimCC and multi-animal heads are not decoded"
+            )
+        return kind
+
+
+class HeatmapConfig(_Table):
+    """The layers between the backbone and the heatmaps."""
+
+    strides: tuple[Annotated[Number, Field(gt=1e-3, lt=1e3)], ...] = Field((), description="Of each layer [-]")
+
+
+class Head(_Table):
+    """What makes the maps."""
+
+    predictor: Predictor = Field(Predictor(), description="How they are decoded")
+    heatmap_config: HeatmapConfig = Field(HeatmapConfig(), description="Layers of the heatmaps")
+    locref_config: dict | None = Field(None, description="Layers of the offsets, where there are any")
+
+
+class Heads(_Table):
+    """The heads of a network, of which one is read."""
+
+    bodypart: Head = Field(Head(), description="That of the body parts")
+
+
+class Backbone(_Table):
+    """What the heads stand on."""
+
+    output_stride: Number | None = Field(None, gt=0.0, lt=1e30, description="Input pixels per cell of its maps")
+
+
+class Architecture(_Table):
+    """The network."""
+
+    backbone: Backbone = Field(Backbone(), description="What the heads stand on")
+    heads: Heads = Field(Heads(), description="What makes the maps")
+
+
+class Padding(_Table):
+    """Multiples to which pictures are padded; DeepLabCut pads HRNet's images to those of 32."""
+
+    pad_height_divisor: Side = Field(1, description="Of the height [px]")
+    pad_width_divisor: Side = Field(1, description="Of the width [px]")
+
+
+class Inference(_Table):
+    """How pictures are prepared."""
+
+    normalize_images: StrictBool = Field(True, description="Whether ImageNet's mean and deviation are taken off")
+    auto_padding: Padding = Field(Padding(), description="Multiples to which pictures are padded")
+
+
+class Data(_Table):
+    """What the network is given."""
+
+    colormode: Annotated[Literal["RGB", "BGR"], BeforeValidator(lambda word: str(word).upper())] = Field(
+        "RGB", description="Order of the colours that the network was trained on"
+    )
+    inference: Inference = Field(Inference(), description="How pictures are prepared")
+
+
+class Names(_Table):
+    """Who is in the pictures."""
+
+    bodyparts: tuple[str, ...] = Field(min_length=1, description="Names in the order of the heatmaps")
+    individuals: tuple[str, ...] = Field((), description="Names of the animals")
+
+    @model_validator(mode="after")
+    def _check_names(self) -> Names:
+        if not all(name.strip() and name.isprintable() for name in self.bodyparts):
+            raise ValueError(f"bodyparts: got {describe(self.bodyparts)}, expected the list of the body parts' names")
+        doubled = sorted(name for name, count in Counter(self.bodyparts).items() if count > 1)
+        if doubled:
+            raise ValueError(f"bodyparts: {', '.join(doubled)} more than once, expected each name once")
+        if len(self.individuals) > 1:
+            raise ValueError(
+                f"individuals: got {len(self.individuals)}, expected one; name the points of the two jaws left_... and "
+                "right_..."
+            )
+        return self
+
+
+class TrainingSize(_Table):
+    """The size of the training images."""
+
+    height: Side = Field(description="[px]")
+    width: Side = Field(description="[px]")
+
+
+class OwnSection(_Table):
+    """What this package keeps in a configuration; no other keys."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    training_size: TrainingSize | None = Field(None, description="Size of the training images")
+    pooled: StrictBool = Field(False, description="Whether the offsets around a peak are averaged")
+    likelihood_stddev: tuple[tuple[Number, Number], ...] | None = Field(
+        None, min_length=1, description="Rows of likelihood [-] and its standard deviation [px]"
+    )
+    plane: dict[str, Any] | None = Field(None, description="Grid of a network of side planes, see PlaneGrid")
+    network: dict[str, Any] | None = Field(None, description="Shape of the network, for people")
+
+    @field_validator("likelihood_stddev")
+    @classmethod
+    def _check_rows(cls, rows: tuple | None) -> tuple | None:
+        likelihood, stddev = np.array(rows or [(0.0, 1.0)]).T
+        if (np.diff(likelihood) <= 0.0).any() or likelihood[0] < 0.0 or likelihood[-1] > 1.0 or (stddev <= 0.0).any():
+            raise ValueError(
+                f"got {describe(rows)}, expected likelihoods that rise from 0 to 1 and positive standard deviations "
+                "[px]"
+            )
+        return rows
+
+
+class ModelMetadata(_Table):
+    """What a DeepLabCut configuration says of its network."""
+
+    data: Data = Field(Data(), description="What the network is given")
+    metadata: Names = Field(description="Who is in the pictures")
+    model: Architecture = Field(Architecture(), description="The network")
+    finforce: OwnSection = Field(OwnSection(), description="What this package keeps")
+
+    @property
+    def predictor(self) -> Predictor:
+        """How heatmaps are decoded."""
+        return self.model.heads.bodypart.predictor
+
+    @property
+    def stride(self) -> float | None:
+        """Input pixels per heatmap cell, None where the file does not tell."""
+        stride = self.model.backbone.output_stride
+        return None if stride is None else stride / prod(self.model.heads.bodypart.heatmap_config.strides)
+
+    @property
+    def divisors(self) -> tuple[int, int]:
+        """Height and width are padded to multiples of these [px]; (1, 1) for none."""
+        padding = self.data.inference.auto_padding
+        return padding.pad_height_divisor, padding.pad_width_divisor
 
     @property
     def training_size(self) -> tuple[int, int] | None:
-        """Height and width of the training images [px] (`finforce: training_size: {height, width}`), None if not kept.
-
-        Raises:
-            ModelError: they are not two positive whole numbers.
-        """
-        size = self.extra.get("training_size")
-        if size is None:
-            return None
-        numbers = [size.get("height"), size.get("width")] if isinstance(size, Mapping) else []
-        if len(numbers) != 2 or not all(type(n) is int and 0 < n <= LARGEST_SIDE for n in numbers):
-            raise ModelError(
-                f"finforce.training_size: got {shorten(size)}, expected {{height: px, width: px}} up to {LARGEST_SIDE}"
-            )
-        return numbers[0], numbers[1]
-
-    @property
-    def pooled(self) -> bool:
-        """Whether the offsets around a peak are averaged (`finforce: pooled`).
-
-        Raises:
-            ModelError: it is neither true nor false.
-        """
-        return _look_up(self.extra, "pooled", bool, False)
-
-    @property
-    def likelihood_stddev(self) -> NDArray | None:
-        """The calibrated map (n, 2) of likelihood to standard deviation [px], None where it was not calibrated.
-
-        Raises:
-            ModelError: it is no table of rising likelihoods and positive standard deviations.
-        """
-        rows = self.extra.get("likelihood_stddev")
-        return None if rows is None else check_stddev_table(rows)
-
-
-def check_stddev_table(rows: Any) -> NDArray:
-    """Return a map of likelihood to standard deviation [px] as an array (n, 2).
-
-    Raises:
-        ModelError: it is no table of rising likelihoods from 0 to 1 and positive standard deviations.
-    """
-    try:
-        table = np.array(rows, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        table = np.empty(0)
-    if table.ndim != 2 or table.shape[1] != 2 or len(table) < 1 or not np.isfinite(table).all():
-        raise ModelError(f"finforce.likelihood_stddev: got {shorten(rows)}, expected rows of [likelihood, stddev px]")
-    likelihood, stddev = table.T
-    if (np.diff(likelihood) <= 0.0).any() or likelihood[0] < 0.0 or likelihood[-1] > 1.0 or (stddev <= 0.0).any():
-        raise ModelError(
-            f"finforce.likelihood_stddev: got {shorten(table.tolist())}, expected likelihoods that rise from 0 to "
-            "1 and positive standard deviations [px]"
-        )
-    return table
+        """Height and width of the training images [px], None if not kept."""
+        size = self.finforce.training_size
+        return None if size is None else (size.height, size.width)
 
 
 def read_metadata(path: str | Path) -> ModelMetadata:
     """Return what a `pytorch_config.yaml` says.
-
-    Args:
-        path: the file.
 
     Raises:
         ModelError: it is missing, is no YAML, lacks the body parts, or asks for a decoding that is not offered.
@@ -131,126 +212,9 @@ def read_metadata(path: str | Path) -> ModelMetadata:
             "knows the body parts"
         ) from error
     try:
-        return parse_metadata(content)
+        return parse_model(content, ModelMetadata, ModelError)
     except ModelError as error:
         raise ModelError(f"{path.name}: {error}") from error
-
-
-def parse_metadata(content: Any) -> ModelMetadata:
-    """Return what the content of a `pytorch_config.yaml` says; see `read_metadata`.
-
-    Raises:
-        ModelError: a value is missing, of another type, or asks for what is not offered.
-    """
-    if not isinstance(content, Mapping):
-        raise ModelError(f"got {type(content).__name__}, expected the tables of a DeepLabCut configuration")
-    _check_method(content)
-    predictor, inference = f"{_HEAD}.predictor", "data.inference"
-    extra = _look_up(content, "finforce", Mapping, {})
-    metadata = ModelMetadata(
-        bodyparts=_parse_bodyparts(content),
-        colormode=_parse_colormode(content),
-        normalize=_look_up(content, f"{inference}.normalize_images", bool, True),
-        divisors=_parse_divisors(content),
-        stride=_parse_stride(content),
-        locref_std=float(_look_up(content, f"{predictor}.locref_std", Real, LOCREF_STD)),
-        apply_sigmoid=_look_up(content, f"{predictor}.apply_sigmoid", bool, False),
-        location_refinement=_look_up(content, f"{predictor}.location_refinement", bool, True),
-        has_locref=_look_up(content, f"{_HEAD}.locref_config", Mapping, None) is not None,
-        extra=extra,
-    )
-    if metadata.locref_std <= 0.0:
-        raise ModelError(f"{predictor}.locref_std: got {metadata.locref_std:g}, expected a positive number of pixels")
-    return metadata
-
-
-def _check_method(content: Mapping) -> None:
-    """Refuse networks whose outputs are no heatmaps of one animal."""
-    kind = _look_up(content, f"{_HEAD}.predictor.type", str, _PREDICTOR)
-    if kind != _PREDICTOR:
-        raise ModelError(
-            f"{_HEAD}.predictor.type: got {kind}, expected {_PREDICTOR}; train a single-animal network with heatmaps "
-            "(resnet_50, hrnet_w18, hrnet_w32), RTMPose's SimCC and multi-animal heads are not decoded"
-        )
-    individuals = _look_up(content, "metadata.individuals", list, [])
-    if len(individuals) > 1:
-        raise ModelError(
-            f"metadata.individuals: got {len(individuals)}, expected one; name the points of the two jaws "
-            "left_... and right_..."
-        )
-
-
-def _parse_bodyparts(content: Mapping) -> tuple[str, ...]:
-    """Return the names of the body parts, all different."""
-    names = _look_up(content, "metadata.bodyparts", list, [])
-    if not names or not all(isinstance(name, str) and name.strip() and name.isprintable() for name in names):
-        raise ModelError(f"metadata.bodyparts: got {shorten(names)}, expected the list of the body parts' names")
-    doubled = sorted(name for name, count in Counter(names).items() if count > 1)
-    if doubled:
-        raise ModelError(f"metadata.bodyparts: {', '.join(doubled)} more than once, expected each name once")
-    return tuple(names)
-
-
-def _parse_colormode(content: Mapping) -> str:
-    mode = _look_up(content, "data.colormode", str, "RGB").upper()
-    if mode not in ("RGB", "BGR"):
-        raise ModelError(f"data.colormode: got {mode}, expected RGB or BGR")
-    return mode
-
-
-def _parse_divisors(content: Mapping) -> tuple[int, int]:
-    """Return the divisors of height and width; DeepLabCut pads HRNet's images to multiples of 32."""
-    padding = "data.inference.auto_padding"
-    if _look_up(content, padding, Mapping, None) is None:
-        return 1, 1
-    height = _look_up(content, f"{padding}.pad_height_divisor", int, 1)
-    width = _look_up(content, f"{padding}.pad_width_divisor", int, 1)
-    if not 1 <= min(height, width) <= max(height, width) <= LARGEST_SIDE:
-        raise ModelError(
-            f"{padding}: got divisors {shorten(height)} and {shorten(width)}, expected whole numbers from 1 to "
-            f"{LARGEST_SIDE}"
-        )
-    return height, width
-
-
-def _parse_stride(content: Mapping) -> float | None:
-    """Return backbone stride / upsampling of the head, None where the backbone's is not written."""
-    stride = _look_up(content, "model.backbone.output_stride", Real, None)
-    if stride is None:
-        return None
-    steps = _look_up(content, f"{_HEAD}.heatmap_config.strides", list, [])
-    if stride <= 0 or not all(is_number(step) and 1e-3 < step < 1e3 for step in steps):
-        raise ModelError(
-            f"model.backbone.output_stride {shorten(stride)}, heatmap_config.strides {shorten(steps)}: expected "
-            "positive numbers"
-        )
-    return float(stride) / prod(steps)
-
-
-def _look_up(content: Mapping, place: str, kind: type, default: Any) -> Any:
-    """Return the value at a dotted place, the default where it or one of its tables is absent or empty."""
-    value: Any = content
-    for key in place.split("."):
-        if not isinstance(value, Mapping):
-            raise ModelError(f"{place}: got {shorten(value)} on the way there, expected a table")
-        value = value.get(key)
-        if value is None:
-            return default
-    if not isinstance(value, kind) or (kind in (int, Real) and not is_number(value)):
-        raise ModelError(f"{place}: got {shorten(value)}, expected {'a number' if kind is Real else kind.__name__}")
-    return value
-
-
-def is_number(value: Any) -> bool:
-    """Say whether a value is a finite number, neither a flag nor a whole number beyond all floats."""
-    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) < _BEYOND
-
-
-def shorten(value: Any) -> str:
-    """Return a value as Python writes it, long and deep ones in part: aliases let a small file stand for gigabytes."""
-    short = Repr()
-    short.maxlevel, short.maxstring = 2, 60
-    return " ".join(short.repr(value).split())
 
 
 IGNORED = "-"  # what a body part is mapped to that belongs to no jaw

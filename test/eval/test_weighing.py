@@ -1,6 +1,5 @@
 """Claims about the stiffness that a kitchen scale tells."""
 
-from dataclasses import replace
 from importlib import resources
 
 import numpy as np
@@ -78,7 +77,7 @@ def test_readings_that_no_scale_shows_are_refused(grams):
 def test_a_wrong_modulus_is_mended_by_weights(tmp_path, capsys):
     base = load_calibration("bench")
     wrong, mended = tmp_path / "wrong.yaml", tmp_path / "mended.yaml"
-    save_calibration(replace(base, young_modulus=1.5 * base.young_modulus), wrong)
+    save_calibration(base.changed(young_modulus=1.5 * base.young_modulus), wrong)
     options = ["weigh", str(RECORDING), "--contact", "fixed:case", "--calibration", str(wrong)]
     assert main(options) == 0
     spans = [line.split()[2:5:2] for line in capsys.readouterr().out.splitlines() if line.startswith("hold ")]

@@ -1,7 +1,5 @@
 """Claims about calibrations: what they change on a jaw, and their files."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import yaml
@@ -42,11 +40,11 @@ def test_load_inverts_save(calibration, tmp_path):
     assert load_calibration(str(path)) == calibration
 
 
-def test_uncertainty_is_written_for_people_and_ignored_when_read(tmp_path):
+def test_uncertainty_is_written_for_people_and_changes_no_force(tmp_path):
     path = tmp_path / "finger.yaml"
-    save_calibration(FULL, path, uncertainty={"young_modulus": np.float64(1e6)})
+    save_calibration(FULL.changed(uncertainty={"young_modulus": np.float64(1e6)}), path)
     assert yaml.safe_load(path.read_text())["uncertainty"] == {"young_modulus": 1e6}
-    assert load_calibration(path) == FULL
+    assert load_calibration(path).changed(uncertainty={}) == FULL
 
 
 def test_modulus_alone_is_a_calibration(tmp_path):
@@ -67,19 +65,19 @@ def test_shipped_calibration_fits_the_shipped_jaw():
     [
         ({**PLAIN, "young_modulos": 1.0}, "unknown key 'young_modulos'"),
         ({"clamped_z": 0.001}, "young_modulus"),
-        ([1, 2], "expected a mapping"),
-        ("", "expected a mapping"),
+        ([1, 2], "got a list .*, expected a mapping"),
+        ("", "is empty, expected a mapping of young_modulus"),
         ("a: [", "finger.yaml"),
-        ({"young_modulus": "soft"}, "young_modulus = 'soft'"),
+        ({"young_modulus": "soft"}, "young_modulus: got the text 'soft', expected a valid number"),
         ({"young_modulus": None}, "young_modulus"),
         ({"young_modulus": -3.0}, "young_modulus"),
-        ({"young_modulus": 30.0}, "young_modulus = 30.0"),
+        ({"young_modulus": 30.0}, "young_modulus: got 30, expected greater than or equal to 1000"),
         ({"young_modulus": float("nan")}, "young_modulus"),
         ({**PLAIN, "inner_thickness_factor": 10.0}, "inner_thickness_factor"),
         ({**PLAIN, "outer_thickness_factor": 0.0}, "outer_thickness_factor"),
         ({**PLAIN, "rib_thickness_factor": float("inf")}, "rib_thickness_factor"),
         ({**PLAIN, "clamped_z": -0.001}, "clamped_z"),
-        ({**PLAIN, "clamped_z": 3.0}, "clamped_z = 3.0"),
+        ({**PLAIN, "clamped_z": 3.0}, "clamped_z: got 3, expected less than or equal to 0.05"),
         ({**PLAIN, "force_error": 2.0}, "force_error"),
         ({**PLAIN, "relaxation": [{"share": -0.1, "time_constant": 1.0}]}, "share"),
         ({**PLAIN, "relaxation": [{"share": 0.1, "time_constant": 0.0}]}, "time_constant"),
@@ -148,7 +146,7 @@ def test_calibration_of_another_jaw_is_refused_with_both_names():
 
 
 def test_calibration_without_a_name_fits_any_jaw():
-    assert replace(FULL, jaw="").apply(load_jaw("steel")).material.young_modulus == 31.5e6
+    assert FULL.changed(jaw="").apply(load_jaw("steel")).material.young_modulus == 31.5e6
 
 
 def test_calibration_fits_both_sides():

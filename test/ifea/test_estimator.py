@@ -122,7 +122,7 @@ def test_two_runs_are_identical_to_the_bit(solver):
 
 def test_reset_forgets_everything():
     """Offsets, place, hidden points, overstress, stamps: a second recording is as good as a first one."""
-    relaxing = replace(CALIBRATION, relaxation=(RelaxationTerm(share=0.3, time_constant=10.0),))
+    relaxing = CALIBRATION.changed(relaxation=(RelaxationTerm(share=0.3, time_constant=10.0),))
     expected = run(pressed(), make_estimator(solver="frame", calibration=relaxing))
     estimator = make_estimator(solver="frame", calibration=relaxing)
     before = pressed(20, seed=2).changed(range(170, 200), lambda _, likelihood: likelihood.put([3, 4], 0.1))
@@ -234,7 +234,7 @@ def test_relaxation_of_the_material_is_added():
     terms = (RelaxationTerm(share=0.3, time_constant=1.0), RelaxationTerm(share=0.1, time_constant=10.0))
     elastic = magnitudes(solved())
     found = magnitudes(
-        run(pressed(), make_estimator(solver="frame", calibration=replace(CALIBRATION, relaxation=terms)))
+        run(pressed(), make_estimator(solver="frame", calibration=CALIBRATION.changed(relaxation=terms)))
     )
     stamps = np.array([observation.stamp for observation in pressed().observations])
     expected = apply_relaxation(np.nan_to_num(elastic), stamps, terms)

@@ -230,7 +230,7 @@ def test_every_setting_says_its_unit_and_meaning():
 
 def test_calibration_of_another_jaw_is_refused():
     with pytest.raises(CalibrationError, match="bench"):
-        JawEstimator(load_jaw("steel"), calibration=replace(CALIBRATION, jaw="bench"))
+        JawEstimator(load_jaw("steel"), calibration=CALIBRATION.changed(jaw="bench"))
 
 
 def test_steel_finger_is_no_solid():

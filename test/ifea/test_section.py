@@ -326,7 +326,7 @@ BAD_SECTIONS = [
         "section.taper: leaves a width of -4",
     ),
     ({"material": "cheese"}, "material: got 'cheese', expected one of tpu85a"),
-    ({"model": "frame"}, "model: got the text 'frame', expected plane or solid"),
+    ({"model": "frame"}, "model: got frame, expected plane or solid for a section"),
     ({"candidates": [[0.0, 0.0, 0.03]]}, "lies off the inner surface"),
     ({"keypoints": {"far": [0.030, 0.0, 0.03]}}, "keypoints.far .* off the jaw"),
 ]

@@ -9,10 +9,11 @@ import yaml
 from keypoint_scene_fakes import CAMERA, Fake, FakePixelDetector, FakeScene, bare_image, sidecar, write_model
 from onnx import TensorProto, helper, numpy_helper
 
+from finforce.typed_yaml import parse_model
 from finforce_keypoints.detector import KeypointDetector
 from finforce_keypoints.errors import FrozenImageError, ModelError
 from finforce_keypoints.images import ImageWatch
-from finforce_keypoints.networks.metadata import parse_metadata, read_metadata
+from finforce_keypoints.networks.metadata import ModelMetadata, read_metadata
 from finforce_keypoints.networks.model import DecodingRule, KeypointModel, decode
 
 SIZE = (256, 256)
@@ -133,7 +134,7 @@ def test_a_configuration_that_repeats_itself_is_refused_briefly():
     for _ in range(12):
         names = [names] * 9
     with pytest.raises(ModelError, match="bodyparts") as caught:
-        parse_metadata({"metadata": {"bodyparts": names}})
+        parse_model({"metadata": {"bodyparts": names}}, ModelMetadata, ModelError)
     assert len(str(caught.value)) < 600
 
 

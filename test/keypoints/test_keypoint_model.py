@@ -7,10 +7,11 @@ import yaml
 from keypoint_scene_fakes import Fake, paint, sidecar, write_model
 
 from finforce.errors import MissingDependencyError
+from finforce.typed_yaml import parse_model
 from finforce_keypoints.build import BENCH
 from finforce_keypoints.errors import DetectionError, ModelError
 from finforce_keypoints.networks import network as network_module
-from finforce_keypoints.networks.metadata import parse_metadata
+from finforce_keypoints.networks.metadata import ModelMetadata
 from finforce_keypoints.networks.model import KeypointModel, decode
 
 # The squares of 12 px lie on the middles of cells: one cell is pure, its neighbours hold a quarter.
@@ -240,18 +241,20 @@ def test_without_onnxruntime_the_message_says_what_to_install(tmp_path, monkeypa
 
 
 def test_defaults_of_absent_keys_are_those_of_deeplabcut():
-    metadata = parse_metadata({"metadata": {"bodyparts": ["a"]}})
-    assert metadata.normalize and metadata.location_refinement and not metadata.apply_sigmoid
-    assert metadata.locref_std == 7.2801 and metadata.stride is None and metadata.divisors == (1, 1)
-    with pytest.raises(ModelError, match="expected a table"):
-        parse_metadata({"metadata": {"bodyparts": ["a"]}, "data": [1]})
-    with pytest.raises(ModelError, match="expected the tables"):
-        parse_metadata([])
+    metadata = parse_model({"metadata": {"bodyparts": ["a"]}}, ModelMetadata, ModelError)
+    assert metadata.data.inference.normalize_images and metadata.predictor.location_refinement
+    assert not metadata.predictor.apply_sigmoid
+    assert metadata.predictor.locref_std == 7.2801 and metadata.stride is None and metadata.divisors == (1, 1)
+    with pytest.raises(ModelError, match="data: got a list .*, expected a mapping"):
+        parse_model({"metadata": {"bodyparts": ["a"]}, "data": [1]}, ModelMetadata, ModelError)
+    with pytest.raises(ModelError, match="got none, expected a mapping of data, metadata"):
+        parse_model([], ModelMetadata, ModelError)
 
 
 def test_metadata_are_those_that_deeplabcut_writes():
-    metadata = parse_metadata(yaml.safe_load(yaml.safe_dump(sidecar(Fake()))))
-    assert metadata.stride == 8.0 and metadata.has_locref and metadata.bodyparts == Fake().names
+    metadata = parse_model(yaml.safe_load(yaml.safe_dump(sidecar(Fake()))), ModelMetadata, ModelError)
+    assert metadata.stride == 8.0 and metadata.model.heads.bodypart.locref_config is not None
+    assert metadata.metadata.bodyparts == Fake().names
 
 
 def test_threads_that_share_pictures_find_what_one_finds():

@@ -156,7 +156,7 @@ class ShadeModel:
 
     def __init__(self, names=NAMES, plane=PLANE):
         self.names, self.path, self.sha256 = tuple(names), Path("shades/shades.onnx"), ""
-        self.metadata = SimpleNamespace(extra={"plane": plane})
+        self.metadata = SimpleNamespace(finforce=SimpleNamespace(plane=plane))
 
     def locate(self, pictures):
         template = Template(half=None, points=np.zeros((len(NAMES), 2)), pieces=None)
@@ -185,7 +185,7 @@ def test_a_network_without_its_plane_is_refused(plane):
 
 
 def test_the_plane_of_the_metadata_is_the_grid():
-    assert grid_from_metadata({"plane": PLANE}) == PlaneGrid()
+    assert grid_from_metadata(PLANE) == PlaneGrid()
 
 
 def test_a_camera_that_does_not_see_the_sides_is_refused_with_what_to_give():
