@@ -1,4 +1,4 @@
-"""Hooks of mkdocs: links to files outside docs/, which the site does not hold, become text; equations become MathML."""
+"""Hooks of mkdocs: links to files outside docs/, which the site does not contain, become text that names the file; equations become MathML."""
 
 import re
 from html import unescape
@@ -13,8 +13,16 @@ _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Return a page without its links out of docs/; one to a file that does not exist stays, and mkdocs refuses it."""
-    return _LINK.sub(lambda match: match[1] if (ROOT / match[2]).exists() else match[0], markdown)
+    """Return a page without its links out of docs/; a link to a missing file stays, and mkdocs rejects it."""
+    return _LINK.sub(_name_file, markdown)
+
+
+def _name_file(link: re.Match[str]) -> str:
+    """Return the text of a link, with the path of its file where the text does not name it."""
+    text, path = link.groups()
+    if not (ROOT / path).exists():
+        return link[0]
+    return text if path in text else f"{text} (`{path}`)"
 
 
 def on_page_content(html: str, **_: Any) -> str:
