@@ -28,7 +28,7 @@ bench: .venv/.$(ROS)-run
 	$(PYTHON) -m finforce_eval.cli.main bench --json report/bench.json
 
 docs: .venv/.$(ROS)-docs
-	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict
 
 build: .venv/.$(ROS)-build
 	$(PYTHON) -m colcon build --event-handlers console_cohesion+

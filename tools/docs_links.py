@@ -1,4 +1,4 @@
-"""Hooks of mkdocs: links to files outside docs/, which the site does not contain, become text that names the file; equations become MathML."""
+"""Hooks of mkdocs: a link out of docs/ becomes text that names the file; equations become MathML."""
 
 import re
 from html import unescape
