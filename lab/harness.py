@@ -54,11 +54,20 @@ class Tradeoff:
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """What a part has measured: tables by name, sentences below them, a picture, and further plain values."""
+    """What was measured.
+
+    Attributes:
+        tables: by name.
+        notes: sentences below them.
+        picture: to be drawn of a table.
+        drawn: pictures that are drawn already, file names by what they show.
+        more: further plain values.
+    """
 
     tables: Mapping[str, pd.DataFrame]
     notes: Sequence[str] = ()
     picture: Tradeoff | None = None
+    drawn: Mapping[str, str] = field(default_factory=dict)
     more: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -148,8 +157,9 @@ def time_calls(call: Callable[[], Any], count: int, clock: Callable[[], float] =
 
 
 def format_figures(figures: Figures) -> str:
-    """Return the tables and notes in Markdown."""
-    return "\n\n".join([*map(format_table, figures.tables.values()), *figures.notes])
+    """Return the tables, each below its name, and the notes in Markdown."""
+    tables = [f"**{name}**\n\n{format_table(table)}" for name, table in figures.tables.items()]
+    return "\n\n".join([*tables, *figures.notes])
 
 
 def format_table(table: pd.DataFrame) -> str:

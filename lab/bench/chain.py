@@ -31,8 +31,8 @@ from finforce_eval.recordings.tracks import Recording
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import NodeRun, describe_load, run_nodes
 from finforce_eval.replay.synthetic_stream import SyntheticStream, stream_images, stream_keypoints
-from lab.bench.scenes import GRASP, GRASP_FAST, find_scene
 from lab.harness import Figures, Tradeoff, percentiles
+from lab.scenes import GRASP, GRASP_FAST, find_scene
 
 RATES = (30, 60, 90)  # [Hz]
 IMAGES, KEYPOINTS = "images", "key points"

@@ -27,8 +27,8 @@ from finforce_keypoints.build import build_detector
 from finforce_keypoints.errors import KeypointError
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import load_jaws
-from lab.bench.scenes import DIM, GRASP, BenchScene, find_scene
 from lab.harness import Figures, Tradeoff, percentiles
+from lab.scenes import DIM, GRASP, TwinScene, find_scene
 
 QUICK_IMAGES = 45
 BLOCK = 30  # images that one way sees in a row
@@ -100,7 +100,7 @@ def measure(quick: bool) -> Figures:
     return measure_ways(WAYS, [GRASP] if quick else [GRASP, DIM], QUICK_IMAGES if quick else None)
 
 
-def measure_ways(ways: Sequence[Way], scenes: Sequence[BenchScene], count: int | None = None) -> Figures:
+def measure_ways(ways: Sequence[Way], scenes: Sequence[TwinScene], count: int | None = None) -> Figures:
     """Return times and pixel errors of some ways on scenes.
 
     Args:

@@ -27,8 +27,8 @@ from finforce_eval.replay.synthetic_stream import SyntheticStream, stream_images
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.relaxation import RelaxationTerm, apply_relaxation, invert_relaxation
 from lab.bench.chain import SIDES, TARE, TrueGrasp, chain_processes
-from lab.bench.scenes import GRASP, find_scene
 from lab.harness import Figures, percentiles
+from lab.scenes import GRASP, find_scene
 
 RATE = 30  # [Hz]
 HOUR, QUICK_MINUTES = 60.0, 0.5

@@ -8,6 +8,7 @@ and calibrated with true key points on the same recording: what images add is th
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -18,12 +19,9 @@ import pandas as pd
 
 from finforce.errors import FinforceError
 from finforce_eval.cli.main import main as finforce
-from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
-from finforce_sim.footage import parse_size
-from finforce_sim.scenarios import build_scenario
 from lab.bench.detection import sight_columns, time_product
-from lab.bench.scenes import SIZE, scene_folder
 from lab.harness import Figures
+from lab.scenes import TwinScene, find_scene
 
 # Name of a case: scene, and what is changed in it; no object is one of the shapes trained on.
 UNSEEN: dict[str, tuple[str, dict[str, Any]]] = {
@@ -55,14 +53,14 @@ def measure(
         count: seeds of each scene.
         model: folder of another network than the shipped one.
     """
-    folder = Path(folder) if folder else scene_folder() / "unseen"
-    folder.mkdir(parents=True, exist_ok=True)
     scenes = [QUICK_SCENE] if quick else list(UNSEEN)
     rows, notes = [], []
     for scene, name, seed in product(scenes, jaw.split(","), range(FIRST_SEED, FIRST_SEED + count)):
         about = {"scene": scene, "jaw": Path(name).stem, "seed": seed}
+        scenario, changes = UNSEEN[scene]
+        unseen = TwinScene(scenario=scenario, seed=seed, changes={**changes, "jaw": name}, farthest=math.inf)
         try:
-            rows.append(about | measure_scene(record_unseen(scene, seed, folder, name), name, model))
+            rows.append(about | measure_scene(find_scene(unseen, Path(folder) if folder else None), name, model))
         except FinforceError as error:  # a finger that cannot be used is a finding, too
             notes.append(f"{' '.join(map(str, about.values()))}: {error}")
     product_ms = 1e3 * float(np.median([time_product() for _ in range(25)]))
@@ -119,24 +117,3 @@ def calibrate(bag: Path, jaw: str) -> str:
     if not file.exists() and finforce(["calibrate", str(bag), "--jaw", jaw, "--from", "truth", "-o", str(file)]) != 0:
         raise FinforceError(f"{bag.name}: {jaw} cannot be calibrated there")
     return str(file)
-
-
-def record_unseen(name: str, seed: int, folder: Path, jaw: str = BENCH) -> Path:
-    """Record a case of `UNSEEN` with a seed into a folder, unless that was done before; return where.
-
-    Args:
-        name: of the case.
-        seed: of textures, light and noise.
-        folder: of the recordings.
-        jaw: shipped jaw or jaw file.
-
-    Raises:
-        FinforceError: the scene cannot be recorded.
-    """
-    scene, changes = UNSEEN[name]
-    label = name.replace(",", "").replace(" ", "_")
-    bag = folder / (f"{label}_{seed}" if jaw == BENCH else f"{label}_{Path(jaw).stem}_{seed}")
-    if not bag.exists():
-        scenario = build_scenario(scene, **changes, jaw=jaw)
-        record_scene(scenario, seed, bag, camera=parse_size(SIZE), form=RecordingForm())
-    return bag

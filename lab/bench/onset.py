@@ -19,8 +19,8 @@ from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import describe_load, run_nodes
 from finforce_eval.replay.synthetic_stream import stream_images
 from lab.bench.chain import SIDES, TARE, TrueGrasp, chain_processes, true_grasp
-from lab.bench.scenes import EVERY_RATE, BenchScene, find_scene
 from lab.harness import Figures
+from lab.scenes import EVERY_RATE, TwinScene, find_scene
 
 GRASPS = 7
 USUAL_SPEED = 0.02
@@ -77,7 +77,7 @@ def measure(quick: bool) -> Figures:
 
 def _play(changes: Mapping[str, float], rate: int, phases: Sequence[int]) -> tuple[list[Delay], float]:
     """Play a grasp at a rate [Hz], once from each phase of the images; return delays and other load [% of a core]."""
-    path = find_scene(BenchScene(scenario="grasp_cylinder", seed=101, changes=SHORT | changes, slots=EVERY_RATE))
+    path = find_scene(TwinScene(scenario="grasp_cylinder", seed=101, changes=SHORT | changes, slots=EVERY_RATE))
     recording = read_recording(path)
     truth, delays, load = true_grasp(recording), [], 0.0
     for phase in phases:

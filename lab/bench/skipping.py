@@ -22,10 +22,10 @@ from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.processes import CpuMeter
 from finforce_eval.replay.synthetic_stream import stream_images
 from lab.bench.chain import SIDES, chain_processes
-from lab.bench.scenes import BenchScene, find_scene
 from lab.harness import Figures
+from lab.scenes import TwinScene, find_scene
 
-SCENE = BenchScene(
+SCENE = TwinScene(
     scenario="hold",
     seed=101,
     changes={"tare": 12.0, "clearance": 0.015, "closing_speed": 0.005, "record": 8.0, "settle": 0.5},

@@ -8,29 +8,29 @@ from pathlib import Path
 
 from finforce_eval.cli.parser import SOURCES, add_engine_options, read_engine
 from finforce_eval.errors import OptionError
-from lab.experiments.experiment import PAGE, Experiment, format_tables, run_experiment
+from lab.experiments.experiment import PAGE, Experiment, run_experiment
 from lab.experiments.runs import RunOptions
+from lab.harness import format_figures
 
 TWIN = "twin"
 QUICK_SIZE = "320x240"
 
 
-# what each does, its module and its class
+# what each does, and the module in which it stands under its name in capitals
 EXPERIMENTS = {
-    "bench": ("Table I: nine cylinders pressed on one jaw", "paper_tables", "BenchExperiment"),
-    "places": ("Table II: what knowing the place is worth", "paper_tables", "PlacesExperiment"),
-    "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp", "GraspExperiment"),
-    "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation", "ManipulationExperiment"),
-    "chip": ("what breaks at 5.43 N, grasped to 5 N by force, position and current", "chip", "ChipExperiment"),
-    "network": ("an end-to-end network on what it has seen and what it has not", "network", "NetworkExperiment"),
-    "shape": ("generated meshes brought to scale, in two file formats", "shape", "ShapeExperiment"),
-    "pose": ("poses of the object that are late, flipped or lost", "pose", "PoseExperiment"),
+    "bench": ("Table I: nine cylinders pressed on one jaw", "paper_tables"),
+    "places": ("Table II: what knowing the place is worth", "paper_tables"),
+    "grasp": ("27 grasps: three objects, places and forces, both jaws", "grasp"),
+    "manipulation": ("a held weight of 100 g that is turned, in two lights", "manipulation"),
+    "chip": ("what breaks at 5.43 N, grasped to 5 N by force, position and current", "chip"),
+    "network": ("an end-to-end network on what it has seen and what it has not", "network"),
+    "pose": ("poses of the object that are late, flipped or lost", "pose"),
 }
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    names = "; ".join(f"{name}: {text}" for name, (text, *_) in EXPERIMENTS.items())
+    names = "; ".join(f"{name}: {text}" for name, (text, _) in EXPERIMENTS.items())
     parser.add_argument("name", choices=tuple(EXPERIMENTS), metavar="NAME", help=names)
     text = "twin, or recordings with measured forces (twin)"
     parser.add_argument("--on", nargs="+", default=[TWIN], metavar="twin|BAG", help=text)
@@ -76,12 +76,12 @@ def read_options(options: argparse.Namespace) -> RunOptions:
 
 def run(options: argparse.Namespace) -> None:
     """Run an experiment, print its tables, name its page."""
-    _, module, kind = EXPERIMENTS[options.name]
-    build = getattr(import_module(f"lab.experiments.{module}"), kind)
-    experiment: Experiment = build(options=read_options(options))
-    findings = run_experiment(experiment, Path(options.report), read_engine(options), options.shard)
-    if findings is None:
+    _, module = EXPERIMENTS[options.name]
+    experiment: Experiment = getattr(import_module(f"lab.experiments.{module}"), options.name.upper())
+    report, chosen = Path(options.report), read_options(options)
+    figures = run_experiment(experiment, chosen, report, read_engine(options), options.shard)
+    if figures is None:
         print(f"Part {options.shard} is done; without --shard all parts are put on a page")
         return
-    print(format_tables(findings))
-    print(f"Page: {Path(options.report) / experiment.name / PAGE}")
+    print(format_figures(figures))
+    print(f"Page: {report / experiment.name / PAGE}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,13 @@ import numpy as np
 import pandas as pd
 
 from finforce_eval.errors import OptionError
-from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE, new_figure, style_axes
+from finforce_eval.figures.figures import BLACK, BLUE, GREEN, ORANGE
 from finforce_sim.gripper import PressedGrasp
 from finforce_sim.scenarios import build_scenario
-from lab.experiments.experiment import Case, Findings, ResultTable, tabulate
+from lab.experiments.experiment import Experiment, draw_panels, tabulate
 from lab.experiments.grasp_world import EstimatorSensor, GraspCase, ImageSensor, NoisySensor, World, build_plant
-from lab.experiments.runs import RunOptions
+from lab.experiments.runs import Case, RunOptions
+from lab.harness import Figures
 
 BEARS, BREAKS = 5.0, 5.43  # [N]
 SPEED = 0.004  # [m/s] of the opening
@@ -37,87 +37,73 @@ SPREAD = ("least", "mean", "largest")
 DRAWN_EVERY = 20  # milliseconds
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChipExperiment:
-    """Grasps to 5 N of something that breaks at 5.43 N, in three ways."""
+def list_cases(options: RunOptions) -> Sequence[Case]:
+    """Return the grasps."""
+    if options.bags:
+        raise OptionError("--on BAG: the chip is grasped in a closed loop, which no recording is; expected twin")
+    count = QUICK_GRASPS if options.quick else GRASPS
+    source = options.source or ("truth" if options.quick else "images")
+    cases = []
+    for way in WAYS:
+        for number in range(count):
+            seed = options.seed + number
+            settings = {"way": way, "seed": seed, "source": source if way == "force" else ""}
+            cases.append(Case(name=f"{way}_{number:02d}", settings=settings | {"size": options.size}))
+    return cases
 
-    options: RunOptions
-    name: str = "chip"
-    title: str = "Grasping something that breaks"
-    about: str = (
-        "The paper grasps and lifts a potato chip with the force of its camera in the loop, raising the threshold by "
-        "1 N until the chip breaks: it bore 5 N and broke at 5.43 N. Here a thing that breaks when the true force "
-        "reaches 5.43 N is grasped to 5 N through the driver and the emulated gripper, its frames, delays and steps "
-        "of the position included. It lies up to 4 mm higher or lower than in the grasp that was taught, and its "
-        "width strays by 0.5 mm (one standard deviation). Without a camera, *position* goes to the opening that made "
-        "5 N in the taught grasp; *current* closes with 150 mA, the least with which this gripper is stable."
-    )
 
-    def list_cases(self) -> Sequence[Case]:
-        """Return the grasps; see `Experiment`."""
-        if self.options.bags:
-            raise OptionError("--on BAG: the chip is grasped in a closed loop, which no recording is; expected twin")
-        count = QUICK_GRASPS if self.options.quick else GRASPS
-        source = self.options.source or ("truth" if self.options.quick else "images")
-        cases = []
-        for way in WAYS:
-            for number in range(count):
-                seed = self.options.seed + number
-                settings = {"way": way, "seed": seed, "source": source if way == "force" else ""}
-                cases.append(Case(name=f"{way}_{number:02d}", settings=settings | {"size": self.options.size}))
-        return cases
+def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
+    """Return the figures of a grasp."""
+    way, seed, untold = case.settings["way"], case.settings["seed"], []
+    pressed = _lay(seed)
+    grasp = GraspCase(plant=build_plant(OBJECT, pressed), force=BEARS, speed=SPEED, latency=LATENCY, seed=seed)
+    if way == "force":
+        make = ImageSensor if case.settings["source"] == "images" else EstimatorSensor
+        more = {"size": case.settings["size"]} if make is ImageSensor else {}
+        sensor = make(pressed, seed, **more)
+        course, untold = World(grasp, sensor, holding=HOLDING).run(), sensor.untold
+    else:
+        opening = find_taught_opening() if way == "position" else 0.0
+        course = World(grasp, NoisySensor(0.0, seed)).run_blind(opening, STRONG if way == "position" else CURRENT)
+    times, forces = np.array(course.times), np.array(course.forces)
+    start = course.touched_at if np.isfinite(course.touched_at) else 0.0
+    return {
+        "way": way,
+        "peak_N": float(forces.max(initial=0.0)),
+        "end_N": float(forces[times > times[-1] - 1.0].mean()),
+        "is_broken": bool(forces.max(initial=0.0) >= BREAKS),
+        "error": course.error,
+        "untold": [[round(stamp - start, 3), words] for stamp, words in untold],
+        "violations": sum(course.violations.values()),
+        "drawn": {
+            "seconds": np.round(times[::DRAWN_EVERY] - start, 3).tolist(),
+            "force": np.round(forces[::DRAWN_EVERY], 3).tolist(),
+        },
+    }
 
-    def run(self, case: Case, folder: Path) -> dict[str, Any]:
-        """Return the figures of a grasp; see `Experiment`."""
-        way, seed, untold = case.settings["way"], case.settings["seed"], []
-        pressed = _lay(seed)
-        grasp = GraspCase(plant=build_plant(OBJECT, pressed), force=BEARS, speed=SPEED, latency=LATENCY, seed=seed)
-        if way == "force":
-            make = ImageSensor if case.settings["source"] == "images" else EstimatorSensor
-            more = {"size": case.settings["size"]} if make is ImageSensor else {}
-            sensor = make(pressed, seed, **more)
-            course, untold = World(grasp, sensor, holding=HOLDING).run(), sensor.untold
-        else:
-            opening = find_taught_opening() if way == "position" else 0.0
-            course = World(grasp, NoisySensor(0.0, seed)).run_blind(opening, STRONG if way == "position" else CURRENT)
-        times, forces = np.array(course.times), np.array(course.forces)
-        start = course.touched_at if np.isfinite(course.touched_at) else 0.0
-        return {
-            "way": way,
-            "peak_N": float(forces.max(initial=0.0)),
-            "end_N": float(forces[times > times[-1] - 1.0].mean()),
-            "is_broken": bool(forces.max(initial=0.0) >= BREAKS),
-            "error": course.error,
-            "untold": [[round(stamp - start, 3), words] for stamp, words in untold],
-            "violations": sum(course.violations.values()),
-            "drawn": {
-                "seconds": np.round(times[::DRAWN_EVERY] - start, 3).tolist(),
-                "force": np.round(forces[::DRAWN_EVERY], 3).tolist(),
-            },
-        }
 
-    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
-        """Return how many broke; see `Experiment`."""
-        draw_chips(figures).savefig(folder / "chips.png")
-        rows = []
-        for way, grasps in tabulate(figures).groupby("way", sort=False):
-            row: dict[str, Any] = {"by": WAYS[way], "grasps": len(grasps), "broken": int(grasps.is_broken.sum())}
-            for column, heading in (("peak_N", "peak/N"), ("end_N", "at the end/N")):
-                spread = grasps[column].agg(["min", "mean", "max"]).tolist()
-                row |= {f"{heading}: {name}": value for name, value in zip(SPREAD, spread, strict=True)}
-            row["ended early"] = int(grasps.error.astype(bool).sum())
-            row["images without force"] = int(grasps.untold.map(len).sum())
-            rows.append(row | {"violations": int(grasps.violations.sum())})
-        note = f"Broken: a true force of {BREAKS:g} N was reached; wanted: {BEARS:g} N."
-        note += "".join(_tell_end(name, row) for name, row in figures.items() if row["error"])
-        table = ResultTable(title="Grasps", rows=pd.DataFrame(rows), note=note)
-        return Findings(tables=[table], pictures={"True force over time; the line is where it breaks": "chips.png"})
+def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
+    """Return how many broke."""
+    draw_chips(figures).savefig(folder / "chips.png")
+    rows = []
+    for way, grasps in tabulate(figures).groupby("way", sort=False):
+        row: dict[str, Any] = {"by": WAYS[way], "grasps": len(grasps), "broken": int(grasps.is_broken.sum())}
+        for column, heading in (("peak_N", "peak/N"), ("end_N", "at the end/N")):
+            spread = grasps[column].agg(["min", "mean", "max"]).tolist()
+            row |= {f"{heading}: {name}": value for name, value in zip(SPREAD, spread, strict=True)}
+        row["ended early"] = int(grasps.error.astype(bool).sum())
+        row["images without force"] = int(grasps.untold.map(len).sum())
+        rows.append(row | {"violations": int(grasps.violations.sum())})
+    notes = [f"Broken: a true force of {BREAKS:g} N was reached; wanted: {BEARS:g} N."]
+    notes += [_tell_end(name, row) for name, row in figures.items() if row["error"]]
+    drawn = {"True force over time; the line is where it breaks": "chips.png"}
+    return Figures(tables={"Grasps": pd.DataFrame(rows)}, notes=notes, drawn=drawn)
 
 
 def _tell_end(name: str, row: Mapping[str, Any]) -> str:
     """Return why a grasp ended early, and what the jaws said of the last image that had no force."""
     last = f" ({row['untold'][-1][1]})" if row["untold"] else ""
-    return f" {name} ended early: {row['error']}{last}."
+    return f"{name} ended early: {row['error']}{last}."
 
 
 def _lay(seed: int | None) -> PressedGrasp:
@@ -139,19 +125,36 @@ def find_taught_opening() -> float:
 
 def draw_chips(figures: Mapping[str, Mapping[str, Any]]) -> Any:
     """Return a figure of the true forces [N] over time, a panel for each way of grasping."""
-    ways = list(dict.fromkeys(row["way"] for row in figures.values()))
-    figure = new_figure(4.2 * len(ways), 3.2)
-    panels = figure.subplots(1, len(ways), squeeze=False, sharey=True)[0]
-    for axes, way in zip(panels, ways, strict=True):
-        style_axes(axes)
-        members = [row for row in figures.values() if row["way"] == way]
-        for row in members:
+    ways: dict[str, list[Mapping[str, Any]]] = {}
+    for row in figures.values():
+        ways.setdefault(row["way"], []).append(row)
+    titles = {
+        f"by {way}: {sum(row['is_broken'] for row in rows)} of {len(rows)} broken": rows for way, rows in ways.items()
+    }
+
+    def draw(axes: Any, title: str) -> None:
+        for row in titles[title]:
             colour = ORANGE if row["is_broken"] else BLUE
             axes.plot(row["drawn"]["seconds"], row["drawn"]["force"], color=colour, linewidth=0.9, alpha=0.7)
         axes.axhline(BREAKS, color=BLACK, linewidth=0.9, dashes=(4, 2))
         axes.axhline(BEARS, color=GREEN, linewidth=0.9, dashes=(4, 2))
-        broken = sum(row["is_broken"] for row in members)
-        axes.set_title(f"by {way}: {broken} of {len(members)} broken", loc="left", fontsize=10)
-        axes.set(xlabel="after first touch [s]", xlim=(-0.5, 8.0))
-    panels[0].set_ylabel("true force [N]")
-    return figure
+        axes.set_xlim(-0.5, 8.0)
+
+    return draw_panels(list(titles), len(titles), "after first touch [s]", "true force [N]", draw)
+
+
+CHIP = Experiment(
+    name="chip",
+    title="Grasping something that breaks",
+    about=(
+        "The paper grasps and lifts a potato chip with the force of its camera in the loop, raising the threshold by "
+        "1 N until the chip breaks: it bore 5 N and broke at 5.43 N. Here a thing that breaks when the true force "
+        "reaches 5.43 N is grasped to 5 N through the driver and the emulated gripper, its frames, delays and steps "
+        "of the position included. It lies up to 4 mm higher or lower than in the grasp that was taught, and its "
+        "width strays by 0.5 mm (one standard deviation). Without a camera, *position* goes to the opening that made "
+        "5 N in the taught grasp; *current* closes with 150 mA, the least with which this gripper is stable."
+    ),
+    list_cases=list_cases,
+    run=run,
+    find=find,
+)

@@ -5,95 +5,45 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import pandas as pd
 
 from finforce.errors import FinforceError
 from finforce_eval.engine.engines import EngineOptions, run_tasks
 from finforce_eval.engine.tasks import OK, Manifest, Task, choose_shard
+from finforce_eval.figures.figures import new_figure, style_axes
 from finforce_eval.machine import commit, version, write_figures
-from lab.harness import format_table
+from lab.experiments.runs import Case, RunOptions
+from lab.harness import Figures, format_figures
 
 PAGE = "README.md"
 EDITION = 1  # of what is kept of a case; another one does not go on where an older one ended
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
-    """One run of an experiment.
-
-    Attributes:
-        name: unlike the others', and a part of file names.
-        settings: that decide its figures, as JSON has them; what stands under `words` becomes part of them.
-    """
-
-    name: str
-    settings: Mapping[str, Any]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ResultTable:
-    """Figures in rows, whose columns name their units.
-
-    Attributes:
-        title: what it shows.
-        rows: the figures; columns of text come first when they are shown.
-        note: what there is to say of them.
-    """
-
-    title: str
-    rows: pd.DataFrame
-    note: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Findings:
-    """What an experiment found.
-
-    Attributes:
-        tables: for the terminal, the page and the JSON.
-        pictures: file names in the experiment's folder, by what they show.
-    """
-
-    tables: Sequence[ResultTable]
-    pictures: Mapping[str, str] = field(default_factory=dict)
-
-
-class Experiment(Protocol):
+class Experiment:
     """An experiment; its cases are run in their order.
 
     Attributes:
         name: of the command line.
         title: of the page.
         about: what is done, and how it differs from the paper's own.
+        list_cases: returns what is to be run; raises FinforceError where recordings lack what the experiment needs.
+        run: returns the figures of a case as JSON has them, those that are only drawn under `drawn`; files go into a
+            folder of the experiment's own.
+        find: returns what the figures of the cases, by name, say together; pictures of it go into the folder.
     """
 
     name: str
     title: str
     about: str
-
-    def list_cases(self) -> Sequence[Case]:
-        """Return what is to be run.
-
-        Raises:
-            FinforceError: recordings lack what the experiment needs.
-        """
-        ...
-
-    def run(self, case: Case, folder: Path) -> dict[str, Any]:
-        """Return the figures of a case as JSON has them, those that are only drawn under `drawn`.
-
-        Files go into a folder of the experiment's own.
-        """
-        ...
-
-    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
-        """Return what the figures of the cases, by name, say together, and draw it into a folder."""
-        ...
+    list_cases: Callable[[RunOptions], Sequence[Case]]
+    run: Callable[[RunOptions, Case, Path], dict[str, Any]]
+    find: Callable[[RunOptions, Mapping[str, Mapping[str, Any]], Path], Figures]
 
 
 def hash_case(case: Case) -> str:
@@ -102,24 +52,25 @@ def hash_case(case: Case) -> str:
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
-def run_case(experiment: Experiment, case: Case, folder: str) -> dict[str, Any]:
+def run_case(experiment: Experiment, options: RunOptions, case: Case, folder: str) -> dict[str, Any]:
     """Return the figures of a case; files go into the experiment's folder.
 
     Raises:
         FinforceError: it has none.
     """
-    return {**case.settings.get("words", {}), **experiment.run(case, Path(folder))}
+    return {**case.settings.get("words", {}), **experiment.run(options, case, Path(folder))}
 
 
 def run_experiment(
-    experiment: Experiment, report: Path, engine: EngineOptions | None = None, shard: str = ""
-) -> Findings | None:
+    experiment: Experiment, options: RunOptions, report: Path, engine: EngineOptions | None = None, shard: str = ""
+) -> Figures | None:
     """Run what is not done yet of an experiment, and write `NAME.json`, pictures and a page into `report/NAME`.
 
     A case that fails is told of, costs itself only, and is tried again by the next run.
 
     Args:
         experiment: what is run.
+        options: how.
         report: folder of all experiments.
         engine: where the cases are run; here, one after the other, without.
         shard: "i/n" to run a part of the cases only, without a page.
@@ -131,9 +82,9 @@ def run_experiment(
         FinforceError: the cases cannot be listed, or none of them gave figures.
     """
     folder = report / experiment.name
-    cases = experiment.list_cases()
+    cases = experiment.list_cases(options)
     manifest = Manifest(folder, shard)
-    given = [{"experiment": experiment, "case": case, "folder": str(folder)} for case in cases]
+    given = [{"experiment": experiment, "options": options, "case": case, "folder": str(folder)} for case in cases]
     tasks = [
         Task(name=case.name, key=hash_case(case), work=run_case, given=each)
         for case, each in zip(cases, given, strict=True)
@@ -149,9 +100,9 @@ def run_experiment(
     if not figures:
         raise FinforceError(f"{experiment.name}: not one of {len(cases)} cases gave figures; the first: "
                             f"{next(iter(failed.values()), 'there are none')}")  # fmt: skip
-    findings = experiment.find(figures, folder)
+    findings = experiment.find(options, figures, folder)
     about = {"experiment": experiment.name, "version": version(), "cases": len(cases), "failed": failed}
-    about["tables"] = {table.title: table.rows.to_dict("records") for table in findings.tables}
+    about["tables"] = {title: rows.to_dict("records") for title, rows in findings.tables.items()}
     about["figures"] = {name: _without_drawn(row) for name, row in figures.items()}
     write_figures(folder / f"{experiment.name}.json", about)
     (folder / PAGE).write_text(_write_page(experiment, findings, len(cases), failed), encoding="utf-8")
@@ -185,20 +136,37 @@ def _without_drawn(row: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in row.items() if name != "drawn"}
 
 
-def format_tables(findings: Findings) -> str:
-    """Return the tables for a terminal, each with its title above and its note below."""
-    blocks = []
-    for table in findings.tables:
-        note = ("", table.note) if table.note else ()
-        blocks.append("\n".join((f"**{table.title}**", "", format_table(table.rows), *note)))
-    return "\n\n".join(blocks)
-
-
-def _write_page(experiment: Experiment, findings: Findings, cases: int, failed: Mapping[str, str]) -> str:
+def _write_page(experiment: Experiment, findings: Figures, cases: int, failed: Mapping[str, str]) -> str:
     """Return the page of an experiment."""
     done = f"{cases - len(failed)} of {cases} cases, finforce {version()}."
     lines = [f"# {experiment.title}", "", experiment.about, "", done]
     lines += [f"- **failed:** {name}: {text}" for name, text in failed.items()]
-    lines += ["", format_tables(findings), ""]
-    lines += [f"![{caption}]({name})" for caption, name in findings.pictures.items()]
+    lines += ["", format_figures(findings), ""]
+    lines += [f"![{caption}]({name})" for caption, name in findings.drawn.items()]
     return "\n".join(lines) + "\n"
+
+
+def draw_panels(titles: Sequence[str], columns: int, across: str, up: str, draw: Callable[[Any, str], None]) -> Any:
+    """Return a figure with a panel for each title, `columns` side by side.
+
+    Args:
+        titles: of the panels.
+        columns: panels in a row.
+        across: label of the lowest panels' axes.
+        up: label of the first panels' axes.
+        draw: draws into the axes of a title.
+    """
+    rows = -(-len(titles) // columns)
+    figure = new_figure(3.6 * columns, 2.5 * rows + 0.4)
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    for axes in grid.flat[len(titles) :]:
+        axes.set_visible(False)
+    for axes, title in zip(grid.flat, titles, strict=False):
+        style_axes(axes)
+        axes.set_title(title, loc="left", fontsize=9)
+        draw(axes, title)
+    for axes in grid[:, 0]:
+        axes.set_ylabel(up)
+    for axes in grid[-1]:
+        axes.set_xlabel(across)
+    return figure

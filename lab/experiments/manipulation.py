@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,9 @@ from finforce_eval.table import ForceSeries
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_sim.footage import START
 from finforce_sim.scenarios import build_scenario, write_script
-from lab.experiments.experiment import Case, Findings, ResultTable, average, tabulate
-from lab.experiments.runs import RunOptions, build_setup
+from lab.experiments.experiment import Experiment, average, tabulate
+from lab.experiments.runs import Case, RunOptions, build_setup
+from lab.harness import Figures
 
 MASS, SPEED = 0.1, 1.2  # [kg], [rad/s]
 # The axis of the turn, and how the gripper looks at first: level for a turn about where it points, else down.
@@ -38,67 +39,52 @@ LEAST = 0.5  # [N] of true net force, from which on it has a direction
 PAPER = {("roll", "bright"): "0.12 ± 0.00", ("roll", "dim"): "0.28 ± 0.02"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class ManipulationExperiment:
-    """A held weight of 100 g that is turned once round and back about three axes, in two lights; or recordings."""
+def list_cases(options: RunOptions) -> Sequence[Case]:
+    """Return the turns."""
+    if options.bags:
+        return options.bag_cases()
+    cases, times = [], QUICK if options.quick else {"turn_angle": 2.0 * np.pi}
+    for axis, posture in AXES.items():
+        for light, scene in LIGHTS.items():
+            for jaws, turned in JAWS.items():
+                words = {"axis": axis, "light": light, "jaws": jaws}
+                name = f"{axis}_{light}_{'swapped' if turned else 'plain'}"
+                angle = (-1.0 if turned else 1.0) * times["turn_angle"]
+                changes = {"mass": MASS, "turn_rate": SPEED, **posture, **times, "turn_angle": angle}
+                cases.append(options.scene_case(name, scene, changes, len(cases), words=words))
+    return [cases[0], cases[6]] if options.quick else cases
 
-    options: RunOptions
-    name: str = "manipulation"
-    title: str = "A held weight that is turned"
-    about: str = (
-        "The paper grasps a calibration weight of 100 g (0.98 N), turns the gripper once round and back, with a lamp "
-        "and without, five times each, and compares the manipulation force of Eq. 3 with the weight along gravity. "
-        "Here the turn is rendered: about where a level gripper points (roll: gravity presses on one jaw and then on "
-        "the other, and acts across the fingers between), about the axis along which the jaws close (x: it never "
-        "presses on a jaw) and about the camera's (y: it never acts across), in bright and in dim light, and "
-        "*swapped*: begun the other way round, as if left and right had changed places. The object's poses come at "
-        "10 Hz with noise; its mass is not known to the estimator."
+
+def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
+    """Return the figures of a turn."""
+    setup = build_setup(case.settings)
+    with options.open_case(case, folder) as recording:
+        figures = score_turn(recording, setup)
+        if options.bags:
+            return figures
+        told = score_turn(tell_gravity(recording, true_gravity(case.settings)), setup)
+    return figures | {f"told_{key}": told[key] for key in KEYS}
+
+
+def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
+    """Return errors along gravity by light."""
+    draw_weights(figures).savefig(folder / "weights.png")
+    turns = tabulate(figures).reindex(columns=list(COLUMNS))
+    turns[["axis", "light"]] = turns[["axis", "light"]].fillna("")
+    errors = {"along_rmse_N": "along gravity/N", "told_along_rmse_N": "direction told/N"}
+    lights = average(turns, ("axis", "light"), errors)
+    lights["paper/N"] = [PAPER.get(key, "") for key in zip(lights.axis, lights.light, strict=True)]
+    note = (
+        "RMSE of the net force of both jaws (Eq. 3) along the true one, while that is above 0.5 N: mean and "
+        "standard deviation over the turns; direction told: the solvers know which way gravity points in "
+        "the gripper, as an arm does."
     )
-
-    def list_cases(self) -> Sequence[Case]:
-        """Return the turns; see `Experiment`."""
-        if self.options.bags:
-            return self.options.bag_cases()
-        cases, times = [], QUICK if self.options.quick else {"turn_angle": 2.0 * np.pi}
-        for axis, posture in AXES.items():
-            for light, scene in LIGHTS.items():
-                for jaws, turned in JAWS.items():
-                    words = {"axis": axis, "light": light, "jaws": jaws}
-                    name = f"{axis}_{light}_{'swapped' if turned else 'plain'}"
-                    angle = (-1.0 if turned else 1.0) * times["turn_angle"]
-                    changes = {"mass": MASS, "turn_rate": SPEED, **posture, **times, "turn_angle": angle}
-                    cases.append(self.options.scene_case(name, scene, changes, len(cases), words=words))
-        return [cases[0], cases[6]] if self.options.quick else cases
-
-    def run(self, case: Case, folder: Path) -> dict[str, Any]:
-        """Return the figures of a turn; see `Experiment`."""
-        setup = build_setup(case.settings)
-        with self.options.open_case(case, folder) as recording:
-            figures = score_turn(recording, setup)
-            if self.options.bags:
-                return figures
-            told = score_turn(tell_gravity(recording, true_gravity(case.settings)), setup)
-        return figures | {f"told_{key}": told[key] for key in KEYS}
-
-    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
-        """Return errors along gravity by light; see `Experiment`."""
-        draw_weights(figures).savefig(folder / "weights.png")
-        turns = tabulate(figures).reindex(columns=list(COLUMNS))
-        turns[["axis", "light"]] = turns[["axis", "light"]].fillna("")
-        errors = {"along_rmse_N": "along gravity/N", "told_along_rmse_N": "direction told/N"}
-        lights = average(turns, ("axis", "light"), errors)
-        lights["paper/N"] = [PAPER.get(key, "") for key in zip(lights.axis, lights.light, strict=True)]
-        note = (
-            "RMSE of the net force of both jaws (Eq. 3) along the true one, while that is above 0.5 N: mean and "
-            "standard deviation over the turns; direction told: the solvers know which way gravity points in "
-            "the gripper, as an arm does."
-        )
-        first = ResultTable(title="By axis and light", rows=lights, note=note)
-        each = turns[["case", *KEYS]].rename(columns=COLUMNS)
-        return Findings(
-            tables=[first, ResultTable(title="Each turn", rows=each)],
-            pictures={"Net force along gravity over its direction in the gripper": "weights.png"},
-        )
+    each = turns[["case", *KEYS]].rename(columns=COLUMNS)
+    return Figures(
+        tables={"By axis and light": lights, "Each turn": each},
+        notes=[note],
+        drawn={"Net force along gravity over its direction in the gripper": "weights.png"},
+    )
 
 
 KEYS = {
@@ -179,3 +165,21 @@ def draw_weights(figures: Mapping[str, Mapping[str, Any]]) -> Any:
         axes.set_rlim(0.0, 1.3 * max([*drawn["truth"], 0.1]))
         axes.tick_params(labelsize=7)
     return figure
+
+
+MANIPULATION = Experiment(
+    name="manipulation",
+    title="A held weight that is turned",
+    about=(
+        "The paper grasps a calibration weight of 100 g (0.98 N), turns the gripper once round and back, with a lamp "
+        "and without, five times each, and compares the manipulation force of Eq. 3 with the weight along gravity. "
+        "Here the turn is rendered: about where a level gripper points (roll: gravity presses on one jaw and then on "
+        "the other, and acts across the fingers between), about the axis along which the jaws close (x: it never "
+        "presses on a jaw) and about the camera's (y: it never acts across), in bright and in dim light, and "
+        "*swapped*: begun the other way round, as if left and right had changed places. The object's poses come at "
+        "10 Hz with noise; its mass is not known to the estimator."
+    ),
+    list_cases=list_cases,
+    run=run,
+    find=find,
+)

@@ -6,25 +6,27 @@ import hashlib
 import json
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.optional import import_cv2
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.scoring import rms
 from finforce_eval.evaluation.setup import evaluate_all
-from finforce_eval.figures.figures import BLACK, BLUE, ORANGE, new_figure, style_axes
+from finforce_eval.figures.figures import BLACK, BLUE, ORANGE
 from finforce_eval.recordings.images import StampedImage
 from finforce_keypoints.networks.network import open_session
 from finforce_keypoints.networks.side_network import METADATA
-from lab.experiments.experiment import Case, Findings, ResultTable, average, tabulate
-from lab.experiments.grasp import join_jaws
-from lab.experiments.runs import RunOptions, build_setup
+from lab.experiments.experiment import Experiment, average, draw_panels, tabulate
+from lab.experiments.grasp import find_phases, join_jaws
+from lab.experiments.runs import Case, RunOptions, build_setup
+from lab.harness import Figures
 
 SHOWN = 10  # images that the network is given at a time
 HEIGHT, WIDTH = 120, 160  # [px] of its images
@@ -112,80 +114,67 @@ class ForceNetwork:
         return np.array(stamps, dtype=np.int64), np.array(forces)
 
 
-@dataclass(frozen=True, kw_only=True)
-class NetworkExperiment:
-    """Grasps that are judged by finforce and by an end-to-end network; of the twin, or recordings with images."""
+@cache
+def load_network(path: str) -> ForceNetwork:
+    """Return the network of a file; the shipped one for an empty path."""
+    return ForceNetwork(path or SHIPPED)
 
-    options: RunOptions
-    name: str = "network"
-    title: str = "Against an end-to-end network"
-    about: str = (
-        "The paper trains a network on images and forces alone (ResNet-50 features of ten images, a transformer), and "
-        "finds that it fails on what it has not seen. The network here is of the same kind, with a smaller encoder, "
-        "trained on rendered grasps of a cylinder and a cube in bright light; both methods see the same images. "
-        "finforce also has the object's mesh and poses, and the finger's model; the network has neither."
+
+def list_cases(options: RunOptions) -> Sequence[Case]:
+    """Return the grasps."""
+    used = {"network": load_network(options.network).sha256}
+    if options.bags:
+        read = options.read_bags()
+        blind = [case.settings["bag"] for case, recording in read if recording.images is None]
+        if blind:
+            raise RecordingError(f"{blind[0]}: this experiment needs colour images, which are not in it")
+        return [replace(case, settings={**case.settings, **used}) for case, _ in read]
+    times = QUICK_GRASP if options.quick else GRASP
+    return [
+        options.scene_case(name, scene, times | changes, number, words={"group": group}, **used)
+        for number, (group, name, scene, changes) in enumerate(GRASPS)
+        if name in QUICK or not options.quick
+    ]
+
+
+def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
+    """Return the errors of both on one grasp."""
+    with options.open_case(case, folder) as recording:
+        stamps, forces = load_network(options.network).follow(recording.images.colors_alone())
+        grasp = join_jaws(evaluate_all([recording], build_setup(case.settings)), recording.name)
+    grasp["network"] = grasp.stamp.map(dict(zip(stamps.tolist(), forces.tolist(), strict=True)))
+    held = grasp[find_phases(grasp)["all"] & grasp.network.notna()]
+    error, both = held.network - held.truth, held[held.found.notna()]
+    return {
+        "peak_N": float(np.nanmax(grasp.truth, initial=0.0)),
+        "span_N": float(np.ptp(held.truth)) if len(held) else float("nan"),
+        "rmse_N": rms((both.found - both.truth).to_numpy()),
+        "network_rmse_N": rms(error.to_numpy()),
+        "network_bias_N": float(error.mean()),
+        "answered_pct": 100.0 * len(both) / max(len(held), 1),
+        "drawn": grasp[["seconds", "truth", "found", "network"]].round(4).to_dict("list"),
+    }
+
+
+def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
+    """Return both methods' errors by what the network had seen."""
+    draw_networks(figures).savefig(folder / "network.png")
+    grasps = tabulate(figures)
+    grasps["group"] = grasps.get("group", "recordings")
+    for column in ("", "network_"):
+        grasps[f"{column}nrmsd_pct"] = 100.0 * grasps[f"{column}rmse_N"] / grasps.span_N
+    groups = average(grasps, ("group",), GROUPS)[["group", "n", *GROUPS.values()]]
+    groups["network : finforce"] = groups["network/N"] / groups["finforce/N"]
+    note = (
+        "Mean over the grasps of each one's RMSE of min(|F_left|, |F_right|) while the true force is above 0.02 N; "
+        f"NRMSD of each grasp's own range. The network: {load_network(options.network).about}."
     )
-
-    @cached_property
-    def _network(self) -> ForceNetwork:
-        return ForceNetwork(self.options.network) if self.options.network else ForceNetwork()
-
-    def list_cases(self) -> Sequence[Case]:
-        """Return the grasps; see `Experiment`."""
-        used = {"network": self._network.sha256}
-        if self.options.bags:
-            read = self.options.read_bags()
-            blind = [case.settings["bag"] for case, recording in read if recording.images is None]
-            if blind:
-                raise RecordingError(f"{blind[0]}: this experiment needs colour images, which are not in it")
-            return [replace(case, settings={**case.settings, **used}) for case, _ in read]
-        times = QUICK_GRASP if self.options.quick else GRASP
-        return [
-            self.options.scene_case(name, scene, times | changes, number, words={"group": group}, **used)
-            for number, (group, name, scene, changes) in enumerate(GRASPS)
-            if name in QUICK or not self.options.quick
-        ]
-
-    def run(self, case: Case, folder: Path) -> dict[str, Any]:
-        """Return the errors of both on one grasp; see `Experiment`."""
-        with self.options.open_case(case, folder) as recording:
-            stamps, forces = self._network.follow(recording.images.colors_alone())
-            course = join_jaws(evaluate_all([recording], build_setup(case.settings)), recording.name)
-        told = dict(zip(stamps.tolist(), forces.tolist(), strict=True))
-        theirs = np.array([told.get(stamp, np.nan) for stamp in course.stamps.tolist()])
-        held = course.phases["all"] & np.isfinite(theirs)
-        both = held & np.isfinite(course.found)
-        span = float(np.ptp(course.truth[held])) if held.any() else float("nan")
-        series = {"seconds": course.seconds, "truth": course.truth, "found": course.found, "network": theirs}
-        return {
-            "peak_N": float(np.nanmax(course.truth, initial=0.0)),
-            "span_N": span,
-            "rmse_N": rms((course.found - course.truth)[both]),
-            "network_rmse_N": rms((theirs - course.truth)[held]),
-            "network_bias_N": float((theirs - course.truth)[held].mean()) if held.any() else float("nan"),
-            "answered_pct": 100.0 * float(both.sum() / max(held.sum(), 1)),
-            "drawn": {name: np.round(values, 4).tolist() for name, values in series.items()},
-        }
-
-    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
-        """Return both methods' errors by what the network had seen; see `Experiment`."""
-        draw_networks(figures).savefig(folder / "network.png")
-        grasps = tabulate(figures)
-        grasps["group"] = grasps.get("group", "recordings")
-        for column in ("", "network_"):
-            grasps[f"{column}nrmsd_pct"] = 100.0 * grasps[f"{column}rmse_N"] / grasps.span_N
-        groups = average(grasps, ("group",), GROUPS)[["group", "n", *GROUPS.values()]]
-        groups["network : finforce"] = groups["network/N"] / groups["finforce/N"]
-        note = (
-            "Mean over the grasps of each one's RMSE of min(|F_left|, |F_right|) while the true force is above 0.02 N; "
-            f"NRMSD of each grasp's own range. The network: {self._network.about}."
-        )
-        first = ResultTable(title="By what the network has seen", rows=groups, note=note)
-        each = grasps[["case", *GRASP_COLUMNS]].rename(columns={"case": "grasp", **GRASP_COLUMNS})
-        return Findings(
-            tables=[first, ResultTable(title="Each grasp", rows=each)],
-            pictures={"Measured force (dashed), finforce (blue), network (orange)": "network.png"},
-        )
+    each = grasps[["case", *GRASP_COLUMNS]].rename(columns={"case": "grasp", **GRASP_COLUMNS})
+    return Figures(
+        tables={"By what the network has seen": groups, "Each grasp": each},
+        notes=[note],
+        drawn={"Measured force (dashed), finforce (blue), network (orange)": "network.png"},
+    )
 
 
 GROUPS = {
@@ -206,21 +195,27 @@ GRASP_COLUMNS = {
 
 def draw_networks(figures: Mapping[str, Mapping[str, Any]]) -> Any:
     """Return a figure of the grasp force by both methods over time, a panel for each grasp."""
-    columns = min(len(figures), 4)
-    rows = -(-len(figures) // columns)
-    figure = new_figure(3.6 * columns, 2.5 * rows + 0.4)
-    panels = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    for axes in panels.flat[len(figures) :]:
-        axes.set_visible(False)
-    for axes, (name, row) in zip(panels.flat, figures.items(), strict=False):
-        style_axes(axes)
-        course = {key: np.array(values, dtype=float) for key, values in row["drawn"].items()}
-        axes.plot(course["seconds"], course["network"], color=ORANGE, linewidth=1.0)
-        axes.plot(course["seconds"], course["found"], color=BLUE, linewidth=1.2)
-        axes.plot(course["seconds"], course["truth"], color=BLACK, linewidth=0.9, dashes=(4, 2))
-        axes.set_title(f"{name} ({row.get('group', 'recording')})", loc="left", fontsize=9)
-    for line in panels:
-        line[0].set_ylabel("grasp force [N]")
-    for axes in panels[-1]:
-        axes.set_xlabel("time [s]")
-    return figure
+    rows = {f"{name} ({row.get('group', 'recording')})": row["drawn"] for name, row in figures.items()}
+
+    def draw(axes: Any, title: str) -> None:
+        grasp = pd.DataFrame(rows[title])
+        axes.plot(grasp.seconds, grasp.network, color=ORANGE, linewidth=1.0)
+        axes.plot(grasp.seconds, grasp.found, color=BLUE, linewidth=1.2)
+        axes.plot(grasp.seconds, grasp.truth, color=BLACK, linewidth=0.9, dashes=(4, 2))
+
+    return draw_panels(list(rows), min(len(rows), 4), "time [s]", "grasp force [N]", draw)
+
+
+NETWORK = Experiment(
+    name="network",
+    title="Against an end-to-end network",
+    about=(
+        "The paper trains a network on images and forces alone (ResNet-50 features of ten images, a transformer), and "
+        "finds that it fails on what it has not seen. The network here is of the same kind, with a smaller encoder, "
+        "trained on rendered grasps of a cylinder and a cube in bright light; both methods see the same images. "
+        "finforce also has the object's mesh and poses, and the finger's model; the network has neither."
+    ),
+    list_cases=list_cases,
+    run=run,
+    find=find,
+)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,9 @@ from finforce_eval.evaluation.evaluate import Evaluation
 from finforce_eval.evaluation.results import ONSET
 from finforce_eval.evaluation.setup import EvaluationSetup, evaluate_all
 from finforce_eval.recordings.tracks import Recording
-from lab.experiments.experiment import Case, Findings, ResultTable
-from lab.experiments.runs import RunOptions, build_setup
+from lab.experiments.experiment import Experiment
+from lab.experiments.runs import Case, RunOptions, build_setup
+from lab.harness import Figures
 
 # Ø [mm] and height of the axis [mm] of the twin's cylinders, whose finger the paper's heights do not fit
 DIAMETERS = (15, 25, 35)
@@ -120,86 +121,60 @@ def _fixed(height_mm: float) -> ContactChoice:
     return ContactChoice(mode="fixed", height_mm=height_mm)
 
 
-@dataclass(frozen=True, kw_only=True)
-class BenchExperiment:
-    """Nine cylinders pressed on one jaw: Table I."""
-
-    options: RunOptions
-    name: str = "bench"
-    title: str = "Table I: cylinders pressed on one jaw"
-    about: str = (
-        "The paper presses cylinders of 15, 25 and 35 mm on one jaw at three places, in three levels up and down, "
-        "three times, and gives the place to its solver. Here the same is done with the place given and with it "
-        "estimated from the object's mesh and pose. On `twin` everything is rendered, and seen by the detector."
-    )
-
-    def list_cases(self) -> Sequence[Case]:
-        """Return the cylinders; see `Experiment`."""
-        every = [(diameter, place) for diameter in DIAMETERS for place in HEIGHTS]
-        return list_cylinders(self.options, QUICK_CASES if self.options.quick else every)
-
-    def run(self, case: Case, folder: Path) -> dict[str, Any]:
-        """Return the errors on a cylinder; see `Experiment`."""
-        own = _fixed(case.settings["words"]["height_mm"])
-        contacts = {"given": own, ESTIMATE: ContactChoice(mode="estimate")}
-        return measure_contacts(self.options, case, folder, contacts)
-
-    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
-        """Return Table I; see `Experiment`."""
-        tables = []
-        for contact, words in (("given", "the place given, as in the paper"), (ESTIMATE, "the place estimated")):
-            rows = []
-            for place in HEIGHTS:
-                cells = [_find_cell(figures, diameter, place, contact) for diameter in DIAMETERS]
-                paper = TABLE_I[place]
-                rows.append((place, *(f"{_format(one)} ({own:.2f})" for one, own in zip(cells, paper, strict=True))))
-            known = [row["contacts"][contact]["rmse_N"] for row in figures.values()]
-            known = [value for value in known if value is not None]
-            note = ""
-            if known:
-                note = f"Mean {np.mean(known):.3f} N, worst {np.max(known):.3f} N; the paper's in brackets."
-            head = ("RMSE/N", *(f"Ø{diameter}" for diameter in DIAMETERS))
-            tables.append(ResultTable(title=f"With {words}", rows=pd.DataFrame(rows, columns=head), note=note))
-        return Findings(tables=tables)
+def list_bench(options: RunOptions) -> Sequence[Case]:
+    """Return the cylinders of Table I."""
+    every = [(diameter, place) for diameter in DIAMETERS for place in HEIGHTS]
+    return list_cylinders(options, QUICK_CASES if options.quick else every)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlacesExperiment:
-    """A cylinder of 15 mm at three places, each solved as if it were at all of them: Table II."""
+def run_bench(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
+    """Return the errors on a cylinder."""
+    own = _fixed(case.settings["words"]["height_mm"])
+    return measure_contacts(options, case, folder, {"given": own, ESTIMATE: ContactChoice(mode="estimate")})
 
-    options: RunOptions
-    name: str = "places"
-    title: str = "Table II: what knowing the place is worth"
-    about: str = (
-        "The paper presses a cylinder of 15 mm at three places and solves each with the place fixed at all three, and "
-        "with its contact estimator. A place at which the key points do not fit is refused here, rather than answered; "
-        "such a cell shows what was answered."
-    )
 
-    def list_cases(self) -> Sequence[Case]:
-        """Return the places; see `Experiment`."""
-        places = ("middle",) if self.options.quick else tuple(HEIGHTS)
-        return list_cylinders(self.options, [(DIAMETERS[0], place) for place in places])
-
-    def run(self, case: Case, folder: Path) -> dict[str, Any]:
-        """Return the errors at a place; see `Experiment`."""
-        heights = BENCH_HEIGHTS if self.options.bags else HEIGHTS
-        contacts = {mode: ContactChoice(mode=mode) for mode in (ESTIMATE, *OTHERS)}
-        contacts |= {place: _fixed(height) for place, height in heights.items()}
-        return measure_contacts(self.options, case, folder, contacts)
-
-    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
-        """Return Table II; see `Experiment`."""
+def find_bench(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
+    """Return Table I."""
+    tables, notes = {}, []
+    for contact, words in (("given", "the place given, as in the paper"), (ESTIMATE, "the place estimated")):
         rows = []
-        for place, paper in TABLE_II.items():
-            cells = {contact: _find_cell(figures, DIAMETERS[0], place, contact) for contact in paper}
-            if any(cells.values()):
-                others = (_format(_find_cell(figures, DIAMETERS[0], place, contact)) for contact in OTHERS)
-                ours = (f"{_format(cells[contact])} ({own:.2f})" for contact, own in paper.items())
-                rows.append((place, *ours, *others))
-        head = ("really at", "estimated", *(f"fixed {place}" for place in HEIGHTS), *OTHERS.values())
-        note = "RMSE [N] over the record phases, the paper's in brackets; %: share of the images that was answered."
-        return Findings(tables=[ResultTable(title="Ø15", rows=pd.DataFrame(rows, columns=head), note=note)])
+        for place in HEIGHTS:
+            cells = [_find_cell(figures, diameter, place, contact) for diameter in DIAMETERS]
+            paper = TABLE_I[place]
+            rows.append((place, *(f"{_format(one)} ({own:.2f})" for one, own in zip(cells, paper, strict=True))))
+        tables[f"With {words}"] = pd.DataFrame(rows, columns=("RMSE/N", *(f"Ø{diameter}" for diameter in DIAMETERS)))
+        known = [row["contacts"][contact]["rmse_N"] for row in figures.values()]
+        known = [value for value in known if value is not None]
+        if known:
+            notes.append(f"With {words}: mean {np.mean(known):.3f} N, worst {np.max(known):.3f} N.")
+    return Figures(tables=tables, notes=[*notes, "The paper's in brackets."])
+
+
+def list_places(options: RunOptions) -> Sequence[Case]:
+    """Return the places of Table II."""
+    return list_cylinders(options, [(DIAMETERS[0], place) for place in (("middle",) if options.quick else HEIGHTS)])
+
+
+def run_places(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
+    """Return the errors at a place under every contact."""
+    heights = BENCH_HEIGHTS if options.bags else HEIGHTS
+    contacts = {mode: ContactChoice(mode=mode) for mode in (ESTIMATE, *OTHERS)}
+    contacts |= {place: _fixed(height) for place, height in heights.items()}
+    return measure_contacts(options, case, folder, contacts)
+
+
+def find_places(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
+    """Return Table II."""
+    rows = []
+    for place, paper in TABLE_II.items():
+        cells = {contact: _find_cell(figures, DIAMETERS[0], place, contact) for contact in paper}
+        if any(cells.values()):
+            others = (_format(_find_cell(figures, DIAMETERS[0], place, contact)) for contact in OTHERS)
+            ours = (f"{_format(cells[contact])} ({own:.2f})" for contact, own in paper.items())
+            rows.append((place, *ours, *others))
+    head = ("really at", "estimated", *(f"fixed {place}" for place in HEIGHTS), *OTHERS.values())
+    note = "RMSE [N] over the record phases, the paper's in brackets; %: share of the images that was answered."
+    return Figures(tables={"Ø15": pd.DataFrame(rows, columns=head)}, notes=[note])
 
 
 def _find_cell(
@@ -218,3 +193,29 @@ def _format(cell: Mapping[str, Any] | None) -> str:
     if cell["rmse_N"] is None or not np.isfinite(cell["rmse_N"]) or cell["solved_pct"] < LEAST_SOLVED:
         return "refused"
     return f"{cell['rmse_N']:.2f}" + ("" if cell["solved_pct"] > 99.9 else f", {cell['solved_pct']:.0f} %")
+
+
+BENCH = Experiment(
+    name="bench",
+    title="Table I: cylinders pressed on one jaw",
+    about=(
+        "The paper presses cylinders of 15, 25 and 35 mm on one jaw at three places, in three levels up and down, "
+        "three times, and gives the place to its solver. Here the same is done with the place given and with it "
+        "estimated from the object's mesh and pose. On `twin` everything is rendered, and seen by the detector."
+    ),
+    list_cases=list_bench,
+    run=run_bench,
+    find=find_bench,
+)
+PLACES = Experiment(
+    name="places",
+    title="Table II: what knowing the place is worth",
+    about=(
+        "The paper presses a cylinder of 15 mm at three places and solves each with the place fixed at all three, and "
+        "with its contact estimator. A place at which the key points do not fit is refused here, rather than answered; "
+        "such a cell shows what was answered."
+    ),
+    list_cases=list_places,
+    run=run_places,
+    find=find_places,
+)

@@ -28,9 +28,10 @@ from finforce_keypoints.images import RgbdImage
 from finforce_sim.footage import CAMERAS, FINGER, START
 from finforce_sim.gripper import TwinGripper
 from finforce_sim.scenarios import build_scenario
-from lab.experiments.experiment import Case, Findings, ResultTable
-from lab.experiments.grasp import join_jaws, score_course
-from lab.experiments.runs import RunOptions, build_setup, keep_poses
+from lab.experiments.experiment import Experiment
+from lab.experiments.grasp import join_jaws, score_grasp
+from lab.experiments.runs import Case, RunOptions, build_setup, keep_poses
+from lab.harness import Figures
 
 SCENES = {
     "cylinder": ("grasp_cylinder", {}),
@@ -55,6 +56,12 @@ POSE_FIGURES = {
     "rotation_median_deg": "turn: median/°",
     "rotation_p95_deg": "turn: 95 %/°",
 }
+EACH = "Each grasp, RMSE [N]"
+NOTES = (
+    "Grasp force: mean over the grasps of each one's RMSE while the true force is above 0.02 N.",
+    "By source: FoundationPose needs a GPU and is not run: its figures are those of a publisher that behaves like it. "
+    "Delay of the built-in tracker: the median of its computation here.",
+)
 ON_MESH = 4e-3  # [m] within which a pixel's depth is that of the object, for the first pose
 FIRST_WITHIN = 50_000_000  # [ns] between the first pose that is known and an image
 NANOSECOND = 1e-9
@@ -77,77 +84,62 @@ def drop_poses(recording: Recording) -> Recording:
     return keep_poses(recording, np.mod(seconds, GAPS_EVERY) < GAPS_EVERY - GAP)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PoseExperiment:
-    """Grasps, whose object's poses come in several ways."""
-
-    options: RunOptions
-    name: str = "pose"
-    title: str = "Poses of the object: late, flipped, lost"
-    about: str = (
-        "The paper takes the object's pose from FoundationPose, which is late, takes a thing that looks the same when "
-        "turned for turned, and now and then loses it. Here the poses of the twin's tracker (10 Hz, 0.3 mm and 0.3° of "
-        "noise) arrive 0, 100 and 200 ms after their image, a tenth of them is turned by half a turn about an axis of "
-        "the object, and for 0.8 s in every 2 s there are none; the built-in tracker follows the object in the same "
-        "depth images. The key points are those of the images, the same each time."
-    )
-
-    def list_cases(self) -> Sequence[Case]:
-        """Return the grasps; see `Experiment`."""
-        if self.options.bags:
-            return self.options.bag_cases()
-        names = QUICK_SCENES if self.options.quick else tuple(SCENES)
-        numbers = {name: number for number, name in enumerate(SCENES)}
-        return [self.options.scene_case(name, *SCENES[name], numbers[name]) for name in names]
-
-    def run(self, case: Case, folder: Path) -> dict[str, Any]:
-        """Return the figures of a grasp in each way; see `Experiment`."""
-        with self.options.open_case(case, folder) as recording:
-            flipped, lost = flip_poses(recording, self.options.seed), drop_poses(recording)
-            ways = {name: (recording, delay) for name, delay in DELAYS.items()}
-            ways |= {"flips": (flipped, 0), "gaps": (lost, 0), WORST: (drop_poses(flipped), DELAYS["200 ms late"])}
-            truth, found, seen_mm = {} if self.options.bags else true_poses(case.settings), {}, {}
-            if recording.images is not None and recording.images.has_depth:
-                tracked = track_object(recording)
-                ways[TRACKER] = (tracked.recording, tracked.delay)
-            for way in set(SOURCES) & set(ways):
-                seen, delay = ways[way]
-                seen_mm[way] = {"delay_ms": 1e-6 * delay, **score_poses(seen, truth)}
-            for way, (seen, delay) in ways.items():
-                setup = build_setup(case.settings, ContactChoice(mode="estimate", pose_delay=delay))
-                evaluation = evaluate_all([seen], setup)
-                places = [score.solved_place.median_mm for score in evaluation.scores.values()]
-                known = [place for place in places if place is not None]
-                score = score_course(join_jaws(evaluation, recording.name))
-                found[way] = {**score, "place_median_mm": max(known) if known else float("nan")}
-        return {"ways": found, "poses": seen_mm}
-
-    def find(self, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Findings:
-        """Return what each way adds to the error; see `Experiment`."""
-        rows = [
-            {"case": name, "poses": way, **one, "rmse_N": one["rmse_N"]["all"]}
-            for name, row in figures.items()
-            for way, one in row["ways"].items()
-        ]
-        scores = pd.DataFrame(rows)
-        errors = scores.pivot(index="case", columns="poses", values="rmse_N").astype(float)
-        errors = errors[scores.poses.unique()].dropna(axis=1)
-        added, ways = errors.sub(errors["on time"], axis=0), scores.groupby("poses")
-        summary = {
-            "RMSE/N": errors.mean(),
-            "added/N": added.mean(),
-            "most added/N": added.max(),
-            "place: worst median/mm": ways.place_median_mm.max(),
-            "answered/%": ways.answered_pct.mean(),
-        }
-        by_way = pd.DataFrame(summary).loc[errors.columns].reset_index()
-        note = "Grasp force, mean over the grasps of each one's RMSE while the true force is above 0.02 N."
-        first = ResultTable(title="By way", rows=by_way, note=note)
-        last = ResultTable(title="Each grasp, RMSE [N]", rows=errors.reset_index())
-        return Findings(tables=[first, _source_table(figures, errors.mean()), last])
+def list_cases(options: RunOptions) -> Sequence[Case]:
+    """Return the grasps."""
+    if options.bags:
+        return options.bag_cases()
+    names = QUICK_SCENES if options.quick else tuple(SCENES)
+    numbers = {name: number for number, name in enumerate(SCENES)}
+    return [options.scene_case(name, *SCENES[name], numbers[name]) for name in names]
 
 
-def _source_table(figures: Mapping[str, Mapping[str, Any]], errors: pd.Series) -> ResultTable:
+def run(options: RunOptions, case: Case, folder: Path) -> dict[str, Any]:
+    """Return the figures of a grasp in each way."""
+    with options.open_case(case, folder) as recording:
+        flipped, lost = flip_poses(recording, options.seed), drop_poses(recording)
+        ways = {name: (recording, delay) for name, delay in DELAYS.items()}
+        ways |= {"flips": (flipped, 0), "gaps": (lost, 0), WORST: (drop_poses(flipped), DELAYS["200 ms late"])}
+        truth, found, seen_mm = {} if options.bags else true_poses(case.settings), {}, {}
+        if recording.images is not None and recording.images.has_depth:
+            tracked = track_object(recording)
+            ways[TRACKER] = (tracked.recording, tracked.delay)
+        for way in set(SOURCES) & set(ways):
+            seen, delay = ways[way]
+            seen_mm[way] = {"delay_ms": 1e-6 * delay, **score_poses(seen, truth)}
+        for way, (seen, delay) in ways.items():
+            setup = build_setup(case.settings, ContactChoice(mode="estimate", pose_delay=delay))
+            evaluation = evaluate_all([seen], setup)
+            places = [score.solved_place.median_mm for score in evaluation.scores.values()]
+            known = [place for place in places if place is not None]
+            score = score_grasp(join_jaws(evaluation, recording.name))
+            found[way] = {**score, "place_median_mm": max(known) if known else float("nan")}
+    return {"ways": found, "poses": seen_mm}
+
+
+def find(options: RunOptions, figures: Mapping[str, Mapping[str, Any]], folder: Path) -> Figures:
+    """Return what each way adds to the error."""
+    rows = [
+        {"case": name, "poses": way, **one, "rmse_N": one["rmse_N"]["all"]}
+        for name, row in figures.items()
+        for way, one in row["ways"].items()
+    ]
+    scores = pd.DataFrame(rows)
+    errors = scores.pivot(index="case", columns="poses", values="rmse_N").astype(float)
+    errors = errors[scores.poses.unique()].dropna(axis=1)
+    added, ways = errors.sub(errors["on time"], axis=0), scores.groupby("poses")
+    summary = {
+        "RMSE/N": errors.mean(),
+        "added/N": added.mean(),
+        "most added/N": added.max(),
+        "place: worst median/mm": ways.place_median_mm.max(),
+        "answered/%": ways.answered_pct.mean(),
+    }
+    by_way = pd.DataFrame(summary).loc[errors.columns].reset_index()
+    tables = {"By way": by_way, "By source": _source_table(figures, errors.mean()), EACH: errors.reset_index()}
+    return Figures(tables=tables, notes=NOTES)
+
+
+def _source_table(figures: Mapping[str, Mapping[str, Any]], errors: pd.Series) -> pd.DataFrame:
     """Return what poses and forces are worth by where the poses come from."""
     rows = [
         {"way": way, **{heading: one.get(key) for key, heading in POSE_FIGURES.items()}}
@@ -157,11 +149,7 @@ def _source_table(figures: Mapping[str, Mapping[str, Any]], errors: pd.Series) -
     means = pd.DataFrame(rows).groupby("way").mean().reindex(SOURCES).dropna(how="all")
     means["force/N"] = errors.reindex(means.index)
     means.insert(0, "source", [SOURCES[way] for way in means.index])
-    note = (
-        "Means over the grasps. FoundationPose needs a GPU and is not run: its figures are those of a publisher that "
-        "behaves like it. Delay of the built-in tracker: the median of its computation here."
-    )
-    return ResultTable(title="By source", rows=means, note=note)
+    return means
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -280,3 +268,19 @@ def _measure(T: NDArray, T_true: NDArray, symmetry: Symmetry) -> tuple[float, fl
 def _read_poses(track: PoseTrack) -> list[NDArray]:
     """Return the poses (4, 4) of a track."""
     return [pose_from_quaternion(*numbers) for numbers in zip(track.position, track.quaternion, strict=True)]
+
+
+POSE = Experiment(
+    name="pose",
+    title="Poses of the object: late, flipped, lost",
+    about=(
+        "The paper takes the object's pose from FoundationPose, which is late, takes a thing that looks the same when "
+        "turned for turned, and now and then loses it. Here the poses of the twin's tracker (10 Hz, 0.3 mm and 0.3° of "
+        "noise) arrive 0, 100 and 200 ms after their image, a tenth of them is turned by half a turn about an axis of "
+        "the object, and for 0.8 s in every 2 s there are none; the built-in tracker follows the object in the same "
+        "depth images. The key points are those of the images, the same each time."
+    ),
+    list_cases=list_cases,
+    run=run,
+    find=find,
+)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import rmtree
@@ -18,20 +17,29 @@ from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.evaluation.setup import EvaluationSetup
-from finforce_eval.machine import commit, write_json
 from finforce_eval.recordings.bags import bag_source
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
-from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_ifea.settings import EstimatorSettings
-from finforce_sim.footage import parse_size
-from finforce_sim.scenarios import build_scenario
-from lab.experiments.experiment import Case
+from lab.scenes import TwinScene, find_scene
 
-RECORDINGS, SCENE = "recordings", "scene.json"
+RECORDINGS = "recordings"
 FARTHEST = 0.3  # [m] of depth that is kept; jaws are nearer
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One run of an experiment.
+
+    Attributes:
+        name: unlike the others', and a part of file names.
+        settings: that decide its figures, as JSON has them; what stands under `words` becomes part of them.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,13 +114,19 @@ class RunOptions:
         """
         settings, source = case.settings, case.settings["source"]
         is_own = "bag" in settings
-        bag = Path(settings["bag"]) if is_own else folder / RECORDINGS / case.name
-        if not is_own:
-            render_scene(settings, bag)
-            source = source or "images"
+        if is_own:
+            bag = Path(settings["bag"])
+        else:
+            bag, source = find_scene(build_scene(settings), folder / RECORDINGS), source or "images"
         yield KeypointSource(source=source, jaw_file=settings["jaw"]).apply(read_recording(bag))
         if not is_own and not self.keep:
             rmtree(bag, ignore_errors=True)
+
+
+def build_scene(settings: Mapping[str, Any]) -> TwinScene:
+    """Return the scene of the twin that a case's settings name."""
+    about = {name: settings[name] for name in ("changes", "seed", "size")}
+    return TwinScene(scenario=settings["scene"], farthest=FARTHEST, **about)
 
 
 def list_missing(recording: Recording, needed: Sequence[str]) -> list[str]:
@@ -135,20 +149,6 @@ def build_setup(settings: Mapping[str, Any], contact: ContactChoice | None = Non
         contacts=contact or ContactChoice(mode="estimate"),
         about={},
     )
-
-
-def render_scene(settings: Mapping[str, Any], bag: Path) -> None:
-    """Write the recording of a scene, unless it is there: of the same scene, seed, size and code."""
-    made = {key: settings[key] for key in ("scene", "changes", "seed", "size")} | {"commit": commit()}
-    told = bag / SCENE
-    with suppress(OSError, ValueError):
-        if json.loads(told.read_text(encoding="utf-8")) == made:
-            return
-    rmtree(bag, ignore_errors=True)  # another scene of that name, or what a killed run has left
-    scenario = build_scenario(settings["scene"], **settings["changes"])
-    form = RecordingForm(farthest=FARTHEST)
-    record_scene(scenario, settings["seed"], bag, camera=parse_size(settings["size"]), form=form)
-    write_json(told, made)  # last: where it stands all of the recording is there
 
 
 def keep_poses(recording: Recording, seen: NDArray) -> Recording:

@@ -14,7 +14,7 @@ from lerobot_fakes import CAMERA, write_dataset  # noqa: E402
 from finforce_eval.cli.main import main  # noqa: E402
 from finforce_eval.recordings.recording import read_recording  # noqa: E402
 from lab.bench.chain import true_grasp  # noqa: E402
-from lab.bench.scenes import GRASP, find_scene  # noqa: E402
+from lab.scenes import GRASP, find_scene  # noqa: E402
 
 VERSIONS = ("v2.1", "v3.0")
 HEIGHT = 41.7  # mm, of the rod

@@ -10,7 +10,6 @@ from finforce_eval.engine.engines import EngineOptions
 from finforce_eval.engine.tasks import Task
 from finforce_eval.recordings.recording import DEMO, read_recording
 from finforce_eval.recordings.writer import write_recording
-from lab.experiments.experiment import run_experiment
 from lab.training.commands import DatasetError
 from lab.training.pictures import make_all
 
@@ -55,8 +54,8 @@ def test_evaluations_agree(engine, bags, tmp_path, capsys):
 
 
 def test_an_experiment_goes_to_processes(tmp_path):
-    findings = run_experiment(Counting(), tmp_path, EngineOptions(engine="processes", workers=2))
-    assert findings.tables[0].rows["letters"].sum() == 11
+    figures = Counting().carry_out(tmp_path, EngineOptions(engine="processes", workers=2))
+    assert figures.tables["Letters"]["letters"].sum() == 11
 
 
 def write_number(number, path):

@@ -24,7 +24,7 @@ from finforce_eval.replay.synthetic_stream import (
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_sim.footage import Footage
 from finforce_sim.photographer import SceneSetting
-from lab.bench.scenes import EVERY_RATE, SmoothGripper
+from lab.scenes import EVERY_RATE, SmoothGripper
 
 
 def message(slot, topic="/left/keypoints"):

@@ -10,7 +10,7 @@ from finforce_eval.annotation.forces import estimate_forces  # noqa: E402
 from finforce_eval.cli.main import main, parse  # noqa: E402
 from finforce_eval.evaluation.setup import make_setup  # noqa: E402
 from finforce_eval.recordings.recording import read_recording  # noqa: E402
-from lab.bench.scenes import GRASP, find_scene  # noqa: E402
+from lab.scenes import GRASP, find_scene  # noqa: E402
 
 
 @pytest.fixture(scope="module")

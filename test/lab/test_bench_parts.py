@@ -87,8 +87,8 @@ def test_grasps_with_faults_stay_below_the_limit():
 
 def test_a_scene_without_a_force_is_noted_and_the_others_are_measured(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(images, "record_unseen", lambda scene, seed, folder, jaw: folder / f"{scene}_{seed}")
-    monkeypatch.setattr(images, "UNSEEN", {"cylinder": (), "cube": ()})
+    monkeypatch.setattr(images, "find_scene", lambda scene, folder: folder / f"{scene.scenario}_{scene.seed}")
+    monkeypatch.setattr(images, "UNSEEN", {name: (name, {}) for name in ("cylinder", "cube")})
     sight = dict.fromkeys(("pixel_median_px", "pixel_p95_px", "point_median_mm", "point_p95_mm"), 1.0)
     found = {
         "sight": {**sight, "hidden_accepted_pct": None, "visible_lost_pct": 2.0},

@@ -1,4 +1,4 @@
-"""Rendered scenes with truth for benchmarks, none of whose seeds a network was trained on; kept once they are made.
+"""Rendered scenes of the twin with truth, none of whose seeds a network was trained on; kept once they are made.
 
 A scene is rendered as a camera of 180 Hz would see it, without what no camera of 30, 60 or 90 Hz sees.
 """
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 SCRIPT_SLOTS = 6  # slots from one state of a script to the next
 EVERY_RATE = (0, 2, 3, 4)  # slots of those six that a camera of 30, 60 or 90 Hz sees
 SIZE = "640x480"
-FARTHEST = 0.4  # [m]; depth beyond it is left away, which makes a recording smaller
+FARTHEST = 0.4  # [m]
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchScene:
+class TwinScene:
     """One scene.
 
     Attributes:
@@ -34,12 +34,16 @@ class BenchScene:
         seed: of textures, lights, background and noise.
         changes: numbers of the scenario that differ.
         slots: of six, those that are rendered; (0,) is a camera of 30 Hz.
+        size: of the images, WIDTHxHEIGHT.
+        farthest: depth beyond it is left away, which makes a recording smaller [m].
     """
 
     scenario: str
     seed: int
     changes: Mapping[str, Any] = field(default_factory=dict)
     slots: tuple[int, ...] = (0,)
+    size: str = SIZE
+    farthest: float = FARTHEST
 
     def build(self) -> Scenario:
         """Return the scenario.
@@ -54,9 +58,9 @@ class BenchScene:
 
 # [s] of rest at each level and of its record: a grasp of five seconds
 _SHORT = {"settle": 0.3, "record": 0.8}
-GRASP = BenchScene(scenario="grasp_cylinder", seed=101, changes=_SHORT)
+GRASP = TwinScene(scenario="grasp_cylinder", seed=101, changes=_SHORT)
 GRASP_FAST = replace(GRASP, slots=EVERY_RATE)
-DIM = BenchScene(scenario="grasp_asymmetric", seed=102, changes={**_SHORT, "light": "dim"})
+DIM = TwinScene(scenario="grasp_asymmetric", seed=102, changes={**_SHORT, "light": "dim"})
 
 
 class SmoothGripper:
@@ -85,7 +89,7 @@ class SmoothGripper:
         yield before
 
 
-def find_scene(scene: BenchScene, folder: Path | None = None) -> Path:
+def find_scene(scene: TwinScene, folder: Path | None = None) -> Path:
     """Return the recording of a scene, rendered under a progress bar unless it is there already.
 
     Args:
@@ -117,17 +121,17 @@ def scene_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "finforce" / "scenes"
 
 
-def fingerprint(scene: BenchScene) -> str:
+def fingerprint(scene: TwinScene) -> str:
     """Return a text that is another one for another scene, and for another twin."""
     import finforce_sim
 
-    content = hashlib.sha256(json.dumps({**asdict(scene), "size": SIZE}, sort_keys=True).encode())
+    content = hashlib.sha256(json.dumps(asdict(scene), sort_keys=True).encode())
     for source in sorted(Path(finforce_sim.__path__[0]).rglob("*.py")):
         content.update(source.read_bytes())
     return content.hexdigest()[:12]
 
 
-def _render(scene: BenchScene, path: Path) -> None:
+def _render(scene: TwinScene, path: Path) -> None:
     """Render a scene into a new folder."""
     from tqdm import tqdm
 
@@ -137,9 +141,10 @@ def _render(scene: BenchScene, path: Path) -> None:
     from finforce_sim.photographer import Photographer
 
     gripper = TwinGripper(scene.build(), FINGER)
-    setting = set_stage(gripper, parse_size(SIZE), 1e-3)
+    setting = set_stage(gripper, parse_size(scene.size), 1e-3)
     smooth = SmoothGripper(gripper, scene.slots)
     footage = Footage(smooth, Photographer(setting, scene.seed), setting, scene.seed)
     case = {"scene": scene.scenario, "seed": scene.seed, "finger": FINGER, "object": {"kind": scene.build().object}}
     with tqdm(total=len(footage), unit="image", desc=scene.scenario, disable=None, leave=False) as bar:
-        write_footage(footage, path, form=RecordingForm(farthest=FARTHEST), case=case, seen=lambda _: bar.update())
+        form = RecordingForm(farthest=scene.farthest)
+        write_footage(footage, path, form=form, case=case, seen=lambda _: bar.update())

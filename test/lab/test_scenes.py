@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from finforce_eval.replay import synthetic_stream
 from finforce_eval.replay.synthetic_stream import FINE_RATE, slot_of
 from finforce_sim.footage import START
-from lab.bench import scenes
-from lab.bench.scenes import EVERY_RATE, GRASP, SmoothGripper, find_scene
+from lab import scenes
+from lab.scenes import EVERY_RATE, GRASP, SmoothGripper, find_scene
 
 
 def turned(state, angle):
