@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
+import warnings
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.errors import FinforceError
-from finforce.optional import import_cv2
+from finforce.errors import FinforceError, one_line
 
 DEPTH_TYPES = {"16UC1": np.dtype(np.uint16), "mono16": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}
 MILLIMETRE = 1e-3  # the unit of 16-bit depth images (REP 118)
@@ -310,44 +312,36 @@ def decode_color(data: NDArray | bytes, encoding: str, layout: ImageLayout | Non
 
 
 LARGEST_PICTURE = 50_000_000  # px, of a picture that is unpacked: no camera here makes more
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of a jpeg after which its size stands
+
+
+def open_picture(data: bytes, what: str, formats: tuple[str, ...] | None = ("JPEG", "PNG")) -> Any:
+    """Return a picture of Pillow, unpacked; of any format that Pillow reads where `formats` is None.
+
+    Raises:
+        ImageError: the bytes are none, are damaged, or unpack to more than 50 million pixels; `what` names them.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    expected = f"at most {LARGEST_PICTURE} pixels"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # smaller ones are refused below
+            picture = Image.open(io.BytesIO(data), formats=formats)
+        if picture.width * picture.height > LARGEST_PICTURE:
+            raise ImageError(f"{what}: {picture.width} x {picture.height}; expected {expected}")
+        picture.load()
+    except ImageError:
+        raise
+    except UnidentifiedImageError as error:
+        kinds = "no picture" if formats is None else f"neither {' nor '.join(map(str.lower, formats))}"
+        raise ImageError(f"{what}: {len(data)} bytes that are {kinds}") from error
+    except Image.DecompressionBombError as error:
+        raise ImageError(f"{what}: expected {expected}: {error}") from error
+    except Exception as error:  # each format has its own classes for damage
+        raise ImageError(f"{what}: damaged: {one_line(error)}") from error
+    return picture
 
 
 def decode_picture(data: NDArray | bytes, what: str) -> NDArray[np.uint8]:
-    """Return the colours (h, w, 3), red green blue, of a jpeg or png.
-
-    Raises:
-        ImageError: the bytes are neither, are damaged, or unpack to more than 50 million pixels; `what` names them.
-        MissingDependencyError: OpenCV is not installed.
-    """
-    cv2, content = import_cv2(), bytes(data)
-    size = read_picture_size(content)
-    if size is None:
-        raise ImageError(f"{what}: {len(content)} bytes that are neither jpeg nor png")
-    if size[0] * size[1] > LARGEST_PICTURE:
-        raise ImageError(f"{what}: {size[1]} x {size[0]}; expected at most {LARGEST_PICTURE} pixels")
-    try:
-        # as it lies in the file: a camera does not turn its pictures
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        picture = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    except cv2.error:
-        picture = None
-    if picture is None or picture.shape[:2] != size:
-        raise ImageError(f"{what}: damaged: {len(content)} bytes that cannot be decoded")
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-
-
-def read_picture_size(content: bytes) -> tuple[int, int] | None:
-    """Return height and width [px] as a jpeg or a png says them in its head; None of anything else."""
-    if content.startswith(_PNG) and len(content) >= 24:
-        width, height = (int.from_bytes(content[at : at + 4], "big") for at in (16, 20))
-        return height, width
-    at = len(_JPEG)
-    while content.startswith(_JPEG) and at + 9 <= len(content) and content[at] == 0xFF:
-        marker, length = content[at + 1], int.from_bytes(content[at + 2 : at + 4], "big")
-        if marker in _FRAMES:
-            height, width = (int.from_bytes(content[at + k : at + k + 2], "big") for k in (5, 7))
-            return height, width
-        at += 1 if marker == 0xFF else 2 + max(length, 2)
-    return None
+    """Return the colours (h, w, 3), red green blue, of a jpeg or png; raises ImageError as `open_picture` does."""
+    return np.array(open_picture(bytes(data), what).convert("RGB"))

@@ -135,7 +135,7 @@ def _render(scene: TwinScene, path: Path) -> None:
     """Render a scene into a new folder."""
     from tqdm import tqdm
 
-    from finforce_eval.recordings.twin_writer import RecordingForm, write_footage
+    from finforce_eval.cli.twin import RecordingForm, write_footage
     from finforce_sim.footage import FINGER, Footage, parse_size, set_stage
     from finforce_sim.gripper import TwinGripper
     from finforce_sim.photographer import Photographer

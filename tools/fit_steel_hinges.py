@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from finforce_eval.recordings.steel import SHIPPED, points_from_picture
+from finforce_eval.cli.convert_steel import SHIPPED, points_from_picture
 from finforce_ifea.jaw.drawing import Drawing
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_mechanics

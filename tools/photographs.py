@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.optional import import_cv2
-from finforce_eval.recordings.steel import HALF_BASE, points_from_picture
+from finforce_eval.cli.convert_steel import HALF_BASE, points_from_picture
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_keypoints.build import ANY_FINGER
 from finforce_keypoints.detectors.side_plane import AnyFinger

@@ -18,12 +18,17 @@ from finforce.messages import read_stamp
 from finforce_eval.annotation.forces import reasons
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.bags import NO_DIGEST, BagReader, open_bag
-from finforce_eval.recordings.recording import CLOUD, WRENCH
 from finforce_eval.recordings.tracks import Recording
-from finforce_eval.recordings.writer import MARKERS, Entry, MessageFactory
+from finforce_eval.recordings.writer import (
+    Entry,
+    cloud_message,
+    force_markers,
+    status_message,
+    typestore,
+    wrench_message,
+)
 from finforce_eval.table import AXES, ForceSeries
 
-STATUS = "diagnostic_msgs/msg/DiagnosticArray"
 GRIPPER_FRAME = "gripper_base"
 _OK, _WARN = 0, 1
 
@@ -37,7 +42,6 @@ class ForceMessages:
     """
 
     def __init__(self, jaws: Mapping[str, ForceSeries], grasp: ForceSeries) -> None:
-        self.factory = MessageFactory()
         self._jaws = {side: _rows(forces, {"reason": reasons(forces)}) for side, forces in jaws.items()}
         self._grasp = _rows(grasp)
         self._drawn: dict[str, bool] = {}
@@ -56,29 +60,28 @@ class ForceMessages:
         for side, rows in self._jaws.items():
             if stamp in rows:
                 yield from self._of_jaw(side, rows[stamp], stamp)
-        factory = self.factory
         force = np.array([row["grasp_force"], 0.0, 0.0]) + 0.0 * row["grasp_force"]
-        grasp = factory.wrench(stamp, GRIPPER_FRAME, force, 0.0 * force)
-        yield Entry(stamp, "/grasp_wrench", WRENCH, grasp)
-        net = factory.wrench(stamp, GRIPPER_FRAME, _vector(row, "force"), _vector(row, "torque"))
-        yield Entry(stamp, "/manipulation_wrench", WRENCH, net)
+        grasp = wrench_message(stamp, GRIPPER_FRAME, force, 0.0 * force)
+        yield Entry(stamp, "/grasp_wrench", grasp)
+        net = wrench_message(stamp, GRIPPER_FRAME, _vector(row, "force"), _vector(row, "torque"))
+        yield Entry(stamp, "/manipulation_wrench", net)
 
     def _of_jaw(self, side: str, row: Mapping[str, Any], stamp: int) -> Iterator[Entry]:
         """Yield the messages of one jaw in one image."""
-        factory, frame, force = self.factory, f"{side}_jaw", _vector(row, "force")
-        wrench = factory.wrench(stamp, frame, force, _vector(row, "torque"))
-        yield Entry(stamp, f"/{side}/wrench", WRENCH, wrench)
-        stddev = factory.wrench(stamp, frame, _vector(row, "force_stddev"), _vector(row, "torque_stddev"))
-        yield Entry(stamp, f"/{side}/wrench_stddev", WRENCH, stddev)
+        frame, force = f"{side}_jaw", _vector(row, "force")
+        wrench = wrench_message(stamp, frame, force, _vector(row, "torque"))
+        yield Entry(stamp, f"/{side}/wrench", wrench)
+        stddev = wrench_message(stamp, frame, _vector(row, "force_stddev"), _vector(row, "torque_stddev"))
+        yield Entry(stamp, f"/{side}/wrench_stddev", stddev)
         level = _OK if np.isfinite(force).all() else _WARN
         text, values = row["reason"] or row["status"], {"status": row["status"]}
-        message = factory.status(stamp, level, f"finforce: {side} jaw", text, values)
-        yield Entry(stamp, f"/{side}/wrench_status", STATUS, message)
+        message = status_message(stamp, level, f"finforce: {side} jaw", text, values)
+        yield Entry(stamp, f"/{side}/wrench_status", message)
         if row["points_x"] is not None:
-            yield Entry(stamp, f"/{side}/contact", CLOUD, factory.cloud(stamp, frame, _contact_cloud(row)))
+            yield Entry(stamp, f"/{side}/contact", cloud_message(stamp, frame, _contact_cloud(row)))
         if self._is_drawn(side, force):
-            markers = factory.force_markers(stamp, frame, _vector(row, "contact_point"), force)
-            yield Entry(stamp, f"/{side}/markers", MARKERS, markers)
+            markers = force_markers(stamp, frame, _vector(row, "contact_point"), force)
+            yield Entry(stamp, f"/{side}/markers", markers)
 
     def _is_drawn(self, side: str, force: NDArray[np.float64]) -> bool:
         """Say whether an image has another picture than the one before: there is a force, or one has gone."""
@@ -146,7 +149,7 @@ def _write(bag: BagReader, recording: Recording, forces: ForceMessages, folder: 
     """Copy the bag into a folder that does not exist yet, the forces of an image behind it."""
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    types, triggers = forces.factory.typestore, _triggers(recording, bag)
+    types, triggers = typestore(), _triggers(recording, bag)
     plugin = StoragePlugin.SQLITE3 if _is_sqlite(recording.path) else StoragePlugin.MCAP
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         known = {} if side_file else {each.id: _copy_connection(writer, each) for each in bag.connections}
@@ -155,9 +158,10 @@ def _write(bag: BagReader, recording: Recording, forces: ForceMessages, folder: 
             if not side_file:
                 writer.write(known[connection.id], time, data)
             for entry in forces.at(read_stamp(data)) if connection.topic in triggers else ():
+                kind = entry.message.__msgtype__
                 if entry.topic not in added:
-                    added[entry.topic] = writer.add_connection(entry.topic, entry.msgtype, typestore=types)
-                writer.write(added[entry.topic], time, types.serialize_cdr(entry.message, entry.msgtype))
+                    added[entry.topic] = writer.add_connection(entry.topic, kind, typestore=types)
+                writer.write(added[entry.topic], time, types.serialize_cdr(entry.message, kind))
 
 
 def _triggers(recording: Recording, bag: BagReader) -> set[str]:

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tqdm import tqdm
 
+from finforce.errors import MissingDependencyError
+from finforce.messages import read_stamp
 from finforce_eval.cli.extrinsics import read_at_rest
 from finforce_eval.cli.parser import whole_number
-from finforce_eval.errors import OptionError
+from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.at_rest import ROUNDS
 from finforce_eval.evaluation.check import FAULT, check_recording
-from finforce_eval.recordings.listening import CameraTopics, record_camera
+from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED, IMAGE
+from finforce_eval.recordings.writer import Entry, typestore, write_entries
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC, is_compressed
 
 PICTURE = "check.png"
+TIMEOUT = 15.0  # [s] after which no more images are waited for
+MORE = 2  # images beyond those wanted, whose depth may not have come
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -59,8 +66,44 @@ def _listen(options: argparse.Namespace, folder: Path) -> Path:
             f"--topics {' '.join(options.topics)}: expected none, or those of colour, camera_info and perhaps depth; "
             "and no BAG"
         )
-    topics = CameraTopics(*options.topics, *([""] if len(options.topics) == 2 else []))
+    topics = options.topics or (COLOR_TOPIC, INFO_TOPIC, DEPTH_TOPIC)
     return record_camera(topics, options.images, folder)
+
+
+def record_camera(topics: Sequence[str], count: int, folder: Path, domain: int | None = None) -> Path:
+    """Listen to a camera until `count` images have come, and write them as a rosbag2 folder under usual names.
+
+    Args:
+        topics: of colour, camera_info and perhaps depth, which is not waited for.
+        count: of images.
+        folder: a new one.
+        domain: ROS_DOMAIN_ID; None for that of the environment.
+
+    Raises:
+        RecordingError: images or intrinsics do not come; the message says which topics do.
+        MissingDependencyError: ROS is not there.
+    """
+    try:
+        from finforce.ros.listening import listen
+    except ImportError as error:
+        raise MissingDependencyError(f"listening to topics needs ROS 2: {error}") from error
+    color, info = topics[:2]
+    kinds = dict(zip(topics, (COMPRESSED if is_compressed(color) else IMAGE, CAMERA_INFO, IMAGE), strict=False))
+    heard, published = listen(kinds, lambda heard: len(heard[color]) >= count + MORE and heard[info], TIMEOUT, domain)
+    if not heard[info] or len(heard[color]) < count:
+        there = ", ".join(name for name, types in published.items() if {IMAGE, COMPRESSED} & set(types))
+        raise RecordingError(
+            f"{len(heard[color])} images on {color} and {len(heard[info])} camera_info on {info}; expected {count} and "
+            f"1 within {TIMEOUT:g} s; images are published on {there or 'no topic at all'}"
+        )
+    usual = (COLOR_TOPIC + ("/compressed" if is_compressed(color) else ""), INFO_TOPIC, DEPTH_TOPIC)
+    names, decode = dict(zip(topics, usual, strict=False)), typestore().deserialize_cdr
+    entries = [
+        Entry(read_stamp(data), names[topic], decode(data, kinds[topic]))
+        for topic, messages in heard.items()
+        for data in (messages[-1:] if topic == info else messages)
+    ]
+    return write_entries(sorted(entries, key=lambda entry: entry.stamp), folder)
 
 
 def _check(options: argparse.Namespace) -> int:

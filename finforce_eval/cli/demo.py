@@ -153,7 +153,7 @@ def _is_synthetic(folder: Path) -> bool:
 
 def _render(folder: Path) -> None:
     """Render the demo's scene into a new folder, under a progress bar."""
-    from finforce_eval.recordings.twin_writer import RecordingForm, record_scene
+    from finforce_eval.cli.twin import RecordingForm, record_scene
     from finforce_sim.footage import parse_size
     from finforce_sim.scenarios import build_scenario
 

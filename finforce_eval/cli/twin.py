@@ -1,17 +1,55 @@
-"""The subcommands `twin list` and `twin record`: options to a scenario, footage to a recording and a picture of it."""
+"""The subcommands `twin list` and `twin record`: a synthetic scene as a recording with its truth, and a preview."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from finforce.optional import import_cv2, import_trimesh
+from finforce.transforms import pose_numbers, quaternion_from_pose
 from finforce_eval.cli.parser import Parser, whole_number
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.results import parse_changes
-from finforce_eval.recordings.twin_writer import PREVIEW, RecordingForm, record_scene
-from finforce_sim.footage import parse_size
+from finforce_eval.recordings.images import (
+    CAMERA_INFO,
+    COMPRESSED,
+    DEPTH_FORMAT,
+    IMAGE,
+    QUALITY,
+    compress_depth,
+    encode_color,
+)
+from finforce_eval.recordings.recording import STRING, TRUE_KEYPOINTS, TRUE_POSE
+from finforce_eval.recordings.writer import (
+    Entry,
+    cloud_message,
+    header,
+    make_message,
+    pose_message,
+    wrench_message,
+    write_entries,
+)
+from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
+from finforce_sim.footage import (
+    FINGER,
+    Footage,
+    TrueJaw,
+    TwinFrame,
+    build_footage,
+    detection_truth_columns,
+    encode_depth,
+    info_fields,
+    parse_size,
+)
 from finforce_sim.scenarios import SCENARIOS, Scenario, build_scenario, write_script
 
 
@@ -132,3 +170,214 @@ def scenario_from_options(options: argparse.Namespace) -> Scenario:
         if getattr(options, name) is not None:
             changes[name] = getattr(options, name)
     return build_scenario(options.scene, **changes)
+
+
+FRAME = "camera_color_optical_frame"
+MESH = "object.stl"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingForm:
+    """How a recording is written.
+
+    Attributes:
+        compressed: jpeg colour and png depth; else plain images.
+        quality: of a jpeg, 1 to 95.
+        farthest: depth beyond it is left away, which makes a recording smaller [m].
+        storage: "mcap" or "sqlite3".
+        depth_step: of the depth image [m], that of the footage.
+    """
+
+    compressed: bool = True
+    quality: int = QUALITY
+    farthest: float = math.inf
+    storage: str = "mcap"
+    depth_step: float = 1e-3
+
+
+def write_footage(
+    footage: Footage,
+    folder: str | Path,
+    *,
+    form: RecordingForm | None = None,
+    case: Mapping[str, Any] | None = None,
+    seen: Callable[[TwinFrame], Any] = lambda frame: None,
+) -> Path:
+    """Write footage as a rosbag2 folder with its `case.json` and the object's mesh.
+
+    Args:
+        footage: what is written; one image after the other, never all of them in memory.
+        folder: the new folder, which must not exist.
+        form: how it is written.
+        case: further content of the `case.json`.
+        seen: called with every image when it has been written.
+
+    Returns:
+        The folder.
+
+    Raises:
+        RecordingError: the folder exists.
+        FinforceError: the footage cannot be made.
+    """
+    form, folder = form or RecordingForm(), Path(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    is_new = not folder.exists()
+    try:
+        write_entries(footage_entries(footage, form, seen), folder, storage=form.storage)
+    except BaseException:
+        if is_new:  # half a recording would look like a whole one
+            rmtree(folder, ignore_errors=True)
+        raise
+    content = dict(case or {})
+    if footage.mesh is not None:
+        mesh = import_trimesh().Trimesh(vertices=footage.mesh.vertices, faces=footage.mesh.triangles, process=False)
+        mesh.export(folder / MESH)
+        content["mesh"] = f"{folder.name}/{MESH}"
+    content["depth_scale"] = footage.depth_step
+    content["T_gripper_camera"] = list(pose_numbers(footage.T_gripper_camera))
+    (folder / "case.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return folder
+
+
+def footage_entries(
+    footage: Footage, form: RecordingForm, seen: Callable[[TwinFrame], Any] = lambda frame: None
+) -> Iterator[Entry]:
+    """Yield every message of the footage in the order of its stamps."""
+    phase = None
+    for frame in footage:
+        if frame.phase != phase:
+            phase = frame.phase
+            yield Entry(frame.stamp, "/bench/phase", make_message(STRING, data=phase))
+        for side, jaw in frame.jaws.items():
+            yield from _truth_entries(frame.stamp, side, jaw)
+        if frame.T_camera_object is not None:
+            yield Entry(frame.stamp, "/object_pose", _pose(frame.stamp, frame.T_camera_object))
+        yield from _image_entries(frame, footage, form)
+        seen(frame)
+
+
+def _truth_entries(stamp: int, side: str, jaw: TrueJaw) -> Iterator[Entry]:
+    """Yield the truth about one jaw in one image."""
+    frame = f"{side}_jaw"
+    yield Entry(stamp, f"/{side}/ground_truth_wrench", wrench_message(stamp, frame, jaw.force, jaw.torque))
+    yield Entry(stamp, f"/{side}/{TRUE_KEYPOINTS}", cloud_message(stamp, frame, detection_truth_columns(jaw)))
+    yield Entry(stamp, f"/{side}/{TRUE_POSE}", _pose(stamp, jaw.T_camera_jaw))
+
+
+def _pose(stamp: int, pose: NDArray) -> Any:
+    return pose_message(stamp, FRAME, pose[:3, 3], quaternion_from_pose(pose))
+
+
+def _image_entries(frame: TwinFrame, footage: Footage, form: RecordingForm) -> Iterator[Entry]:
+    """Yield colour, depth and intrinsics of an image."""
+    stamp, told = frame.stamp, {"header": header(frame.stamp, FRAME)}
+    yield Entry(stamp, INFO_TOPIC, make_message(CAMERA_INFO, **told, **info_fields(footage.camera)))
+    steps = encode_depth(np.where(frame.depth <= form.farthest, frame.depth, np.nan), footage.depth_step)
+    if form.compressed:
+        color = encode_color(frame.color, quality=form.quality)
+        yield Entry(stamp, f"{COLOR_TOPIC}/compressed", _packed(told, "rgb8; jpeg compressed bgr8", color))
+        yield Entry(stamp, f"{DEPTH_TOPIC}/compressedDepth", _packed(told, DEPTH_FORMAT, compress_depth(steps)))
+    else:
+        yield Entry(stamp, COLOR_TOPIC, _plain(told, "rgb8", frame.color))
+        yield Entry(stamp, DEPTH_TOPIC, _plain(told, "16UC1", steps))
+
+
+def _packed(told: Mapping[str, Any], form: str, data: bytes) -> Any:
+    return make_message(COMPRESSED, **told, format=form, data=np.frombuffer(data, dtype=np.uint8))
+
+
+def _plain(told: Mapping[str, Any], encoding: str, pixels: NDArray) -> Any:
+    pixels = np.ascontiguousarray(pixels)
+    height, width = pixels.shape[:2]
+    size = {"height": height, "width": width, "step": pixels.strides[0]}
+    return make_message(IMAGE, **told, **size, encoding=encoding, data=pixels.reshape(-1).view(np.uint8))
+
+
+PREVIEW = "preview.jpg"
+
+
+def record_scene(
+    scenario: Scenario, seed: int, folder: Path, *, camera: Any, form: RecordingForm, finger: int = FINGER
+) -> None:
+    """Render a scene of a finger into a new folder, under a progress bar."""
+    from tqdm import tqdm
+
+    footage = build_footage(scenario, seed, camera, finger=finger, depth_step=form.depth_step)
+    preview = Preview(len(footage))
+    case = {
+        "scene": scenario.name,
+        "seed": seed,
+        "finger": finger,
+        "light": scenario.light,
+        "object": {"kind": scenario.object},
+    }
+    with tqdm(total=len(footage), unit="image", desc=scenario.name, disable=None, leave=False) as bar:
+
+        def seen(frame: Any) -> None:
+            preview.take(frame)
+            bar.update()
+
+        write_footage(footage, folder, form=form, case=case, seen=seen)
+    preview.save(folder / PREVIEW)
+
+
+COUNT, COLUMNS = 6, 2
+WIDEST = 320  # [px] of an image in the picture
+VISIBLE, HIDDEN = (60, 230, 90), (235, 60, 60)
+ARM = 3  # [px] of the cross at a key point
+NEAR, FAR = 0.07, 0.25  # [m] of the depth that is drawn from bright to dark
+
+
+class Preview:
+    """Keeps a few images, evenly spread, and draws them with their depth.
+
+    Args:
+        frames: how many images there will be.
+    """
+
+    def __init__(self, frames: int) -> None:
+        self._wanted = set(np.linspace(0, frames - 1, min(COUNT, frames)).round().astype(int).tolist())
+        self._next, self._tiles = 0, []
+
+    def take(self, frame: TwinFrame) -> None:
+        """Take the next image."""
+        if self._next in self._wanted:
+            step = -(-frame.color.shape[1] // WIDEST)
+            tile = np.hstack((draw_keypoints(frame, step), draw_depth(frame.depth[::step, ::step])))
+            self._tiles.append(tile)
+        self._next += 1
+
+    def save(self, path: Path) -> None:
+        """Write what was kept; nothing without images."""
+        from PIL import Image
+
+        if not self._tiles:
+            return
+        missing = -len(self._tiles) % COLUMNS if len(self._tiles) > COLUMNS else 0
+        tiles = [*self._tiles, *[np.zeros_like(self._tiles[0])] * missing]
+        columns = min(COLUMNS, len(tiles))
+        rows = [np.hstack(tiles[begin : begin + columns]) for begin in range(0, len(tiles), columns)]
+        Image.fromarray(np.vstack(rows)).save(path)
+
+
+def draw_keypoints(frame: TwinFrame, step: int = 1) -> NDArray[np.uint8]:
+    """Return the image with a cross at each true key point, green where it is visible, else red.
+
+    Args:
+        frame: with an image (h, w, 3).
+        step: every how many of its pixels are drawn.
+    """
+    cv2, picture = import_cv2(), np.array(frame.color[::step, ::step])
+    for jaw in frame.jaws.values():
+        for pixel, visible in zip(jaw.pixels, jaw.visible, strict=True):
+            if np.isfinite(pixel).all():
+                place, color = np.round(pixel / step).astype(int).tolist(), VISIBLE if visible else HIDDEN
+                cv2.drawMarker(picture, place, color, cv2.MARKER_CROSS, 2 * ARM + 1)
+    return picture
+
+
+def draw_depth(depth: NDArray) -> NDArray[np.uint8]:
+    """Return a depth image (h, w) [m] in grey (h, w, 3), bright where it is near, black where there is none."""
+    share = (FAR - np.nan_to_num(depth, nan=FAR)) / (FAR - NEAR)
+    grey = (40.0 + 215.0 * np.clip(share, 0.0, 1.0)) * np.isfinite(depth)
+    return np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import LARGEST_PICTURE, PLUMB_BOB, CameraIntrinsics, decode_depth
-from finforce.errors import MissingDependencyError, PoseError, one_line
+from finforce.camera import PLUMB_BOB, CameraIntrinsics, ImageError, decode_depth, open_picture
+from finforce.errors import PoseError, one_line
 from finforce.files import FileError, read_bytes, read_json, read_yaml
 from finforce_contact.reconstruction.generated import affine_from_generator
 from finforce_eval.errors import OptionError
@@ -31,24 +31,14 @@ def read_image(path: Path | str) -> NDArray:
 
     Raises:
         OptionError: the file is missing, no picture, damaged or too large.
-        MissingDependencyError: Pillow is not installed.
     """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise MissingDependencyError("reading pictures needs Pillow: pip install pillow") from error
     path = Path(path)
     content = _read_file(path)
     try:
-        with Image.open(io.BytesIO(content)) as image:
-            if image.width * image.height > LARGEST_PICTURE:
-                size = f"{image.width} x {image.height}"
-                raise OptionError(f"{path.name}: {size} pixels; expected at most {LARGEST_PICTURE}")
-            return np.array(image.convert("RGB") if image.mode == "P" else image)
-    except OptionError:
-        raise
-    except Exception as error:  # each format has its own classes for damage
-        raise OptionError(f"{path.name}: no picture, or a damaged one: {one_line(error)}") from error
+        image = open_picture(content, path.name, formats=None)
+    except ImageError as error:
+        raise OptionError(str(error)) from error
+    return np.array(image.convert("RGB") if image.mode == "P" else image)
 
 
 def _read_file(path: Path) -> bytes:

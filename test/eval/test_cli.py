@@ -12,7 +12,7 @@ import pytest
 from eval_fakes import FakeEstimator, make_recording
 
 from finforce_eval.cli.main import main
-from finforce_eval.recordings.writer import MessageFactory, write_entries, write_recording
+from finforce_eval.recordings.writer import write_entries, write_recording
 
 BENCH_KEYPOINTS = 15
 ROOT = Path(__file__).resolve().parents[2]
@@ -97,7 +97,7 @@ def test_a_recording_of_which_nothing_is_left_is_refused(capsys, bag):
 
 
 def test_empty_recording_is_refused(capsys, tmp_path):
-    write_entries([], tmp_path / "bag", MessageFactory())
+    write_entries([], tmp_path / "bag")
     assert_refused(capsys, ["evaluate", tmp_path / "bag"], "empty")
 
 

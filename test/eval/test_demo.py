@@ -12,12 +12,12 @@ from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 
 from finforce_contact.jaw_contact import GivenContact
 from finforce_eval.cli import demo
+from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.scoring import score_grasp
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.twin_writer import write_footage
 from finforce_eval.replay.replay import Replay
 
 
@@ -30,7 +30,7 @@ def rendered(monkeypatch):
         calls.append((scenario.name, seed, finger))
         return make_footage(seed=seed)
 
-    monkeypatch.setattr("finforce_eval.recordings.twin_writer.build_footage", build)
+    monkeypatch.setattr("finforce_eval.cli.twin.build_footage", build)
     return calls
 
 

@@ -8,13 +8,13 @@ import pytest
 from rgbd_fakes import FakeDetector, FakeGripper, FakePhotographer, make_footage
 
 from finforce_eval.cli.main import main
+from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.keypoint_source import KeypointSource, awaiting_keypoints, detect_keypoints, parse_source
 from finforce_eval.evaluation.results import compare_detection, detection_stats
 from finforce_eval.evaluation.setup import make_setup
 from finforce_eval.recordings.objects import track_object
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.twin_writer import write_footage
 from finforce_eval.recordings.writer import write_recording
 from finforce_keypoints.images import check_image
 

@@ -9,13 +9,13 @@ from eval_fakes import FakeEstimator, FakeJaw, make_recording
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 
 from finforce_contact.jaw_contact import GivenContact
+from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.figures.report import write_report
 from finforce_eval.recordings.images import ImageTrack
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.twin_writer import write_footage
 from finforce_keypoints.diagnostics import COLORS
 
 pytest.importorskip("matplotlib")

@@ -1,5 +1,6 @@
 """Claims about RGB-D recordings: what is written comes back, image by image, and what is wrong is named."""
 
+import copy
 import tracemalloc
 from dataclasses import fields, replace
 
@@ -9,12 +10,12 @@ from rgbd_fakes import CAMERA, FakeGripper, make_footage
 from scipy.spatial.transform import Rotation
 
 from finforce.camera import ImageError
+from finforce_eval.cli.twin import RecordingForm, footage_entries, write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import compress_depth, depth_from_message, depth_steps, encode_color
 from finforce_eval.recordings.objects import find_mesh
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.twin_writer import ImageFactory, RecordingForm, _footage_entries, write_footage
-from finforce_eval.recordings.writer import MessageFactory, write_entries
+from finforce_eval.recordings.writer import write_entries
 from finforce_eval.replay.playback import read_playback
 from finforce_keypoints.parameters import COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC
 from finforce_sim.footage import encode_depth
@@ -39,10 +40,9 @@ def written(request, tmp_path_factory):
 
 def write_without(folder, *topics, footage=None, edit=lambda entry: entry):
     """Write plain footage without some topics, each message after an edit."""
-    factory = MessageFactory()
-    entries = _footage_entries(footage or make_footage(), ImageFactory(factory, FORMS["raw"]), lambda frame: None)
+    entries = footage_entries(footage or make_footage(), FORMS["raw"])
     kept = [edit(entry) for entry in entries if entry.topic not in topics]
-    return write_entries([entry for entry in kept if entry is not None], folder, factory)
+    return write_entries([entry for entry in kept if entry is not None], folder)
 
 
 def test_images_come_back_as_they_were_taken(written):
@@ -170,11 +170,10 @@ def test_images_without_any_topic_of_a_jaw_are_refused_with_what_would_do(tmp_pa
 
 def separate_headers(edit):
     """Give the depth image a header of its own before an edit."""
-    factory = MessageFactory()
 
     def edited(entry):
         if entry.topic == DEPTH_TOPIC:
-            entry.message.header = factory.header(entry.stamp, entry.message.header.frame_id)
+            entry.message.header = copy.deepcopy(entry.message.header)
         return edit(entry)
 
     return edited
@@ -262,9 +261,8 @@ def test_key_points_that_were_recorded_do_not_need_whole_images(tmp_path):
     from finforce_eval.recordings.writer import recording_entries
 
     recording = replace(make_recording(frames=6), case={})
-    factory = MessageFactory()
-    entries = sorted(recording_entries(recording, factory), key=lambda entry: entry.stamp)
-    footage = _footage_entries(make_footage(), ImageFactory(factory, FORMS["raw"]), lambda frame: None)
+    entries = sorted(recording_entries(recording), key=lambda entry: entry.stamp)
+    footage = footage_entries(make_footage(), FORMS["raw"])
     colors = [entry for entry in footage if entry.topic == COLOR_TOPIC]
-    read = read_recording(write_entries([*entries, *colors], tmp_path / "bag", factory))
+    read = read_recording(write_entries([*entries, *colors], tmp_path / "bag"))
     assert read.images is None and any("camera_info" in note for note in read.notes)

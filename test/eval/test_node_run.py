@@ -3,7 +3,7 @@
 import pytest
 
 from finforce_eval.recordings.recording import POSE
-from finforce_eval.recordings.writer import MessageFactory
+from finforce_eval.recordings.writer import pose_message, typestore
 from finforce_eval.replay.node_run import Listener, describe_load, run_nodes
 from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.processes import ProcessError
@@ -14,11 +14,11 @@ TOPIC = "/left/jaw_pose"
 
 def make_film(count):
     """Poses at 30 Hz."""
-    factory, messages = MessageFactory(), []
+    messages = []
     for index in range(count):
         stamp = 10**12 + round(index * 1e9 / 30)
-        pose = factory.pose(stamp, "camera", [0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0])
-        messages.append(RawMessage(stamp, TOPIC, POSE, bytes(factory.typestore.serialize_cdr(pose, POSE)), True))
+        pose = pose_message(stamp, "camera", [0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0])
+        messages.append(RawMessage(stamp, TOPIC, POSE, bytes(typestore().serialize_cdr(pose, POSE)), True))
     return SyntheticStream(messages=messages)
 
 

@@ -10,20 +10,23 @@ from eval_fakes import PERIOD, START, make_recording
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import parse_phases
-from finforce_eval.recordings.writer import Entry, MessageFactory, recording_entries, write_entries, write_recording
+from finforce_eval.recordings.writer import (
+    Entry,
+    cloud_message,
+    make_message,
+    recording_entries,
+    typestore,
+    write_entries,
+    write_recording,
+)
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 
 
-@pytest.fixture(scope="module")
-def factory():
-    return MessageFactory()
-
-
 @pytest.fixture
-def entries(factory):
+def entries():
     """The messages of a good recording, to be spoilt."""
-    return sorted(recording_entries(make_recording(), factory), key=lambda entry: entry.stamp)
+    return sorted(recording_entries(make_recording()), key=lambda entry: entry.stamp)
 
 
 def spoil(entries, topic, number, change):
@@ -79,10 +82,10 @@ def test_recording_without_truth_phases_and_case_is_read(tmp_path):
         read.truth("left")
 
 
-def test_unknown_types_are_skipped_with_a_note(tmp_path, factory, entries):
+def test_unknown_types_are_skipped_with_a_note(tmp_path, entries):
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    types = factory.typestore
+    types = typestore()
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         odd = writer.add_connection("/odd", "own_msgs/msg/Odd", msgdef="own_msgs/Lost part", rihs01="RIHS01_0")
         cloud = writer.add_connection("/left/keypoints", CLOUD, typestore=types)
@@ -115,22 +118,22 @@ def test_absent_and_empty_places_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_empty_recording_is_refused(tmp_path, factory, storage):
-    write_entries([], tmp_path / "bag", factory, storage=storage)
+def test_empty_recording_is_refused(tmp_path, storage):
+    write_entries([], tmp_path / "bag", storage=storage)
     with pytest.raises(RecordingError, match="empty"):
         read_recording(tmp_path / "bag")
 
 
-def test_recording_without_key_points_is_refused(tmp_path, factory, entries):
+def test_recording_without_key_points_is_refused(tmp_path, entries):
     rest = [entry for entry in entries if entry.topic != "/left/keypoints"]
-    write_entries(rest, tmp_path / "bag", factory)
+    write_entries(rest, tmp_path / "bag")
     with pytest.raises(RecordingError, match="no key points"):
         read_recording(tmp_path / "bag")
 
 
-def test_our_topic_with_another_type_is_refused(tmp_path, factory):
-    entry = Entry(START, "/left/keypoints", "std_msgs/msg/String", factory.string("hello"))
-    write_entries([entry], tmp_path / "bag", factory)
+def test_our_topic_with_another_type_is_refused(tmp_path):
+    entry = Entry(START, "/left/keypoints", make_message("std_msgs/msg/String", data="hello"))
+    write_entries([entry], tmp_path / "bag")
     with pytest.raises(RecordingError, match="is std_msgs/msg/String; expected sensor_msgs/msg/PointCloud2"):
         read_recording(tmp_path / "bag")
 
@@ -183,14 +186,14 @@ def make_infinite(message):
         (make_infinite, "message 7 has infinite coordinates"),
     ],
 )
-def test_spoilt_key_points_are_refused(tmp_path, factory, entries, change, reason):
-    write_entries(spoil(entries, "/left/keypoints", 7, change), tmp_path / "bag", factory)
+def test_spoilt_key_points_are_refused(tmp_path, entries, change, reason):
+    write_entries(spoil(entries, "/left/keypoints", 7, change), tmp_path / "bag")
     with pytest.raises(RecordingError, match=reason):
         read_recording(tmp_path / "bag")
 
 
-def test_truth_in_another_frame_is_refused(tmp_path, factory, entries):
-    write_entries(spoil(entries, "/left/ground_truth_wrench", 0, wrong_frame), tmp_path / "bag", factory)
+def test_truth_in_another_frame_is_refused(tmp_path, entries):
+    write_entries(spoil(entries, "/left/ground_truth_wrench", 0, wrong_frame), tmp_path / "bag")
     with pytest.raises(RecordingError, match="frame 'map'; expected 'left_jaw'"):
         read_recording(tmp_path / "bag")
 
@@ -245,27 +248,26 @@ def test_existing_folder_is_never_overwritten(tmp_path):
 
 
 @pytest.mark.parametrize("topic", ["/object_pose", "/left/jaw_pose"])
-def test_poses_of_one_topic_in_two_frames_are_refused(tmp_path, factory, entries, topic):
+def test_poses_of_one_topic_in_two_frames_are_refused(tmp_path, entries, topic):
     def rename(message):
         message.header.frame_id = "other"
 
-    bag = write_entries(spoil(entries, topic, 2, rename), tmp_path / "bag", factory)
+    bag = write_entries(spoil(entries, topic, 2, rename), tmp_path / "bag")
     with pytest.raises(RecordingError, match=f"bag: {topic} message 2 is in the frame 'other', the first in 'camera_"):
         read_recording(bag)
 
 
 def stated(number, *, axes="xyz"):
     """An entry with four key points that state their standard deviations, the second not valid."""
-    factory = MessageFactory()
     columns = {axis: np.float32([0, 1, 2, 3]) for axis in "xyz"}
     columns |= {f"stddev_{axis}": np.float32([1e-3, np.nan, 2e-3, 3e-3]) for axis in axes}
     columns["valid"] = np.array([1, 0, 1, 1], dtype="u1")
     stamp = START + number * PERIOD
-    return Entry(stamp, "/left/keypoints", CLOUD, factory.cloud(stamp, "left_jaw", columns))
+    return Entry(stamp, "/left/keypoints", cloud_message(stamp, "left_jaw", columns))
 
 
 def test_stated_deviations_go_with_the_key_points(tmp_path):
-    write_entries([stated(0), stated(1)], tmp_path / "bag", MessageFactory())
+    write_entries([stated(0), stated(1)], tmp_path / "bag")
     track = read_recording(tmp_path / "bag").jaw("left").keypoints
     np.testing.assert_array_equal(track.stddev[:, 2:, 1], np.float32([[2e-3, 3e-3]] * 2))
     observation = track.observation(1)
@@ -273,14 +275,14 @@ def test_stated_deviations_go_with_the_key_points(tmp_path):
     assert np.isnan(observation.points[1]).all() and observation.stamp == track.stamps[1] * 1e-9
 
 
-def test_recording_without_deviations_has_none(tmp_path, factory, entries):
-    write_entries(entries, tmp_path / "bag", factory)
+def test_recording_without_deviations_has_none(tmp_path, entries):
+    write_entries(entries, tmp_path / "bag")
     track = read_recording(tmp_path / "bag").jaw("left").keypoints
     assert track.stddev is None and track.observation(0).stddev is None
 
 
 @pytest.mark.parametrize(("axes", "reason"), [("", "message 1 differs from the first"), ("xy", "expected all of")])
 def test_deviations_in_some_messages_or_along_some_axes_are_refused(tmp_path, axes, reason):
-    write_entries([stated(0), stated(1, axes=axes)], tmp_path / "bag", MessageFactory())
+    write_entries([stated(0), stated(1, axes=axes)], tmp_path / "bag")
     with pytest.raises(RecordingError, match=reason):
         read_recording(tmp_path / "bag")

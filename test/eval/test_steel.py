@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from finforce_eval.cli.convert_steel import SHIPPED, points_from_picture, recording_from_measurement
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.steel import SHIPPED, points_from_picture, recording_from_measurement
 from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.jaw.jaw import load_jaw
 

@@ -8,9 +8,9 @@ from rgbd_fakes import CAMERA, MESH, FakeGripper, FakePhotographer
 
 from finforce.gripper_frames import BENCH_CAMERA
 from finforce.messages import read_stamp
+from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.recordings.images import IMAGE
-from finforce_eval.recordings.twin_writer import write_footage
 from finforce_eval.replay.playback import RawMessage
 from finforce_eval.replay.synthetic_stream import (
     FINE_RATE,

@@ -11,11 +11,11 @@ from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 from finforce_contact.jaw_contact import GivenContact
 from finforce_eval.cli import twin as twin_commands
 from finforce_eval.cli.main import main
+from finforce_eval.cli.twin import write_footage
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.keypoint_source import detect_keypoints
 from finforce_eval.evaluation.tables import evaluation_json, format_sight, format_table, markdown_sight
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.twin_writer import write_footage
 from finforce_sim.scenarios import SCENARIOS
 
 
@@ -28,7 +28,7 @@ def asked(monkeypatch):
         calls.append((scenario, seed, camera, finger, depth_step))
         return make_footage(seed=seed)
 
-    monkeypatch.setattr("finforce_eval.recordings.twin_writer.build_footage", build)
+    monkeypatch.setattr("finforce_eval.cli.twin.build_footage", build)
     return calls
 
 

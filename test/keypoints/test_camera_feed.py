@@ -132,5 +132,5 @@ def test_a_jpeg_stream_is_decoded_and_a_damaged_one_refused():
             camera.feed.decode(ImagePair(1, Picture(later.header, broken), None))
     huge = data.tobytes().replace(bytes([0xFF, 0xC0, 0, 17, 8, *divmod(HEIGHT, 256)]), b"\xff\xc0\0\x11\x08\xff\xff")
     huge = huge[: huge.index(b"\xff\xff") + 2] + b"\xff\xff" + huge[huge.index(b"\xff\xff") + 4 :]
-    with pytest.raises(ImageError, match="65535 x 65535; expected at most 50000000 pixels"):
+    with pytest.raises(ImageError, match="expected at most 50000000 pixels"):
         camera.feed.decode(ImagePair(1, Picture(raw.header, huge), None))

@@ -14,14 +14,14 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from finforce.gripper_frames import ROBOT_CAMERA
 from finforce.ros import node as ros
 from finforce.transforms import invert_pose, pose_numbers
+from finforce_eval.cli.check import record_camera
 from finforce_eval.cli.main import main
+from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.check import FAULT, OK, WARNING, judge_picture
 from finforce_eval.recordings.bags import open_bag
 from finforce_eval.recordings.images import CAMERA_INFO, COMPRESSED
-from finforce_eval.recordings.listening import CameraTopics, record_camera
-from finforce_eval.recordings.twin_writer import write_footage
-from finforce_keypoints.parameters import COLOR_TOPIC
+from finforce_keypoints.parameters import COLOR_TOPIC, INFO_TOPIC
 from finforce_sim.footage import build_footage
 from finforce_sim.scenarios import build_scenario
 
@@ -144,7 +144,7 @@ def test_too_few_images_are_refused(still, capsys):
     assert "expected at least 5" in capsys.readouterr().err
 
 
-COLOR_ALONE = CameraTopics(color=f"{COLOR_TOPIC}/compressed", depth="")
+COLOR_ALONE = (f"{COLOR_TOPIC}/compressed", INFO_TOPIC)
 
 
 @contextmanager

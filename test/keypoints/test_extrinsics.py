@@ -10,7 +10,7 @@ from finforce.camera import project
 from finforce.gripper_frames import BENCH_CAMERA, BENCH_ORIGIN_X, ROBOT_CAMERA, jaw_in_camera
 from finforce.transforms import move_pose, pose_from_quaternion, pose_numbers, rotation_between
 from finforce_eval.cli.main import main
-from finforce_eval.recordings.twin_writer import write_footage
+from finforce_eval.cli.twin import write_footage
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_keypoints.errors import GeometryError
 from finforce_keypoints.geometry.extrinsics import SeenJaw, find_extrinsics

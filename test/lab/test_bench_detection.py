@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from rgbd_fakes import FakeDetector, FakePhotographer, make_footage
 
+from finforce_eval.cli.twin import write_footage
 from finforce_eval.recordings.recording import read_recording
-from finforce_eval.recordings.twin_writer import write_footage
 from lab.bench import detection as bench
 from lab.bench.detection import Way, measure_ways
 
