@@ -12,7 +12,6 @@ from typing import Any
 from numpy.typing import NDArray
 
 from finforce.gripper_frames import SIDES
-from finforce_eval.cli.twin import RecordingForm, record_scene
 from finforce_eval.engine.settings import hash_files
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import ContactChoice
