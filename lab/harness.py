@@ -104,7 +104,6 @@ PARTS = (
     Part(name="chain", title="Latency against force error of the whole chain", usual=True),
     Part(name="start", title="From a node's start until it is ready, and its memory"),
     Part(name="onset", title="From the onset of a force until it shows"),
-    Part(name="endurance", title="An hour of grasps: growth of memory, drift of the force, lost images"),
     Part(name="skipping", title="CPU time of each node in three scenes, with the skip rules and without"),
     Part(name="mechanics", title="Mechanics against an independent program, and the shipped fingers"),
     Part(name="images", title="From images to forces on unseen scenes, beside true key points"),

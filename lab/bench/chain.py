@@ -5,13 +5,16 @@ own; once more while something else takes one processor. Who listens hears the g
 and every image is to be answered. Latency is from the image's leaving to the arrival of the grasp force. The error is
 counted twice: at the image's own time, and "now": what is known at any time, the newest force that has arrived, against
 the truth at that time.
+
+For some minutes, the same grasp is played again and again from images to all stages in one process: growth of memory,
+lost images, and drift of the force.
 """
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,7 @@ from numpy.typing import NDArray
 from finforce.skipping import IDLE
 from finforce.stamps import NANOSECONDS
 from finforce.systems.processes import Process, ReplayOptions, compose, replay_processes
+from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.keypoint_source import KeypointSource
 from finforce_eval.evaluation.scoring import match_truth, rms
 from finforce_eval.recordings.objects import require_mesh
@@ -30,6 +34,8 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.tracks import Recording
 from finforce_eval.replay.live import ReplayLog
 from finforce_eval.replay.node_run import NodeRun, describe_load, run_nodes
+from finforce_eval.replay.playback import RawMessage
+from finforce_eval.replay.processes import resident_bytes
 from finforce_eval.replay.synthetic_stream import SyntheticStream, stream_images, stream_keypoints
 from lab.harness import Figures, Tradeoff, percentiles
 from lab.scenes import GRASP, GRASP_FAST, find_scene
@@ -39,6 +45,8 @@ IMAGES, KEYPOINTS = "images", "key points"
 TOGETHER, APART, BUSY = "one process", "four processes", "one, a core taken"
 BURN = "while True: pass"
 TARE = 1.8  # [s] from the first image, in which the solvers take their tare and give no force
+SETTLED = 8  # grasps until memory is taken, and the fingers' material has bent as often as it remembers
+EDGE = 0.1  # share of the grasps whose mean errors are compared, at either end
 STEP = 1e-3  # [s] between two times at which the error now is taken
 SIDES = ("left", "right")
 
@@ -55,13 +63,22 @@ class TrueGrasp:
         return np.interp(stamps, self.stamps, self.force, left=np.nan, right=np.nan)
 
 
-def measure(quick: bool) -> Figures:
-    """Return latency and force error from images and from key points at every rate, at 30 Hz alone when `quick`.
+def measure(quick: bool, minutes: float = 0.0) -> Figures:
+    """Return latency and force error from images and from key points at every rate.
+
+    Args:
+        quick: at 30 Hz alone.
+        minutes: for which one grasp is played again and again instead, when above zero.
 
     Raises:
         MissingDependencyError: ROS 2 is not installed.
+        OptionError: the minutes are no duration.
         FinforceError: the scene cannot be rendered, or a node ended early.
     """
+    if not 0.0 <= minutes < np.inf:
+        raise OptionError(f"--minutes {minutes:g}: expected a duration above zero")
+    if minutes:
+        return measure_long(minutes)
     scene = find_scene(GRASP if quick else GRASP_FAST)
     recording = read_recording(scene)
     truth, rows = true_grasp(recording), []
@@ -88,6 +105,48 @@ def measure(quick: bool) -> Figures:
             title="Whole chain: latency against error of the force now",
         ),
     )
+
+
+def measure_long(minutes: float) -> Figures:
+    """Return growth of memory, lost images and drift of the force of a grasp that is repeated for some minutes."""
+    path = find_scene(GRASP)
+    recording, once = read_recording(path), stream_images(path, RATES[0])
+    stream = replace(once, repeats=max(SETTLED + 2, round(60.0 * minutes * NANOSECONDS / once.period)))
+    memory: list[float] = []
+
+    def note_memory(pids: Mapping[str, int], message: RawMessage) -> None:
+        if message.time >= stream.begin + len(memory) * stream.period:
+            memory.append(1e-6 * sum(resident_bytes(pid) for pid in pids.values()))
+
+    processes = chain_processes(recording, images=True, off=(IDLE,))
+    run = run_nodes(processes, stream, SIDES, heard=(), watch=note_memory)
+    grasps = divide_grasps(run.log, true_grasp(recording), stream).assign(**{"memory/MB": memory})
+    settled = grasps[SETTLED:]
+    edge = max(1, int(EDGE * len(settled)))
+    bias = settled["bias/N"]
+    row = {
+        "minutes": run.seconds / 60.0,
+        "grasps": len(grasps),
+        "images": int(grasps["images"].sum()),
+        "lost": int((grasps["images"] - grasps["answered"]).sum()),
+        "growth/MB": settled["memory/MB"].iloc[-1] - settled["memory/MB"].iloc[0],
+        "drift/N": bias.iloc[-edge:].mean() - bias.iloc[:edge].mean(),
+        **percentiles(list(run.log.grasp_latency.values()), "latency"),
+        "process/% of a core": sum(run.cpu.values()),
+    }
+    notes = [describe_load([run.others])]
+    return Figures(tables={"long": pd.DataFrame([row])}, notes=notes, more={"grasps": grasps.to_dict("records")})
+
+
+def divide_grasps(log: ReplayLog, truth: TrueGrasp, stream: SyntheticStream) -> pd.DataFrame:
+    """Return images, answers and mean error of each grasp after the tare, beside the truth of the first one."""
+    sent = np.array(sorted(log.jaws[SIDES[0]].sent))
+    sent = sent[sent >= sent[0] + TARE * NANOSECONDS]
+    number = (sent - stream.messages[0].stamp) // stream.period
+    force = np.array([log.grasp.get(int(stamp), np.nan) for stamp in sent])
+    groups = pd.DataFrame({"error": force - truth.at(sent - number * stream.period)}).groupby(number)["error"]
+    answered = pd.Series(np.isfinite(force)).groupby(number).sum()
+    return pd.DataFrame({"images": groups.size(), "answered": answered, "bias/N": groups.mean()})
 
 
 def _run(source: str, setup: str, stream: SyntheticStream, recording: Recording) -> NodeRun:

@@ -20,7 +20,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
     text = "jaw file or shipped jaw of the parts solvers and images; of the latter several, separated by commas"
     parser.add_argument("--jaw", metavar="NAME", help=text)
-    parser.add_argument("--minutes", type=float, metavar="N", help="duration of the part endurance")
+    parser.add_argument("--minutes", type=float, metavar="N", help="for which the part chain repeats one grasp")
     text = "repetitions of each case of the parts images, pose_tracking and reconstruction; faults or grasps of others"
     parser.add_argument("--count", type=int, metavar="N", help=text)
     parser.add_argument("--model", metavar="FOLDER", help="network of the part images, in place of the shipped one")
