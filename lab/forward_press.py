@@ -154,6 +154,8 @@ def press_jaw(
     rigid: RigidObject,
     height: float,
     depths: Sequence[float],
+    *,
+    partial: bool = False,
 ) -> list[PressState]:
     """Press a rigid object into the inner surface, displacement driven, frictionless.
 
@@ -164,6 +166,7 @@ def press_jaw(
         rigid: the object.
         height: of its centre above the clamped base [m].
         depths: rising depths [m]; steps between them are cut to half a millimetre, and further where needed.
+        partial: whether the depths that are reached are enough, however few.
 
     Raises:
         ContactError: No stable equilibrium is found that is reached without a snap; the message says at which depth.
@@ -179,12 +182,20 @@ def press_jaw(
                 state, reached, iterations = trial, target, iterations + trial.iterations
                 continue
             step *= 0.5
+            if step < _SHORTEST_STEP and partial:
+                return results
             if step < _SHORTEST_STEP:
                 raise ContactError(
                     f"no equilibrium beyond a depth of {1e3 * reached:.3f} mm: the jaw buckles or slips off"
                 )
         results.append(_describe(setting, state.q, depth, iterations))
     return results
+
+
+def follow_points(model: JawModel, points: NDArray, presses: Sequence[PressState]) -> NDArray:
+    """Return where material points (k, 3) [m] of a jaw are at rest and in n presses (n + 1, k, 3) [m]."""
+    probe = model.attach(points, max_distance=1.0)
+    return np.stack([model.positions(probe, q) for q in (np.zeros(model.size), *(press.q for press in presses))])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,7 +15,7 @@ from finforce_ifea.jaw.drawing import Drawing
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
-from lab.forward_press import RigidCylinder, press_jaw
+from lab.forward_press import RigidCylinder, follow_points, press_jaw
 
 # What a clamp may be off by [m]; the hinges are free.
 _CLAMP_STDDEV = 0.003
@@ -55,11 +55,10 @@ def press(
     """Return the drawn hinge points (depths, hinges, 2) [m] of the finger pressed on a cylinder."""
     finger = replace(jaw, drawing=replace(drawing, clamped_z=clamp))
     mechanics = build_mechanics(finger, EstimatorSettings())
-    probe = mechanics.model.attach(np.insert(drawn, 1, 0.0, axis=1), 1e-3)
     presses = press_jaw(
         mechanics.model, mechanics.contact.surface, finger.inner_face_x, RigidCylinder(radius=radius), height, depths
     )
-    return np.stack([mechanics.model.positions(probe, state.q)[:, [0, 2]] for state in presses])
+    return follow_points(mechanics.model, np.insert(drawn, 1, 0.0, axis=1), presses)[1:, :, [0, 2]]
 
 
 if __name__ == "__main__":

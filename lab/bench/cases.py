@@ -7,16 +7,14 @@ errors, holes and points behind the object are those of the bench recordings' me
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce_ifea.errors import ContactError
-from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw, load_jaw
+from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.observation import Contact, ObjectOutline, Observation
 from finforce_ifea.settings import EstimatorSettings
 
@@ -65,8 +63,7 @@ class ReplayedPress:
     Attributes:
         case: what was pressed.
         observations: n images.
-        heights: the contact at the height of first touch, image by image.
-        outlines: the contact with the object's outline, image by image.
+        contacts: image by image, with the "height" of first touch and with the object's "outline".
         force: true forces on the jaw (n, 3) [N].
         held: images in the last second of a level (n,) bool.
         ends: the last image of each level (levels,).
@@ -74,15 +71,10 @@ class ReplayedPress:
 
     case: BenchCase
     observations: Sequence[Observation]
-    heights: Sequence[Contact]
-    outlines: Sequence[Contact]
+    contacts: Mapping[str, Sequence[Contact]]
     force: NDArray
     held: NDArray
     ends: NDArray
-
-    def contacts(self, kind: str) -> Sequence[Contact]:
-        """Return the contacts of a kind, "height" or "outline", image by image."""
-        return self.outlines if kind == "outline" else self.heights
 
 
 def load_cases(path: Path | str = TRUTH) -> tuple[BenchCase, ...]:
@@ -125,7 +117,7 @@ def press_cases(jaw: Jaw, diameters: Sequence[float] = DIAMETERS) -> tuple[Bench
         FinforceError: No solid describes the jaw.
     """
     from finforce_ifea.mechanics import build_mechanics
-    from lab.forward_press import RigidCylinder, press_jaw
+    from lab.forward_press import RigidCylinder, follow_points, press_jaw
 
     mesh = "default" if jaw.section is None else "coarse"
     mechanics = build_mechanics(jaw, EstimatorSettings(solver="solid", mesh=mesh))
@@ -133,20 +125,17 @@ def press_cases(jaw: Jaw, diameters: Sequence[float] = DIAMETERS) -> tuple[Bench
     heights, bench = jaw.candidates[:, 2], load_jaw("bench").candidates[:, 2]
     size = float(np.ptp(heights) / np.ptp(bench))
     levels = min(size, 1.0) * np.array(LEVELS)
-    probe = model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
-    rest, cases = model.positions(probe, np.zeros(model.size)), []
+    cases = []
     for name, height in HEIGHTS.items():
         there = float(heights.min() + size * (height - bench.min()))
         for diameter in diameters:
-            rigid, states = RigidCylinder(radius=0.5 * diameter), []
+            rigid = RigidCylinder(radius=0.5 * diameter)
             first = press_jaw(model, surface, jaw.inner_face_x, rigid, there, levels[:1])[0]
             depths = levels * min(1.0, _HARDEST / float(np.linalg.norm(first.force)) * levels[0] / levels[-1])
-            for count in range(len(depths), _FEWEST_DEPTHS - 1, -1):
-                with suppress(ContactError):
-                    states = press_jaw(model, surface, jaw.inner_face_x, rigid, there, depths[:count])
-                    break
-            if not states:
+            states = press_jaw(model, surface, jaw.inner_face_x, rigid, there, depths, partial=True)
+            if len(states) < _FEWEST_DEPTHS:
                 continue
+            places = follow_points(model, jaw.keypoints, states)
             cases.append(
                 BenchCase(
                     name=f"Ø{1e3 * diameter:.0f} {name}",
@@ -154,7 +143,7 @@ def press_cases(jaw: Jaw, diameters: Sequence[float] = DIAMETERS) -> tuple[Bench
                     height=there,
                     radius=rigid.radius,
                     depth=depths[: len(states)],
-                    moved=np.stack([model.positions(probe, state.q) - rest for state in states]),
+                    moved=places[1:] - places[0],
                     force=np.stack([state.force for state in states]),
                 )
             )
@@ -182,15 +171,18 @@ def record_press(case: BenchCase, jaw: Jaw, camera: NoisyCamera | None = None, s
     force = PchipInterpolator(grid, np.concatenate([np.zeros((1, 3)), case.force]))(depth)
     axes = np.stack([jaw.inner_face_x + case.radius - depth, np.full(len(depth), case.height)], axis=1)
     random = np.random.default_rng([seed, round(1e4 * case.radius), round(1e3 * case.height)])
-    sight = MeasuredKeypoints(points=points, likelihood=np.ones(points.shape[:2]))
+    likelihood = np.ones(points.shape[:2])
     if camera is not None:
-        sight = camera.observe(points, axes, case.radius, random)
+        points, likelihood = camera.observe(points, axes, case.radius, random)
     contact = Contact.fixed(jaw, case.height)
+    outlines = _outlines(contact, axes, case.radius, 0.0 if camera is None else random.standard_normal(3))
     return ReplayedPress(
         case=case,
-        observations=_observe(sight),
-        heights=[contact] * len(depth),
-        outlines=_outlines(contact, axes, case.radius, 0.0 if camera is None else random.standard_normal(3)),
+        observations=[
+            Observation(stamp=1.0 + PERIOD * index, points=points[index], likelihood=likelihood[index])
+            for index in range(len(depth))
+        ],
+        contacts={"height": [contact] * len(depth), "outline": outlines},
         force=force,
         held=motion.held,
         ends=motion.ends,
@@ -222,13 +214,6 @@ def _build_motion(depths: NDArray) -> _PressMotion:
     return _PressMotion(depth=depth, held=held, ends=np.array(ends))
 
 
-def _observe(sight: MeasuredKeypoints) -> list[Observation]:
-    return [
-        Observation(stamp=1.0 + PERIOD * index, points=points, likelihood=likelihood)
-        for index, (points, likelihood) in enumerate(zip(sight.points, sight.likelihood, strict=True))
-    ]
-
-
 def _outlines(contact: Contact, axes: NDArray, radius: float, error: NDArray | float) -> list[Contact]:
     """Return the contact with a round outline at axes (n, 2) [m], its pose off by `error` standard deviations (3,)."""
     angles = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
@@ -247,14 +232,6 @@ def _outlines(contact: Contact, axes: NDArray, radius: float, error: NDArray | f
 # Half the length of the pressed cylinders [m].
 _HALF_LENGTH = 0.03
 _SEEN_LIKELIHOOD, _HIDDEN_LIKELIHOOD = (0.6, 1.0), (0.02, 0.55)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MeasuredKeypoints:
-    """Seen key points (n, K, 3) [m], jaw frame, NaN without depth, and their likelihoods (n, K)."""
-
-    points: NDArray
-    likelihood: NDArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,8 +260,10 @@ class NoisyCamera:
     holes: float = 0.01
     hidden_trusted: float = 0.05
 
-    def observe(self, points: NDArray, axes: NDArray, radius: float, random: np.random.Generator) -> MeasuredKeypoints:
-        """Return what the camera sees of key points (n, K, 3) [m] next to a cylinder along y.
+    def observe(
+        self, points: NDArray, axes: NDArray, radius: float, random: np.random.Generator
+    ) -> tuple[NDArray, NDArray]:
+        """Return key points (n, K, 3) [m] next to a cylinder as seen, NaN without depth, and likelihoods (n, K).
 
         Args:
             points: true key points, jaw frame.
@@ -310,7 +289,7 @@ class NoisyCamera:
         likelihood = np.where(
             doubted, random.uniform(*_HIDDEN_LIKELIHOOD, shape), random.uniform(*_SEEN_LIKELIHOOD, shape)
         )
-        return MeasuredKeypoints(points=seen, likelihood=likelihood)
+        return seen, likelihood
 
     def _find_cover(self, points: NDArray, axes: NDArray, radius: float) -> NDArray:
         """Return which share of the way to each point (n, K) a cylinder lets the sight go; NaN when all of it."""

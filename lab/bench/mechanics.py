@@ -16,14 +16,12 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from finforce_ifea.contact_mechanics.pressed_jaw import Mechanics
-from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.calibration import load_calibration
-from finforce_ifea.jaw.jaw import KEYPOINT_DISTANCE, Jaw, list_shipped_jaws, load_jaw
+from finforce_ifea.jaw.jaw import Jaw, list_shipped_jaws, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.settings import EstimatorSettings
 from lab.bench.cases import POISSON_RATIO, YOUNG_MODULUS, BenchCase, load_cases
-from lab.forward_press import PressState, RigidCylinder, press_jaw
+from lab.forward_press import RigidCylinder, follow_points, press_jaw
 from lab.harness import Figures
 
 SHOWN = (2, 5, 10)  # [mm] of depth
@@ -68,18 +66,18 @@ def measure(quick: bool) -> Figures:
     return Figures(tables={"summary": summarise(found), "cases": found, "fingers": pd.DataFrame(fingers)})
 
 
-def press_model(model: Model, cases: Sequence[BenchCase]) -> list[dict[str, Any]]:
+def press_model(chosen: Model, cases: Sequence[BenchCase]) -> list[dict[str, Any]]:
     """Return a row for each case: errors of a model that is pressed as the truth was."""
-    jaw = load_calibration(model.calibration).apply(load_jaw("bench")) if model.calibration else load_jaw("bench")
+    jaw = load_calibration(chosen.calibration).apply(load_jaw("bench")) if chosen.calibration else load_jaw("bench")
     jaw = replace(jaw, material=replace(jaw.material, young_modulus=YOUNG_MODULUS, poisson_ratio=POISSON_RATIO))
-    mechanics = build_mechanics(jaw, EstimatorSettings(solver=model.solver, mesh=model.mesh))
-    probe = mechanics.model.attach(jaw.keypoints, KEYPOINT_DISTANCE)
-    rest = mechanics.model.positions(probe, np.zeros(mechanics.model.size))
-    rows = []
+    mechanics = build_mechanics(jaw, EstimatorSettings(solver=chosen.solver, mesh=chosen.mesh))
+    model, surface, rows = mechanics.model, mechanics.contact.surface, []
     for case in cases:
-        presses = press_as_deep_as_it_goes(mechanics, jaw.inner_face_x, case)
-        count = len(presses)
-        moved = np.stack([mechanics.model.positions(probe, press.q) - rest for press in presses])
+        rigid = RigidCylinder(radius=case.radius)
+        # as deep as it goes before it buckles
+        presses = press_jaw(model, surface, jaw.inner_face_x, rigid, case.height, case.depth, partial=True)
+        count, places = len(presses), follow_points(model, jaw.keypoints, presses)
+        moved = places[1:] - places[0]
         true = np.linalg.norm(case.force[:count], axis=1)
         force = 100.0 * (np.array([np.linalg.norm(press.force) for press in presses]) / true - 1.0)
         points = 1e3 * np.linalg.norm(moved - case.moved[:count], axis=2).max(axis=1)
@@ -96,21 +94,6 @@ def press_model(model: Model, cases: Sequence[BenchCase]) -> list[dict[str, Any]
             }
         )
     return rows
-
-
-def press_as_deep_as_it_goes(mechanics: Mechanics, face_x: float, case: BenchCase) -> Sequence[PressState]:
-    """Return the equilibria up to the depth at which the model buckles.
-
-    Raises:
-        ContactError: there is none at any depth.
-    """
-    model, surface, cylinder = mechanics.model, mechanics.contact.surface, RigidCylinder(radius=case.radius)
-    for count in range(len(case.depth), 0, -1):
-        try:
-            return press_jaw(model, surface, face_x, cylinder, case.height, case.depth[:count])
-        except ContactError:
-            continue
-    raise ContactError(f"{case.name}: no equilibrium at any depth")
 
 
 def measure_turn(jaw: Jaw, case: BenchCase, moved: NDArray) -> float:

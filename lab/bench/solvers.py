@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from gc import collect, disable, enable
-from pathlib import Path
 from time import perf_counter, thread_time
 from typing import Any
 
@@ -14,15 +13,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError
-from finforce_eval.errors import OptionError, RecordingError
-from finforce_eval.evaluation.contact_source import parse_contacts
-from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.evaluation.scoring import rms
-from finforce_eval.evaluation.setup import EvaluationSetup
-from finforce_eval.recordings.recording import read_recording
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.fem.solid import SolidModel
-from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.settings import SOLVERS, EstimatorSettings
 from lab.bench.cases import (
@@ -46,7 +39,6 @@ LEAST_ANSWERED = 99.0
 SOFA = {"step_ms": 3.9, "yardstick_ms": 3.0, "rmse_N": 20.9, "one_factor_N": 1.01, "factor_per_height_N": 0.74}
 # Quoted, Zuo, Yang, Chua, RA-L 2026: the rate of the whole loop, and the RMSE range of Tables I and II.
 PAPER = {"rate_Hz": 40.0, "least_N": 0.20, "largest_N": 1.21}
-CONTACTS = {"height": "fixed:case", "outline": "estimate"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,16 +94,15 @@ def list_tiers(*, slow: bool = True, section: bool = False) -> tuple[Tier, ...]:
     return tuple(tier for tier in every if slow or not tier.slow)
 
 
-def measure(quick: bool, folder: Path | str | None = None, jaw: str = "bench") -> Figures:
+def measure(quick: bool, jaw: str = "bench") -> Figures:
     """Return times and errors of every tier.
 
     Args:
         quick: three cases instead of nine, and no slow tier.
-        folder: recordings of the bench finger that the tiers run on, too.
         jaw: finger; another one than that of the bench is pressed by its own solid model.
 
     Raises:
-        FinforceError: the jaw cannot be used, the folder holds no recordings, or one that cannot be used.
+        FinforceError: the jaw cannot be used.
     """
     from tqdm import tqdm
 
@@ -121,9 +112,8 @@ def measure(quick: bool, folder: Path | str | None = None, jaw: str = "bench") -
         "noise-free": [record_press(case, finger) for case in cases],
         "noisy": [record_press(case, finger, NoisyCamera(), SEED) for case in cases],
     }
-    recordings = find_recordings(folder) if folder else []
-    rows, by_case, shapes, recorded, notes = [], [], [], [], []
-    with tqdm(total=len(tiers) * (2 * len(cases) + len(recordings)), unit="press", disable=None, leave=False) as bar:
+    rows, by_case, shapes, notes = [], [], [], []
+    with tqdm(total=len(tiers) * 2 * len(cases), unit="press", disable=None, leave=False) as bar:
         for tier in tiers:
             bar.set_description(tier.name)
             try:
@@ -136,11 +126,10 @@ def measure(quick: bool, folder: Path | str | None = None, jaw: str = "bench") -
             rows += [tier_row(tier, kind, found, yardstick) for kind, found in runs.items()]
             by_case += [case_row(tier, kind, found) for kind, found in runs.items()]
             shapes.append({"tier": tier.name, **score_shapes(runs["noise-free"]), **compare_with_sofa(rows[-1])})
-            recorded += measure_recordings(recordings, tier, bar.update)
     shapes.append({"tier": "SOFA, quoted", **quoted_shapes()})
-    tables = {"tiers": rows, "cases": by_case, "shapes": shapes, "recorded": recorded}
+    tables = {"tiers": rows, "cases": by_case, "shapes": shapes}
     return Figures(
-        tables={name: pd.DataFrame(found) for name, found in tables.items() if found},
+        tables={name: pd.DataFrame(found) for name, found in tables.items()},
         notes=notes,
         picture=Tradeoff(
             table="tiers",
@@ -219,7 +208,7 @@ def _run_press(tier: Tier, estimator: JawEstimator, press: ReplayedPress, frames
     estimator.reset()
     force = np.full(press.force.shape, np.nan)
     seconds, cpu = [], []
-    contacts = press.contacts(tier.contact)
+    contacts = press.contacts[tier.contact]
     # a collection in the middle of a step is not the step's own time
     collect()
     disable()
@@ -325,57 +314,3 @@ def quoted_shapes() -> dict[str, float]:
     names = ("nothing fitted/N", "one factor/N", "a factor per height/N")
     quoted = dict(zip(names, (SOFA[name] for name in errors), strict=True))
     return {"shapes": 45, "solved": 45, **quoted, "rate in SOFA's": 1.0, "by the yardstick": 1.0}
-
-
-def find_recordings(folder: Path | str) -> list[Path]:
-    """Return the recordings in a folder: its folders with a bag in them.
-
-    Raises:
-        OptionError: there are none.
-    """
-    folder = Path(folder)
-    found = sorted(path.parent for path in folder.glob("*/metadata.yaml"))
-    if not found:
-        raise OptionError(f"{folder}: no recordings, expected folders with a rosbag2 each")
-    return found
-
-
-def measure_recordings(
-    paths: Sequence[Path], tier: Tier, progress: Callable[[], object] = lambda: None
-) -> Iterator[dict[str, Any]]:
-    """Yield one row: a tier over recordings of the bench finger, as `finforce evaluate` scores them.
-
-    Raises:
-        FinforceError: a recording cannot be used.
-    """
-    if not paths:
-        return
-    setup = EvaluationSetup(
-        jaw=load_jaw("bench"),
-        settings=tier.settings(),
-        calibration=load_calibration("bench"),
-        contacts=parse_contacts([CONTACTS[tier.contact]]),
-        about={},
-    )
-    recordings, results = [read_recording(path) for path in paths], []
-    for recording in recordings:
-        try:
-            source = setup.source(recording)
-            results.append(evaluate_recording(recording, setup.jaw, source, factory=setup.estimator))
-        except RecordingError:  # not one frame was solved
-            pass
-        progress()
-    if not results:
-        return
-    total = score_results(results, recordings).total
-    steps = [result.column("step_ms")[result.column("status") == "ok"] for result in results]
-    step = percentiles(1e-3 * np.concatenate(steps), "step")
-    yield {
-        "tier": tier.name,
-        "step p50/ms": step["step p50/ms"],
-        "step p99/ms": step["step p99/ms"],
-        "RMSE/N": total.all.rmse_N,
-        "bias/N": total.all.bias_N,
-        "answered/%": 100.0 * (1.0 - total.record_skipped / total.record_frames),
-        "not solved at all": len(recordings) - len(results),
-    }

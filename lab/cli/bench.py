@@ -16,7 +16,7 @@ from lab.harness import PARTS, Part, draw_tradeoff, figures_json, format_figures
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the subcommand."""
-    text = "folder of recordings: those of the bench finger that the solvers run on, too, or those that images makes"
+    text = "folder in which the part images keeps its recordings (a cache)"
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help=text)
     text = "jaw file or shipped jaw of the parts solvers and images; of the latter several, separated by commas"
     parser.add_argument("--jaw", metavar="NAME", help=text)

@@ -17,7 +17,7 @@ from finforce_ifea.jaw.jaw import Jaw, load_jaw
 from finforce_ifea.mechanics import build_mechanics
 from finforce_ifea.observation import Contact, Observation, Solution
 from finforce_ifea.settings import EstimatorSettings
-from lab.forward_press import PressState, RigidCylinder, measure_penalty_energy, press_jaw
+from lab.forward_press import PressState, RigidCylinder, follow_points, measure_penalty_energy, press_jaw
 from lab.stress.stress import Plan, Trial, attempt
 
 PERIOD = 1 / 30
@@ -279,15 +279,12 @@ class Bench:
         model, surface = self.mechanics.model, self.mechanics.contact.surface
         depths = np.linspace(0.0, depth, COURSE_STEPS + 1)[1:]
         presses = press_jaw(model, surface, self.jaw.inner_face_x, RigidCylinder(radius=radius), height, depths)
-        probe = model.attach(self.jaw.keypoints, 1.0)
-        points = np.stack([model.positions(probe, press.q) for press in presses])
-        grid, rest = np.r_[0.0, depths], model.positions(probe, np.zeros(model.size))
-        zero = np.zeros((1, 3))
+        grid, zero = np.r_[0.0, depths], np.zeros((1, 3))
         return PressHistory(
             height=height,
             radius=radius,
             depth=depth,
-            keypoints=PchipInterpolator(grid, np.concatenate([rest[None], points])),
+            keypoints=PchipInterpolator(grid, follow_points(model, self.jaw.keypoints, presses)),
             forces=PchipInterpolator(grid, np.concatenate([zero, [press.force for press in presses]])),
             torques=PchipInterpolator(grid, np.concatenate([zero, [press.torque for press in presses]])),
             balance=self._balance(presses, RigidCylinder(radius=radius), height, grid),

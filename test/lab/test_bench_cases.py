@@ -47,11 +47,11 @@ def test_key_points_move_at_two_millimetres_a_second_and_not_faster(exact):
 
 
 def test_outline_is_the_cylinder_that_comes_into_the_face(exact, noisy):
-    last = exact.outlines[-1].outline
+    last = exact.contacts["outline"][-1].outline
     np.testing.assert_allclose(np.linalg.norm(last.polygons[0], axis=1), WIDE.radius, rtol=1e-12)
     np.testing.assert_allclose(last.origin, [JAW.inner_face_x + WIDE.radius - LEVELS[-1], WIDE.height], atol=1e-12)
-    assert exact.contacts("height")[0].outline is None
-    wrong = noisy.outlines[-1].outline.origin - last.origin
+    assert exact.contacts["height"][0].outline is None
+    wrong = noisy.contacts["outline"][-1].outline.origin - last.origin
     assert 0 < np.abs(wrong).max() < 3e-3
 
 

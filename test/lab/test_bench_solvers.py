@@ -1,14 +1,11 @@
 """Claims about how the solver tiers are measured, scored and compared."""
 
-import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from finforce_eval.errors import OptionError
-from finforce_eval.recordings.recording import DEMO as RECORDING
 from finforce_ifea.settings import SOLVERS
 from lab.bench import solvers as bench
 from lab.bench.cases import bench_finger, load_cases, record_press
@@ -94,12 +91,3 @@ def test_tier_that_does_not_exist_is_noted_and_the_others_are_measured(monkeypat
     assert set(figures.tables["tiers"]["tier"]) == {"frame"}
     assert figures.notes[0].startswith("nothing: not measured: solver: got 'nothing'")
     assert figures.tables["tiers"]["RMSE/N"].max() < 0.3
-
-
-def test_recordings_in_a_folder_are_scored_with_each_tier(tmp_path):
-    shutil.copytree(RECORDING, tmp_path / RECORDING.name)
-    (row,) = bench.measure_recordings(bench.find_recordings(tmp_path), Tier(name="frame", solver="frame"))
-    # what `finforce evaluate` says of the shipped recording, 0.05 N, and as much again
-    assert 0.0 < row["RMSE/N"] < 0.1 and row["not solved at all"] == 0
-    with pytest.raises(OptionError, match="no recordings"):
-        bench.find_recordings(tmp_path / RECORDING.name)
