@@ -13,6 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from finforce_keypoints.networks.side_network import (
@@ -24,14 +25,15 @@ from finforce_keypoints.networks.side_network import (
     METADATA,
     SideNetwork,
 )
-from lab.training.commands import CheckpointError, import_onnx, import_torch, one_line_errors
-from lab.training.evaluate import detect, fit_factor
+from lab.training.commands import CheckpointError, import_onnx, import_torch, one_line_errors, read_share
+from lab.training.evaluate import detect, fit_factor, fit_shift
 from lab.training.network import PIECE, ExportedCoarse, ExportedFine, FingerNetwork, NetworkShape, fold_batch_norm
 from lab.training.pictures import VALIDATION, load_pictures
 from lab.training.quantize import quantize_network
 
 torch = import_torch()
 OPSET = 17
+BIAS = "part.judge.2.bias"  # of logit and log deviation, in the fine part's file
 # where the parts are in what was exported, and in the network
 _PLACES = {COARSE: ("network.coarse.", "coarse."), FINE: ("part.", "fine.")}
 
@@ -43,6 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the two files")
     parser.add_argument("--dataset", type=Path, required=True, help="folder of shards val_*.npz")
     parser.add_argument("--floats", action="store_true", help="do not turn the convolutions into bytes")
+    text = "share of the visible points that the threshold is to lose; without it likelihoods stay as they were learnt"
+    parser.add_argument("--lost", type=read_share, help=text)
     options = parser.parse_args(arguments)
     with one_line_errors():
         network = build_averaged(load_checkpoint(options.checkpoint))
@@ -52,6 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         write_network(network, options.output, factor)
         if not options.floats:
             quantize_network(options.output, pictures)
+        if options.lost is not None:
+            found = detect(SideNetwork(options.output, threads=1), pictures)
+            shift_likelihoods(options.output, fit_shift(found, options.lost))
     print(f"{options.output}: {COARSE}, {FINE}")
 
 
@@ -70,6 +77,16 @@ def write_network(network: FingerNetwork, folder: Path, factor: float) -> None:
     points = {name: {0: "batch", 1: "points"} for name in ("points", "guesses", "context")}
     write_onnx(ExportedCoarse(folded), coarse, COARSE_LAYOUT, folder / COARSE, said, points)
     write_onnx(ExportedFine(folded), fine, FINE_LAYOUT, folder / FINE, said, {})
+
+
+def shift_likelihoods(folder: Path, shift: float) -> None:
+    """Add a shift to the logits of visibility of an exported network; nothing else of it changes."""
+    onnx = import_onnx()
+    model = onnx.load(str(folder / FINE))
+    (bias,) = (item for item in model.graph.initializer if item.name == BIAS)
+    shifted = onnx.numpy_helper.to_array(bias) + np.array([shift, 0.0], dtype=np.float32)
+    bias.CopyFrom(onnx.numpy_helper.from_array(shifted, BIAS))
+    onnx.save(model, str(folder / FINE))
 
 
 def make_examples(shape: NetworkShape, batch: int = 2, count: int = 5) -> tuple[tuple[Any, ...], tuple[Any, ...]]:

@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,18 +27,6 @@ FEWEST = 3  # labelled pictures
 HELD_BACK = 6  # every sixth picture judges, the others teach; of fewer than twelve every second one
 MINUTES, RATE = 5.0, 3e-4
 MIXED = 2000  # pictures of the data set that are mixed in
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Project:
-    """A labelled DeepLabCut project: labels, the folder of its images, camera, and the names of its jaws' points."""
-
-    labels: Labels
-    folder: Path
-    view: CameraView
-    jaw: str
-    sides: tuple[str, ...]
-    mapping: dict[str, str]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -76,7 +63,9 @@ def add_refinement(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Fine-tune as the options say."""
     # PyTorch is only wanted once the labels are known to be usable
-    pictures = load_project(read_project(options))
+    folder = options.project or options.labels.resolve().parent.parent.parent
+    labels, view = read_labels(options.labels), read_camera(options.camera)
+    pictures = load_project(labels, folder, view, options.jaw, options.sides, parse_mapping(options.map))
     from lab.training.train import refine
 
     every = HELD_BACK if len(pictures) >= 2 * HELD_BACK else 2
@@ -89,34 +78,32 @@ def run(options: argparse.Namespace) -> None:
     print(format_scores({"before": score_detections(before), "after": score_detections(after)}))
 
 
-def read_project(options: argparse.Namespace) -> Project:
-    """Return the project that the options name."""
-    return Project(
-        labels=read_labels(options.labels),
-        folder=options.project or options.labels.resolve().parent.parent.parent,
-        view=read_camera(options.camera),
-        jaw=options.jaw,
-        sides=tuple(options.sides),
-        mapping=parse_mapping(options.map),
-    )
+def load_project(
+    labels: Labels, folder: Path, view: CameraView, jaw: str, sides: Sequence[str], mapping: Mapping[str, str]
+) -> FingerPictures:
+    """Return every labelled jaw of a DeepLabCut project as a rectified picture, with a progress bar.
 
-
-def load_project(project: Project) -> FingerPictures:
-    """Return every labelled jaw of a project as a rectified picture, with a progress bar.
+    Args:
+        labels: of its images.
+        folder: that holds them.
+        view: of their camera.
+        jaw: jaw file, or the name of a shipped jaw.
+        sides: which jaws are labelled.
+        mapping: names of the jaw's points by body part, where they differ.
 
     Raises:
         LabelFileError: an image is missing or of another size, or hardly any picture shows a labelled jaw.
         NamingError: the body parts are not the jaws' key points.
     """
-    left = load_jaw(project.jaw)
-    jaws = {side: left if side == "left" else left.mirrored() for side in project.sides}
-    rows = build_name_map(project.labels.names, jaws, project.mapping).rows
+    left = load_jaw(jaw)
+    jaws = {side: left if side == "left" else left.mirrored() for side in sides}
+    rows = build_name_map(labels.names, jaws, mapping).rows
     found = []
-    for number, name in enumerate(tqdm(project.labels.images, desc="images", leave=False)):
-        image = read_image(project.folder / name)
-        for side, jaw in jaws.items():
-            labelled = LabelledImage(image=image, points=project.labels.points[number, rows[side]])
-            found.append(rectify(labelled, jaw, side, project.view))
+    for number, name in enumerate(tqdm(labels.images, desc="images", leave=False)):
+        image = read_image(folder / name)
+        for side, own in jaws.items():
+            labelled = LabelledImage(image=image, points=labels.points[number, rows[side]])
+            found.append(rectify(labelled, own, side, view))
     usable = [picture for picture in found if picture is not None]
     if len(usable) < FEWEST:
         raise LabelFileError(

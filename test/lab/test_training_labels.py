@@ -16,13 +16,12 @@ from finforce_keypoints.errors import NamingError
 from finforce_keypoints.geometry.side_picture import find_side, project_plane
 from finforce_keypoints.geometry.template import find_shape, fit_grid
 from lab.training.commands import LabelFileError
-from lab.training.finetune import Project, load_project
+from lab.training.finetune import load_project
 from lab.training.labels import (
     CameraView,
     LabelledImage,
     find_origin,
     parse_camera,
-    parse_labels,
     read_camera,
     read_labels,
     rectify,
@@ -108,9 +107,10 @@ def test_half_a_point_is_no_point(tmp_path):
     [
         (OLD.replace("bodyparts", "parts"), "no row 'bodyparts'"),
         (OLD.split("labeled")[0], "no frame after the header"),
-        (OLD.replace("20.25", "twenty"), "tip y: got 'twenty'"),
-        (OLD.replace(",3,4", ",3"), "a row of 3 values; the header has 4 columns"),
-        (OLD.replace("x,y,x,y", "x,y,x"), "4 body parts for 3 coordinates"),
+        (OLD.replace("20.25", "twenty"), "'twenty'; expected numbers of pixels"),
+        (OLD.replace(",3,4", ",3"), "rows of different lengths"),
+        (OLD.replace("x,y,x,y", "x,y,x"), "rows of different lengths"),
+        (OLD.replace(",3,4", ",3,4,5"), "rows of different lengths"),
         (OLD.replace("x,y,x,y", "x,x,x,y"), "not one x and one y"),
         (OLD.replace("img02", "img01"), "stands in 2 rows"),
     ],
@@ -163,16 +163,8 @@ def test_labels_land_where_the_points_are_in_the_picture(side, origin_x):
 
 
 def test_a_point_that_is_marked_nowhere_is_refused(tmp_path):
-    project = Project(
-        labels=parse_labels([row.split(",") for row in OLD.splitlines()]),
-        folder=tmp_path,
-        view=view_of_robot(),
-        jaw="bench",
-        sides=("left",),
-        mapping={},
-    )
     with pytest.raises(NamingError, match="missing inner_2"):
-        load_project(project)
+        load_project(read(OLD, tmp_path), tmp_path, view_of_robot(), "bench", ("left",), {})
 
 
 def test_a_camera_without_a_place_is_refused(tmp_path):

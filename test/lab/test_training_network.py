@@ -1,6 +1,7 @@
 """The network learns, its export says the same as it does, and its losses want what they should."""
 
 import re
+import shutil
 from dataclasses import fields, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -20,10 +21,9 @@ from training_fakes import KEYPOINTS, POINTS, draw_ladders, write_ladders
 import lab.training.evaluate
 from finforce_keypoints.networks.side_network import COARSE, FINE, SideNetwork
 from lab.training.batches import AugmentSettings, augment, choose_pictures, load_batches
-from lab.training.calibrate import main as calibrate_main
 from lab.training.commands import CheckpointError, DatasetError, RecipeError
-from lab.training.evaluate import Detections, fit_factor, score_detections
-from lab.training.export import load_checkpoint, read_network, save_checkpoint, write_network
+from lab.training.evaluate import Detections, fit_factor, fit_shift, score_detections
+from lab.training.export import load_checkpoint, read_network, save_checkpoint, shift_likelihoods, write_network
 from lab.training.export import main as export_main
 from lab.training.losses import COVERED, choose_points, compute_losses
 from lab.training.network import FingerNetwork, NetworkShape, fold_batch_norm
@@ -96,8 +96,10 @@ def test_shifted_likelihoods_lose_the_wanted_share_and_move_no_point(tmp_path):
     write_network(build_trained_like(), tmp_path / "network", 1.5)
     quantize_network(tmp_path / "network", draw_ladders(3, 3, 7))
     dataset = write_ladders(tmp_path / "data", 1, 1)
-    calibrate_main([str(tmp_path / "network"), str(dataset), "--lost", "0.25", "-o", str(tmp_path / "shifted")])
     pictures = load_pictures(dataset, VALIDATION)
+    shutil.copytree(tmp_path / "network", tmp_path / "shifted")
+    found = lab.training.evaluate.detect(SideNetwork(tmp_path / "network", threads=1), pictures)
+    shift_likelihoods(tmp_path / "shifted", fit_shift(found, 0.25))
     before, after = (
         lab.training.evaluate.detect(SideNetwork(tmp_path / name, threads=1), pictures)
         for name in ("network", "shifted")
