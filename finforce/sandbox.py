@@ -18,6 +18,7 @@ from finforce.errors import FinforceError, one_line
 from finforce.files import BUDGET, raise_budget
 
 MEMORY, SECONDS = 1 << 30, 20
+WAITS = 5  # how much longer than it computes a process may take, on a machine with other work
 _CHILD = "from finforce.sandbox import _serve; _serve()"
 
 ResultT = TypeVar("ResultT")
@@ -40,7 +41,7 @@ def run_limited(
         function: of a module, found there by its name.
         arguments: picklable, as the result has to be.
         memory: that the process may take [bytes].
-        seconds: that it may take [s].
+        seconds: that it may compute [s].
         disk: that a file may have that it writes [bytes].
 
     Raises:
@@ -53,12 +54,12 @@ def run_limited(
     environment = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", _CHILD], input=order, capture_output=True, timeout=seconds, env=environment
+            [sys.executable, "-c", _CHILD], input=order, capture_output=True, timeout=WAITS * seconds, env=environment
         )
     except subprocess.TimeoutExpired:
-        raise SandboxError(f"took more than {seconds:g} s; {BUDGET}=10 would allow ten times as much") from None
+        raise SandboxError(f"waited more than {WAITS * seconds:g} s; expected an answer") from None
     if not done.stdout:
-        raise SandboxError(_say_how_it_ended(done.returncode, done.stderr.decode(errors="replace"), memory))
+        raise SandboxError(_say_how_it_ended(done.returncode, done.stderr.decode(errors="replace"), memory, seconds))
     result, error = pickle.loads(done.stdout)
     if isinstance(error, FinforceError):
         raise error
@@ -93,10 +94,10 @@ def limit_growth(memory: int, disk: int = MEMORY) -> Iterator[None]:
             resource.setrlimit(kind, limits)
 
 
-def _say_how_it_ended(code: int, said: str, memory: int) -> str:
+def _say_how_it_ended(code: int, said: str, memory: int, seconds: float) -> str:
     """Return why a process gave no answer."""
     if code == -signal.SIGXCPU:
-        return f"took more time than it may; {BUDGET}=10 would allow ten times as much"
+        return f"took more than {seconds:g} s; {BUDGET}=10 would allow ten times as much"
     if any(word in said for word in ("MemoryError", "bad_alloc", "out of memory")):
         return _say_memory(memory)
     if code < 0:

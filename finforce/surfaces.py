@@ -1,8 +1,13 @@
-"""Triangles out of surface and CAD files; formats that can announce more than they hold are read in a sandbox."""
+"""Triangles out of surface and CAD files, cells out of volume meshes.
+
+Formats that can announce more than they hold are read in a sandbox.
+"""
 
 from __future__ import annotations
 
 import io
+from contextlib import redirect_stderr, redirect_stdout
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +47,45 @@ def read_surface(path: Path) -> tuple[NDArray, NDArray]:
     except Exception as error:  # trimesh has no base error
         reason = f"{type(error).__name__}: {one_line(error, 120)}"
         raise FileError(f"cannot be read ({reason}); expected a whole {suffix} file: export it again") from error
+
+
+Cells = list[tuple[str, NDArray]]
+
+
+def read_cells(path: Path) -> tuple[NDArray, Cells]:
+    """Return the points (n, 3) and the blocks of cells (kind, indices) of a volume mesh file that meshio reads.
+
+    Raises:
+        FileError: It cannot be read, or took too much memory or time; the message is a predicate.
+    """
+    state = path.stat()
+    try:
+        return _read_cells(path, state.st_size, state.st_mtime_ns)
+    except SandboxError as error:
+        raise FileError(f"{error}; expected a whole volume mesh: export it again") from error
+
+
+@lru_cache(maxsize=2)
+def _read_cells(path: Path, size: int, changed: int) -> tuple[NDArray, Cells]:
+    """Read a file in a sandbox, once as long as it stays the same."""
+    if size > LARGEST:
+        raise FileError(f"has {size >> 20} MB, expected at most {LARGEST >> 20} of a volume mesh")
+    return run_limited(_load_cells, path, memory=_MEMORY, seconds=_SECONDS)
+
+
+def _load_cells(path: Path) -> tuple[NDArray, Cells]:
+    """Return points and cells, the way meshio has them."""
+    import meshio
+
+    said = io.StringIO()
+    try:
+        with redirect_stdout(said), redirect_stderr(said):
+            content = meshio.read(path)
+    # meshio has no base error, and ends the process when it knows no way to read a file
+    except (Exception, SystemExit) as error:
+        reason = said.getvalue() if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
+        raise FileError(f"meshio cannot read it ({' '.join(reason.split())})") from error
+    return content.points, [(block.type, block.data) for block in content.cells]
 
 
 def _load_triangles(path: Path) -> tuple[NDArray, NDArray]:

@@ -1,14 +1,13 @@
-"""Volume meshes from files, through meshio; the only module that imports it."""
+"""Volume meshes from files, checked."""
 
-import contextlib
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.errors import MissingDependencyError
+from finforce.files import FileError
+from finforce.surfaces import read_cells
 from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.mesh import EDGES_TET10, VolumeMesh, build_volume_mesh, check_connection
 
@@ -65,10 +64,14 @@ def read_volume_mesh(path: Path | str, *, scale: float = 1.0, clamp: ClampRule) 
     Raises:
         MeshError: The file is missing, cannot be read, has no volume elements, several or unsupported kinds
             of them, its mesh does not pass `build_volume_mesh`, or is not one piece.
-        MissingDependencyError: meshio is not installed.
     """
     path = Path(path)
-    points, cells = _read_cells(path)
+    if not path.is_file():
+        raise MeshError(f"there is no mesh file {path}; the path is relative to the jaw file")
+    try:
+        points, cells = read_cells(path)
+    except FileError as error:
+        raise MeshError(f"{path.name}: {error}") from error
     kind, elements = _merge_cells(cells, path)
     nodes = np.asarray(points, dtype=float) * scale
     if nodes.ndim != 2 or nodes.shape[1] != 3:
@@ -82,27 +85,6 @@ def read_volume_mesh(path: Path | str, *, scale: float = 1.0, clamp: ClampRule) 
     except MeshError as error:
         raise MeshError(f"{path.name}: {error}") from error
     return mesh
-
-
-def _read_cells(path: Path) -> tuple[NDArray, list[tuple[str, NDArray]]]:
-    """Read the points and the blocks of cells of a file."""
-    try:
-        import meshio
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"reading {path.name} needs meshio, which is not installed: python -m pip install meshio"
-        ) from error
-    if not path.is_file():
-        raise MeshError(f"there is no mesh file {path}; the path is relative to the jaw file")
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            content = meshio.read(path)
-    # meshio has no base error, and ends the process when it knows no way to read a file
-    except (Exception, SystemExit) as error:
-        reason = said.getvalue() if isinstance(error, SystemExit) else f"{type(error).__name__}: {error}"
-        raise MeshError(f"{path.name}: meshio cannot read it ({' '.join(reason.split())})") from error
-    return content.points, [(block.type, block.data) for block in content.cells]
 
 
 def _merge_cells(cells: list[tuple[str, NDArray]], path: Path) -> tuple[str, NDArray]:

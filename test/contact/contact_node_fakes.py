@@ -32,7 +32,8 @@ def cylinder_before_jaw(gap=0.001, height=0.04):
 
 def start_contact_estimator(probe, **parameters):
     """Add a contact estimator to the probe's executor; of the shipped cylinder unless told otherwise."""
-    given = {"object_mesh": MESH, "diagnostics_period": 0.1, **parameters}
+    # a loaded machine is late: neither is an image old then, nor a node silent
+    given = {"object_mesh": MESH, "diagnostics_period": 0.1, "max_age": 3.0, **parameters}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     node = ContactEstimatorNode(context=probe.context, parameter_overrides=overrides)
     probe.spinner.add_node(node)
@@ -58,6 +59,7 @@ class ContactBench:
         self.jaw_out = probe.speak(f"{side}/jaw_pose", PoseStamped)
         self.object_out = probe.speak("object_pose", PoseStamped)
         probe.connected(self.jaw_out)
+        probe.connected(self.object_out, 1 if self.node.parameters.pose_source == "topic" else 0)
         probe.wait_for(lambda: self.node.out.contact[side].get_subscription_count() == 1)
         probe.wait_for(lambda: self.node.out.outline[side].get_subscription_count() == 1)
 

@@ -84,7 +84,7 @@ class Course:
         probe.hear("left/object_outline", PointCloud2)
         jaw_out = probe.speak("left/jaw_pose", PoseStamped)
         probe.connected(jaw_out)
-        probe.wait_for(lambda: tracker.out.get_subscription_count() == 1)
+        probe.connected(tracker.out)
         assert jaw.side == "left"
         start, count = time_ns(), round(seconds * 30)
         self.seconds, self.true, self.found = (

@@ -134,7 +134,7 @@ def test_an_object_around_the_jaw_gives_no_contact(probe):
 
 def test_old_poses_give_no_contact(probe):
     bench = ContactBench(probe)
-    bench.image(cylinder_before_jaw(), time_ns() - SECOND)
+    bench.image(cylinder_before_jaw(), time_ns() - 10 * SECOND)
     bench.diagnosis(level=Level.STALE, word="old")
     assert not bench.contacts
 

@@ -120,7 +120,14 @@ class Probe(Node):
         return {topic: len(messages) for topic, messages in self.got.items()}, states
 
     def connected(self, publisher, count=1):
-        self.wait_for(lambda: publisher.get_subscription_count() >= count)
+        """Wait until both ends know of each other: a reader drops what comes before it knows the writer."""
+
+        def is_met():
+            readers = [reader for node in self.spinner.get_nodes() for reader in node.subscriptions]
+            own = [reader for reader in readers if reader.topic_name == publisher.topic_name]
+            return publisher.get_subscription_count() >= count and all(r.get_publisher_count() > 0 for r in own)
+
+        self.wait_for(is_met)
 
     def diagnosis(self, jaw="left", level=None, word=""):
         """Wait for the state of a jaw at a level, with a word in its message."""
@@ -154,7 +161,8 @@ def ros_domain():
 
 def start_solver(probe, estimator=None, **parameters):
     """Add a solver node around an estimator to the probe's executor."""
-    given = {"contact_height": 0.04, "diagnostics_period": 0.1, **parameters}
+    # a loaded machine is late: neither is an image old then, nor a node silent
+    given = {"contact_height": 0.04, "diagnostics_period": 0.1, "max_age": 3.0, **parameters}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     estimator = estimator or FakeEstimator()
     node = IfeaSolverNode(lambda *_: estimator, context=probe.context, parameter_overrides=overrides)

@@ -1,5 +1,6 @@
 """Claims about work in a process of its own: its answer comes back, and whatever ends it costs one sentence."""
 
+import itertools
 import operator
 import os
 import time
@@ -21,7 +22,8 @@ def test_the_answer_comes_back_and_what_is_printed_does_not_disturb_it(capfd):
     ("function", "arguments", "words"),
     [
         (np.ones, (1 << 29,), "took more than 512 MB of memory; FINFORCE_BUDGET=10 would allow"),
-        (time.sleep, (60,), "took more than 1 s; FINFORCE_BUDGET=10 would allow"),
+        (time.sleep, (60,), "waited more than 5 s"),
+        (sum, (itertools.count(),), "took more than 1 s; FINFORCE_BUDGET=10 would allow"),
         (os.abort, (), "made its reader crash .SIGABRT"),
         (os._exit, (3,), "made its reader end with 3"),
         (operator.truediv, (1, 0), "made its reader fail .ZeroDivisionError"),

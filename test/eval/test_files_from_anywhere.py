@@ -9,13 +9,16 @@ import zlib
 from contextlib import closing
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 import trimesh
 from eval_fakes import make_recording, pack_mcap
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from keypoint_scene_fakes import Fake, write_model
 from PIL import Image
+from zstandard import ZstdCompressor
 
 import finforce_ifea
 import finforce_keypoints
@@ -26,7 +29,9 @@ from finforce_eval.recordings.recording import read_recording
 from finforce_eval.recordings.writer import write_recording
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.jaw.jaw import load_jaw
+from finforce_ifea.jaw.mesh_file import ClampRule, read_volume_mesh
 from finforce_keypoints.networks.metadata import read_metadata
+from finforce_keypoints.networks.trial import try_network
 
 JAWS, MODELS = Path(finforce_ifea.__file__).parent / "jaw", Path(finforce_keypoints.__file__).parent / "models"
 BOX = trimesh.creation.box((0.03, 0.04, 0.05))
@@ -37,16 +42,26 @@ def make_image(path):
 
 
 def make_bag(path, compression):
-    pack_mcap(write_recording(make_recording(frames=200), path.parent / "plain"), path, compression)
+    pack_mcap(write_recording(make_recording(frames=80), path.parent / "plain"), path, compression)
 
 
 def make_database(path):
-    plain = write_recording(make_recording(frames=200), path.parent / "plain", storage="sqlite3")
+    plain = write_recording(make_recording(frames=80), path.parent / "plain", storage="sqlite3")
     shutil.copyfile(next(plain.glob("*.db3")), path)
 
 
 def make_depth(path):
     np.save(path, np.full((12, 16), 0.3, np.float32))
+
+
+def make_volume(path):
+    mesh = load_jaw("bench").build_mesh("coarse")
+    meshio.write(path, meshio.Mesh(mesh.nodes, [("hexahedron", mesh.elements)]))
+
+
+def make_network(path):
+    write_model(path.parent / "made", Fake())
+    shutil.copyfile(path.parent / "made" / "network.onnx", path)
 
 
 def copy_of(source):
@@ -71,6 +86,12 @@ FILES = {
         lambda path: path.write_text('{"fx": 430.0, "fy": 430.0, "cx": 320.0, "cy": 240.0, "D": [0, 0, 0, 0, 0]}'),
         lambda path: read_intrinsics([str(path)], (480, 640)),
     ),
+}
+# read in a process of their own, a second for each
+SLOW = {
+    "box.glb": (BOX.export, load_object_mesh),
+    "finger.vtu": (make_volume, lambda path: read_volume_mesh(path, clamp=ClampRule(z_below=0.001))),
+    "network.onnx": (make_network, lambda path: try_network(path, "test")),
 }
 PLACE = st.floats(0.0, 1.0, exclude_max=True)
 CHANGES = st.lists(
@@ -110,15 +131,30 @@ def good(request, tmp_path_factory):
     return path, path.read_bytes(), read
 
 
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(changes=CHANGES)
-def test_a_damaged_file_is_read_or_refused(good, changes):
-    path, content, read = good
-    path.write_bytes(damage(content, changes))
+def read_or_refuse(path, content, read):
+    path.write_bytes(content)
     try:
         read(path)
     except FinforceError as error:
         assert str(error)
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(changes=CHANGES)
+def test_a_damaged_file_is_read_or_refused(good, changes):
+    path, content, read = good
+    read_or_refuse(path, damage(content, changes), read)
+
+
+@pytest.mark.parametrize("name", SLOW)
+def test_a_damaged_file_that_is_read_aside_is_read_or_refused(tmp_path, monkeypatch, name):
+    monkeypatch.setenv("FINFORCE_CACHE", str(tmp_path / "cache"))
+    make, read = SLOW[name]
+    make(tmp_path / name)
+    read(tmp_path / name)
+    content = (tmp_path / name).read_bytes()
+    for changes in ([("cut", 0.7, b"")], [("set", 0.3, b"\xff" * 8)]):
+        read_or_refuse(tmp_path / name, damage(content, changes), read)
 
 
 def make_endless_view(path, table):
@@ -143,6 +179,13 @@ def make_png(path, side):
     head = part(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
     data = part(b"IDAT", zlib.compress(bytes(1 << 20), 9))
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + head + data + part(b"IEND", b""))
+
+
+def make_bomb(path):
+    """Write a recording whose chunk unpacks to a gigabyte, and announces a hundred bytes."""
+    records = ZstdCompressor().compress(bytes(1 << 30))
+    chunk = struct.pack("<QQQII", 0, 1, 100, 0, 4) + b"zstd" + struct.pack("<Q", len(records)) + records
+    path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, len(chunk)) + chunk + b"\x89MCAP0\r\n")
 
 
 def make_pickle(path):
@@ -170,6 +213,7 @@ HARMFUL = {
         lambda path: path.write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, 1 << 63) + bytes(100)),
         read_recording,
     ),
+    "bomb.mcap": (make_bomb, read_recording),
     "huge.png": (functools.partial(make_png, side=100_000), read_image),
     "pickle.npy": (make_pickle, read_depth),
 }

@@ -1,11 +1,9 @@
 """Volume meshes from files."""
 
-import sys
 
 import numpy as np
 import pytest
 
-from finforce.errors import FinforceError, MissingDependencyError
 from finforce_ifea.errors import MeshError
 from finforce_ifea.fem.tetrahedra import to_tet4, to_tet10
 from finforce_ifea.jaw.jaw import load_jaw
@@ -109,10 +107,3 @@ def test_truncated_file_is_refused(tmp_path):
 def test_missing_file_is_named(tmp_path):
     with pytest.raises(MeshError, match="there is no mesh file .*absent.msh"):
         read_volume_mesh(tmp_path / "absent.msh", clamp=BASE)
-
-
-def test_missing_meshio_says_how_to_install_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "meshio", None)
-    with pytest.raises(MissingDependencyError, match="pip install meshio") as caught:
-        read_volume_mesh(tmp_path / "finger.msh", clamp=BASE)
-    assert isinstance(caught.value, FinforceError)

@@ -407,7 +407,7 @@ def test_no_rows_say_that_there_is_no_object(probe):
 
 def test_an_old_contact_is_none(probe):
     estimator, node, out, contact = contact_jaw(probe)
-    contact.publish(contact_cloud([[0.014, 0.0, 0.038]], stamp=time_ns() - SECOND))
+    contact.publish(contact_cloud([[0.014, 0.0, 0.038]], stamp=time_ns() - 10 * SECOND))
     probe.wait_for(lambda: node.contacts._contact is not None)
     out.publish(keypoint_cloud())
     probe.wait_for(lambda: estimator.contacts)

@@ -68,7 +68,8 @@ class FakeDetector:
 
 def start_detector(probe, **parameters):
     """Add a detector node around a fake detector to the probe's executor."""
-    given = {"diagnostics_period": 0.1, **parameters}
+    # a loaded machine is late: neither is an image old then, nor a node silent
+    given = {"diagnostics_period": 0.1, "max_age": 3.0, **parameters}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
 
     def build(jaws, *_):
@@ -81,7 +82,7 @@ def start_detector(probe, **parameters):
 
 def start_real_detector(probe, **parameters):
     """Add a detector node with all its parts to the probe's executor."""
-    given = {"diagnostics_period": 0.1, **parameters}
+    given = {"diagnostics_period": 0.1, "max_age": 3.0, **parameters}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     node = KeypointDetectorNode(context=probe.context, parameter_overrides=overrides)
     probe.spinner.add_node(node)

@@ -185,7 +185,7 @@ def test_a_stamp_far_from_now_is_refused_and_spoils_nothing(probe, away, word):
 
 
 def test_a_camera_that_falls_silent_is_noticed(probe):
-    bench = CameraBench(probe)
+    bench = CameraBench(probe, max_age=0.5)
     recovers(bench)
     bench.diagnosis(level=Level.STALE, word="nothing has arrived")
     assert len(bench.clouds()) == 1
@@ -198,7 +198,7 @@ def test_a_camera_that_never_speaks_is_named(probe):
 
 def speaks_on_another_topic(probe):
     """A camera that was heard, and has the other name from now on."""
-    bench = CameraBench(probe)
+    bench = CameraBench(probe, max_age=0.5)
     recovers(bench)
     bench.color_out = probe.speak(OLD_COLOR, Image)
     probe.connected(bench.color_out)
@@ -218,7 +218,7 @@ def test_images_of_the_topic_that_is_not_listened_to_hide_no_silence(probe, monk
     monkeypatch.setattr(camera_feed, "SILENCE", 1e9)
     bench = speaks_on_another_topic(probe)
     probe.got["/diagnostics"].clear()
-    for _ in range(15):  # more than max_age
+    for _ in range(35):  # more than max_age
         bench.color(time_ns())
     bench.diagnosis(level=Level.STALE, word=f"nothing has arrived on {TOPICS.color_topics[0]}")
     assert len(bench.clouds()) == 1
