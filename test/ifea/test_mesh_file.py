@@ -1,6 +1,5 @@
 """Volume meshes from files."""
 
-
 import numpy as np
 import pytest
 
