@@ -509,16 +509,14 @@ class FaultTally:
 
     def add(self, other: FaultTally) -> None:
         """Add another tally."""
-        for name in ("faults", "wrong", "motion", "crashes", "phases", "outcomes", "violations"):
-            getattr(self, name).update(getattr(other, name))
-        for name in ("hangs", "unrecovered", "states", "orders"):
-            setattr(self, name, getattr(self, name) + getattr(other, name))
+        for name, value in vars(other).items():
+            if isinstance(value, Counter):
+                getattr(self, name).update(value)
+            elif isinstance(value, int):
+                setattr(self, name, getattr(self, name) + value)
         for name, value in other.worst.items():
             self.worst[name] = max(self.worst.get(name, 0.0), value)
 
     def plain(self) -> dict[str, Any]:
-        """Return counts, or counts by what they count in words, by name."""
-        return {
-            name: {str(key): number for key, number in value.items()} if isinstance(value, dict) else value
-            for name, value in vars(self).items()
-        }
+        """Return counts, or counts by what they count, by name."""
+        return {name: dict(value) if isinstance(value, Counter) else value for name, value in vars(self).items()}

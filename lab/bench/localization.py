@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import count
 from time import perf_counter
 from typing import Any
 
@@ -45,6 +47,7 @@ GRIDS = ((48, 9), (100, 24), (200, 49))  # triangles around and along a cylinder
 RADIUS, LENGTH = 0.0125, 0.06  # [m] of the cylinder of the shipped recording
 WARM_UP = 5  # calls that compile and cut before any is timed
 APART = 0.05  # [m] that the object is moved away, to time a scene without contact
+MESH = ContactSettings().mesh
 JITTER, SEED = 0.05e-3, 1  # [m], so that no two calls are alike
 
 
@@ -87,8 +90,10 @@ def measure_methods(meshes: Sequence[ObjectMesh], every: int) -> Figures:
     recording = read_recording(RECORDING)
     images = list(follow(recording, load_object_mesh(RECORDING.parent / recording.case["mesh"]), every))
     rows = []
+    jaw = load_calibration("bench").apply(load_jaw("bench"))
     for mesh in tqdm(meshes, desc="contact locations", unit="mesh", disable=None, leave=False):
-        for name, method in build_methods(mesh).items():
+        for name, build in METHODS.items():
+            method = build(jaw, mesh)
             found = np.array(list(_run(method, images, lambda T: T)))
             apart = [spent for spent, _ in _run(method, images, _jittered_apart())]
             rows.append(summarise(name, len(mesh.triangles), found, apart))
@@ -106,12 +111,6 @@ def measure_methods(meshes: Sequence[ObjectMesh], every: int) -> Figures:
             title="Location of the contact: time against error; numbers: triangles of the mesh",
         ),
     )
-
-
-def build_methods(mesh: ObjectMesh) -> dict[str, Method]:
-    """Return the methods on a mesh by name."""
-    jaw = load_calibration("bench").apply(load_jaw("bench"))
-    return {name: build(MethodSetup(jaw=jaw, mesh=mesh)) for name, build in METHODS.items()}
 
 
 def follow(recording: Recording, mesh: ObjectMesh, every: int) -> Iterator[LocatedImage]:
@@ -203,67 +202,42 @@ Wrench = tuple[NDArray, NDArray] | None
 Method = Callable[[NDArray, NDArray, Wrench], float | None]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MethodSetup:
-    """A jaw and an object."""
-
-    jaw: Jaw
-    mesh: ObjectMesh
-
-
-def by_outline(setup: MethodSetup, *, with_wrench: bool) -> Method:
+def by_outline(jaw: Jaw, mesh: ObjectMesh, *, with_wrench: bool = True) -> Method:
     """Return the method of mode "estimate"."""
-    settings = ContactSettings()
-    face = build_inner_face(setup.jaw, settings.mesh)
-    return _by_localizer(setup, OutlineLocalizer(face), with_wrench=with_wrench)
+    return _by_localizer(OutlineLocalizer(build_inner_face(jaw, MESH)), jaw, mesh, with_wrench=with_wrench)
 
 
-def by_closest(setup: MethodSetup) -> Method:
+def by_closest(jaw: Jaw, mesh: ObjectMesh) -> Method:
     """Return the method of mode "closest"."""
-    face = build_inner_face(setup.jaw, ContactSettings().mesh)
-    return _by_localizer(setup, ClosestLocalizer(setup.jaw, face), with_wrench=False)
+    return _by_localizer(ClosestLocalizer(jaw, build_inner_face(jaw, MESH)), jaw, mesh, with_wrench=False)
 
 
-def _by_localizer(setup: MethodSetup, localizer: Localizer, *, with_wrench: bool) -> Method:
-    settings = ContactSettings()
-    face = build_inner_face(setup.jaw, settings.mesh)
-    sections = SectionKeeper(setup.mesh, face.half_width)
+def _by_localizer(localizer: Localizer, jaw: Jaw, mesh: ObjectMesh, *, with_wrench: bool) -> Method:
+    face = build_inner_face(jaw, MESH)
+    sections = SectionKeeper(mesh, face.half_width)
 
     def locate(T: NDArray, surface: NDArray, wrench: Wrench) -> float | None:
-        scene = ContactScene(
-            T=T,
-            section=sections.at(T),
-            surface=surface,
-            line=face.deform(surface),
-            wrench=wrench if with_wrench else None,
-        )
-        found = localizer.locate(scene)
+        told, line = wrench if with_wrench else None, face.deform(surface)
+        found = localizer.locate(ContactScene(T=T, section=sections.at(T), surface=surface, line=line, wrench=told))
         return None if found is None else found.patch.mean
 
     return locate
 
 
-def by_intersection(setup: MethodSetup) -> Method:
-    """Return the centre of the intersection with the object."""
-    settings = ContactSettings()
-    jaw = setup.jaw.build_mesh(settings.mesh)
-    solid = to_manifold(setup.mesh)
+def by_intersection(jaw: Jaw, mesh: ObjectMesh) -> Method:
+    """Return the height of the vertex nearest to the centre of the intersection with the object, as the paper does."""
+    own, solid = jaw.build_mesh(MESH), to_manifold(mesh)
 
     def locate(T: NDArray, surface: NDArray, wrench: Wrench) -> float | None:
-        centre = intersect(solid, T, surface, jaw.surface)
-        return None if centre is None else _height_of(centre, surface, jaw.nodes)
+        centre = intersect(solid, T, surface, own.surface)
+        return None if centre is None else float(own.nodes[((surface - centre) ** 2).sum(axis=1).argmin(), 2])
 
     return locate
 
 
-def _height_of(centre: NDArray, surface: NDArray, nodes: NDArray) -> float:
-    """Return the undeformed height [m] of the deformed vertex nearest to a centre (3,) [m], as the paper does."""
-    return float(nodes[((surface - centre) ** 2).sum(axis=1).argmin(), 2])
-
-
-def by_whole_estimator(setup: MethodSetup) -> Method:
+def by_whole_estimator(jaw: Jaw, mesh: ObjectMesh) -> Method:
     """Return the estimator with its pose filter and its outline as a method."""
-    estimator, stamps = ContactEstimator(setup.jaw, mesh=setup.mesh, settings=ContactSettings()), iter(range(10**9))
+    estimator, stamps = ContactEstimator(jaw, mesh=mesh, settings=ContactSettings()), count()
 
     def locate(T: NDArray, surface: NDArray, wrench: Wrench) -> float | None:
         stamp = next(stamps) / 30.0
@@ -274,9 +248,9 @@ def by_whole_estimator(setup: MethodSetup) -> Method:
     return locate
 
 
-METHODS: dict[str, Callable[[MethodSetup], Method]] = {
-    "outline and line of action": lambda setup: by_outline(setup, with_wrench=True),
-    "outline alone": lambda setup: by_outline(setup, with_wrench=False),
+METHODS: dict[str, Callable[[Jaw, ObjectMesh], Method]] = {
+    "outline and line of action": by_outline,
+    "outline alone": partial(by_outline, with_wrench=False),
     "manifold3d": by_intersection,
     "closest point, undeformed": by_closest,
     "the whole estimator": by_whole_estimator,

@@ -18,7 +18,7 @@ from finforce_ifea.contact_mechanics.penalty import PenaltyContact
 from finforce_ifea.errors import ContactError
 from finforce_ifea.observation import Solution
 from lab.forward_press import PressState, press_jaw
-from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, SessionStep, judge, noise_of, observe
+from lab.stress.session import LIKELIHOOD, OFFSET, PERIOD, Bench, SessionStep, judge, noise_of
 from lab.stress.stress import Family, Plan, Trial, attempt
 
 APPROACH, RISE, HOLD = 10, 20, 20
@@ -140,7 +140,7 @@ class Chain:
         T = T.copy()
         T[:3, 3] += POSE_NOISE * self._random.normal(size=3)
         self._loop.take_pose(step.stamp, T)
-        return self._loop.update(observe(step))
+        return self._loop.update(step.observation)
 
 
 def run_objects(plan: Plan) -> Iterator[Trial]:

@@ -40,7 +40,6 @@ class SessionStep:
         force: true (3,) [N].
         torque: true (3,) [N m].
         level: see `Trial`.
-        stddev: stated (K, 3) [m], or None.
     """
 
     stamp: float
@@ -50,7 +49,11 @@ class SessionStep:
     force: NDArray
     torque: NDArray
     level: str = ""
-    stddev: NDArray | None = None
+
+    @property
+    def observation(self) -> Observation:
+        """What an estimator sees of the step."""
+        return Observation(stamp=self.stamp, points=self.points, likelihood=self.likelihood)
 
 
 def noise_of(random: np.random.Generator, shape: tuple[int, ...], scale: float = 1.0) -> NDArray:
@@ -151,14 +154,9 @@ def take_another(session: Session, random: np.random.Generator) -> Session:
     return replace(session, history=history, contact=Contact.fixed(session.bench.jaw, history.height + error))
 
 
-def observe(step: SessionStep) -> Observation:
-    """Return what an estimator sees of a step."""
-    return Observation(stamp=step.stamp, points=step.points, likelihood=step.likelihood, stddev=step.stddev)
-
-
 def update(bench: Bench, step: SessionStep) -> Solution:
     """Return what the bench's estimator says of a step."""
-    return bench.estimator.update(observe(step), step.contact)
+    return bench.estimator.update(step.observation, step.contact)
 
 
 def judge(solution: Solution, step: SessionStep, balance: float = math.nan) -> Trial:

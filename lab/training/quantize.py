@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from shutil import copy
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -120,14 +121,14 @@ def quantize_file(source: Path, target: Path, inputs: Sequence[dict[str, NDArray
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
     onnx = import_onnx()
-    said = list(onnx.load(str(source)).metadata_props)
+    said, left = list(onnx.load(str(source)).metadata_props), iter(inputs)
     with tempfile.TemporaryDirectory() as scratch:
         plain = str(Path(scratch) / source.name)
         quant_pre_process(str(source), plain, skip_symbolic_shape=True)
         quantize_static(
             plain,
             str(target),
-            _Inputs(inputs),
+            SimpleNamespace(get_next=lambda: next(left, None)),
             quant_format=QuantFormat.QDQ,
             op_types_to_quantize=["Conv"],
             per_channel=True,
@@ -201,17 +202,6 @@ class _RecordingNetwork(SideNetwork):
     def _run(self, session, names: tuple[str, ...], inputs: tuple[NDArray, ...]) -> list[NDArray]:
         self.inputs[names != COARSE_LAYOUT[0]].append(dict(zip(names, inputs, strict=True)))
         return super()._run(session, names, inputs)
-
-
-class _Inputs:
-    """Inputs of one part, one after the other, as onnxruntime's quantization reads them."""
-
-    def __init__(self, inputs: Sequence[dict[str, NDArray]]) -> None:
-        self._left = iter(inputs)
-
-    def get_next(self) -> dict[str, NDArray] | None:
-        """Return the next ones, None at the end."""
-        return next(self._left, None)
 
 
 if __name__ == "__main__":

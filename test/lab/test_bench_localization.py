@@ -12,7 +12,7 @@ from lab.bench.localization import METHODS, LocatedImage, build_cylinder, measur
 MESH = build_cylinder(0.0125, 0.06, 48, 9)
 
 
-def at_truth(setup):
+def at_truth(jaw, mesh):
     """A way that knows the truth, which the frames' poses tell it, but for 2 mm; half of the time it finds nothing."""
     answers = iter([0.002, None] * 1000)
 
