@@ -524,19 +524,35 @@ class _Sketch:
         self.parts.append(_Part(axis, rib.thickness, beams))
 
     def number_beams(self, material: Material) -> Beams:
-        """Return the beams with their unknowns in reverse Cuthill-McKee order."""
-        dof = np.array(self._dof)
-        rows = dof.reshape(len(dof), -1)
-        row, col = (index.ravel() for index in np.broadcast_arrays(rows[:, :, None], rows[:, None, :]))
-        free = (row >= 0) & (col >= 0)
-        graph = sparse.coo_matrix((np.ones(free.sum()), (row[free], col[free])), (self.count, self.count))
-        number = np.full(self.count + 1, self.count)
-        number[reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True)] = np.arange(self.count)
-        ends = np.array(self._ends)
-        along = ends[:, 1] - ends[:, 0]
-        length = np.linalg.norm(along, axis=1)
-        stiffness = _beam_stiffness(length, np.array(self._thickness), self.drawing.width, material)
-        return Beams(number[dof], ends, np.array(self._arms), along / length[:, None], length, stiffness)
+        """Return the beams with their unknowns in an order of small bandwidth."""
+        ends, arms, thickness = np.array(self._ends), np.array(self._arms), np.array(self._thickness)
+        return build_beams(np.array(self._dof), ends, arms, thickness, self.drawing.width, material)
+
+
+def build_beams(
+    dof: NDArray, ends: NDArray, arms: NDArray, thickness: NDArray, width: float, material: Material
+) -> Beams:
+    """Return beams with their unknowns in reverse Cuthill-McKee order.
+
+    Args:
+        dof: unknowns of both ends (m, 2, 4), see `Beams`, numbered in any order; -1 for what is held.
+        ends: undeformed (m, 2, 2), (x, z) [m].
+        arms: from the joints to the ends (m, 2, 2) [m].
+        thickness: (m,) [m], 0 for a bar.
+        width: of all [m].
+        material: of all.
+    """
+    count = int(dof.max()) + 1
+    rows = dof.reshape(len(dof), -1)
+    row, col = (index.ravel() for index in np.broadcast_arrays(rows[:, :, None], rows[:, None, :]))
+    free = (row >= 0) & (col >= 0)
+    graph = sparse.coo_matrix((np.ones(free.sum()), (row[free], col[free])), (count, count))
+    number = np.full(count + 1, count)
+    number[reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True)] = np.arange(count)
+    along = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    stiffness = _beam_stiffness(length, thickness, width, material)
+    return Beams(number[dof], ends, arms, along / length[:, None], length, stiffness)
 
 
 def _beam_stiffness(length: NDArray, thickness: NDArray, width: float, material: Material) -> NDArray:

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from finforce_ifea.fem.factorisation import factorise_banded
-from finforce_ifea.fem.frame import BeamPoints, Beams, add_beams, point_positions, shape_weights
+from finforce_ifea.fem.frame import BeamPoints, add_beams, build_beams, point_positions, shape_weights
 from finforce_ifea.jaw.cad.proposal import FEW
+from finforce_ifea.jaw.jaw_file import Material
 from finforce_ifea.jaw.section import order_rings
 
 SEED = 40_000_000_000  # of training's fingers begin here
@@ -230,7 +229,6 @@ class BentFinger:
         held = max(finger.clamped_z, 0.0)
         tip = self._joint()
         joints: list[list[NDArray]] = [[], []]
-        self._loaded: list[tuple[NDArray, NDArray]] = []
         for side, band in enumerate((front, back)):
             heights = sorted((rib.line[0 if side == 0 else -1, 1], number) for number, rib in enumerate(ribs))
             joints[side] = [np.zeros(3, int)] * len(ribs)
@@ -242,8 +240,6 @@ class BentFinger:
                 chain = [start, *(self._joint() for _ in range(BETWEEN - 1)), end]
                 stiff = 0.5 * (z[0] + z[1])
                 self._chain(chain, line, float(np.interp(stiff, band.line[:, 1], band.thickness)), side)
-                if side == 0:
-                    self._loaded += list(zip(line[1:], chain[1:], strict=True))
                 if number >= 0:
                     joints[side][number] = end
                 start, below = end, height
@@ -255,7 +251,9 @@ class BentFinger:
             chain = [first, *(self._joint() for _ in range(ALONG - 1)), last]
             self._chain(chain, rib.line, float(rib.thickness[0]), 2)
         self._side = np.array(self._of)
-        self._beams, self._number = self._build(float(rng.uniform(0.3, 0.49)))
+        ends, thickness = np.array(self._ends), np.array(self._thickness)
+        material = Material(young_modulus=1e6, poisson_ratio=float(rng.uniform(0.3, 0.49)))
+        self._beams = build_beams(np.array(self._dof), ends, np.zeros_like(ends), thickness, 1.0, material)
         self._band = int(
             np.ptp(np.where(self._beams.dof < self._count, self._beams.dof, -1).reshape(-1, 8), axis=1).max()
         )
@@ -274,25 +272,6 @@ class BentFinger:
             self._thickness.append(thickness)
             self._of.append(side)
 
-    def _build(self, ratio: float) -> tuple[Beams, NDArray]:
-        dof, ends = np.array(self._dof), np.array(self._ends)
-        rows = dof.reshape(len(dof), -1)
-        row, col = (index.ravel() for index in np.broadcast_arrays(rows[:, :, None], rows[:, None, :]))
-        free = (row >= 0) & (col >= 0)
-        graph = sparse.coo_matrix((np.ones(free.sum()), (row[free], col[free])), (self._count, self._count))
-        number = np.full(self._count + 1, self._count)
-        number[reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True)] = np.arange(self._count)
-        along = ends[:, 1] - ends[:, 0]
-        length = np.linalg.norm(along, axis=1)
-        t = np.array(self._thickness)
-        EA, EI = t * 1e6, t**3 * 1e6 / (12.0 * (1.0 - ratio**2))
-        shear = 1.0 + 12.0 * EI * 2.0 * (1.0 + ratio) / (5.0 / 6.0 * EA * length**2)
-        stiffness = np.stack(
-            [EA / length, 4.0 * EI / length, 12.0 * EI / (length * shear), length / 3.0, length / (5.0 * shear**2)], 1
-        )
-        arms = np.zeros((len(ends), 2, 2))
-        return Beams(number[dof], ends, arms, along / length[:, None], length, stiffness), number
-
     def bend(self, place: float, spread: float, slope: float, largest: float, states: int) -> list[NDArray]:
         """Return equilibria q (n,) under a load that grows until something has moved by `largest` [m].
 
@@ -304,11 +283,10 @@ class BentFinger:
             states: how many equilibria are wanted, evenly spread.
         """
         load = np.zeros(self._count + 1)
-        for point, joint in self._loaded:
-            weight = np.exp(-0.5 * ((point[1] - place) / spread) ** 2)
-            numbers = self._number[joint]
-            load[numbers[0]] -= weight
-            load[numbers[1]] += slope * weight
+        front = np.flatnonzero(self._side == 0)
+        weight = np.exp(-0.5 * ((self._beams.ends[front, 1, 1] - place) / spread) ** 2)
+        load[self._beams.dof[front, 1, 0]] -= weight
+        load[self._beams.dof[front, 1, 1]] += slope * weight
         load = load[:-1]
         q, found, size, wanted = np.zeros(self._count), [], 0.0, largest / states
         step = None
