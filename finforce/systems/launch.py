@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 from finforce.errors import MissingDependencyError
-from finforce.systems.processes import DEPTHS, SINGLE_THREAD, Include, Process
+from finforce.settings import describe
+from finforce.systems.processes import SINGLE_THREAD, Include, Process
 
 OptionsT = TypeVar("OptionsT")
 
@@ -19,80 +20,44 @@ NONE = "none"  # on a command line, where an empty text cannot be given
 SWITCH = ("true", "false", "True", "False")
 
 
-def solver_arguments(*, images: str = "false", parameter_file: str = NONE, use_sim_time: str = "false") -> list[Any]:
-    """Return the launch arguments of every system with solvers; the defaults are those of its launch file."""
+def describe_system(
+    record: type[OptionsT], processes: Callable[[OptionsT, Path], Sequence[Process | Include]], share: Path, **own: str
+) -> Any:
+    """Return the launch description of a system: an argument for every option, and an action for every process.
+
+    Args:
+        record: the options.
+        processes: makes of options, and of the share folder, what is to be started.
+        share: folder with the configuration.
+        own: defaults of the launch file in place of the record's.
+    """
+    from launch import LaunchDescription
+    from launch.actions import OpaqueFunction
+
+    def start(context: Any) -> list[Any]:
+        options = options_from_texts(record, context.launch_configurations)
+        return [launch_action(part) for part in processes(options, share)]
+
+    arguments = [argument for entry in fields(record) for argument in _arguments_of(entry, own.get(entry.name))]
+    return LaunchDescription([*arguments, OpaqueFunction(function=start)])
+
+
+def _arguments_of(entry: Field, default: str | None) -> list[Any]:
+    """Return the launch argument of an option, after the one by its former name, where it has one."""
+    from launch.actions import DeclareLaunchArgument
     from launch.substitutions import LaunchConfiguration
 
+    choices = SWITCH if isinstance(entry.default, bool) else entry.metadata.get("choices")
+    some = {"choices": [str(word) or NONE for word in choices]} if choices else {}
+    default = default or (str(entry.default).lower() if isinstance(entry.default, bool) else str(entry.default)) or NONE
+    former = entry.metadata.get("alias")
+    if former is None:
+        return [DeclareLaunchArgument(entry.name, default_value=default, description=describe(entry), **some)]
+    text = f"Former name of {entry.name}, for one release"
     return [
-        _text("jaw_file", "Jaw file or name of a shipped jaw; none: bench"),
-        _text("calibration_file", "Calibration file or name of a shipped calibration; none: material of the jaw file"),
-        _text("contact_height", "Height of first touch above the clamped base [m]; nan: contacts come by topic", "nan"),
-        _text("object_mesh", "Mesh file of the object, from which contacts are estimated"),
-        _text("object_mesh_unit", "Unit of the mesh file: m, cm, mm or inch"),
-        _text("contact", "Contact estimation: estimate, paper (Algorithm 1) or closest"),
-        _text("pose_source", "Source of object poses: topic, detections or tracker"),
-        _text("pose_topic", "Topic of object poses from another program; none: object_pose, object_detections"),
-        _text("pose_origin", "Origin of these poses in the object: mesh, middle or added"),
-        _switch("images", "Detection of key points in camera images; false: key points come by topic", images),
-        _text("finder", "Former name of detection_method, for one release"),
-        _text("detection_method", "network, frame (DeepLabCut) or dots", LaunchConfiguration("finder")),
-        _text("model", "Folder of a network"),
-        _choice(
-            "depth", "Depth images: aligned (every image needs one), auto (where there is one), off", (NONE, *DEPTHS)
-        ),
-        _text("T_gripper_camera", "Pose of the camera in the gripper frame: x y z [m] qx qy qz qw"),
-        _text("solver", "Mechanics: reduced, solid, frame, linear or paper (Eq. 1)"),
-        _text("mesh", "Mesh density: default, coarse or fine"),
-        _text("parameter_file", "YAML file with node parameters", parameter_file),
-        _switch("use_sim_time", "Time from /clock", use_sim_time),
-        _switch("composed", "Detector, contact estimator and solvers in one process; false: one process each", "true"),
-        _switch("rviz", "RViz with the markers"),
+        DeclareLaunchArgument(former, default_value=default, description=text),
+        DeclareLaunchArgument(entry.name, default_value=LaunchConfiguration(former), description=describe(entry)),
     ]
-
-
-def gripper_arguments() -> list[Any]:
-    """Return the launch arguments of every system with a gripper."""
-    port = "Serial port of the CAN adapter, or CAN channel; none: from the parameter file, with sim a temporary one"
-    return [
-        _text("gripper_port", port),
-        _text("gripper_interface", "slcan for a serial CAN adapter, or an interface of python-can, such as socketcan"),
-        _switch("sim", "Simulation: an emulated gripper, with the synthetic twin as its camera"),
-    ]
-
-
-def stack_arguments() -> list[Any]:
-    """Return the launch arguments of the gripper in a manipulation stack."""
-    return [
-        _text("description", "xacro or URDF file of the robot; none: the gripper alone"),
-        _text("semantics", "SRDF file of the robot, for MoveIt; none: that of the gripper"),
-        _text("controllers", "YAML file of the controllers; none: those of the gripper"),
-        _switch("gripper", "Start of the gripper driver", "true"),
-        _text("gripper_port", "Serial port of the CAN adapter, or CAN channel"),
-        _text("gripper_interface", "slcan for a serial CAN adapter, or an interface of python-can, such as socketcan"),
-        _text("parameter_file", "YAML file with driver parameters"),
-        _switch("sim", "Simulation: an emulated gripper in place of hardware"),
-    ]
-
-
-def _text(name: str, description: str, default: Any = NONE) -> Any:
-    """Return a launch argument of any text."""
-    from launch.actions import DeclareLaunchArgument
-
-    return DeclareLaunchArgument(name, default_value=default, description=description)
-
-
-def _choice(name: str, description: str, choices: Sequence[str]) -> Any:
-    """Return a launch argument of one of several words, the first by default."""
-    from launch.actions import DeclareLaunchArgument
-
-    return DeclareLaunchArgument(name, default_value=choices[0], choices=choices, description=description)
-
-
-def _switch(name: str, description: str, default: str = "false") -> Any:
-    """Return a launch argument that is true or false."""
-    from launch.actions import DeclareLaunchArgument
-
-    return DeclareLaunchArgument(name, default_value=default, choices=SWITCH, description=description)
 
 
 def options_from_texts(record: type[OptionsT], texts: Mapping[str, str]) -> OptionsT:

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from finforce.settings import setting
+
 # small matrices: more threads per process cost time and make it vary
 SINGLE_THREAD = {
     name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -259,73 +261,101 @@ def emulated_port() -> str:
     return str(Path(tempfile.gettempdir()) / f"finforce_gripper_{os.getpid()}")
 
 
+_PORT = "Serial port of the CAN adapter, or CAN channel"
+_INTERFACE = "slcan for a serial CAN adapter, or an interface of python-can, such as socketcan"
+
+
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions:
     """What every system with solvers is asked for; NaN and empty texts leave the node's own default.
 
-    The launch files and `finforce.systems.launch` say what each option means.
+    Each option is an argument of the launch files, where none stands for an empty text.
     """
 
-    jaw_file: str = ""
-    calibration_file: str = ""
-    contact_height: float = math.nan
-    object_mesh: str = ""
-    object_mesh_unit: str = ""
-    contact: str = ""
-    pose_source: str = ""
-    pose_topic: str = ""
-    pose_origin: str = ""
-    images: bool = False
-    detection_method: str = ""
-    model: str = ""
-    depth: str = ""
-    T_gripper_camera: str = ""
-    solver: str = ""
-    mesh: str = ""
-    parameter_file: str = ""
-    use_sim_time: bool = False
-    composed: bool = True
-    rviz: bool = False
+    jaw_file: str = setting("", "Jaw file or name of a shipped jaw; none: bench")
+    calibration_file: str = setting(
+        "", "Calibration file or name of a shipped calibration; none: material of the jaw file"
+    )
+    contact_height: float = setting(
+        math.nan, "Height of first touch above the clamped base [m]; nan: contacts come by topic"
+    )
+    object_mesh: str = setting("", "Mesh file of the object, from which contacts are estimated")
+    object_mesh_unit: str = setting("", "Unit of the mesh file: m, cm, mm or inch")
+    contact: str = setting("", "Contact estimation: estimate, paper (Algorithm 1) or closest")
+    pose_source: str = setting("", "Source of object poses: topic, detections or tracker")
+    pose_topic: str = setting("", "Topic of object poses from another program; none: object_pose, object_detections")
+    pose_origin: str = setting("", "Origin of these poses in the object: mesh, middle or added")
+    images: bool = setting(False, "Detection of key points in camera images; false: key points come by topic")
+    detection_method: str = setting("", "network, frame (DeepLabCut) or dots", alias="finder")
+    model: str = setting("", "Folder of a network")
+    depth: str = setting(
+        "", "Depth images: aligned (every image needs one), auto (where there is one), off", choices=("", *DEPTHS)
+    )
+    T_gripper_camera: str = setting("", "Pose of the camera in the gripper frame: x y z [m] qx qy qz qw")
+    solver: str = setting("", "Mechanics: reduced, solid, frame, linear or paper (Eq. 1)")
+    mesh: str = setting("", "Mesh density: default, coarse or fine")
+    parameter_file: str = setting("", "YAML file with node parameters; none: that of the system")
+    use_sim_time: bool = setting(False, "Time from /clock")
+    composed: bool = setting(True, "Detector, contact estimator and solvers in one process; false: one process each")
+    rviz: bool = setting(False, "RViz with the markers")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayOptions(SolverOptions):
     """The jaws of a recording."""
 
-    jaws: str = "left"
-    bag: str = ""
-    rate: float = 1.0
-    use_sim_time: bool = True
+    jaws: str = setting("left", "Jaws of the recording", choices=("left", "right", "both"))
+    bag: str = setting("", "Recording to be played; none: somebody else plays it, with /clock")
+    rate: float = setting(1.0, "Speed of playing")
+    use_sim_time: bool = setting(True, "Time from /clock")
 
 
 @dataclass(frozen=True, kw_only=True)
 class GripperOptions(SolverOptions):
-    """What a system with the gripper is asked for beside the forces."""
+    """What a system with the gripper is asked for in addition to the forces."""
 
-    gripper_port: str = ""
-    gripper_interface: str = ""
-    sim: bool = False
+    gripper_port: str = setting("", f"{_PORT}; none: from the parameter file, with sim a temporary one")
+    gripper_interface: str = setting("", _INTERFACE)
+    sim: bool = setting(False, "Simulation: an emulated gripper, with the synthetic twin as its camera")
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions(GripperOptions):
     """One jaw, live; the gripper, if there is one, brings the object to it."""
 
-    jaw: str = "left"
+    jaw: str = setting("left", "Jaw that is on the bench", choices=("left", "right"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotOptions(GripperOptions):
     """Both jaws on a robot's wrist, with the camera beside them."""
 
-    images: bool = True
-    gripper: bool = True
-    camera: bool = True
-    camera_name: str = "wrist_camera"
-    camera_config: str = ""
-    camera_serial: str = ""
-    arm: bool = False
-    arm_description: str = ""
-    robot_ip: str = "192.168.1.10"
-    dof: int = 7
-    use_fake_hardware: bool = False
+    images: bool = setting(True, "Detection of key points in camera images; false: key points come by topic")
+    gripper: bool = setting(True, "Start of the gripper driver")
+    camera: bool = setting(True, "Start of the wrist camera, a RealSense D405, by realsense2_camera; not with sim")
+    camera_name: str = setting(
+        "wrist_camera", "Topics /camera/NAME/..., frames NAME_...; none: topics and frame of the parameter file"
+    )
+    camera_config: str = setting("", "YAML file with parameters of realsense2_camera; none: the shipped d405.yaml")
+    camera_serial: str = setting("", "Serial number of the camera; none: the only one")
+    arm: bool = setting(False, "Start of the arm, a Kinova Gen3, by kortex_bringup; with sim one that is not there")
+    arm_description: str = setting(
+        "", "xacro file of arm and gripper; none: the shipped one, the gripper on the flange of a Gen3"
+    )
+    robot_ip: str = setting("192.168.1.10", "Address of the arm")
+    dof: int = setting(7, "Joints of the arm", choices=(6, 7))
+    use_fake_hardware: bool = setting(False, "An arm that is not there: it mirrors its commands")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackOptions:
+    """What is asked of a gripper that a manipulation stack drives."""
+
+    description: str = setting("", "xacro or URDF file of the robot; none: the gripper alone")
+    semantics: str = setting("", "SRDF file of the robot, for MoveIt; none: that of the gripper")
+    controllers: str = setting("", "YAML file of the controllers; none: those of the gripper")
+    gripper: bool = setting(True, "Start of the gripper driver")
+    gripper_port: str = setting("", f"{_PORT}; none: that of the parameter file")
+    gripper_interface: str = setting("", _INTERFACE)
+    parameter_file: str = setting("", "YAML file with driver parameters; none: config/robot.yaml")
+    sim: bool = setting(False, "Simulation: an emulated gripper in place of hardware")

@@ -2,41 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from finforce.files import read_yaml
 from finforce.optional import import_library
-from finforce.systems.processes import Process, emulated_port, given
+from finforce.systems.processes import Process, StackOptions, emulated_port, given
 
 STATES = "gripper_driver/joint_states"  # of the driver, where joint_states are those of the whole robot
 CONTROLLERS = ("joint_state_broadcaster", "finray_gripper_controller")
-
-
-@dataclass(frozen=True, kw_only=True)
-class StackOptions:
-    """What can be asked of a gripper that a manipulation stack drives.
-
-    Attributes:
-        description: xacro or URDF file of the robot; empty: the gripper alone.
-        semantics: SRDF file that belongs to it, for MoveIt; empty: that of the gripper.
-        controllers: YAML file of the controllers; empty: those of the gripper.
-        gripper: start the driver.
-        gripper_port: of the CAN adapter; empty: that of the parameter file.
-        gripper_interface: slcan, or python-can's name of one; empty: that of the parameter file.
-        parameter_file: of the driver; empty: config/robot.yaml.
-        sim: an emulated gripper stands in for the real one.
-    """
-
-    description: str = ""
-    semantics: str = ""
-    controllers: str = ""
-    gripper: bool = True
-    gripper_port: str = ""
-    gripper_interface: str = ""
-    parameter_file: str = ""
-    sim: bool = False
 
 
 def control_processes(options: StackOptions, share: Path) -> list[Process]:

@@ -11,8 +11,7 @@ import pytest
 from finforce.errors import MissingDependencyError
 from finforce.ros.composition import read_part
 from finforce.systems import launch as launch_module
-from finforce.systems.processes import BenchOptions, ReplayOptions, RobotOptions
-from finforce.systems.stacks import StackOptions
+from finforce.systems.processes import BenchOptions, ReplayOptions, RobotOptions, StackOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted((ROOT / "launch").glob("*.launch.py"))
