@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import fields as fields_of
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,15 +33,6 @@ from finforce.transforms import pose_from_quaternion
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 STDDEV_COLUMNS = ("stddev_x", "stddev_y", "stddev_z")
 _CODES = {np.dtype(name): code for code, name in DATATYPES.items()}
-
-
-class FieldLike(Protocol):
-    """What is read of a field description; sensor_msgs/PointField satisfies it."""
-
-    name: str
-    offset: int
-    datatype: int
-    count: int
 
 
 @dataclass(frozen=True)
@@ -91,7 +82,7 @@ def _layout(entries: tuple[tuple[str, int, int, int], ...], point_step: int, big
 
 
 def _wanted(
-    fields: Iterable[FieldLike], names: Sequence[str], optional: Sequence[str]
+    fields: Iterable[Any], names: Sequence[str], optional: Sequence[str]
 ) -> tuple[tuple[str, int, int, int], ...]:
     """Pick the wanted fields; the first of a repeated name wins, unknown ones are ignored."""
     entries: dict[str, tuple[str, int, int, int]] = {}
@@ -103,53 +94,6 @@ def _wanted(
     if missing:
         raise ObservationError(f"the cloud has no field {', '.join(missing)}; expected {', '.join(names)}")
     return tuple(entries.values())
-
-
-def decode_cloud(
-    fields: Iterable[FieldLike],
-    data: Any,
-    *,
-    width: int,
-    height: int,
-    point_step: int,
-    row_step: int,
-    is_bigendian: bool,
-    names: Sequence[str],
-    optional: Sequence[str] = (),
-) -> dict[str, NDArray]:
-    """Return the named columns of a PointCloud2, whatever their order, offset, type and byte order.
-
-    Args:
-        fields: field descriptions (`name`, `offset`, `datatype`, `count`).
-        data: the buffer: bytes, array('B') or a uint8 array.
-        width: points per row.
-        height: rows.
-        point_step: bytes per point.
-        row_step: bytes per row; ignored for a single row.
-        is_bigendian: byte order of the numbers.
-        names: columns that must be there.
-        optional: columns that are returned when they are there.
-
-    Returns:
-        For each name an array (width * height,), or (width * height, count) for a field of several
-        elements, with the field's own type in native byte order.
-
-    Raises:
-        ObservationError: a field is missing or leaves the point, or the buffer is too short.
-    """
-    points = int(width) * int(height)
-    if min(width, height) < 0 or not 0 <= point_step <= _LARGEST_POINT:
-        raise ObservationError(f"{height} rows of {width} points of {point_step} bytes; expected a cloud")
-    if points == 0:
-        return {name: np.empty(0) for name in names}
-    wanted = _wanted(fields, names, optional)
-    rows = _rows(data, int(width), int(height), int(point_step), int(row_step))
-    layout = _layout(wanted, int(point_step), bool(is_bigendian))
-    table = rows.view(layout).reshape(points)
-    return {
-        name: np.ascontiguousarray(table[name], dtype=table[name].dtype.newbyteorder("="))
-        for name in layout.names or ()
-    }
 
 
 def _rows(data: Any, width: int, height: int, point_step: int, row_step: int) -> NDArray[np.uint8]:
@@ -175,7 +119,7 @@ def encode_cloud(columns: Mapping[str, ArrayLike]) -> EncodedCloud:
         columns: name -> (n,) or (n, count) array; the field takes the array's type, in this order.
 
     Returns:
-        The field descriptions, the bytes per point and the buffer; `decode_cloud` inverts it.
+        The field descriptions, the bytes per point and the buffer; `decode_columns` inverts it.
 
     Raises:
         ObservationError: the columns differ in length or have a type that PointField lacks.
@@ -231,7 +175,7 @@ class CloudColumns:
         return _plan(tuple((name, array.dtype, array.shape[1:]) for name, array in self.columns.items()))[0]
 
     def pick(self, names: Sequence[str], optional: Sequence[str]) -> dict[str, NDArray]:
-        """Return columns by name as `decode_cloud` does of the packed cloud."""
+        """Return columns by name as `decode_columns` does of the packed cloud."""
         if not self.width:
             return {name: np.empty(0) for name in names}
         missing = [name for name in names if name not in self.columns]
@@ -241,28 +185,32 @@ class CloudColumns:
 
 
 def decode_columns(cloud: Any, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray]:
-    """Return the named columns of any object with the attributes of PointCloud2; see `decode_cloud`.
+    """Return columns of a PointCloud2, or any object with its attributes, whatever their order, type and byte order.
+
+    Args:
+        cloud: its data may be bytes, array('B') or a uint8 array; `row_step` is ignored for a single row.
+        names: columns that must be there.
+        optional: columns that are returned when they are there.
+
+    Returns:
+        For each name an array (width * height,) with the field's own type in native byte order.
 
     Raises:
         ObservationError: a field is missing, leaves the point or has several elements, or the buffer is too short.
     """
     if isinstance(cloud, CloudColumns):
         return cloud.pick(names, optional)
-    columns = decode_cloud(
-        cloud.fields,
-        cloud.data,
-        width=cloud.width,
-        height=cloud.height,
-        point_step=cloud.point_step,
-        row_step=cloud.row_step,
-        is_bigendian=cloud.is_bigendian,
-        names=names,
-        optional=optional,
-    )
-    several = next((name for name, column in columns.items() if column.ndim != 1), None)
-    if several is not None:
-        raise ObservationError(f"field '{several}' has {columns[several].shape[1]} numbers a point; expected count 1")
-    return columns
+    width, height, point_step = int(cloud.width), int(cloud.height), int(cloud.point_step)
+    if min(width, height) < 0 or not 0 <= point_step <= _LARGEST_POINT:
+        raise ObservationError(f"{height} rows of {width} points of {point_step} bytes; expected a cloud")
+    if not width * height:
+        return {name: np.empty(0) for name in names}
+    layout = _layout(_wanted(cloud.fields, names, optional), point_step, bool(cloud.is_bigendian))
+    for name in layout.names:
+        if layout[name].shape:
+            raise ObservationError(f"field '{name}' has {layout[name].shape[0]} numbers a point; expected count 1")
+    table = _rows(cloud.data, width, height, point_step, int(cloud.row_step)).view(layout).reshape(width * height)
+    return {name: np.ascontiguousarray(table[name], dtype=table[name].dtype.newbyteorder("=")) for name in layout.names}
 
 
 def decode_keypoints(cloud: Any) -> Keypoints:

@@ -20,7 +20,7 @@ MILLIMETRE = 1e-3
 
 
 def build_object(name: str) -> ObjectMesh:
-    """Return an object by its name, one of `OBJECT_NAMES` or `SMALL_OBJECT_NAMES`.
+    """Return an object by its name, one of `OBJECT_NAMES` or a smaller one.
 
     Raises:
         ObjectMeshError: there is none of this name.
@@ -130,7 +130,6 @@ SMALL_BUILDERS: dict[str, Callable] = {
     "wedge": _build_wedge,
 }
 OBJECT_NAMES = tuple(BUILDERS)
-SMALL_OBJECT_NAMES = tuple(SMALL_BUILDERS)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

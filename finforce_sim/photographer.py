@@ -130,15 +130,6 @@ def _move(points: NDArray, T: NDArray) -> NDArray:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def draw_jaws(jaws: Mapping[str, Jaw], density: str) -> dict[str, DrawnJaw]:
-    """Return the shapes of jaws by side, of meshes with a density."""
-    shapes = {}
-    for side, jaw in jaws.items():
-        mesh = jaw.build_mesh(density)
-        shapes[side] = DrawnJaw(jaw=jaw, rest=mesh.nodes, triangles=mesh.surface)
-    return shapes
-
-
 SHUTTER = 0.008  # [s] that the sensor collects light
 WINDOW_MARGIN = 90  # [px] around the jaws
 BANDS = 16  # of rows that a rolling shutter exposes together

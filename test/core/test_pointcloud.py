@@ -9,24 +9,24 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from finforce.errors import ObservationError
-from finforce.messages import PointField, decode_cloud, decode_keypoints, encode_cloud
+from finforce.messages import PointField, decode_columns, decode_keypoints, encode_cloud
 
 NAMES = ("x", "y", "z", "likelihood", "candidate")
 TYPES = ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8")
 
 
-def cloud_of(columns, *, names):
+def packed(columns):
+    """A cloud of one row."""
     encoded = encode_cloud(columns)
     rows = len(next(iter(columns.values())))
-    return decode_cloud(
-        encoded.fields,
-        encoded.data,
+    return SimpleNamespace(
+        fields=encoded.fields,
+        data=encoded.data,
         width=rows,
         height=1,
         point_step=encoded.point_step,
         row_step=encoded.point_step * rows,
         is_bigendian=False,
-        names=names,
     )
 
 
@@ -39,7 +39,7 @@ def tables(draw):
 
 @given(tables())
 def test_decode_inverts_encode(columns):
-    decoded = cloud_of(columns, names=NAMES)
+    decoded = decode_columns(packed(columns), NAMES)
     for name, values in columns.items():
         assert decoded[name].dtype == values.dtype.newbyteorder("=")
         np.testing.assert_array_equal(decoded[name], values)
@@ -54,22 +54,22 @@ def test_order_offset_type_padding_rows_and_byte_order_do_not_matter():
     table["y"], table["z"] = 7, -0.25
     data = b"".join(row.tobytes() + b"padding" for row in table)[:-7]
     fields = [PointField("y", 8, 3), PointField("rgb", 24, 6), PointField("z", 16, 8), PointField("x", 3, 7)]
-    decoded = decode_cloud(
-        fields, data, width=3, height=2, point_step=29, row_step=94, is_bigendian=True, names=("x", "y", "z")
-    )
+    cloud = SimpleNamespace(fields=fields, data=data, width=3, height=2, point_step=29, row_step=94, is_bigendian=True)
+    decoded = decode_columns(cloud, ("x", "y", "z"))
     np.testing.assert_array_equal(decoded["x"], [1, 2, 3, 4, 5, 6])
     np.testing.assert_array_equal(decoded["y"], [7] * 6)
     np.testing.assert_array_equal(decoded["z"], [-0.25] * 6)
     assert decoded["x"].dtype.isnative
 
 
-def test_several_elements_per_field_become_a_second_axis():
-    values = np.arange(6.0).reshape(2, 3)
-    np.testing.assert_array_equal(cloud_of({"x": values}, names=["x"])["x"], values)
+def test_several_elements_per_field_are_refused():
+    with pytest.raises(ObservationError, match="field 'x' has 3 numbers a point; expected count 1"):
+        decode_columns(packed({"x": np.arange(6.0).reshape(2, 3)}), ["x"])
 
 
 def test_empty_cloud_gives_empty_columns():
-    decoded = decode_cloud((), b"", width=0, height=1, point_step=0, row_step=0, is_bigendian=False, names=("x", "y"))
+    empty = SimpleNamespace(fields=(), data=b"", width=0, height=1, point_step=0, row_step=0, is_bigendian=False)
+    decoded = decode_columns(empty, ("x", "y"))
     assert decoded["x"].shape == decoded["y"].shape == (0,)
 
 
@@ -96,7 +96,7 @@ def test_malformed_cloud_is_refused_with_the_reason(change, message):
         "names": ("x", "y"),
     } | change
     with pytest.raises(ObservationError, match=message):
-        decode_cloud(cloud.pop("fields"), cloud.pop("data"), **cloud)
+        decode_columns(SimpleNamespace(**cloud), cloud["names"])
 
 
 def test_columns_of_different_length_or_unknown_type_are_refused():
@@ -107,16 +107,7 @@ def test_columns_of_different_length_or_unknown_type_are_refused():
 
 
 def test_key_points_without_likelihood_are_certain():
-    encoded = encode_cloud({"x": np.float32([1, np.nan]), "y": np.float32([2, 2]), "z": np.float32([3, 3])})
-    cloud = SimpleNamespace(
-        fields=encoded.fields,
-        data=encoded.data,
-        width=2,
-        height=1,
-        point_step=encoded.point_step,
-        row_step=24,
-        is_bigendian=False,
-    )
+    cloud = packed({"x": np.float32([1, np.nan]), "y": np.float32([2, 2]), "z": np.float32([3, 3])})
     points, likelihood, stddev = decode_keypoints(cloud)
     np.testing.assert_array_equal(points, [[1, 2, 3], [np.nan, 2, 3]])
     np.testing.assert_array_equal(likelihood, [1, 1])
@@ -125,32 +116,14 @@ def test_key_points_without_likelihood_are_certain():
 
 def test_rows_that_the_detector_calls_invalid_are_not_used():
     columns = {name: np.arange(3, dtype="<f4") for name in ("x", "y", "z", "likelihood")}
-    encoded = encode_cloud({**columns, "valid": np.array([1, 0, 1], dtype="u1")})
-    cloud = SimpleNamespace(
-        fields=encoded.fields,
-        data=encoded.data,
-        width=3,
-        height=1,
-        point_step=encoded.point_step,
-        row_step=3 * encoded.point_step,
-        is_bigendian=False,
-    )
+    cloud = packed({**columns, "valid": np.array([1, 0, 1], dtype="u1")})
     points, *_ = decode_keypoints(cloud)
     assert np.isnan(points[1]).all()
     np.testing.assert_array_equal(points[[0, 2]], [[0, 0, 0], [2, 2, 2]])
 
 
 def keypoint_cloud(**columns):
-    encoded = encode_cloud({name: np.arange(3, dtype="<f4") for name in "xyz"} | columns)
-    return SimpleNamespace(
-        fields=encoded.fields,
-        data=encoded.data,
-        width=3,
-        height=1,
-        point_step=encoded.point_step,
-        row_step=3 * encoded.point_step,
-        is_bigendian=False,
-    )
+    return packed({name: np.arange(3, dtype="<f4") for name in "xyz"} | columns)
 
 
 def stated(*values):

@@ -31,7 +31,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import String
 
 from finforce.health import Level
-from finforce.messages import decode_cloud, pose_from_message, stamp_of
+from finforce.messages import decode_columns, pose_from_message, stamp_of
 from finforce.ros import node as ros
 from finforce_keypoints.errors import DetectionError
 from finforce_keypoints.node import KeypointDetectorNode
@@ -41,8 +41,7 @@ COLUMNS = ("x", "y", "z", "likelihood", "u", "v", "valid", "reason", "stddev_x",
 
 
 def columns(cloud):
-    layout = {name: getattr(cloud, name) for name in ("width", "height", "point_step", "row_step", "is_bigendian")}
-    return decode_cloud(cloud.fields, cloud.data, names=COLUMNS, **layout)
+    return decode_columns(cloud, COLUMNS)
 
 
 def test_key_points_and_pose_carry_the_stamp_of_the_image_and_all_columns(probe):
