@@ -19,24 +19,16 @@ FINGER = 0  # seed of the material for which the package has a calibration, `twi
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class JawState:
-    """One jaw at one instant; all but its place in its own jaw frame.
+class JawState(JawShape):
+    """One jaw at one instant.
 
     Attributes:
         origin_x: of its frame on the closing axis of `gripper_base` [m].
-        vertices: deformed (n, 3) [m], in mesh order.
-        keypoints: (K, 3) [m], in the order of the jaw file.
-        reference: of the reference point, which does not deform (3,) [m].
-        force: that the object applies to the jaw (3,) [N].
-        torque: of the same about the jaw frame's origin (3,) [N m].
+        reference: the reference point, which does not deform (3,) [m], jaw frame.
     """
 
     origin_x: float
-    vertices: NDArray
-    keypoints: NDArray
     reference: NDArray
-    force: NDArray
-    torque: NDArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,14 +124,8 @@ class TwinGripper(Assembly):
 
     def _jaw_state(self, side: str, posture: Posture, shape: JawShape, wrench: RelaxedWrench) -> JawState:
         force, torque = wrench.update(shape.force, shape.torque, 1.0 / self.scenario.rate)
-        return JawState(
-            origin_x=self.origin_x(side, posture),
-            vertices=shape.vertices,
-            keypoints=shape.keypoints,
-            reference=self._jaws[side].jaw.reference_point,
-            force=force,
-            torque=torque,
-        )
+        place = {"origin_x": self.origin_x(side, posture), "reference": self._jaws[side].jaw.reference_point}
+        return JawState(**vars(replace(shape, force=force, torque=torque)), **place)
 
 
 STEP = 1e-4  # [m] of each jaw from one solved grasp to the next
@@ -217,16 +203,14 @@ class PressedGrasp:
 
     def state(self, opening: float, stamp: float = 0.0) -> TwinState:
         """Return jaws and object at an opening [m], with elastic wrenches, as of a stamp [s]."""
-        wrenches, closing = self.wrenches(opening), self.closing_at(opening)
-        posture = Posture(closing=closing)
+        wrenches, posture = self.wrenches(opening), Posture(closing=self.closing_at(opening))
         jaws = {
             side: JawState(
                 origin_x=self.assembly.origin_x(side, posture),
+                reference=self.assembly.jaws[side].reference_point,
                 vertices=self._read(table.vertices, opening),
                 keypoints=self._read(table.keypoints, opening),
-                reference=self.assembly.jaws[side].reference_point,
-                force=wrenches[side].force,
-                torque=wrenches[side].torque,
+                **wrenches[side]._asdict(),
             )
             for side, table in self._tables.items()
         }
@@ -315,5 +299,4 @@ def _solve_grasps(assembly: Assembly, step: float) -> list[_SolvedGrasp]:
 
 def _stack_shapes(shapes: Sequence[JawShape]) -> JawShape:
     """Return shapes of one jaw as rows of arrays: vertices (m, n, 3), keypoints (m, K, 3), force and torque (m, 3)."""
-    names = ("vertices", "keypoints", "force", "torque")
-    return JawShape(**{name: np.stack([getattr(shape, name) for shape in shapes]) for name in names})
+    return JawShape(**{name: np.stack([getattr(shape, name) for shape in shapes]) for name in vars(shapes[0])})

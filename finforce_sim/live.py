@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -142,11 +141,7 @@ class ImageTable(Generic[T]):
 
     def find(self, opening: float) -> int:
         """Return the place of the image that was taken nearest to an opening [m]."""
-        right = bisect_left(self.openings, opening)
-        if right in (0, len(self.openings)):
-            return min(right, len(self.openings) - 1)
-        is_left = opening - self.openings[right - 1] < self.openings[right] - opening
-        return right - 1 if is_left else right
+        return int(np.abs(self.openings - opening).argmin())
 
 
 def choose_openings(grasp: PressedGrasp, low: float, high: float) -> NDArray:

@@ -67,12 +67,12 @@ class JawStep:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JawShape:
-    """One jaw as it stands.
+    """One jaw as it stands, in its own frame.
 
     Attributes:
-        vertices: (n, 3) [m], in mesh order.
-        keypoints: (K, 3) [m].
-        force: elastic, of pressure and pull (3,) [N].
+        vertices: deformed (n, 3) [m], in mesh order.
+        keypoints: (K, 3) [m], in the order of the jaw file.
+        force: that the object applies, by pressure and pull (3,) [N]; elastic as long as nothing relaxes it.
         torque: of the same about the jaw frame's origin (3,) [N m].
     """
 

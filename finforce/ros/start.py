@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from functools import partial
 from importlib import import_module
 
 NODES = {
@@ -18,48 +19,6 @@ NODES = {
     "twin_camera": "finforce_sim.node",
 }
 STOPS = (signal.SIGINT, signal.SIGTERM)
-
-
-def ifea_solver() -> int:
-    """Run the solver of one jaw."""
-    return start("ifea_solver")
-
-
-def contact_estimator() -> int:
-    """Run the contact estimator of one jaw or both."""
-    return start("contact_estimator")
-
-
-def keypoint_detector() -> int:
-    """Run the key point detector of one jaw or both."""
-    return start("keypoint_detector")
-
-
-def pipeline() -> int:
-    """Run detector, contact estimator and solvers in one process."""
-    return start("pipeline")
-
-
-def gripper_driver() -> int:
-    """Run the driver of the gripper."""
-    return start("gripper_driver")
-
-
-def emulated_gripper() -> int:
-    """Run the emulated gripper, which is no node; what `ros2 launch` adds for nodes is left out."""
-    if "--ros-args" in sys.argv:
-        del sys.argv[sys.argv.index("--ros-args") :]
-    return start("emulated_gripper")
-
-
-def recording_player() -> int:
-    """Run the player of recordings."""
-    return start("recording_player")
-
-
-def twin_camera() -> int:
-    """Run the camera of the synthetic twin."""
-    return start("twin_camera")
 
 
 def start(name: str) -> int:
@@ -76,6 +35,23 @@ def start(name: str) -> int:
     for number, handler in zip(STOPS, before, strict=True):
         signal.signal(number, handler)
     return module.main()
+
+
+def emulated_gripper() -> int:
+    """Run the emulated gripper, which is no node; what `ros2 launch` adds for nodes is left out."""
+    if "--ros-args" in sys.argv:
+        del sys.argv[sys.argv.index("--ros-args") :]
+    return start("emulated_gripper")
+
+
+# the entry points of the others, see setup.py
+ifea_solver = partial(start, "ifea_solver")
+contact_estimator = partial(start, "contact_estimator")
+keypoint_detector = partial(start, "keypoint_detector")
+pipeline = partial(start, "pipeline")
+gripper_driver = partial(start, "gripper_driver")
+recording_player = partial(start, "recording_player")
+twin_camera = partial(start, "twin_camera")
 
 
 if __name__ == "__main__":

@@ -239,14 +239,7 @@ class Recording:
     def between(self, start: int, stop: int) -> Recording:
         """Return the part with start <= stamp < stop [ns]; a phase under way at start begins there."""
         jaws = {
-            side: JawTrack(
-                keypoints=_cut(track.keypoints, start, stop),
-                truth=track.truth and _cut(track.truth, start, stop),
-                pose=track.pose and _cut(track.pose, start, stop),
-                sight=track.sight and _cut(track.sight, start, stop),
-                true_pose=track.true_pose and _cut(track.true_pose, start, stop),
-                detection=track.detection and _cut(track.detection, start, stop),
-            )
+            side: JawTrack(**{name: part and _cut(part, start, stop) for name, part in vars(track).items()})
             for side, track in self.jaws.items()
         }
         phases = self.phases
