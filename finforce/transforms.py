@@ -16,7 +16,7 @@ _UNIT, _LAST = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def check_pose(T: ArrayLike, what: str = "pose") -> NDArray:
-    """Returns a pose as a (4, 4) array of floats after having refused what is no rigid motion.
+    """Return a pose as a (4, 4) array of floats after refusing what is no rigid motion.
 
     Args:
         T: matrix [[R, t], [0, 1]] (4, 4), t in [m].
@@ -53,7 +53,7 @@ def check_pose(T: ArrayLike, what: str = "pose") -> NDArray:
 
 
 def pose_from_quaternion(position: ArrayLike, quaternion: ArrayLike) -> NDArray:
-    """Returns the pose of a position and a unit quaternion.
+    """Return the pose of a position and a unit quaternion.
 
     Args:
         position: translation (3,) [m].
@@ -83,17 +83,17 @@ def pose_from_quaternion(position: ArrayLike, quaternion: ArrayLike) -> NDArray:
 
 
 def quaternion_from_pose(T: ArrayLike) -> NDArray:
-    """Returns the quaternion x, y, z, w (4,) of a pose (4, 4), with w >= 0; raises PoseError as `check_pose` does."""
+    """Return the quaternion x, y, z, w (4,) of a pose (4, 4), with w >= 0; raises PoseError as `check_pose` does."""
     return np.array(_quaternion(check_pose(T)[:3, :3]))
 
 
 def pose_numbers(T: ArrayLike) -> tuple[float, ...]:
-    """Returns x, y, z [m], qx, qy, qz, qw of a pose (4, 4); raises PoseError as `check_pose` does."""
+    """Return x, y, z [m], qx, qy, qz, qw of a pose (4, 4); raises PoseError as `check_pose` does."""
     return tuple(float(number) for number in (*np.asarray(T)[:3, 3], *quaternion_from_pose(T)))
 
 
 def invert_pose(T_a_b: NDArray) -> NDArray:
-    """Returns T_b_a (4, 4), [[R^T, -R^T t], [0, 1]], of a rigid pose T_a_b (4, 4)."""
+    """Return T_b_a (4, 4), [[R^T, -R^T t], [0, 1]], of a rigid pose T_a_b (4, 4)."""
     T_b_a = np.eye(4)
     T_b_a[:3, :3] = T_a_b[:3, :3].T
     T_b_a[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
@@ -101,7 +101,7 @@ def invert_pose(T_a_b: NDArray) -> NDArray:
 
 
 def rotation_between(T_a: NDArray, T_b: NDArray) -> float:
-    """Returns the angle [rad], 0 to pi, by which two poses (4, 4) differ in orientation.
+    """Return the angle [rad], 0 to pi, by which two poses (4, 4) differ in orientation.
 
     With D = R_a^T R_b: angle = 2 asin(|D - 1|_F / sqrt 8), which is exact near zero, where acos is not.
     """
@@ -110,7 +110,7 @@ def rotation_between(T_a: NDArray, T_b: NDArray) -> float:
 
 
 def move_pose(T: NDArray, step: NDArray) -> NDArray:
-    """Returns a pose (4, 4) moved by a small twist, turned about its own origin in the outer frame's axes.
+    """Return a pose (4, 4) moved by a small twist, turned about its own origin in the outer frame's axes.
 
     t' = t + step[:3], R' = exp(step[3:]) R: the finite step (6,) is x, y, z [m] and rotation vector [rad], also
     the order and the meaning of the (6, 6) covariances of poses here and in ROS.
@@ -125,7 +125,7 @@ def move_pose(T: NDArray, step: NDArray) -> NDArray:
 
 
 def step_between(T_from: NDArray, T_to: NDArray) -> NDArray:
-    """Returns the step (6,) [m, rad] with `move_pose(T_from, step)` = T_to, both (4, 4)."""
+    """Return the step (6,) [m, rad] with `move_pose(T_from, step)` = T_to, both (4, 4)."""
     x, y, z, w = _quaternion(T_to[:3, :3] @ T_from[:3, :3].T)
     sine = math.sqrt(x * x + y * y + z * z)
     factor = 2.0 * math.atan2(sine, w) / sine if sine else 2.0
@@ -139,7 +139,7 @@ def _determinant(R: NDArray) -> float:
 
 
 def _rotation(x: float, y: float, z: float, w: float) -> list[list[float]]:
-    """Returns the matrix (3, 3) of a unit quaternion."""
+    """Return the matrix (3, 3) of a unit quaternion."""
     return [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
         [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
@@ -148,7 +148,7 @@ def _rotation(x: float, y: float, z: float, w: float) -> list[list[float]]:
 
 
 def _quaternion(R: NDArray) -> tuple[float, float, float, float]:
-    """Returns x, y, z, w with w >= 0 of a rotation (3, 3).
+    """Return x, y, z, w with w >= 0 of a rotation (3, 3).
 
     Of the four ways the one without cancellation: K. Shoemake, Animating rotation with quaternion curves, 1985.
     """

@@ -275,7 +275,7 @@ _ON_LINE = 1e-6
 
 
 def check_overlaps(elements: NDArray, faces: NDArray) -> None:
-    """Refuses elements that lie on each other.
+    """Refuse elements that lie on each other.
 
     Args:
         elements: (m, 4 | 8 | 10) node indices.
@@ -296,7 +296,7 @@ def check_overlaps(elements: NDArray, faces: NDArray) -> None:
 
 
 def check_pieces(nodes: NDArray, elements: NDArray, faces: NDArray, clamped: NDArray) -> None:
-    """Refuses a mesh that is not one piece, or of which a part can turn freely.
+    """Refuse a mesh that is not one piece, or of which a part can turn freely.
 
     Args:
         nodes: (n, 3) [m].
@@ -315,7 +315,7 @@ def check_pieces(nodes: NDArray, elements: NDArray, faces: NDArray, clamped: NDA
 
 
 def _number_faces(faces: NDArray) -> NDArray:
-    """Returns a number (m, f) for each face, the same for the same corners."""
+    """Return a number (m, f) for each face, the same for the same corners."""
     rows = np.sort(faces, axis=2).reshape(-1, faces.shape[2])
     return np.unique(rows, axis=0, return_inverse=True)[1].reshape(faces.shape[:2])
 
@@ -345,7 +345,7 @@ def _check_one_piece(nodes: NDArray, elements: NDArray) -> None:
 
 
 def _check_hinges(nodes: NDArray, elements: NDArray, face: NDArray, clamped: NDArray) -> None:
-    """Refuses parts, elements joined by faces, that hang together with the rest by nodes on one line."""
+    """Refuse parts, elements joined by faces, that hang together with the rest by nodes on one line."""
     number, part = _number_pieces(np.repeat(np.arange(len(face)), face.shape[1]), face.ravel(), elements)
     if number == 1:
         return
@@ -365,7 +365,7 @@ def _check_hinges(nodes: NDArray, elements: NDArray, face: NDArray, clamped: NDA
 
 
 def _number_pieces(rows: NDArray, columns: NDArray, elements: NDArray) -> tuple[int, NDArray]:
-    """Returns how many pieces the elements make that are joined by common columns, and each one's piece (m,)."""
+    """Return how many pieces the elements make that are joined by common columns, and each one's piece (m,)."""
     count = int(columns.max()) + 1
     incidence = sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), (len(elements), count)).tocsr()
     return connected_components(incidence @ incidence.T, directed=False)
