@@ -16,7 +16,7 @@ _HOMES = {
     "Contact": "finforce_ifea.observation",
     "ContactEstimator": "finforce_contact.estimator",
     "DEMO": "finforce_eval.recordings.recording",
-    "ForceLoop": "finforce_contact.jaw_contact",
+    "ForceLoop": "finforce_contact.loop",
     "Gripper": "finforce_driver.gripper",
     "GripperClient": "finforce.ros.client",
     "JawEstimator": "finforce_ifea.estimator",

@@ -2,37 +2,94 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
 from finforce.errors import FinforceError
-from finforce.health import Health, Outcome, Report
+from finforce.health import Health, Level, Outcome, Report
 from finforce.messages import stamp_of
 from finforce.ros import node as ros
 from finforce.settings import refresh_record
 from finforce.skipping import CONTACT, IDLE, Skips
-from finforce.stamps import Idling, StampGate
-from finforce_contact.jaw_contact import TimedEstimate
+from finforce.stamps import SECOND, Idling, StampGate
+from finforce.transforms import pose_numbers
+from finforce_contact.estimator import ContactEstimate
+from finforce_contact.localization.touch import Slip
+from finforce_contact.loop import TimedEstimate
+from finforce_contact.mesh.object_mesh import describe_mesh
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
-from finforce_contact.publishers import ContactOutputs, describe, object_alarms, outcome_of_estimate
-from finforce_contact.session import ContactSession, StampedPose, detections_type
+from finforce_contact.pose.source import StampedPose
+from finforce_contact.session import ContactSession, detections_type
+from finforce_ifea.messages import columns_from_outline
 
 CAMERA = "/camera/camera"
 WAITING = ros.QoSProfile(depth=20, reliability=ros.ReliabilityPolicy.BEST_EFFORT)  # a tenth of a second, and more
 
 
-class Deferred(NamedTuple):
-    """A message of a jaw's solver that is not read until the next contact is looked for, and what takes it."""
+class ContactOutputs:
+    """The publishers of a contact estimator node.
 
-    take: Callable[[str, Any], list[TimedEstimate]]
-    message: Any
+    Args:
+        qos: makes publishers and watches them.
+        parameters: which jaws, and whether the object's poses are found here.
+        skips: whether what nobody subscribes to is left out.
+    """
+
+    def __init__(self, qos: ros.QosWatch, parameters: ContactParameters, skips: Skips) -> None:
+        cloud, sides = ros.PointCloud2, parameters.sides
+        self._frame, self._skips = parameters.camera_frame, skips
+        self.contact = {side: qos.publisher(cloud, f"{side}/contact", ros.RESULT) for side in sides}
+        self.outline = {side: qos.publisher(cloud, f"{side}/object_outline", ros.RESULT) for side in sides}
+        self.slip = {side: qos.publisher(ros.TwistStamped, f"{side}/slip", ros.RESULT) for side in sides}
+        self._slip_told = dict.fromkeys(sides, -math.inf)
+        self.pose = qos.publisher(ros.PoseStamped, "object_pose", ros.RESULT) if parameters.tracks else None
+
+    def send_contact(self, side: str, timed: TimedEstimate) -> None:
+        """Send outline and contact of an image; no rows say that there is none."""
+        header = ros.Header(stamp=ros.stamp_message(timed.stamp), frame_id=f"{side}_jaw")
+        # the outline goes first: the solver looks for it when the contact comes
+        if ros.is_wanted(self.outline[side], self._skips):
+            ros.send_cloud(self.outline[side], header, columns_from_outline(timed.estimate.outline))
+        if ros.is_wanted(self.contact[side], self._skips):
+            ros.send_cloud(self.contact[side], header, contact_columns(timed.estimate))
+        self._send_slip(side, timed.estimate.slip)
+
+    def _send_slip(self, side: str, slip: Slip | None) -> None:
+        """Send how the object moves over a jaw, once for every pose of the object while it touches."""
+        if slip is None or not slip.stamp > self._slip_told[side] or not np.isfinite(slip.stddev):
+            return
+        self._slip_told[side] = slip.stamp
+        if ros.is_wanted(self.slip[side], self._skips):
+            stamp = ros.stamp_message(round(slip.stamp / SECOND))
+            header = ros.Header(stamp=stamp, frame_id=f"{side}_jaw")
+            self.slip[side].publish(ros.twist_message(header, slip.velocity))
+
+    def send_pose(self, found: StampedPose) -> None:
+        """Send the object's pose, unless it came by topic."""
+        if self.pose is not None and ros.is_wanted(self.pose, self._skips):
+            header = ros.Header(stamp=ros.stamp_message(found.stamp), frame_id=self._frame)
+            self.pose.publish(ros.pose_message(header, pose_numbers(found.pose.T_camera_object)))
+
+
+def contact_columns(estimate: ContactEstimate) -> dict[str, NDArray]:
+    """Return the columns of a contact cloud, one row per contact, none without an object."""
+    points = np.asarray(estimate.points, dtype=np.float32).reshape(-1, 3)
+    return {
+        **dict(zip("xyz", points.T, strict=True)),
+        "candidate": np.asarray(estimate.candidates, dtype=np.uint16),
+        "touching": np.full(len(points), estimate.touching, dtype=np.uint8),
+        "weight": np.asarray(estimate.weights, dtype=np.float32),
+    }
 
 
 class ContactEstimatorNode(Node):
@@ -52,19 +109,18 @@ class ContactEstimatorNode(Node):
         contact = ros.declare_record(self, ContactSettings, "contact")
         tracker = ros.declare_record(self, TrackerSettings, "tracker")
         ros.name_unknown_parameters(self)
-        sides, age = parameters.sides, parameters.max_age
+        self.sides, age = parameters.sides, parameters.max_age
         self.skips = Skips(CONTACT, parameters.skip_off)
         ros.warn_first_start(self)
         self.session = ContactSession(parameters, contact, tracker, self.skips)
-        self.gates = {side: StampGate(max_age=age, restart_gap=parameters.restart_gap) for side in sides}
-        self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in sides}
+        self.gates = {side: StampGate(max_age=age, restart_gap=parameters.restart_gap) for side in self.sides}
+        self.health = {side: Health(source=f"{side}/jaw_pose", stale_after=age) for side in self.sides}
         self.qos = ros.QosWatch(self, stage)
         self.out = ContactOutputs(self.qos, parameters, self.skips)
-        with self._refusals(sides):
+        with self._refusals(self.sides):
             self.get_logger().info(self.session.load_mesh(parameters))
         self._serve()
-        self.idling = {side: Idling() for side in sides}
-        self.deferred: dict[str, dict[str, Deferred]] = {side: {} for side in sides}
+        self.idling = {side: Idling() for side in self.sides}
         self._subscribe()
         self.get_logger().info(f"jaws: {parameters.jaws}, ready, object poses by {parameters.pose_source}")
 
@@ -75,7 +131,7 @@ class ContactEstimatorNode(Node):
         ros.serve_trigger(self.qos, "~/load_mesh", lambda: session.load_mesh(self._refreshed()), one_by_one)
         ros.serve_trigger(self.qos, "~/reconstruct", lambda: session.reconstruct(self._refreshed()), one_by_one)
         ros.serve_trigger(self.qos, "~/reset", session.reset)
-        for side in self.parameters.sides:
+        for side in self.sides:
             report = partial(self._report, side)
             ros.publish_diagnostics(self, self.qos, f"finforce: {side} contact", period, report)
 
@@ -93,24 +149,24 @@ class ContactEstimatorNode(Node):
             self.objects = qos.subscription(ros.PoseStamped, "object_pose", self._on_object, ros.SENSOR)
         else:
             self.objects = qos.subscription(detections_type(), "object_detections", self._on_object, ros.SENSOR)
-        for side in self.parameters.sides:
+        for side in self.sides:
             for kind, name, take in (
                 (ros.WrenchStamped, "wrench", session.take_wrench),
                 (ros.PointCloud2, "surface", session.take_surface),
             ):
-                keep = partial(self._on_solver, side, name, take)
+                keep = partial(self._on_solver, side, take)
                 qos.subscription(kind, f"{side}/{name}", keep, ros.SENSOR)
             find = partial(self._on_jaw_pose, side)
             qos.subscription(ros.PoseStamped, f"{side}/jaw_pose", find, WAITING, can_wait=True)
 
     def _subscribe_camera(self) -> None:
         """Subscribe to the images in which the object is found; they wait for each other."""
-        session, group = self.session, MutuallyExclusiveCallbackGroup()
-        info, take_info = f"{CAMERA}/color/camera_info", partial(self._on_image, session.take_camera)
+        camera, group = self.session.camera, MutuallyExclusiveCallbackGroup()
+        info, take_info = f"{CAMERA}/color/camera_info", partial(self._on_image, camera.take_camera)
         self.qos.subscription(ros.CameraInfo, info, take_info, ros.SENSOR, callback_group=group)
         for topic, take in (
-            ("object_mask", session.take_mask),
-            (f"{CAMERA}/aligned_depth_to_color/image_raw", session.take_depth),
+            ("object_mask", camera.take_mask),
+            (f"{CAMERA}/aligned_depth_to_color/image_raw", camera.take_depth),
         ):
             ros.LargeSubscription(self.qos, ros.Image, topic, partial(self._on_image, take), callback_group=group)
 
@@ -120,74 +176,60 @@ class ContactEstimatorNode(Node):
 
     def _on_jaw_pose(self, side: str, pose: ros.PoseStamped) -> None:
         """Find the contact of an image, unless it may be passed over."""
-        with self._refusals((side,)):
-            self._find_contact(side, pose)
-
-    def _find_contact(self, side: str, pose: ros.PoseStamped) -> None:
-        """Find the contact of an image, unless it may be passed over."""
         began, stamp = perf_counter(), stamp_of(pose)
         self.health[side].arrive()
         # poses of the object that came while the image was looked at
         for message in ros.take_waiting(self.objects):
             self._on_object(message)
-        if self.idling[side].passes(stamp):
-            self.skips.count(IDLE)
-            self.session.pass_over(side, stamp, lambda: pose)
-            return
-        if self.gates[side].enter(stamp, self._now()):
-            self.session.restart(side)
-            self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
-        self.idling[side].end()
-        for name, deferred in list(self.deferred[side].items()):
-            self._on_solver(side, name, *deferred)
-        self._send(side, began, self.session.take_jaw_pose(side, pose))
-        is_idle = self.session.jaws[side].is_idle and self.skips.allows(IDLE)
-        self.idling[side].note(stamp, is_idle)
+        with self._refusals((side,)):
+            if self.idling[side].passes(stamp):
+                self.skips.count(IDLE)
+                self.session.pass_over(side, pose)
+                return
+            if self.gates[side].enter(stamp, self._now()):
+                self.session.restart(side)
+                self.get_logger().warning("the stamps went back: a new recording; poses and contacts are forgotten")
+            self.idling[side].end()
+            self._send(side, began, self.session.take_jaw_pose(side, pose))
+            self.idling[side].note(stamp, self.session.jaws[side].loop.is_idle and self.skips.allows(IDLE))
 
-    def _on_solver(self, side: str, name: str, take: Callable[[str, Any], list[TimedEstimate]], message: Any) -> None:
-        """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own.
-
-        Of an image that is passed over it is read when the next contact is looked for, if nothing newer came.
-        """
+    def _on_solver(self, side: str, take: Callable[[str, Any], list[TimedEstimate]], message: Any) -> None:
+        """Keep what a jaw's solver says, and find the contact of an image that has no jaw pose of its own."""
         began = perf_counter()
         with self._refusals((side,)):
-            if self.idling[side].passes(stamp_of(message)):
-                self.deferred[side][name] = Deferred(take, message)
-                return
-            self.deferred[side].pop(name, None)
             self._check_ahead(message)
             self._send(side, began, take(side, message))
 
     def _on_object(self, message: Any) -> None:
         """Use the object's pose that another node has found."""
-        with self._refusals(self.parameters.sides):
+        with self._refusals(self.sides):
             self._check_ahead(message)
             self._hand_on(self.session.read_pose(message))
 
     async def _on_image(self, take: Callable[[Any], StampedPose | None], image: Any) -> None:
         """Use the object's pose, if one is found with an image, while other callbacks go on."""
-        with self._refusals(self.parameters.sides):
+        with self._refusals(self.sides):
             self._check_ahead(image)
             self._hand_on(await ros.run_aside(self, partial(take, image)))
 
     def _check_ahead(self, message: Any) -> None:
         """Refuse a stamp ahead of the clock before anything is kept that all later stamps would be behind."""
         now = self._now()
-        self.gates[self.parameters.sides[0]].check_age(max(stamp_of(message), now), now)
+        self.gates[self.sides[0]].check_age(max(stamp_of(message), now), now)
 
     def _hand_on(self, found: StampedPose | None) -> None:
         """Give the jaws a pose of the object, if it was found."""
-        began, everybody = perf_counter(), self.parameters.sides
+        began = perf_counter()
         if found is None:
             return
-        self.gates[everybody[0]].check_age(found.stamp, self._now())
+        self.gates[self.sides[0]].check_age(found.stamp, self._now())
         self.out.send_pose(found)
-        for side in everybody:
+        for side in self.sides:
             with self._refusals((side,)):
                 self._send(side, began, self.session.take_object_pose(side, found))
 
     def _send(self, side: str, began: float, estimates: Iterable[TimedEstimate]) -> None:
-        """Publish contacts that are still fresh; an object whose place is not known gives none."""
+        """Publish contacts that are still fresh; an object whose pose is not known gives none."""
         for timed in estimates:
             self.gates[side].check_age(timed.stamp, self._now())
             outcome = outcome_of_estimate(timed.estimate)
@@ -218,6 +260,50 @@ class ContactEstimatorNode(Node):
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds
+
+
+LEVELS = {"touching": Level.OK, "apart": Level.OK}  # any other status: WARN
+
+
+def outcome_of_estimate(estimate: ContactEstimate) -> Outcome:
+    """Return the level of an estimate's status and its sentence."""
+    if estimate.slip is not None and estimate.slip.sliding:
+        return Outcome(level=Level.WARN, reason="slip", text=f"the object slides: {describe_slip(estimate.slip)}")
+    level = LEVELS.get(estimate.status, Level.WARN)
+    return Outcome(level=level, reason=estimate.status, text=estimate.message or estimate.status)
+
+
+def object_alarms(session: ContactSession) -> list[Outcome]:
+    """Return the alarm of an object mesh that cannot be used."""
+    return [Outcome(level=Level.ERROR, reason="object", text=session.trouble)] if session.trouble else []
+
+
+def describe(session: ContactSession, side: str) -> dict[str, str]:
+    """Return what is known of the object and of its contact with one jaw, as text."""
+    loop, mesh, pose = session.jaws[side].loop, session.mesh, session.pose
+    values = {"object": describe_mesh(mesh) if mesh else "unknown"}
+    if mesh and pose:
+        values |= {"pose source": pose.source, "pose fitness": f"{pose.fitness:.2f}"}
+    if loop.last is not None:
+        estimate = loop.last.estimate
+        values |= {
+            "status": estimate.status,
+            "contacts": str(len(estimate.points)),
+            "pose age [ms]": f"{1e3 * loop.pose_age():.0f}",
+            "jaw surface": "deformed" if loop.has_surface() else "undeformed: no fresh surface",
+            "slip": describe_slip(estimate.slip),
+            "last skipped": estimate.skipped or "nothing",
+        }
+    counts = loop.estimator.counts.items()
+    return values | {"work": ", ".join(f"{count} {reason}" for reason, count in counts if count) or "none"}
+
+
+def describe_slip(slip: Slip | None) -> str:
+    """Return how an object moves over a jaw, in words."""
+    if slip is None or not np.isfinite(slip.stddev):
+        return "unknown"
+    speed = 1e3 * float(np.linalg.norm(slip.velocity))
+    return f"{speed:.1f} ± {1e3 * slip.stddev:.1f} mm/s{', slides' if slip.sliding else ''}"
 
 
 def main(args: Sequence[str] | None = None) -> int:

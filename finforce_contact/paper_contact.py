@@ -6,7 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce_contact.errors import ObjectMeshError
-from finforce_contact.localization.outline_localizer import ContactPatch, ContactScene, InnerFace, Place
+from finforce_contact.localization.outline_localizer import (
+    ContactLocation,
+    ContactPatch,
+    ContactScene,
+    InnerFace,
+    Localizer,
+)
 from finforce_contact.mesh.object_mesh import ObjectMesh, solid_from_triangles, to_manifold, triangles_of_solid
 from finforce_ifea.jaw.jaw import Jaw
 
@@ -17,7 +23,7 @@ if TYPE_CHECKING:
 OFFSET = 1e-3  # [m] by which the object is pushed into the surface before contact (Eq. 2)
 
 
-class IntersectionLocalizer:
+class IntersectionLocalizer(Localizer):
     """Algorithm 1 of the paper.
 
     While status S is false the object is brought along x into slight contact (Eq. 2); the intersection's centre leads
@@ -51,7 +57,7 @@ class IntersectionLocalizer:
         self._status = False
         self._last: ContactPatch | None = None
 
-    def locate(self, scene: ContactScene) -> Place | None:
+    def locate(self, scene: ContactScene) -> ContactLocation | None:
         """Return the contact, None before any was found."""
         shift = self._slight_contact(scene.T) - scene.T[0, 3] if not self._status else 0.0
         T = scene.T.copy()
@@ -64,7 +70,9 @@ class IntersectionLocalizer:
             return None
         height = float(self._last.heights[0])
         bend = float(np.interp(height, self._face.heights, self._face.x - scene.line[:, 0]))
-        return Place(patch=self._last, gap=float("nan"), bend=bend, touching=bool(self._status and shift >= 0.0))
+        return ContactLocation(
+            patch=self._last, gap=float("nan"), bend=bend, touching=bool(self._status and shift >= 0.0)
+        )
 
     def _slight_contact(self, T: NDArray) -> float:
         """Return t_x = l_0 + l_bd / 2 [m] (Eq. 2), corrected for objects whose origin is not in their middle."""

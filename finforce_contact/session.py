@@ -1,181 +1,231 @@
-"""The object, its poses from topics or depth images, and the jaws that it touches, for several threads."""
+"""From messages to contacts: the object, its poses and those of the jaws, which come late or not at all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
 from importlib import import_module
+from itertools import pairwise
 from threading import RLock
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from finforce.camera import CameraIntrinsics, ImageError
+from finforce.camera import ImageError
 from finforce.errors import FinforceError, MissingDependencyError, ObservationError
-from finforce.messages import (
-    camera_from_info,
-    check_cloud,
-    decode_keypoints,
-    depth_from_image,
-    mask_from_image,
-    pose_from_message,
-    same_camera,
-    stamp_of,
-    wrench_from_message,
-)
+from finforce.messages import check_cloud, decode_keypoints, pose_from_message, stamp_of, wrench_from_message
 from finforce.skipping import Skips
-from finforce.stamps import SECOND, Synchronizer
+from finforce.stamps import SECOND, Stamped, Synchronizer
+from finforce.transforms import invert_pose
 from finforce_contact.errors import ReconstructionError
 from finforce_contact.estimator import ContactEstimator
-from finforce_contact.jaw_contact import JawContact, TimedEstimate
+from finforce_contact.loop import ContactLoop, TimedEstimate
 from finforce_contact.mesh.object_mesh import ObjectMesh, describe_mesh, load_object_mesh
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings, load_generated, load_jaws
-from finforce_contact.pose.source import ExternalPoseSource, ObjectPose
-from finforce_contact.pose.tracker import PoseTracker
-
-DEPTH, MASK = "depth images", "masks"
-KEPT = 32  # images that may wait for their mask, which a segmentation takes a while to find
+from finforce_contact.pose.source import DepthFeed, ExternalPoseSource, StampedPose
+from finforce_contact.pose.tracker import ObjectPose
 
 
-class StampedPose(NamedTuple):
-    """A pose of the object and the exact stamp of its image [ns]."""
+class JawContact:
+    """The contact loop of one jaw, with poses in the camera's frame.
 
-    stamp: int
-    pose: ObjectPose
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MaskedView:
-    """One depth image with the object's mask.
+    A jaw pose makes the contact of its image due. Images without one, where poses are rarer than key points, are due
+    with the surface that the solver found in them.
 
     Attributes:
-        stamp: of the depth image [ns].
-        depth: (h, w) [m], NaN where there is none.
-        mask: (h, w) bool, the object.
-        camera: of both.
+        loop: contact estimator and what the solver said last.
+
+    Args:
+        estimator: of this jaw.
+        tolerance: greatest distance between the stamps of jaw pose and object pose [ns].
+        max_age: greatest distance between the stamps of an image and of the surface and wrench used for it [ns].
+    """
+
+    def __init__(self, estimator: ContactEstimator, *, tolerance: int, max_age: int) -> None:
+        self.loop, self._pairing = ContactLoop(estimator, max_age=max_age), PosePairing(tolerance)
+        self._jaw: NDArray | None = None
+
+    def reset(self) -> None:
+        """Forget everything but the object's mesh."""
+        self.loop.reset()
+        self._pairing.reset()
+        self._jaw = None
+
+    def set_object(self, mesh: ObjectMesh | None) -> None:
+        """Take another object; its pose is not known yet.
+
+        Raises:
+            FinforceError: the mode of the estimator cannot do with this object.
+        """
+        self.loop.set_object(mesh)
+        self._pairing.reset()
+
+    def take_surface(self, stamp: int, surface: NDArray) -> list[TimedEstimate]:
+        """Take the deformed vertices (n, 3) [m] of an image [ns]; return the contacts that are known now.
+
+        Raises:
+            MeshError: the surface is not that of the jaw's mesh.
+        """
+        self.loop.keep_surface(stamp, surface)
+        return self._due(stamp) if self.loop.has_pose and not self._pairing.holds_back(stamp) else []
+
+    def take_jaw_pose(self, stamp: int, T_camera_jaw: NDArray) -> list[TimedEstimate]:
+        """Take the jaw's pose (4, 4) in an image [ns]; return the contacts that are known now.
+
+        Raises:
+            PoseError: a pose of the object in the jaw frame makes no sense.
+            MeshError: the surface is not that of the jaw's mesh.
+        """
+        return self._follow(self._pairing.add_jaw(stamp, T_camera_jaw))
+
+    def take_object_pose(
+        self, stamp: int, T_camera_object: NDArray, covariance: NDArray | None = None
+    ) -> list[TimedEstimate]:
+        """Take the object's pose (4, 4) in an image [ns], with its covariance (6, 6); as `take_jaw_pose`."""
+        return self._follow(self._pairing.add_object(stamp, T_camera_object, covariance))
+
+    def pass_over(self, stamp: int, T_camera_jaw: NDArray) -> None:
+        """Leave an image [ns] without a contact; the jaw's pose (4, 4) serves the object's pose in it alone."""
+        self._follow(self._pairing.pass_over(stamp, T_camera_jaw))
+
+    def _follow(self, steps: Iterable[PoseStep]) -> list[TimedEstimate]:
+        """Hand poses on and update for the images that are due."""
+        estimates = []
+        for step in steps:
+            T_jaw_object = self._carry(step)
+            if T_jaw_object is not None:
+                covariance = turn_covariance(step.covariance, step.T_jaw_camera)
+                self.loop.take_pose(step.stamp, T_jaw_object, covariance, step.T_jaw_camera[:3, 3])
+            if step.is_due:
+                estimates += self._due(step.stamp)
+        return estimates
+
+    def _carry(self, step: PoseStep) -> NDArray | None:
+        """Take the jaw's own motion; return the object's pose (4, 4), if there is one, as the jaw is now.
+
+        Between two poses of the object, which may be rare, the jaw goes on: what is known goes with the camera.
+        """
+        if self._jaw is None:
+            self._jaw = step.T_jaw_camera
+        if np.abs(step.T_jaw_camera - self._jaw).max() <= UNMOVED:
+            return step.T_jaw_object
+        motion = step.T_jaw_camera @ invert_pose(self._jaw)
+        if step.is_due:
+            self.loop.estimator.carry(motion)
+            self._jaw = step.T_jaw_camera
+            return step.T_jaw_object
+        return None if step.T_jaw_object is None else invert_pose(motion) @ step.T_jaw_object
+
+    def _due(self, stamp: int) -> list[TimedEstimate]:
+        estimate = self.loop.update(stamp)
+        return [estimate] if estimate else []
+
+
+def turn_covariance(covariance: NDArray | None, T_jaw_camera: NDArray) -> NDArray | None:
+    """Return a pose's covariance (6, 6) [m, rad], given along the camera's axes, along those of the jaw."""
+    if covariance is None:
+        return None
+    turn = np.kron(np.eye(2), T_jaw_camera[:3, :3])
+    return turn @ covariance @ turn.T
+
+
+JAW, PASSED, OBJECT = "jaw", "passed", "object"
+WAITING = 48  # images that may wait for their other pose: half a second of 90 Hz, as poses may be late
+BRIDGED = 250_000_000  # [ns] between two poses of a jaw that stand for the time between, while it does not move
+UNMOVED = 0.2e-3  # [m] and, for its axes, [1]: a jaw that differs by less has not moved
+
+
+class PoseStep(NamedTuple):
+    """What is to be done next.
+
+    Attributes:
+        stamp: of the image [ns].
+        T_jaw_object: (4, 4), a new pose of the object in the jaw frame; None when the image has none (yet).
+        T_jaw_camera: (4, 4), of the same image.
+        covariance: (6, 6) of the object's pose, camera axes; None when unknown.
+        is_due: the contact of this image is due; else only its pose came late.
     """
 
     stamp: int
-    depth: NDArray
-    mask: NDArray
-    camera: CameraIntrinsics
+    T_jaw_object: NDArray | None
+    T_jaw_camera: NDArray
+    covariance: NDArray | None
+    is_due: bool
 
 
-class DepthFeed:
-    """Brings depth images and masks together and hands them to a tracker, which is made for object and camera.
+class PosePairing:
+    """Brings the poses of jaw and object together by their stamps.
 
-    A mask is needed to find the object first, or again when it was lost; between, depth images are enough.
+    An image is due when its jaw pose comes, unless it is passed over. It waits for its object pose, at most until the
+    next jaw pose, as long as object poses have kept up so far; a slow tracker delays nothing. Of a jaw that stands
+    still not every image is told: an object pose between two equal poses of the jaw is used with them.
 
     Args:
-        parameters: frame, unit of depth and greatest distance of stamps.
-        settings: of the tracker.
+        tolerance: greatest distance of stamps that belong together [ns].
     """
 
-    def __init__(self, parameters: ContactParameters, settings: TrackerSettings) -> None:
-        self._parameters, self._settings = parameters, settings
-        self._tolerance = round(parameters.pose_tolerance / SECOND)
-        self._mesh: ObjectMesh | None = None
-        self._camera: CameraIntrinsics | None = None
-        self._guesses: tuple[NDArray, ...] = ()
+    def __init__(self, tolerance: int) -> None:
+        self._tolerance = tolerance
+        self._poses = Synchronizer({JAW: WAITING, PASSED: WAITING, OBJECT: WAITING}, tolerance)
         self.reset()
 
     def reset(self) -> None:
-        """Forget images and pose."""
-        self.latest: ObjectPose | None = None
-        self._tracker: PoseTracker | None = None
-        self._lost = True
-        self._images = Synchronizer({DEPTH: KEPT, MASK: KEPT}, self._tolerance)
+        """Forget all poses."""
+        self._poses.reset()
+        self._waiting = self._in_step = False
 
-    def set_object(self, mesh: ObjectMesh | None, guesses: Sequence[NDArray] = ()) -> None:
-        """Look for another object from now on, at first near the given poses (4, 4)."""
-        self._mesh, self._guesses, self._tracker = mesh, tuple(guesses), None
-        self.latest, self._lost = None, True
+    def add_jaw(self, stamp: int, T_camera_jaw: NDArray) -> list[PoseStep]:
+        """Take the pose (4, 4) of the jaw in an image [ns]; return what is to be done now."""
+        jaws = self._poses.entries(JAW)
+        overdue = [self._step(jaws[-1], None)] if self._waiting else []
+        self._in_step &= not self._waiting
+        self._poses.add(JAW, stamp, invert_pose(T_camera_jaw))
+        last = list(jaws)[-2:]
+        between = [step for pose in self._poses.entries(OBJECT) for step in self._bridge(pose, last[0], last[-1])]
+        found = self._poses.find(OBJECT, stamp)
+        self._waiting = found is None and self._in_step
+        steps = [*overdue, *between[-1:]]
+        return steps if self._waiting else [*steps, self._step(jaws[-1], found)]
 
-    def take_camera(self, info: Any) -> None:
-        """Take a sensor_msgs/CameraInfo.
+    def add_object(self, stamp: int, T_camera_object: NDArray, covariance: NDArray | None = None) -> list[PoseStep]:
+        """Take the pose (4, 4) of the object in an image [ns]; return what is to be done now."""
+        self._poses.add(OBJECT, stamp, (T_camera_object, covariance))
+        jaws, pose = self._poses.entries(JAW), self._poses.entries(OBJECT)[-1]
+        jaw = self._poses.find(JAW, stamp)
+        if jaw is None:
+            passed = self._poses.take(PASSED, stamp)
+            late = [self._step(passed, pose, is_due=False)] if passed else []
+            return late or [step for last in pairwise(jaws) for step in self._bridge(pose, *last)]
+        is_newest = jaw is jaws[-1]
+        is_due = is_newest and self._waiting
+        self._in_step |= is_newest
+        self._waiting &= not is_newest
+        return [self._step(jaw, pose, is_due=is_due)]
 
-        Raises:
-            ObservationError: the frame is another one.
-            IntrinsicsError: the numbers are no camera's.
-        """
-        camera = camera_from_info(info, self._parameters.camera_frame)
-        if not same_camera(self._camera, camera):
-            self._camera, self._tracker, self._lost = camera, None, True
+    def _bridge(self, pose: Stamped, before: Stamped, after: Stamped) -> list[PoseStep]:
+        """Return what is to be done with an object pose between two poses of a jaw, nothing if the jaw has moved."""
+        is_between = before.stamp + self._tolerance < pose.stamp < after.stamp - self._tolerance
+        is_near = after.stamp - before.stamp <= BRIDGED
+        if not (is_between and is_near and np.abs(after.value - before.value).max() <= UNMOVED):
+            return []
+        return [self._step(Stamped(pose.stamp, before.value), pose, is_due=False)]
 
-    def take_depth(self, image: Any) -> StampedPose | None:
-        """Take a depth image and return the object's pose in it; None while it waits for a mask.
+    def pass_over(self, stamp: int, T_camera_jaw: NDArray) -> list[PoseStep]:
+        """Take the pose (4, 4) of the jaw in an image [ns] that is not due; return what is to be done now."""
+        self._poses.add(PASSED, stamp, invert_pose(T_camera_jaw))
+        found = self._poses.find(OBJECT, stamp)
+        return [self._step(self._poses.entries(PASSED)[-1], found, is_due=False)] if found else []
 
-        Raises:
-            ObservationError: the frame is another one.
-            ImageError: the image cannot be used, or the camera is not known yet.
-            PoseLostError: the object was not found again.
-        """
-        stamp = stamp_of(image)
-        self._images.add(DEPTH, stamp, image)
-        mask = self._images.find(MASK, stamp)
-        if self._mesh is None:
-            return None
-        if self._lost and mask is not None:
-            return self._locate(image, mask.value)
-        if self._tracker is None or self.latest is None:
-            return None
-        self._lost = True  # until it was found again
-        found = None if mask is None else self._decode_mask(mask.value)
-        self.latest = self._tracker.track(SECOND * stamp, self._decode_depth(image), found)
-        self._lost = False
-        return StampedPose(stamp, self.latest)
+    def holds_back(self, stamp: int) -> bool:
+        """Say whether an image [ns] waits for its object pose, or was passed over."""
+        waits = self._waiting and self._poses.belong(self._poses.entries(JAW)[-1].stamp, stamp)
+        return waits or any(entry.stamp == stamp for entry in self._poses.entries(PASSED))
 
-    def take_mask(self, image: Any) -> StampedPose | None:
-        """Take a mask and return the object's pose in its depth image, if it is looked for.
-
-        Raises:
-            ObservationError: the frame is another one.
-            ImageError: one of the images cannot be used.
-            PoseLostError: the object was not found.
-        """
-        stamp = stamp_of(image)
-        self._images.add(MASK, stamp, image)
-        depth = self._images.find(DEPTH, stamp)
-        wanted = self._lost and self._mesh is not None and depth is not None
-        return self._locate(depth.value, image) if wanted else None
-
-    def view(self) -> MaskedView:
-        """Return the newest depth image that has a mask.
-
-        Raises:
-            ImageError: there is none.
-        """
-        pair = self._images.newest_pair(DEPTH, MASK)
-        if pair is None:
-            have = " and ".join(f"{len(self._images.entries(name))} {name}" for name in (DEPTH, MASK))
-            raise ImageError(f"no depth image with its mask: {have} are here, expected a pair of equal stamps")
-        depth, mask = pair
-        return MaskedView(
-            stamp=depth.stamp,
-            depth=self._decode_depth(depth.value),
-            mask=self._decode_mask(mask.value),
-            camera=self._known_camera(),
-        )
-
-    def _locate(self, depth: Any, mask: Any) -> StampedPose:
-        tracker = self._tracker = self._tracker or PoseTracker(self._mesh, self._known_camera(), self._settings)
-        stamp = stamp_of(depth)
-        found = self._decode_mask(mask)
-        self.latest = tracker.locate(SECOND * stamp, self._decode_depth(depth), found, self._guesses)
-        self._lost = False
-        return StampedPose(stamp, self.latest)
-
-    def _decode_depth(self, image: Any) -> NDArray:
-        return depth_from_image(image, self._parameters.camera_frame, self._parameters.depth_scale)
-
-    def _decode_mask(self, image: Any) -> NDArray:
-        return mask_from_image(image, self._parameters.camera_frame)
-
-    def _known_camera(self) -> CameraIntrinsics:
-        if self._camera is None:
-            raise ImageError("a depth image came, but no camera_info yet")
-        return self._camera
+    def _step(self, jaw: Stamped, pose: Stamped | None, *, is_due: bool = True) -> PoseStep:
+        """Return the step of a jaw's inverted pose and the object's pose with its covariance."""
+        T_camera_object, covariance = pose.value if pose else (None, None)
+        T_jaw_object = jaw.value @ T_camera_object if pose else None
+        return PoseStep(jaw.stamp, T_jaw_object, jaw.value, covariance, is_due)
 
 
 class ContactSession:
@@ -185,6 +235,7 @@ class ContactSession:
         mesh: of the object, None while it is unknown.
         trouble: why there is no mesh, empty when there is nothing wrong with it.
         jaws: by side.
+        camera: finds the object's pose in depth images; None where it comes by topic.
 
     Args:
         parameters: of the node.
@@ -213,8 +264,8 @@ class ContactSession:
         self._frame = parameters.camera_frame
         self._origin = parameters.pose_origin
         self._source = ExternalPoseSource(self._frame)
-        self._camera = DepthFeed(parameters, tracker) if parameters.tracks else None
-        self._camera_lock, self._lock = RLock(), RLock()
+        self.camera = DepthFeed(parameters, tracker) if parameters.tracks else None
+        self._lock = RLock()
 
     def load_mesh(self, parameters: ContactParameters) -> str:
         """Load the mesh file that the parameters name and return what it is; without a name the object is unknown.
@@ -243,10 +294,9 @@ class ContactSession:
         from finforce_contact.reconstruction.evidence import collect_evidence
         from finforce_contact.reconstruction.reconstruction import reconstruct
 
-        if self._camera is None:
+        if self.camera is None:
             raise ImageError("reconstruct needs images: set pose_source to tracker, or use finforce reconstruct")
-        with self._camera_lock:
-            view = self._camera.view()
+        view = self.camera.view()
         evidence = collect_evidence(view.depth, view.mask, view.camera)
         generated = load_generated(parameters)
         try:
@@ -265,22 +315,22 @@ class ContactSession:
 
     def _set_object(self, mesh: ObjectMesh | None, guesses: tuple[NDArray, ...] = ()) -> None:
         """Work with another object from now on, to be looked for near the guessed poses (4, 4)."""
-        with self._camera_lock, self._lock:
+        with self._lock:
             self.mesh, self.trouble = mesh, ""
             self._source = ExternalPoseSource(self._frame, mesh=mesh, origin=self._origin)
             for jaw in self.jaws.values():
                 jaw.set_object(mesh)
-            if self._camera:
-                self._camera.set_object(mesh, guesses)
+            if self.camera:
+                self.camera.set_object(mesh, guesses)
 
     def reset(self) -> str:
         """Forget poses, contacts and images; the object stays."""
-        with self._camera_lock, self._lock:
+        with self._lock:
             self._source.reset()
             for jaw in self.jaws.values():
                 jaw.reset()
-            if self._camera:
-                self._camera.reset()
+            if self.camera:
+                self.camera.reset()
         return "contacts and poses are forgotten; the object stays"
 
     def restart(self, side: str) -> None:
@@ -292,7 +342,7 @@ class ContactSession:
     @property
     def pose(self) -> ObjectPose | None:
         """The newest pose of the object that was taken or found."""
-        return self._camera.latest if self._camera else self._source.latest
+        return self.camera.latest if self.camera else self._source.latest
 
     def take_jaw_pose(self, side: str, message: Any) -> list[TimedEstimate]:
         """Take a jaw's PoseStamped; return its contacts that are known now.
@@ -307,9 +357,7 @@ class ContactSession:
     def take_object_pose(self, side: str, found: StampedPose) -> list[TimedEstimate]:
         """Take the object's pose; return the contacts on a jaw that are known now; see `take_jaw_pose`."""
         with self._lock:
-            # what an external pose is worth is not said with it; the estimator finds out
-            covariance = found.pose.covariance if self._camera else None
-            return self.jaws[side].take_object_pose(found.stamp, found.pose.T_camera_object, covariance)
+            return self.jaws[side].take_object_pose(found.stamp, found.pose.T_camera_object, found.pose.covariance)
 
     def take_surface(self, side: str, cloud: Any) -> list[TimedEstimate]:
         """Take a jaw's deformed surface; return its contacts that are known now.
@@ -325,40 +373,24 @@ class ContactSession:
         """Take the wrench on a jaw, with which no contact is due; raises ObservationError for frame or numbers."""
         wrench = wrench_from_message(message, f"{side}_jaw")
         with self._lock:
-            self.jaws[side].take_wrench(stamp_of(message), wrench)
+            self.jaws[side].loop.take_wrench(stamp_of(message), wrench)
         return []
 
-    def pass_over(self, side: str, stamp: int, read: Callable[[], Any]) -> None:
-        """Leave an image [ns] without a contact on a jaw; `read` gives the jaw's PoseStamped when it is needed."""
-        what = f"the pose of the {side} jaw"
+    def pass_over(self, side: str, message: Any) -> None:
+        """Leave the image of a jaw's PoseStamped without a contact on that jaw."""
+        T_camera_jaw = pose_from_message(message, self._frame, f"the pose of the {side} jaw")
         with self._lock:
-            self.jaws[side].pass_over(stamp, lambda: pose_from_message(read(), self._frame, what))
+            self.jaws[side].pass_over(stamp_of(message), T_camera_jaw)
 
     def read_pose(self, message: Any) -> StampedPose | None:
         """Return the object's pose of a PoseStamped or a Detection3DArray, None when nothing was detected.
 
         Raises:
-            PoseError: frame, stamp or numbers are wrong.
+            FinforceError: frame, stamp or numbers are wrong.
         """
         with self._lock:
-            take = self._source.take_detections if hasattr(message, "detections") else self._source.take_pose
-            pose = take(message)
+            pose = self._source.take(message)
         return pose and StampedPose(stamp_of(message), pose)
-
-    def take_camera(self, info: Any) -> None:
-        """Take a camera's intrinsics; see `DepthFeed`."""
-        with self._camera_lock:
-            self._camera.take_camera(info)
-
-    def take_depth(self, image: Any) -> StampedPose | None:
-        """Return the object's pose in a depth image, if it is tracked; see `DepthFeed`."""
-        with self._camera_lock:
-            return self._camera.take_depth(image)
-
-    def take_mask(self, image: Any) -> StampedPose | None:
-        """Return the object's pose in the image that a mask belongs to, if it is looked for; see `DepthFeed`."""
-        with self._camera_lock:
-            return self._camera.take_mask(image)
 
 
 def surface_from_cloud(cloud: Any, frame: str) -> NDArray:

@@ -88,14 +88,14 @@ def _store_equilibria(jaw: Jaw, share: Share) -> str:
 def compile_contact() -> None:
     """Compile the contact estimator with the object of the recording that comes with finforce."""
     from finforce_contact.estimator import ContactEstimator
-    from finforce_contact.jaw_contact import JawContact
+    from finforce_contact.loop import ContactLoop
     from finforce_contact.mesh.object_mesh import load_object_mesh
     from finforce_eval.recordings.objects import find_mesh
     from finforce_eval.recordings.recording import DEMO, read_recording
     from finforce_ifea.jaw.jaw import load_jaw
 
     mesh = load_object_mesh(find_mesh(read_recording(DEMO)))
-    JawContact(ContactEstimator(load_jaw("bench")), tolerance=1, max_age=1).set_object(mesh)
+    ContactLoop(ContactEstimator(load_jaw("bench"))).set_object(mesh)
 
 
 def compile_detector() -> None:

@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from finforce_contact.errors import to_floats
 from finforce_contact.localization.section import Section, compute_gaps, distances_to
 from finforce_ifea.errors import MeshError
 from finforce_ifea.jaw.jaw import Jaw
@@ -19,8 +18,8 @@ from finforce_ifea.jaw.mesh import VolumeMesh
 _SPACING = 0.5e-3
 # No jaw bends by more than this share of its length.
 _MOST_BENT = 0.6
-# Where across the width the line is averaged, as shares of the half width.
-_ACROSS = np.array([-0.8, 0.0, 0.8])
+# Where along the width the line is averaged, as shares of the half width.
+_LATERAL = np.array([-0.8, 0.0, 0.8])
 # Least share of a triangle of the face that stands across x.
 _LEAST_FACING = 0.3
 
@@ -52,7 +51,7 @@ class InnerFace:
             MeshError: Another number of vertices than the mesh has, coordinates that are not finite, or vertices
                 farther from their places at rest than a jaw can bend.
         """
-        surface = np.ascontiguousarray(to_floats(surface, "a deformed surface", MeshError))
+        surface = np.ascontiguousarray(surface, dtype=float)
         if surface.shape != self.mesh.nodes.shape:
             raise MeshError(
                 f"a deformed surface of shape {surface.shape}, expected {self.mesh.nodes.shape}, the jaw's mesh; "
@@ -106,7 +105,7 @@ def build_inner_face(jaw: Jaw, density: str) -> InnerFace:
     (low_y, low), (high_y, high) = places.min(axis=0), places.max(axis=0)
     heights = np.arange(low + 0.5 * _SPACING, high, _SPACING)
     middle, half_width = 0.5 * (low_y + high_y), 0.5 * (high_y - low_y)
-    samples = np.stack(np.meshgrid(middle + half_width * _ACROSS, heights), axis=-1).reshape(-1, 2)
+    samples = np.stack(np.meshgrid(middle + half_width * _LATERAL, heights), axis=-1).reshape(-1, 2)
     chosen, shares = _locate(mesh.nodes[triangles][:, :, 1:], samples)
     return InnerFace(
         mesh=mesh,
@@ -114,7 +113,7 @@ def build_inner_face(jaw: Jaw, density: str) -> InnerFace:
         x=jaw.face.read(heights),
         half_width=half_width,
         nodes=triangles[chosen].reshape(len(heights), -1),
-        weights=shares.reshape(len(heights), -1) / len(_ACROSS),
+        weights=shares.reshape(len(heights), -1) / len(_LATERAL),
     )
 
 
@@ -261,34 +260,6 @@ def _tilt(heights, weights, mean):
     return tilted
 
 
-class ClosestLocalizer:
-    """Takes the candidate nearest to the point of the undeformed inner surface that is nearest to the object.
-
-    Where the object is in the undeformed jaw, the deepest point counts.
-    """
-
-    def __init__(self, jaw: Jaw, face: InnerFace) -> None:
-        """Keep the candidates and the inner face at rest."""
-        self._candidates = jaw.candidates[:, 2]
-        self._face = face
-        self._line = face.deform(face.mesh.nodes)
-
-    def reset(self) -> None:
-        """Start anew; nothing is remembered."""
-
-    def locate(self, scene: ContactScene) -> Place | None:
-        """Return the place, None when the object does not stand before the inner surface."""
-        gaps = compute_gaps(self._line, scene.section.edges)
-        if not np.isfinite(gaps).any():
-            return None
-        nearest = gaps if gaps.min() < 0.0 else distances_to(self._line, scene.section.edges)
-        height = self._face.heights[nearest.argmin()]
-        height = self._candidates[np.abs(self._candidates - height).argmin()]
-        patch = ContactPatch(heights=np.array([height]), weights=np.ones(1))
-        bend = float(np.interp(height, self._face.heights, self._face.x - scene.line[:, 0]))
-        return Place(patch=patch, gap=float(gaps.min()) + bend, bend=bend)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContactScene:
     """What a localizer looks at.
@@ -309,14 +280,14 @@ class ContactScene:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Place:
+class ContactLocation:
     """Where the object touches, or would touch first.
 
     Attributes:
         patch: heights and weights on the undeformed inner surface.
         gap: from the surface to the object along x [m], negative when they overlap.
         bend: how far the surface has given way where the object is nearest [m].
-        touching: what the localizer says itself; None when gap and bend are to decide.
+        touching: what the localizer finds itself; None when gap and bend are to decide.
     """
 
     patch: ContactPatch
@@ -326,13 +297,37 @@ class Place:
 
 
 class Localizer(Protocol):
-    """Finds the place in a scene."""
+    """Finds the contact in a scene."""
 
     def reset(self) -> None:
-        """Start anew, apart."""
+        """Forget earlier scenes, where any are remembered."""
 
-    def locate(self, scene: ContactScene) -> Place | None:
-        """Return the place, None when the object does not stand before the inner surface."""
+    def locate(self, scene: ContactScene) -> ContactLocation | None:
+        """Return the contact, None when the object does not stand before the inner surface."""
+
+
+class ClosestLocalizer(Localizer):
+    """Takes the candidate nearest to the point of the undeformed inner surface that is nearest to the object.
+
+    Where the object is in the undeformed jaw, the deepest point counts.
+    """
+
+    def __init__(self, jaw: Jaw, face: InnerFace) -> None:
+        self._candidates = jaw.candidates[:, 2]
+        self._face = face
+        self._line = face.deform(face.mesh.nodes)
+
+    def locate(self, scene: ContactScene) -> ContactLocation | None:
+        """Return the contact, None when the object does not stand before the inner surface."""
+        gaps = compute_gaps(self._line, scene.section.edges)
+        if not np.isfinite(gaps).any():
+            return None
+        nearest = gaps if gaps.min() < 0.0 else distances_to(self._line, scene.section.edges)
+        height = self._face.heights[nearest.argmin()]
+        height = self._candidates[np.abs(self._candidates - height).argmin()]
+        patch = ContactPatch(heights=np.array([height]), weights=np.ones(1))
+        bend = float(np.interp(height, self._face.heights, self._face.x - scene.line[:, 0]))
+        return ContactLocation(patch=patch, gap=float(gaps.min()) + bend, bend=bend)
 
 
 _OVERLAP = 0.2e-3  # [m] into which the object is brought with the deformed surface
@@ -344,7 +339,7 @@ WRENCH_GAIN = 0.93  # share of the line of action in the mean; the rest is that 
 _WRENCH_REACH, _WRENCH_SLACK = 3e-3, 1e-3
 
 
-class OutlineLocalizer:
+class OutlineLocalizer(Localizer):
     """Brings the object along x into slight overlap with the deformed surface, whatever its pose errs along x.
 
     The overlap is where it touches. Once a force is known, its line of action cuts the surface in the pressure centre;
@@ -354,11 +349,8 @@ class OutlineLocalizer:
     def __init__(self, face: InnerFace) -> None:
         self._face = face
 
-    def reset(self) -> None:
-        """Start anew; nothing is remembered."""
-
-    def locate(self, scene: ContactScene) -> Place | None:
-        """Return the place, None when the object does not stand before the inner surface."""
+    def locate(self, scene: ContactScene) -> ContactLocation | None:
+        """Return the contact, None when the object does not stand before the inner surface."""
         gaps = compute_gaps(scene.line, scene.section.edges)
         nearest = int(gaps.argmin())
         if not np.isfinite(gaps[nearest]):
@@ -369,7 +361,7 @@ class OutlineLocalizer:
         if scene.wrench is not None:
             patch = self._follow_wrench(patch, gaps - gaps[nearest] - _OVERLAP, scene)
         bend = float(np.interp(patch.mean, heights, self._face.x - scene.line[:, 0]))
-        return Place(patch=patch, gap=float(gaps[nearest]), bend=bend)
+        return ContactLocation(patch=patch, gap=float(gaps[nearest]), bend=bend)
 
     def _follow_wrench(self, patch: ContactPatch, gaps: NDArray, scene: ContactScene) -> ContactPatch:
         """Return the rows with their mean moved towards the pressure centre, if that agrees with the gaps left (h,).

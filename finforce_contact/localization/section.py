@@ -22,65 +22,35 @@ _MOST_CROSSINGS = 64
 _RECUT_ANGLE, _RECUT_SHIFT = 0.0175, 1e-3
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Edges:
-    """The edges of an outline's polygons.
-
-    Attributes:
-        starts: (e, 2) x and z [m].
-        ends: (e, 2) x and z [m].
-    """
-
-    starts: NDArray
-    ends: NDArray
+def edges_of(polygons: tuple[NDArray, ...]) -> NDArray:
+    """Return the edges (e, 2, 2) [m], start and end, of closed polygons (n, 2) [m]."""
+    edges = [np.stack([polygon, np.roll(polygon, -1, axis=0)], axis=1) for polygon in polygons]
+    return np.concatenate([np.empty((0, 2, 2)), *edges])
 
 
-def edges_of(polygons: tuple[NDArray, ...]) -> Edges:
-    """Return the edges of closed polygons (n, 2) [m]."""
-    if not polygons:
-        return Edges(starts=np.empty((0, 2)), ends=np.empty((0, 2)))
-    ends = [np.roll(polygon, -1, axis=0) for polygon in polygons]
-    return Edges(starts=np.concatenate(polygons).astype(float), ends=np.concatenate(ends).astype(float))
-
-
-def place_edges(edges: Edges, origin: NDArray, tilt: float) -> Edges:
-    """Return edges turned by a tilt [rad], positive from x to z, and moved to an origin (2,) [m]."""
+def place_edges(edges: NDArray, origin: NDArray, tilt: float) -> NDArray:
+    """Return edges (e, 2, 2) turned by a tilt [rad], positive from x to z, and moved to an origin (2,) [m]."""
     c, s = np.cos(tilt), np.sin(tilt)
-    turn = np.array([[c, s], [-s, c]])
-    return Edges(starts=edges.starts @ turn + origin, ends=edges.ends @ turn + origin)
+    return edges @ np.array([[c, s], [-s, c]]) + origin
 
 
-def compute_gaps(line: NDArray, edges: Edges) -> NDArray:
-    """Return the way along x from a line (h, 2) [m] to the object's near side (h,) [m].
-
-    Negative where the point lies in the object, infinite where nothing of the object stands before the point. What
-    lies behind the point by more than a wall's thickness, as the far wall of a cup around the finger, does not count.
-    """
-    return _compute_gaps(line, edges.starts, edges.ends)
-
-
-def count_inside(points: NDArray, edges: Edges) -> int:
-    """Return how many of points (p, 2) [m] lie within the outline, by the even-odd rule."""
-    return int(_count_inside(points, edges.starts, edges.ends))
-
-
-def distances_to(line: NDArray, edges: Edges) -> NDArray:
-    """Return the distance of each point of a line (h, 2) [m] to the outline's boundary (h,) [m]."""
-    along = edges.ends - edges.starts
-    offset = line[:, None] - edges.starts
+def distances_to(line: NDArray, edges: NDArray) -> NDArray:
+    """Return the distance of each point of a line (h, 2) [m] to an outline's edges (e, 2, 2): (h,) [m]."""
+    along = edges[:, 1] - edges[:, 0]
+    offset = line[:, None] - edges[:, 0]
     share = np.clip((offset * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-30), 0.0, 1.0)
     return np.sqrt(((offset - share[..., None] * along) ** 2).sum(-1).min(axis=1))
 
 
 @njit(**_OPTIONS)
-def _cross(z, starts, ends, crossings):
-    """Fill in the sorted x where the outline crosses the height z; returns their number."""
+def _cross(z, edges, crossings):
+    """Fill in the sorted x where the outline crosses the height z; return their number."""
     count = 0
-    for e in range(len(starts)):
-        z0, z1 = starts[e, 1], ends[e, 1]
+    for e in range(len(edges)):
+        z0, z1 = edges[e, 0, 1], edges[e, 1, 1]
         if (z0 <= z) == (z1 <= z) or count == _MOST_CROSSINGS:
             continue
-        x = starts[e, 0] + (z - z0) / (z1 - z0) * (ends[e, 0] - starts[e, 0])
+        x = edges[e, 0, 0] + (z - z0) / (z1 - z0) * (edges[e, 1, 0] - edges[e, 0, 0])
         k = count
         while k > 0 and crossings[k - 1] > x:
             crossings[k] = crossings[k - 1]
@@ -91,10 +61,15 @@ def _cross(z, starts, ends, crossings):
 
 
 @njit(**_OPTIONS)
-def _compute_gaps(line, starts, ends):
+def compute_gaps(line, edges):
+    """Return the way along x from a line (h, 2) [m] to the near side (h,) [m] of an outline's edges (e, 2, 2).
+
+    Negative where the point lies in the object, infinite where nothing of the object stands before the point. What
+    lies behind the point by more than a wall's thickness, as the far wall of a cup around the finger, does not count.
+    """
     gaps, crossings = np.full(len(line), np.inf), np.empty(_MOST_CROSSINGS)
     for h in range(len(line)):
-        count = _cross(line[h, 1], starts, ends, crossings)
+        count = _cross(line[h, 1], edges, crossings)
         for k in range(0, count - 1, 2):
             if crossings[k + 1] > line[h, 0] - _THROUGH:
                 gaps[h] = crossings[k] - line[h, 0]
@@ -103,10 +78,11 @@ def _compute_gaps(line, starts, ends):
 
 
 @njit(**_OPTIONS)
-def _count_inside(points, starts, ends):
+def count_inside(points, edges):
+    """Return how many of points (p, 2) [m] lie within an outline's edges (e, 2, 2), by the even-odd rule."""
     inside, crossings = 0, np.empty(_MOST_CROSSINGS)
     for p in range(len(points)):
-        count, before = _cross(points[p, 1], starts, ends, crossings), 0
+        count, before = _cross(points[p, 1], edges, crossings), 0
         for k in range(count):
             before += crossings[k] <= points[p, 0]
         inside += before % 2
@@ -300,26 +276,26 @@ class Section:
         polygons: (n, 2) each, x and z [m] about the object's origin as cut.
         origin: (2,) x and z [m] of the object's origin in the jaw frame.
         tilt: turn since the cut [rad], positive from x to z.
-        cut_edges: of the polygons.
+        cut_edges: of the polygons (e, 2, 2) [m].
         across: middle and standard deviation along y of where the object stands nearest (2,) [m].
     """
 
     polygons: tuple[NDArray, ...]
     origin: NDArray
     tilt: float
-    cut_edges: Edges
+    cut_edges: NDArray
     across: NDArray
 
     @cached_property
-    def edges(self) -> Edges:
-        """The edges in the jaw frame now."""
+    def edges(self) -> NDArray:
+        """The edges (e, 2, 2) [m], in the jaw frame now."""
         return place_edges(self.cut_edges, self.origin, self.tilt)
 
 
-_ACROSS, _PRESSED = 21, 0.3e-3
+_SAMPLES, _PRESSED = 21, 0.3e-3
 
 
-def find_across(mesh: ObjectMesh, T: NDArray, half_width: float, span: tuple[float, float]) -> NDArray:
+def find_lateral_contact(mesh: ObjectMesh, T: NDArray, half_width: float, span: tuple[float, float]) -> NDArray:
     """Return middle and standard deviation (2,) [m] along y of where an object stands nearest to the finger.
 
     Its near side is sunk in by 0.3 mm, where it is in front of the finger.
@@ -332,8 +308,8 @@ def find_across(mesh: ObjectMesh, T: NDArray, half_width: float, span: tuple[flo
     """
     points = mesh.vertices @ T[:3, :3].T + T[:3, 3]
     start, stop = points[mesh.edges.ends[:, 0]], points[mesh.edges.ends[:, 1]]
-    places, near = half_width * np.linspace(-1.0, 1.0, _ACROSS), np.full(_ACROSS, np.inf)
-    for row, y in enumerate(places):
+    lateral, near = half_width * np.linspace(-1.0, 1.0, _SAMPLES), np.full(_SAMPLES, np.inf)
+    for row, y in enumerate(lateral):
         cut = np.flatnonzero((start[:, 1] <= y) != (stop[:, 1] <= y))
         share = (y - start[cut, 1]) / (stop[cut, 1] - start[cut, 1])
         x, z = (start[cut][:, ::2] + share[:, None] * (stop[cut] - start[cut])[:, ::2]).T
@@ -342,8 +318,8 @@ def find_across(mesh: ObjectMesh, T: NDArray, half_width: float, span: tuple[flo
         return np.array([0.0, half_width])
     overlap = np.maximum(0.0, near.min() + _PRESSED - near)
     overlap /= overlap.sum()
-    middle = float(overlap @ places)
-    return np.array([middle, float(np.sqrt(overlap @ (places - middle) ** 2))])
+    middle = float(overlap @ lateral)
+    return np.array([middle, float(np.sqrt(overlap @ (lateral - middle) ** 2))])
 
 
 class SectionKeeper:
@@ -373,7 +349,7 @@ class SectionKeeper:
         self._R, self._y = T[:3, :3].copy(), float(T[1, 3])
         self._polygons = cut_outline(self._mesh, self._R, self._half_width, self._y)
         self._edges = edges_of(self._polygons)
-        self._across = find_across(self._mesh, T, self._half_width, self._span)
+        self._across = find_lateral_contact(self._mesh, T, self._half_width, self._span)
         self.cuts += 1
 
 

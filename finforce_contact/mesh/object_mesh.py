@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from finforce.files import FileError
 from finforce.optional import import_manifold3d, import_open3d
 from finforce.surfaces import read_surface
-from finforce_contact.errors import ObjectMeshError, to_floats
+from finforce_contact.errors import ObjectMeshError
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -280,7 +280,7 @@ def prepare_object_mesh(
             has no body.
         MissingDependencyError: manifold3d or open3d is not installed.
     """
-    vertices, triangles = to_floats(vertices, f"{name}: vertices", ObjectMeshError), np.asarray(triangles)
+    vertices, triangles = np.asarray(vertices, dtype=float), np.asarray(triangles)
     _check_triangles(vertices, triangles, name)
     _check_size(vertices, triangles, name, unit)
     vertices = vertices * UNITS[unit]

@@ -2,13 +2,13 @@
 
 from collections import deque
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import PoseError
 from finforce.transforms import check_pose, move_pose, step_between
-from finforce_contact.errors import check_stamp, to_floats
 from finforce_contact.parameters import ContactSettings
 
 _X = 0
@@ -48,7 +48,7 @@ class PoseFilter:
     """Kalman filter of a pose: x moves at constant speed, all else hardly moves in the frame of a closing jaw.
 
     Each of the six numbers has a variance of its own. How noisy they are is learnt from the innovations: r = v^2 - p. A
-    pose far off the trajectory is set aside until some in a row agree with each other; a trend in the innovations
+    pose far off the trajectory is rejected until some in a row agree with each other; a trend in the innovations
     widens the search at once.
     """
 
@@ -68,10 +68,10 @@ class PoseFilter:
         self.latest: NDArray | None = None
         self._scale = np.ones(6)
         self._learnt, self._slide = _NOISE_PRIOR, np.zeros(2)
-        self._aside: deque[tuple[float, NDArray]] = deque(maxlen=_JUMP_POSES)
+        self._rejected: deque[tuple[float, NDArray]] = deque(maxlen=_JUMP_POSES)
 
     def update(self, stamp: float, T: NDArray, covariance: NDArray | None = None) -> str:
-        """Take a pose and returns what became of it: "used", "late", "aside" or "jump".
+        """Take a pose and return what became of it: "used", "late", "rejected" or "jump".
 
         Args:
             stamp: image capture time [s].
@@ -81,7 +81,8 @@ class PoseFilter:
         Raises:
             PoseError: Stamp or pose is none, or the covariance has another shape or no positive diagonal.
         """
-        check_stamp(stamp, "T_jaw_object", PoseError)
+        if not isfinite(stamp):
+            raise PoseError(f"T_jaw_object: got stamp {stamp}, expected the capture time in seconds")
         T = check_pose(T, "T_jaw_object")
         noise = self._noise(covariance)
         if self.stamp is not None and stamp <= self.stamp:
@@ -94,8 +95,8 @@ class PoseFilter:
         innovation = step_between(self._T, T)
         spread = self._P + noise
         if (innovation**2 > _GATE**2 * spread).any():
-            return self._set_aside(stamp, T, noise)
-        self._aside.clear()
+            return self._reject(stamp, T, noise)
+        self._rejected.clear()
         self._learn(innovation, None if covariance is None else noise)
         self._follow_trend(innovation / np.sqrt(spread), noise)
         self._correct(innovation, noise)
@@ -106,7 +107,7 @@ class PoseFilter:
         """Take the motion of the frame itself: T (4, 4) leads from where it was to where it is."""
         if self.stamp is not None:
             self._T = T @ self._T
-            self._aside = deque(((stamp, T @ aside) for stamp, aside in self._aside), maxlen=self._aside.maxlen)
+            self._rejected = deque(((stamp, T @ pose) for stamp, pose in self._rejected), maxlen=self._rejected.maxlen)
 
     def slide(self, T: NDArray, velocity: NDArray) -> None:
         """Take an object for one that slides: this pose, the last that came, is near it, and it goes on so.
@@ -121,7 +122,7 @@ class PoseFilter:
             self._P[1:] += _SLIDING * noise[1:]
             self._correct(step_between(self._T, T), noise)
             self.believed = self.stamp
-            self._aside.clear()
+            self._rejected.clear()
 
     def at(self, stamp: float) -> FilteredPose:
         """Return the pose at a time [s], continued at its speed for a fifth of a second at most.
@@ -143,7 +144,7 @@ class PoseFilter:
         """Return the variances (6,) of a pose; stated ones are raised when the poses scatter more."""
         if covariance is None:
             return self._assumed * self._scale
-        stated = to_floats(covariance, "a pose covariance", PoseError)
+        stated = np.asarray(covariance, dtype=float)
         if stated.shape != (6, 6) or not np.isfinite(stated).all() or not (np.diag(stated) > 0).all():
             raise PoseError(
                 f"a pose covariance {stated.tolist()}, expected (6, 6) with finite numbers and variances above zero; "
@@ -156,7 +157,7 @@ class PoseFilter:
         self.stamp, self.believed, self._T, self._speed = stamp, stamp, T.copy(), speed
         self._P, self._cross, self._speed_variance = noise.copy(), 0.0, _SPEED_SURPRISE**2
         self._trend = np.zeros(6)
-        self._aside.clear()
+        self._rejected.clear()
 
     def _predict(self, stamp: float) -> None:
         """Move the trajectory on to a time [s]: constant speed under white acceleration in x, a random walk else."""
@@ -196,18 +197,18 @@ class PoseFilter:
         if turning[_X]:
             self._speed_variance += _SPEED_SURPRISE**2
 
-    def _set_aside(self, stamp: float, T: NDArray, noise: NDArray) -> str:
+    def _reject(self, stamp: float, T: NDArray, noise: NDArray) -> str:
         """Keep a pose off the trajectory; once enough in a row agree, the trajectory starts anew from them."""
-        self._aside.append((stamp, T))
-        if len(self._aside) < _JUMP_POSES or not self._agree(noise):
-            return "aside"
-        (first, T_first), (last, T_last) = self._aside[0], self._aside[-1]
+        self._rejected.append((stamp, T))
+        if len(self._rejected) < _JUMP_POSES or not self._agree(noise):
+            return "rejected"
+        (first, T_first), (last, T_last) = self._rejected[0], self._rejected[-1]
         self._begin(stamp, T_last, noise, speed=float((T_last - T_first)[_X, 3] / (last - first)))
         return "jump"
 
     def _agree(self, noise: NDArray) -> bool:
-        """Return whether the poses set aside lie on one straight trajectory."""
-        stamps = np.array([stamp for stamp, _ in self._aside])
-        steps = np.array([step_between(self._aside[0][1], T) for _, T in self._aside])
+        """Return whether the rejected poses lie on one straight trajectory."""
+        stamps = np.array([stamp for stamp, _ in self._rejected])
+        steps = np.array([step_between(self._rejected[0][1], T) for _, T in self._rejected])
         line = np.outer((stamps - stamps[0]) / (stamps[-1] - stamps[0]), steps[-1])
         return bool(((steps - line) ** 2 <= _GATE**2 * 2.0 * noise).all())

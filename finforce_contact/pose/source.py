@@ -1,40 +1,40 @@
-"""Where poses of the object come from, and the source fed by another program's messages."""
+"""Where poses of the object come from: another program's messages, or depth images."""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from threading import RLock
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from finforce.camera import CameraIntrinsics, ImageError
 from finforce.errors import PoseError
-from finforce.transforms import check_pose, invert_pose, pose_from_quaternion
-from finforce_contact.mesh.object_mesh import ObjectMesh, surrounds
-from finforce_contact.parameters import ORIGINS
+from finforce.messages import (
+    camera_from_info,
+    depth_from_image,
+    mask_from_image,
+    pose_from_message,
+    same_camera,
+    stamp_of,
+)
+from finforce.stamps import SECOND, Synchronizer
+from finforce_contact.mesh.object_mesh import ObjectMesh
+from finforce_contact.parameters import ORIGINS, ContactParameters, TrackerSettings
+from finforce_contact.pose.alignment import DepthImage
+from finforce_contact.pose.tracker import ObjectPose, PoseTracker, check_camera_outside
+
+DEPTH, MASK = "depth images", "masks"
+KEPT = 32  # images that may wait for their mask, which a segmentation takes a while to find
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectPose:
-    """Where the object was in one image.
+class StampedPose(NamedTuple):
+    """A pose of the object and the exact stamp of its image [ns]."""
 
-    Attributes:
-        stamp: capture time of the image [s].
-        T_camera_object: pose of the mesh file's own frame in the camera optical frame (4, 4) [m].
-        covariance: of x, y, z [m] and the rotations about x, y, z [rad], camera axes, about the object's origin (6, 6);
-            a direction that nothing determines has a large variance.
-        fitness: share of what should be seen that was seen where it should be, 0 to 1; 1 where the source tells none.
-        source: who says so.
-    """
-
-    stamp: float
-    T_camera_object: NDArray
-    covariance: NDArray
-    fitness: float
-    source: str
-
-    def age(self, now: float) -> float:
-        """Return the time since the image was taken [s], at the time `now` [s] of the same clock."""
-        return now - self.stamp
+    stamp: int
+    pose: ObjectPose
 
 
 class ExternalPoseSource:
@@ -42,121 +42,180 @@ class ExternalPoseSource:
 
     Attributes:
         latest: the newest pose taken; a refused one does not replace it.
+
+    Args:
+        frame: the camera optical frame that the messages must be in.
+        mesh: the object, for the check that it is not around the camera; None to do without.
+        origin: what the poses are of, one of `ORIGINS`.
     """
 
-    def __init__(
-        self,
-        frame: str,
-        *,
-        mesh: ObjectMesh | None = None,
-        origin: str = "mesh",
-        stddev: ArrayLike = (0.002,) * 3 + (0.02,) * 3,
-    ) -> None:
-        """Prepare to listen.
-
-        Args:
-            frame: the camera optical frame that the messages must be in.
-            mesh: the object, for the check that it is not around the camera; None to do without.
-            origin: what the poses are of, one of `ORIGINS`.
-            stddev: standard deviations (6,) [m, rad] that the poses are taken to have, as such messages state none.
-
-        Raises:
-            PoseError: A standard deviation is not positive.
-        """
-        stddev = np.asarray(stddev, float)
-        if stddev.shape != (6,) or not (np.isfinite(stddev).all() and (stddev > 0.0).all()):
-            raise PoseError(f"standard deviations of poses: got {stddev}, expected six positive numbers [m, rad]")
+    def __init__(self, frame: str, *, mesh: ObjectMesh | None = None, origin: str = "mesh") -> None:
         self.latest: ObjectPose | None = None
-        self._frame, self._mesh, self._covariance = frame.lstrip("/"), mesh, np.diag(stddev**2)
-        self._back = np.zeros(3)
-        if mesh is not None:
-            self._back = -ORIGINS[origin] * mesh.middle
+        self._frame, self._mesh = frame, mesh
+        self._back = np.zeros(3) if mesh is None else -ORIGINS[origin] * mesh.middle
 
     def reset(self) -> None:
         """Forget the latest pose, so that a stamp before it is taken again."""
         self.latest = None
 
-    def take_pose(self, message: Any) -> ObjectPose:
-        """Take an object shaped like a geometry_msgs/PoseStamped.
+    def take(self, message: Any) -> ObjectPose | None:
+        """Take a PoseStamped, or a Detection3DArray, of which the first detection counts.
 
-        Raises:
-            PoseError: The frame is another one, the stamp is not after the last one taken, the numbers are no rigid
-                pose, or the object would be around the camera.
-        """
-        return self._take(message.header, message.pose, "PoseStamped")
-
-    def take_detections(self, message: Any) -> ObjectPose | None:
-        """Take an object shaped like a vision_msgs/Detection3DArray, of which the first detection counts.
-
-        Its pose is `bbox.center`, where isaac_ros_foundationpose writes it, or `results[0].pose.pose` when the former
-        was left as the message type makes it.
+        A detection's pose is `bbox.center`, where isaac_ros_foundationpose writes it, or `results[0].pose.pose` when
+        the former was left as the message type makes it.
 
         Returns:
-            The pose, or None when the list is empty: nothing was detected.
+            The pose, None when nothing was detected.
 
         Raises:
-            PoseError: As `take_pose`, or the detection holds no pose.
+            ObservationError: The frame is another one.
+            PoseError: The stamp is not after the last one taken, the numbers are no rigid pose, the detection holds
+                none, or the object would be around the camera.
         """
-        if not message.detections:
-            return None
-        detection = message.detections[0]
-        pose = detection.bbox.center
-        if _is_unset(pose):
-            pose = _first_result(detection.results)
-        return self._take(message.header, pose, "Detection3DArray")
-
-    def _take(self, header: Any, pose: Any, source: str) -> ObjectPose:
-        if header.frame_id.lstrip("/") != self._frame:
-            raise PoseError(
-                f"{source}: got a pose in frame '{header.frame_id}', expected '{self._frame}'; "
-                "set the frame of the camera, or have the tracker publish in it"
-            )
-        stamp = header.stamp.sec + 1e-9 * header.stamp.nanosec
+        source = "PoseStamped"
+        if hasattr(message, "detections"):
+            if not message.detections:
+                return None
+            source = "Detection3DArray"
+            message = SimpleNamespace(header=message.header, pose=_pose_of_detection(message.detections[0]))
+        T_camera_object, stamp = pose_from_message(message, self._frame, source), SECOND * stamp_of(message)
         if self.latest is not None and stamp <= self.latest.stamp:
             raise PoseError(
                 f"{source}: got stamp {stamp:.6f} s, expected one after {self.latest.stamp:.6f} s; "
                 "reset after time has jumped back"
             )
-        T_camera_object = pose_from_quaternion(_position(pose), _quaternion(pose))
         T_camera_object[:3, 3] += T_camera_object[:3, :3] @ self._back
         if self._mesh is not None:
             check_camera_outside(T_camera_object, self._mesh)
         self.latest = ObjectPose(
-            stamp=stamp, T_camera_object=T_camera_object, covariance=self._covariance, fitness=1.0, source=source
+            stamp=stamp, T_camera_object=T_camera_object, covariance=None, fitness=1.0, source=source
         )
         return self.latest
 
 
-def check_camera_outside(T_camera_object: ArrayLike, mesh: ObjectMesh) -> NDArray:
-    """Return a checked pose (4, 4) after having refused one that puts the object around the camera.
+def _pose_of_detection(detection: Any) -> Any:
+    """Return the first pose of a detection that was set; raises PoseError where none was."""
+    for pose in (detection.bbox.center, *(result.pose.pose for result in detection.results[:1])):
+        place, turn = pose.position, pose.orientation
+        if any((place.x, place.y, place.z, turn.x, turn.y, turn.z)):
+            return pose
+    raise PoseError("Detection3DArray: got a detection with neither bbox.center nor results[0].pose.pose set")
 
-    Raises:
-        PoseError: The pose is not rigid, or the mesh surrounds the camera's origin.
+
+class DepthFeed:
+    """Brings depth images and masks together and hands them to a tracker, which is made for object and camera.
+
+    A mask is needed to find the object first, or again when it was lost; between, depth images are enough. Several
+    threads may call it.
+
+    Args:
+        parameters: frame, unit of depth and greatest distance of stamps.
+        settings: of the tracker.
     """
-    T_camera_object = check_pose(T_camera_object, "object pose")
-    camera = invert_pose(T_camera_object)[:3, 3]
-    if surrounds(mesh, camera):
-        raise PoseError(
-            f"object pose: got one that puts the camera inside the object '{mesh.name}', at {camera.round(4)} m of its "
-            "frame; expected the object in front of the camera (z forward), with T_camera_object and not its inverse"
-        )
-    return T_camera_object
 
+    def __init__(self, parameters: ContactParameters, settings: TrackerSettings) -> None:
+        self._parameters, self._settings = parameters, settings
+        self._tolerance = round(parameters.pose_tolerance / SECOND)
+        self._mesh: ObjectMesh | None = None
+        self._camera: CameraIntrinsics | None = None
+        self._guesses: tuple[NDArray, ...] = ()
+        self._lock = RLock()
+        self.reset()
 
-def _position(pose: Any) -> NDArray:
-    return np.array([pose.position.x, pose.position.y, pose.position.z], float)
+    def reset(self) -> None:
+        """Forget images and pose."""
+        with self._lock:
+            self.latest: ObjectPose | None = None
+            self._tracker: PoseTracker | None = None
+            self._lost = True
+            self._images = Synchronizer({DEPTH: KEPT, MASK: KEPT}, self._tolerance)
 
+    def set_object(self, mesh: ObjectMesh | None, guesses: Sequence[NDArray] = ()) -> None:
+        """Look for another object from now on, at first near the given poses (4, 4)."""
+        with self._lock:
+            self._mesh, self._guesses, self._tracker = mesh, tuple(guesses), None
+            self.latest, self._lost = None, True
 
-def _quaternion(pose: Any) -> NDArray:
-    return np.array([pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w], float)
+    def take_camera(self, info: Any) -> None:
+        """Take a sensor_msgs/CameraInfo.
 
+        Raises:
+            ObservationError: the frame is another one.
+            IntrinsicsError: the numbers are no camera's.
+        """
+        camera = camera_from_info(info, self._parameters.camera_frame)
+        with self._lock:
+            if not same_camera(self._camera, camera):
+                self._camera, self._tracker, self._lost = camera, None, True
 
-def _is_unset(pose: Any) -> bool:
-    """Return whether a pose is what a new message holds: at the origin, turned by nothing."""
-    return not _position(pose).any() and not _quaternion(pose)[:3].any()
+    def take_depth(self, image: Any) -> StampedPose | None:
+        """Take a depth image and return the object's pose in it; None while it waits for a mask.
 
+        Raises:
+            ObservationError: the frame is another one.
+            ImageError: the image cannot be used, or the camera is not known yet.
+            PoseLostError: the object was not found again.
+        """
+        stamp = stamp_of(image)
+        with self._lock:
+            self._images.add(DEPTH, stamp, image)
+            mask = self._images.find(MASK, stamp)
+            if self._mesh is None:
+                return None
+            if self._lost and mask is not None:
+                return self._locate(image, mask.value)
+            if self._tracker is None or self.latest is None:
+                return None
+            self._lost = True  # until it was found again
+            found = None if mask is None else self._decode_mask(mask.value)
+            self.latest = self._tracker.track(SECOND * stamp, self._decode_depth(image), found)
+            self._lost = False
+            return StampedPose(stamp, self.latest)
 
-def _first_result(results: Sequence[Any]) -> Any:
-    if not results or _is_unset(results[0].pose.pose):
-        raise PoseError("Detection3DArray: got a detection with neither bbox.center nor results[0].pose.pose set")
-    return results[0].pose.pose
+    def take_mask(self, image: Any) -> StampedPose | None:
+        """Take a mask and return the object's pose in its depth image, if it is looked for.
+
+        Raises:
+            ObservationError: the frame is another one.
+            ImageError: one of the images cannot be used.
+            PoseLostError: the object was not found.
+        """
+        stamp = stamp_of(image)
+        with self._lock:
+            self._images.add(MASK, stamp, image)
+            depth = self._images.find(DEPTH, stamp)
+            wanted = self._lost and self._mesh is not None and depth is not None
+            return self._locate(depth.value, image) if wanted else None
+
+    def view(self) -> DepthImage:
+        """Return the newest depth image that has a mask.
+
+        Raises:
+            ImageError: there is none.
+        """
+        with self._lock:
+            pair = self._images.newest_pair(DEPTH, MASK)
+            if pair is None:
+                have = " and ".join(f"{len(self._images.entries(name))} {name}" for name in (DEPTH, MASK))
+                raise ImageError(f"no depth image with its mask: {have} are here, expected a pair of equal stamps")
+            depth, mask = (entry.value for entry in pair)
+            return DepthImage(self._decode_depth(depth), self._known_camera(), self._decode_mask(mask))
+
+    def _locate(self, depth: Any, mask: Any) -> StampedPose:
+        tracker = self._tracker = self._tracker or PoseTracker(self._mesh, self._known_camera(), self._settings)
+        stamp = stamp_of(depth)
+        found = self._decode_mask(mask)
+        self.latest = tracker.locate(SECOND * stamp, self._decode_depth(depth), found, self._guesses)
+        self._lost = False
+        return StampedPose(stamp, self.latest)
+
+    def _decode_depth(self, image: Any) -> NDArray:
+        return depth_from_image(image, self._parameters.camera_frame, self._parameters.depth_scale)
+
+    def _decode_mask(self, image: Any) -> NDArray:
+        return mask_from_image(image, self._parameters.camera_frame)
+
+    def _known_camera(self) -> CameraIntrinsics:
+        if self._camera is None:
+            raise ImageError("a depth image came, but no camera_info yet")
+        return self._camera

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from finforce.transforms import rotation_between
-from finforce_contact.errors import ContactError
 from finforce_contact.mesh.object_mesh import ObjectMesh
 from finforce_contact.mesh.views import sample_with_normals
+from finforce_ifea.errors import ContactError
 
 AUTO, NONE, FULL = "auto", "none", "full"
 AXES = {"x": 0, "y": 1, "z": 2}

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -10,12 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from finforce.camera import CameraIntrinsics, project
 from finforce.errors import PoseError
-from finforce.transforms import move_pose, rotation_between
+from finforce.transforms import check_pose, invert_pose, move_pose, rotation_between
 from finforce_contact.errors import PoseLostError
-from finforce_contact.mesh.object_mesh import ObjectMesh
+from finforce_contact.mesh.object_mesh import ObjectMesh, surrounds
 from finforce_contact.parameters import TrackerSettings
 from finforce_contact.pose.alignment import LEAST_PIXELS, Alignment, DepthImage, Effort, MeshAligner
-from finforce_contact.pose.source import ObjectPose, check_camera_outside
 
 # Depth farther off than this [m] is not the object, at first and in the end.
 _WIDE_GATE, _GATE = 0.006, 0.003
@@ -105,6 +105,42 @@ def _icosphere() -> NDArray:
     middles = [a + b for i, a in enumerate(corners) for b in corners[:i] if np.linalg.norm(a - b) < 2.1]
     points = np.concatenate([corners, middles])
     return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectPose:
+    """Where the object was in one image.
+
+    Attributes:
+        stamp: capture time of the image [s].
+        T_camera_object: pose of the mesh file's own frame in the camera optical frame (4, 4) [m].
+        covariance: of x, y, z [m] and the rotations about x, y, z [rad], camera axes, about the object's origin (6, 6);
+            a direction that nothing determines has a large variance; None where the source tells none.
+        fitness: share of what should be seen that was seen where it should be, 0 to 1; 1 where the source tells none.
+        source: who says so.
+    """
+
+    stamp: float
+    T_camera_object: NDArray
+    covariance: NDArray | None
+    fitness: float
+    source: str
+
+
+def check_camera_outside(T_camera_object: ArrayLike, mesh: ObjectMesh) -> NDArray:
+    """Return a checked pose (4, 4) after having refused one that puts the object around the camera.
+
+    Raises:
+        PoseError: The pose is not rigid, or the mesh surrounds the camera's origin.
+    """
+    T_camera_object = check_pose(T_camera_object, "object pose")
+    camera = invert_pose(T_camera_object)[:3, 3]
+    if surrounds(mesh, camera):
+        raise PoseError(
+            f"object pose: got one that puts the camera inside the object '{mesh.name}', at {camera.round(4)} m of its "
+            "frame; expected the object in front of the camera (z forward), with T_camera_object and not its inverse"
+        )
+    return T_camera_object
 
 
 _SOURCE = "tracker"

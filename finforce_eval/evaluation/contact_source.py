@@ -11,7 +11,7 @@ import numpy as np
 
 from finforce.errors import PoseError
 from finforce.stamps import SECOND
-from finforce_contact.jaw_contact import ContactLoop, ContactSource, GivenContact
+from finforce_contact.loop import ContactLoop, ContactSource, GivenContact
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.scoring import ONSET_FORCE
 from finforce_eval.recordings.objects import ObjectTrack, find_mesh, has_object, mean_pose, require_mesh, track_object

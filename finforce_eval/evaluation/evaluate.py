@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from finforce.errors import FinforceError, ObservationError
-from finforce_contact.jaw_contact import ContactSource, ForceLoop
+from finforce_contact.loop import ContactSource, ForceLoop
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.manipulation import ManipulationStats, score_manipulation
 from finforce_eval.evaluation.places import InnerSurface, true_lines

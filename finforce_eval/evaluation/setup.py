@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from finforce.errors import FinforceError
-from finforce_contact.jaw_contact import ContactSource
+from finforce_contact.loop import ContactSource
 from finforce_eval.errors import OptionError
 from finforce_eval.evaluation.contact_source import ContactChoice, build_source, parse_contacts
 from finforce_eval.evaluation.evaluate import Evaluation, check_keypoint_count, evaluate_recording, score_results

@@ -18,7 +18,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from finforce_contact.estimator import ContactEstimator
-from finforce_contact.jaw_contact import ForceLoop
 from finforce_contact.localization.outline_localizer import (
     ClosestLocalizer,
     ContactScene,
@@ -27,6 +26,7 @@ from finforce_contact.localization.outline_localizer import (
     build_inner_face,
 )
 from finforce_contact.localization.section import SectionKeeper
+from finforce_contact.loop import ForceLoop
 from finforce_contact.mesh.object_mesh import ObjectMesh, load_object_mesh, to_manifold
 from finforce_contact.paper_contact import intersect
 from finforce_contact.parameters import ContactSettings

@@ -20,8 +20,7 @@ from tqdm import tqdm
 from finforce.camera import CameraIntrinsics, deproject
 from finforce.transforms import invert_pose, move_pose, rotation_between
 from finforce_contact.errors import PoseLostError
-from finforce_contact.pose.source import ObjectPose
-from finforce_contact.pose.tracker import PoseTracker
+from finforce_contact.pose.tracker import ObjectPose, PoseTracker
 from finforce_sim.objects import OBJECT_NAMES, build_object
 from finforce_sim.sensor import build_d405
 from lab.harness import Figures

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from finforce.messages import magnitude_stddev
 from finforce_contact.estimator import ContactEstimator
-from finforce_contact.jaw_contact import ForceLoop
+from finforce_contact.loop import ForceLoop
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
 from finforce_driver.grasp.session import hold_force
 from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus

@@ -132,7 +132,7 @@ def test_late_poses_are_carried_forward_by_the_jaws_own_motion(probe):
 def test_flips_of_an_object_that_looks_the_same_turned_do_no_harm(probe):
     course = Course(probe, Tracker(probe, flips=0.5), seconds=4.0)
     assert np.nanmax(course.error[course.seconds > 1.0]) < 1e-3
-    counts = course.node.session.jaws["left"].estimator.counts
+    counts = course.node.session.jaws["left"].loop.estimator.counts
     assert counts["odd pose"] <= 1  # of forty; half of them are turned
 
 

@@ -89,8 +89,6 @@ def test_object_deep_in_a_jaw_that_is_not_bent_is_no_contact(mode):
 
 
 SURFACES = {
-    "text": ("a", "an array of numbers"),
-    "ragged": ([[1, 2], [3]], "an array of numbers"),
     "millimetres": (1e3 * NODES, "in metres"),
     "zeros": (0.0 * NODES, "from its place at rest"),
     "order": (NODES[::-1], "order of the mesh"),
@@ -109,9 +107,7 @@ def test_surface_of_no_jaw_is_refused(name):
     assert serves(tested, FRAME)
 
 
-@pytest.mark.parametrize(
-    "wrench", [5.0, ("a", "b"), (np.zeros(3),), (np.zeros(2), np.zeros(3)), (np.full(3, np.nan),) * 2]
-)
+@pytest.mark.parametrize("wrench", [5.0, (np.zeros(3),), (np.zeros(2), np.zeros(2)), (np.full(3, np.nan),) * 2])
 def test_wrench_that_is_none_is_refused(wrench):
     tested = estimator()
     tested.take_pose(0.0, TOUCHING)
@@ -120,7 +116,7 @@ def test_wrench_that_is_none_is_refused(wrench):
     assert serves(tested, FRAME)
 
 
-@pytest.mark.parametrize("covariance", ["a", np.zeros((6, 6)), np.full((6, 6), np.nan), -np.eye(6), np.eye(3)])
+@pytest.mark.parametrize("covariance", [np.zeros((6, 6)), np.full((6, 6), np.nan), -np.eye(6), np.eye(3)])
 def test_covariance_that_is_none_is_refused(covariance):
     tested = estimator()
     with pytest.raises(PoseError, match="covariance"):
@@ -148,11 +144,11 @@ def test_reconstructed_mesh_that_the_mode_cannot_use_leaves_the_object_as_it_was
     session = ContactSession(parameters, ContactSettings(mode="paper"), TrackerSettings())
     session._set_object(cylinder())
     found = SimpleNamespace(mesh=opened(cylinder()), T_camera_object=np.eye(4), method="paper")
-    monkeypatch.setattr(session._camera, "view", lambda: SimpleNamespace(depth=None, mask=None, camera=None))
+    monkeypatch.setattr(session.camera, "view", lambda: SimpleNamespace(depth=None, mask=None, camera=None))
     monkeypatch.setattr(image_evidence, "collect_evidence", lambda *_: None)
     monkeypatch.setattr(reconstruction, "reconstruct", lambda *_: found)
     with pytest.raises(ObjectMeshError, match="watertight"):
         session.reconstruct(parameters)
     assert session.mesh.name == "cylinder"
-    tested = session.jaws["left"].estimator
+    tested = session.jaws["left"].loop.estimator
     assert serves(tested, 0.0)

@@ -83,7 +83,7 @@ class TrackingBench(ContactBench):
     def see(self, scene, *, masked):
         """Send one image, each part when the one before has come, the mask last; return its stamp."""
         depth, mask = scene
-        feed, stamp = self.node.session._camera, time_ns()
+        feed, stamp = self.node.session.camera, time_ns()
         self.info.publish(camera_info(stamp, self.camera))
         self.probe.wait_for(lambda: feed._camera is not None)
         self.depth.publish(depth_image(stamp, depth))
@@ -157,7 +157,7 @@ def test_reconstruct_finds_the_object_in_the_image(probe, camera, scene):
     answer = call(probe, "contact_estimator/reconstruct")
     assert not answer.success and "no depth image" in answer.message
     bench.see(scene, masked=True)
-    probe.wait_for(lambda: bench.node.session._camera._images.entries("masks"))
+    probe.wait_for(lambda: bench.node.session.camera._images.entries("masks"))
     answer = call(probe, "contact_estimator/reconstruct")
     assert answer.success and "primitive" in answer.message, answer.message
     size = np.sort(np.ptp(bench.node.session.mesh.vertices, axis=0))

@@ -369,11 +369,11 @@ class TestPoseFilter:
         filtered = PoseFilter(SETTINGS)
         for sample in range(20):
             filtered.update(0.1 * sample, pose(0.03, 0.04))
-        assert filtered.update(2.0, pose(0.05, 0.04)) == "aside"
+        assert filtered.update(2.0, pose(0.05, 0.04)) == "rejected"
         assert filtered.at(2.0).T[0, 3] == pytest.approx(0.03)
         assert filtered.update(2.1, pose(0.03, 0.04)) == "used"
         verdicts = [filtered.update(2.2 + 0.1 * k, pose(0.05, 0.04)) for k in range(3)]
-        assert verdicts == ["aside", "aside", "jump"]
+        assert verdicts == ["rejected", "rejected", "jump"]
         np.testing.assert_allclose(filtered.at(2.4).T[:3, 3], [0.05, 0.0, 0.04], atol=1e-12)
 
     def test_wild_poses_that_disagree_are_never_believed(self):
@@ -381,7 +381,7 @@ class TestPoseFilter:
         for sample in range(20):
             filtered.update(0.1 * sample, pose(0.03, 0.04))
         for sample in range(20, 29):
-            assert filtered.update(0.1 * sample, pose(0.1 + 0.1 * random.random(), 0.04)) == "aside"
+            assert filtered.update(0.1 * sample, pose(0.1 + 0.1 * random.random(), 0.04)) == "rejected"
         assert filtered.believed == pytest.approx(1.9)
 
     def test_noise_is_learnt(self):
@@ -459,5 +459,5 @@ class TestDemo:
         assert touching[: onset - 1].mean() < 0.1
 
     def test_every_image_is_counted_once(self, demo):
-        work = ("solved", "still", "no_object", "no_pose", "surrounded", "beside")
+        work = ("solved", "still", "no_object", "no_pose", "surrounded", "out_of_reach")
         assert sum(demo.estimator.counts[reason] for reason in work) == len(demo.estimates)

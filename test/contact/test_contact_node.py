@@ -153,7 +153,7 @@ def test_a_contact_that_comes_too_late_is_not_published(probe, monkeypatch):
     monkeypatch.setattr(jaw, "take_jaw_pose", slow)
     bench.image(cylinder_before_jaw())
     bench.diagnosis(level=Level.STALE, word="old")
-    assert jaw.last is not None and not bench.contacts
+    assert jaw.loop.last is not None and not bench.contacts
 
 
 def test_a_surface_of_another_mesh_is_named(probe):

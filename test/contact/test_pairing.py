@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from finforce_contact.estimator import blank_estimate
-from finforce_contact.jaw_contact import JawContact, PosePairing, turn_covariance
+from finforce_contact.estimator import ContactEstimate
 from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.filter import PoseFilter
+from finforce_contact.session import JawContact, PosePairing, turn_covariance
 
 MS = 1_000_000
 FRAME = 33 * MS
@@ -62,7 +62,7 @@ def test_when_object_poses_cease_one_image_waits_and_no_other():
         pairing.add_jaw(k * FRAME, np.eye(4))
         pairing.add_object(k * FRAME, np.eye(4))
     assert due(pairing.add_jaw(3 * FRAME, np.eye(4))) == []
-    assert pairing.is_waiting(3 * FRAME) and not pairing.is_waiting(2 * FRAME)
+    assert pairing.holds_back(3 * FRAME) and not pairing.holds_back(2 * FRAME)
     assert due(pairing.add_jaw(4 * FRAME, np.eye(4))) == [3 * FRAME, 4 * FRAME]
     assert due(pairing.add_jaw(5 * FRAME, np.eye(4))) == [5 * FRAME]
 
@@ -133,7 +133,7 @@ class FakeEstimator:
 
     def update(self, stamp, surface=None, wrench=None):
         self.updates.append((stamp, surface, wrench))
-        return blank_estimate(stamp, "apart", "")
+        return ContactEstimate(stamp=stamp, status="apart", message="")
 
 
 @pytest.fixture
@@ -144,10 +144,10 @@ def jaw():
 def test_surface_and_wrench_are_used_while_they_are_fresh(jaw):
     surface, wrench = np.zeros((4, 3)), (np.ones(3), np.zeros(3))
     jaw.take_surface(0, surface)
-    jaw.take_wrench(0, wrench)
+    jaw.loop.take_wrench(0, wrench)
     jaw.take_jaw_pose(200 * MS, np.eye(4))
     jaw.take_jaw_pose(201 * MS, np.eye(4))
-    (_, first, pulled), (_, later, none) = jaw.estimator.updates
+    (_, first, pulled), (_, later, none) = jaw.loop.estimator.updates
     assert first is surface and pulled is wrench
     assert later is None and none is None
 
@@ -159,7 +159,7 @@ def test_the_object_stays_where_it_is_while_the_jaw_closes(jaw):
         if number % 3 == 0:
             jaw.take_object_pose(number * FRAME, moved(0.03, 0.0, 0.24))
         jaw.take_jaw_pose(number * FRAME, T_camera_jaw)
-        known = T_camera_jaw @ jaw.estimator.filter.at(1e-9 * number * FRAME).T
+        known = T_camera_jaw @ jaw.loop.estimator.filter.at(1e-9 * number * FRAME).T
         np.testing.assert_allclose(known[:3, 3], [0.03, 0.0, 0.24], atol=1e-9)
 
 
@@ -167,20 +167,20 @@ def test_a_pose_that_comes_late_is_taken_as_the_jaw_is_now(jaw):
     jaw.take_jaw_pose(0, moved(0.0, 0.0, 0.2))
     jaw.take_jaw_pose(FRAME, moved(5e-3, 0.0, 0.2))
     jaw.take_object_pose(0, moved(0.03, 0.0, 0.24))
-    np.testing.assert_allclose(jaw.estimator.filter.at(1e-9 * FRAME).T[:3, 3], [0.025, 0.0, 0.04], atol=1e-9)
+    np.testing.assert_allclose(jaw.loop.estimator.filter.at(1e-9 * FRAME).T[:3, 3], [0.025, 0.0, 0.04], atol=1e-9)
 
 
 def test_what_a_jaw_at_rest_is_seen_to_tremble_moves_nothing(jaw):
     jaw.take_object_pose(0, moved(0.03, 0.0, 0.24))
     jaw.take_jaw_pose(0, moved(0.0, 0.0, 0.2))
     jaw.take_jaw_pose(FRAME, moved(0.1e-3, 0.0, 0.2))
-    np.testing.assert_array_equal(jaw.estimator.filter.at(1e-9 * FRAME).T, moved(0.03, 0.0, 0.24 - 0.2))
+    np.testing.assert_array_equal(jaw.loop.estimator.filter.at(1e-9 * FRAME).T, moved(0.03, 0.0, 0.24 - 0.2))
 
 
 def test_the_camera_stands_where_the_jaw_sees_it(jaw):
     jaw.take_jaw_pose(0, moved(0.0, 0.0, 0.2))
     jaw.take_object_pose(0, moved(0.0, 0.0, 0.23))
-    ((stamp, T_jaw_object, covariance, camera),) = jaw.estimator.poses
+    ((stamp, T_jaw_object, covariance, camera),) = jaw.loop.estimator.poses
     np.testing.assert_allclose(camera, [0.0, 0.0, -0.2])
     np.testing.assert_allclose(T_jaw_object, moved(0.0, 0.0, 0.03))
     assert stamp == 0.0 and covariance is None
@@ -202,13 +202,13 @@ def test_an_image_that_waits_for_its_pose_is_not_answered_by_its_surface(jaw):
     jaw.take_jaw_pose(3 * FRAME, np.eye(4))
     assert jaw.take_surface(3 * FRAME, np.zeros((4, 3))) == []
     (answer,) = jaw.take_object_pose(3 * FRAME, np.eye(4))
-    assert answer.stamp == 3 * FRAME and jaw.estimator.updates[-1][1] is not None
+    assert answer.stamp == 3 * FRAME and jaw.loop.estimator.updates[-1][1] is not None
 
 
 def test_the_age_of_the_pose_is_that_at_the_last_answer(jaw):
-    assert np.isnan(jaw.pose_age())
+    assert np.isnan(jaw.loop.pose_age())
     jaw.take_object_pose(0, np.eye(4))
     jaw.take_jaw_pose(0, np.eye(4))
     jaw.take_jaw_pose(100 * MS, np.eye(4))
     jaw.take_jaw_pose(200 * MS, np.eye(4))
-    assert jaw.pose_age() == pytest.approx(0.2)
+    assert jaw.loop.pose_age() == pytest.approx(0.2)

@@ -6,7 +6,7 @@ import pytest
 from finforce.gripper_frames import jaw_in_gripper
 from finforce.transforms import invert_pose
 from finforce_contact.estimator import ContactEstimator
-from finforce_contact.jaw_contact import ForceLoop
+from finforce_contact.loop import ForceLoop
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.jaw.calibration import load_calibration
 from finforce_ifea.observation import Observation

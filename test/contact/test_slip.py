@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from finforce_contact.localization.slip import SlipWatch, TouchedFace, face_at
+from finforce_contact.localization.touch import SlipWatch, TouchedFace, face_at
 from finforce_contact.parameters import ContactSettings
 
 SETTINGS = ContactSettings()

@@ -120,7 +120,7 @@ class TestContactEstimator:
         assert len(bench.contacts) < 1.5 * TENTHS
         assert int(counted(bench.node, IDLE)) > 1.5 * TENTHS
         # its poses are used, though they belong to images that were passed over
-        assert bench.node.session.jaws["left"].pose_age() < 0.15
+        assert bench.node.session.jaws["left"].loop.pose_age() < 0.15
 
     def test_without_the_rules_every_image_has_its_contact(self, probe):
         bench, first = self.start(probe, skip_off=[ALL])
@@ -135,7 +135,7 @@ class TestContactEstimator:
             self.image(bench, NEAR_GAP, now + TENTH * k // 3)
         bench.probe.spin(0.05)
         assert len(bench.contacts) - known >= 3
-        assert not bench.node.session.jaws["left"].is_out_of_reach
+        assert not bench.node.session.jaws["left"].loop.is_out_of_reach
 
     def find_place(self, off):
         """The height [m] at which an object touches that came from afar."""
@@ -145,7 +145,7 @@ class TestContactEstimator:
             for k in range(15):
                 self.image(bench, NEAR_GAP, now + TENTH * k // 3)
             bench.probe.spin(0.05)
-            found = bench.node.session.jaws["left"].last.estimate
+            found = bench.node.session.jaws["left"].loop.last.estimate
         return float(np.average(found.points[:, 2], weights=found.weights))
 
     def test_the_place_is_the_same_with_the_rules_and_without(self):

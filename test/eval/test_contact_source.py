@@ -7,7 +7,7 @@ import pytest
 from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, make_recording
 
 from finforce.errors import PoseError
-from finforce_contact.jaw_contact import ForceLoop
+from finforce_contact.loop import ForceLoop
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.contact_source import RecordedContact
 from finforce_eval.evaluation.evaluate import evaluate_recording

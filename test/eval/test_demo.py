@@ -10,7 +10,7 @@ import pytest
 from eval_fakes import FakeEstimator, FakeJaw
 from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 
-from finforce_contact.jaw_contact import GivenContact
+from finforce_contact.loop import GivenContact
 from finforce_eval.cli import demo
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError

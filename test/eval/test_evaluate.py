@@ -7,7 +7,7 @@ import pytest
 from eval_fakes import PERIOD, START, FakeContactEstimator, FakeEstimator, FakeJaw, make_recording
 
 from finforce.errors import FinforceError, ObservationError
-from finforce_contact.jaw_contact import GivenContact
+from finforce_contact.loop import GivenContact
 from finforce_eval.errors import OptionError, RecordingError
 from finforce_eval.evaluation.contact_source import RecordedContact, parse_contacts
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from eval_fakes import FakeEstimator, FakeJaw, make_recording
 
-from finforce_contact.jaw_contact import GivenContact
+from finforce_contact.loop import GivenContact
 from finforce_eval.cli.main import main
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results, true_range

@@ -8,7 +8,7 @@ import pytest
 from eval_fakes import FakeEstimator, FakeJaw, make_recording
 from rgbd_fakes import CAMERA, FakeDetector, FakeGripper, make_footage
 
-from finforce_contact.jaw_contact import GivenContact
+from finforce_contact.loop import GivenContact
 from finforce_eval.cli.twin import write_footage
 from finforce_eval.errors import RecordingError
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results

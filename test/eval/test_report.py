@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from eval_fakes import BOX, BOX_TRIANGLES, FakeEstimator, FakeJaw, drawn_hues, make_recording
 
-from finforce_contact.jaw_contact import GivenContact
+from finforce_contact.loop import GivenContact
 from finforce_eval.evaluation.evaluate import evaluate_recording, score_results
 from finforce_eval.figures.report import write_report
 

@@ -8,7 +8,7 @@ from eval_fakes import FakeEstimator, FakeJaw
 from PIL import Image
 from rgbd_fakes import FakeDetector, FakeGripper, make_footage
 
-from finforce_contact.jaw_contact import GivenContact
+from finforce_contact.loop import GivenContact
 from finforce_eval.cli import twin as twin_commands
 from finforce_eval.cli.main import main
 from finforce_eval.cli.twin import write_footage
