@@ -13,7 +13,7 @@ FACE = TouchedFace(point=np.array([0.012, 0.0, 0.040]), tangent=np.array([0.0, 0
 def watch(way, rate=30.0, noise=0.15e-3, seed=0, face=lambda t: FACE):
     """What a watch says of an object that has moved by way(t) (3,) [m], seen with noise [m] at a rate [Hz]."""
     random, eyes, said = np.random.default_rng(seed), SlipWatch(SETTINGS), []
-    eyes.place(0.040)
+    eyes.follow(0.040)
     for number in range(int(6.0 * rate)):
         t, T = number / rate, np.eye(4)
         T[:3, 3] = np.array([0.03, 0.0, 0.04]) + way(t) + noise * random.standard_normal(3)
@@ -73,7 +73,7 @@ def test_an_object_that_came_to_rest_slides_no_more():
 
 def test_gaps_and_release_begin_anew():
     eyes, T = SlipWatch(SETTINGS), np.eye(4)
-    eyes.place(0.04)
+    eyes.follow(0.04)
     for stamp in (0.0, 0.03, 0.06):
         eyes.update(stamp, T, FACE)
     T[2, 3] = 0.01
@@ -92,14 +92,14 @@ def test_the_face_is_found_at_its_material_height():
 
 def test_contact_follows_its_height_until_it_has_gone_elsewhere():
     eyes = SlipWatch(SETTINGS)
-    assert eyes.place(0.040) == 0.040
-    assert eyes.place(0.044) == 0.040
-    assert eyes.place(0.050) == 0.050
+    assert eyes.follow(0.040) == 0.040
+    assert eyes.follow(0.044) == 0.040
+    assert eyes.follow(0.050) == 0.050
 
 
 def test_odd_poses_count_unless_they_are_far_away():
     eyes, T = SlipWatch(SETTINGS), np.eye(4)
-    eyes.place(0.040)
+    eyes.follow(0.040)
     for number in range(60):
         T[:3, 3] = [0.03, 0.0, 0.04 + 1e-5 * (number % 3)]
         eyes.update(number / 30.0, T.copy(), FACE)
