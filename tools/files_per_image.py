@@ -40,7 +40,7 @@ def count_files(bag: Path) -> dict[str, list[set[str]]]:
     def watch(frame, event, _):
         if event == "call":
             owner = frame.f_locals.get("self")
-            running.append(owner.get_name() if owner in nodes else running[-1])
+            running.append(owner.get_name() if isinstance(owner, Node) else running[-1])
             if running[-1] and frame.f_code.co_filename.startswith(f"{ROOT}finforce"):
                 images[running[-1]][-1].add(frame.f_code.co_filename.removeprefix(ROOT))
         elif event == "return" and len(running) > 1:
