@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from finforce.transforms import rotation_between
-from finforce_contact.errors import ContactError
 from finforce_contact.estimator import ContactEstimator
 from finforce_contact.parameters import ContactSettings
 from finforce_contact.pose.symmetry import find_symmetries, read_symmetry
+from finforce_ifea.errors import ContactError
 from finforce_ifea.jaw.jaw import load_jaw
 from finforce_sim.objects import build_object
 
