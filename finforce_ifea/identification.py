@@ -255,9 +255,8 @@ class _Fit:
         elastic, model = self._elastic_forces(x), np.exp(x[0]) * forces
         errors = np.concatenate([target - value for target, value in zip(elastic, model, strict=True)])
         relative = np.concatenate([target / value - 1.0 for target, value in zip(elastic, model, strict=True)])
-        calibration = replace(
-            self.calibration(x), force_error=float(np.clip(np.sqrt(np.mean(relative**2)), 0.005, 0.5))
-        )
+        error = float(np.clip(np.sqrt(np.mean(relative**2)), 0.005, 0.5))
+        calibration = self.calibration(x).changed(force_error=error)
         scale = np.ones(len(_NAMES))
         scale[[0, 4, 6, 8]] = calibration.young_modulus, 1e-3, np.exp(x[6]), np.exp(x[8])
         return CalibrationFit(
