@@ -50,7 +50,7 @@ def measure(quick: bool) -> Figures:
     for setting, off in SETTINGS.items():
         more = {"max_age": MAX_AGE, "skip_off": list(off)}
         nodes = chain_processes(recording, images=True, composed=False)
-        meter = SceneMeter(spans)
+        meter = SceneMeter(spans=spans)
         own = [replace(node, parameters={**node.parameters, **more}) for node in nodes]
         run = run_nodes(own, stream, SIDES, heard=(), watch=meter.note)
         loads.append(run.others)
