@@ -16,14 +16,14 @@ import logging
 import secrets
 from collections.abc import Callable
 from threading import Condition, Event, RLock, Thread
+from time import monotonic
 
 from finforce.errors import FinforceError
 from finforce_driver.can.protocol import Bus
-from finforce_driver.clock import Clock, MonotonicClock
 from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, LinkError
-from finforce_driver.machine.exchange import Request
+from finforce_driver.machine.drive import Request
 from finforce_driver.machine.machine import GripperMachine
-from finforce_driver.settings import GripperScale, GripperSettings
+from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 
 LOG = logging.getLogger(__name__)
@@ -34,10 +34,90 @@ LEAVING_TURNS = 20  # that the last order may take
 Listener = Callable[[GripperState], None]
 StateCondition = Callable[[GripperState], bool]
 JOIN_TIMEOUT = 2.0  # [s], for a cycle under way: the longest wait for a reply is 1 s
-LOST = (Phase.DISCONNECTED, Phase.PROBING, Phase.FAULT, Phase.UNCALIBRATED)
+LIMP = (Phase.DISCONNECTED, Phase.PROBING, Phase.FAULT, Phase.UNCALIBRATED)  # or not known
 
 
-class Gripper:
+class Clock:
+    """The clock of the machine; a test steps one of its own."""
+
+    def now(self) -> float:
+        """Return the time since some moment [s]; it never goes back."""
+        return monotonic()
+
+    def wait(self, seconds: float, wake: Event) -> None:
+        """Return after `seconds` [s], or as soon as `wake` is set."""
+        if seconds > 0.0:
+            wake.wait(seconds)
+
+
+class StateSource:
+    """What has a state that others listen to and wait for.
+
+    Attributes:
+        state: the present one; reading it never blocks.
+        clock: what it lives by.
+    """
+
+    state: GripperState
+
+    def __init__(self, clock: Clock | None) -> None:
+        self.clock = clock or Clock()
+        self._listeners: list[Listener] = []
+        self._told: GripperState | None = None
+        self._changed, self._ended = Condition(), Event()
+
+    def listen(self, callback: Listener) -> Callable[[], None]:
+        """Have a function called with the state after every believed reply and every change of phase.
+
+        It is called in the thread that changes the state and has to return at once.
+
+        Returns:
+            What ends it.
+        """
+        self._listeners.append(callback)
+        return lambda: self._listeners.remove(callback) if callback in self._listeners else None
+
+    def wait(self, condition: StateCondition, timeout: float) -> GripperState:
+        """Return the first state that fulfils a condition.
+
+        Raises:
+            GripperTimeoutError: none did within `timeout` [s].
+            GripperStateError: the gripper was closed meanwhile.
+        """
+        deadline = self.clock.now() + timeout
+        while not condition(state := self.state):
+            if self._ended.is_set():
+                raise GripperStateError("wait: the driver of the gripper has ended; start it again")
+            left = deadline - self.clock.now()
+            if left <= 0.0:
+                raise GripperTimeoutError(
+                    f"not within {timeout:g} s: the gripper is {state.phase.value}: {state.message}"
+                )
+            self._pass_time(condition, left)
+        return state
+
+    def _pass_time(self, condition: StateCondition, left: float) -> None:
+        """Wait for another state, a tenth of a second at most."""
+        with self._changed:
+            if not condition(self.state):
+                self._changed.wait(min(left, 0.1))
+
+    def _tell(self) -> None:
+        """Tell waiters and listeners the state if it is new."""
+        state = self.state
+        if state is self._told:
+            return
+        self._told = state
+        with self._changed:
+            self._changed.notify_all()
+        for listener in list(self._listeners):
+            try:
+                listener(state)
+            except Exception:  # somebody else's error must not stop the gripper's driver
+                LOG.exception("a listener to the gripper failed")
+
+
+class Gripper(StateSource):
     """An SSG-48 behind a bus: one request at a time, and the bus opened again and again.
 
     Whatever is sent is chosen and sent under one lock, so that after an emergency stop, which takes it too, no message
@@ -50,17 +130,14 @@ class Gripper:
     """
 
     def __init__(self, bus: Bus, settings: GripperSettings | None = None, clock: Clock | None = None) -> None:
+        super().__init__(clock)
         self.settings = settings or GripperSettings()
-        self.clock = clock or MonotonicClock()
-        self.scale = GripperScale(self.settings)
         # a gripper that an earlier program left must not take our first command for its last one
         self._machine = GripperMachine(self.settings, salt=secrets.randbelow(16))
         self._bus = bus
         self._lock = RLock()
-        self._wake, self._stop, self._changed = Event(), Event(), Condition()
+        self._wake = Event()
         self._thread: Thread | None = None
-        self._listeners: list[Listener] = [self._tell_waiters]
-        self._told: GripperState | None = None
         self._opened = False
         self._pause, self._next_open = FIRST_PAUSE, self.clock.now()
 
@@ -81,19 +158,19 @@ class Gripper:
     @property
     def resolution(self) -> float:
         """Opening per count of the gripper [m]."""
-        return self.scale.resolution
+        return self.settings.resolution
 
     def start(self) -> None:
         """Run in a thread of its own from now on; nothing moves by that."""
         if self._thread is None:
-            self._stop.clear()
+            self._ended.clear()
             self._thread = Thread(target=self._run, name="gripper", daemon=True)
             self._thread.start()
 
     def close(self) -> None:
         """End the thread and close the port; the gripper holds in place, or lets go with `release_on_stop`."""
         thread, self._thread = self._thread, None
-        self._stop.set()
+        self._ended.set()
         self._wake.set()
         if thread is not None:
             thread.join(JOIN_TIMEOUT)
@@ -126,17 +203,6 @@ class Gripper:
             self._lose(f"unexpected error, please report it: {type(error).__name__}: {error}")
         self._tell()
 
-    def listen(self, callback: Listener) -> Callable[[], None]:
-        """Have a function called with the state after every believed reply and every change of phase.
-
-        It is called in the loop's thread and has to return at once.
-
-        Returns:
-            What ends it.
-        """
-        self._listeners.append(callback)
-        return lambda: self._listeners.remove(callback) if callback in self._listeners else None
-
     def opening_at(self, time: float) -> float:
         """Return the opening [m] at a time of the last 5 s [s]; NaN where it is not known."""
         with self._lock:
@@ -158,16 +224,16 @@ class Gripper:
             GripperStateError: the gripper could not move: absent, faulty, not calibrated, calibrating, switched off.
         """
         if current is not None:
-            force = self.scale.force_for(current, force)
+            force = self.settings.force_for(current, force)
         self._command(lambda machine, now: machine.move(opening, speed, force, now))
 
     def check_move(self, opening: float, speed: float | None = None, force: float | None = None) -> None:
-        """Refuse what `move` would refuse in whatever state.
+        """Reject what `move` would reject in whatever state.
 
         Raises:
             TargetError: a value is no number or out of bounds.
         """
-        self._command(lambda machine, _: machine.check_move(opening, speed, force))
+        self._machine.make_goal(opening, speed, force)
 
     def hold(self) -> None:
         """Stop in place and hold there; during a calibration: stop, limp.
@@ -200,6 +266,7 @@ class Gripper:
         """
         with self._lock:
             messages = self._machine.estop(self.clock.now())
+            self._machine.refresh()
             if self._opened:
                 try:
                     for message in messages:
@@ -223,25 +290,6 @@ class Gripper:
             GripperStateError: the gripper is absent, faulty or calibrating.
         """
         self._command(lambda machine, now: machine.release_power(now))
-
-    def wait(self, condition: StateCondition, timeout: float) -> GripperState:
-        """Return the first state that fulfils a condition.
-
-        Raises:
-            GripperTimeoutError: none did within `timeout` [s].
-            GripperStateError: the gripper was closed meanwhile.
-        """
-        deadline = self.clock.now() + timeout
-        while not condition(state := self.state):
-            if self._stop.is_set():
-                raise GripperStateError("wait: the driver of the gripper has ended; start it again")
-            left = deadline - self.clock.now()
-            if left <= 0.0:
-                raise GripperTimeoutError(
-                    f"not within {timeout:g} s: the gripper is {state.phase.value}: {state.message}"
-                )
-            self._pass_time(condition, left)
-        return state
 
     def grasp_without_vision(
         self,
@@ -273,7 +321,7 @@ class Gripper:
         except GripperTimeoutError:
             self.hold()
             raise
-        if state.phase in LOST:
+        if state.phase in LIMP:
             raise GripperStateError(f"the grasp was lost: {state.message}")
         if state.outcome is not MoveOutcome.GRASPED:
             self.hold()
@@ -284,25 +332,19 @@ class Gripper:
         """Let the gripper get on, by a turn of our own where no thread makes them."""
         if self._thread is None:
             self.turn(left)
-            return
-        with self._changed:
-            if not condition(self.state):
-                self._changed.wait(min(left, 0.1))
-
-    def _tell_waiters(self, _: GripperState) -> None:
-        """Wake those who wait for a state."""
-        with self._changed:
-            self._changed.notify_all()
+        else:
+            super()._pass_time(condition, left)
 
     def _command(self, action: Callable[[GripperMachine, float], None]) -> None:
         """Give the machine a command and wake the thread."""
         with self._lock:
             action(self._machine, self.clock.now())
+            self._machine.refresh()
         self._wake.set()
 
     def _run(self) -> None:
         """Make turns until the gripper is closed."""
-        while not self._stop.is_set():
+        while not self._ended.is_set():
             self.turn()
 
     def _open(self, longest: float) -> None:
@@ -367,15 +409,3 @@ class Gripper:
             self._opened = False
             self._machine.on_link_lost(reason)
         self._bus.close()
-
-    def _tell(self) -> None:
-        """Call the listeners if the state is new."""
-        state = self._machine.state
-        if state is self._told:
-            return
-        self._told = state
-        for listener in list(self._listeners):
-            try:
-                listener(state)
-            except Exception:  # somebody else's error must not stop the gripper's driver
-                LOG.exception("a listener to the gripper failed")

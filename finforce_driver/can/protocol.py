@@ -1,16 +1,17 @@
 """Classic CAN messages, what carries them, and the gripper's own to the bit: commands out, replies in.
 
-Multi-byte values are big-endian, flags are counted from the highest bit.
+Identifiers are (node << 7) | (command << 1) | error. Multi-byte values are big-endian.
 """
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 from typing import Protocol
 
-from finforce_driver.errors import CanMessageError
+from finforce_driver.errors import TargetError
 
 LARGEST_ID = 0x7FF  # 11 bits; the gripper misreads longer ones
 LARGEST_DATA = 8
@@ -30,18 +31,15 @@ class CanMessage:
     data: bytes = b""
     remote: bool = False
 
-    def __post_init__(self) -> None:
-        """Refuse what no bus carries.
+    @property
+    def node(self) -> int:
+        """Node of the gripper, 0 to 15."""
+        return self.id >> 7 & 0xF
 
-        Raises:
-            CanMessageError: identifier or length is out of range, or a remote message has data.
-        """
-        if not 0 <= self.id <= LARGEST_ID:
-            raise CanMessageError(f"CAN identifier {self.id:#x}: expected 0 to {LARGEST_ID:#x}, 11 bits")
-        if len(self.data) > LARGEST_DATA:
-            raise CanMessageError(f"CAN message with {len(self.data)} bytes: expected at most {LARGEST_DATA}")
-        if self.remote and self.data:
-            raise CanMessageError(f"remote CAN message with {len(self.data)} bytes: expected none")
+    @property
+    def command(self) -> int:
+        """Command of the gripper, 0 to 63."""
+        return self.id >> 1 & 0x3F
 
 
 class Bus(Protocol):
@@ -73,7 +71,7 @@ class Bus(Protocol):
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What happened since the bus was made, by name: messages, lines that were no messages, refusals (BELL)."""
+        """Events since the bus was made, by name: messages, lines that were no messages, refusals (BELL)."""
 
     @property
     def suspicion(self) -> str:
@@ -94,18 +92,14 @@ class Command(IntEnum):
     CLEAR = 1
     HEARTBEAT = 9
     PING = 10
-    SET_NODE = 11
     IDLE = 12
-    SAVE = 13
     RESET = 14
     WATCHDOG = 15
     TEMPERATURE = 23
     SUPPLY = 24
-    INFO = 25
     ERRORS = 26
     CURRENT = 27
     ENCODER = 28
-    HEARTBEAT_PERIOD = 30
     REPLY = 60
     MOVE = 61
     CALIBRATE = 62
@@ -121,15 +115,7 @@ class Flag(IntFlag):
 
 
 FREE_FLAGS = 0x0F  # without meaning, but a message that differs in them is a new command
-
-
-@dataclass(frozen=True, kw_only=True)
-class Address:
-    """The three parts of an identifier: node 0 to 15, command 0 to 63, and whether the sender is in error."""
-
-    node: int
-    command: int
-    error: bool
+_MOVE, _REPLY = struct.Struct(">BBhB"), struct.Struct(">BhB")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,10 +135,10 @@ class Move:
     flags: int
 
     def __post_init__(self) -> None:
-        """Refuse what the gripper would misread: it checks nothing itself.
+        """Reject what the gripper would misread: it checks nothing itself.
 
         Raises:
-            CanMessageError: a value is out of range.
+            TargetError: a value is out of range.
         """
         for name, low, high in (
             ("position", 0, LARGEST_BYTE),
@@ -161,7 +147,7 @@ class Move:
             ("flags", 0, LARGEST_BYTE),
         ):
             if not low <= getattr(self, name) <= high:
-                raise CanMessageError(f"{name} of a move is {getattr(self, name)}; expected {low} to {high}")
+                raise TargetError(f"{name} of a move: got {getattr(self, name)}, expected {low} to {high}")
 
     @property
     def drives(self) -> bool:
@@ -174,6 +160,7 @@ class Reply:
     """The content of a reply 60.
 
     Attributes:
+        time: when it came [s].
         position: 0 open to 255 closed, truncated; without meaning while not calibrated.
         current_mA: of the motor [mA], negative when it drives closed.
         activated: echo of the last 5-byte command.
@@ -186,6 +173,7 @@ class Reply:
         error: any fault is latched.
     """
 
+    time: float
     position: int
     current_mA: int
     activated: bool
@@ -203,6 +191,11 @@ class Reply:
         return self.error, self.overheated, self.watchdog, self.estopped
 
     @property
+    def driving(self) -> bool:
+        """Whether the power stage moves or holds the jaws."""
+        return self.activated and self.action and not self.error
+
+    @property
     def contact(self) -> bool:
         """Whether the motor pushes without getting on."""
         return self.code in CONTACT
@@ -211,14 +204,6 @@ class Reply:
     def at_target(self) -> bool:
         """Whether the gripper takes itself to be where it was sent."""
         return self.code == AT_TARGET
-
-
-@dataclass(frozen=True, kw_only=True)
-class ErrorReport:
-    """The answer to command 26: names of the latched faults, and whether the motor was ever calibrated."""
-
-    faults: tuple[str, ...]
-    motor_calibrated: bool
 
 
 # bit of byte 0 of the error state; 0x80 says only that there is a fault
@@ -234,38 +219,17 @@ FAULT_BITS = (
 MOTOR_CALIBRATED, WATCHDOG = 0x80, 0x20  # of byte 1
 
 
-def identifier(node: int, command: int, error: bool = False) -> int:
-    """Return the identifier (node << 7) | (command << 1) | error.
+def encode(node: int, command: int, data: bytes = b"", *, remote: bool = False) -> CanMessage:
+    """Return a message of the host to a gripper; a remote one asks for a value, which comes with the same command.
 
-    Raises:
-        CanMessageError: the node is not 0 to 15 or the command not 0 to 63.
+    An empty command 61 changes nothing and is always answered; no other command with or without data is.
     """
-    if not 0 <= node <= LARGEST_NODE:
-        raise CanMessageError(f"CAN node {node}: expected 0 to {LARGEST_NODE}")
-    if not 0 <= command <= 63:
-        raise CanMessageError(f"command {command}: expected 0 to 63")
-    return node << 7 | int(command) << 1 | int(error)
-
-
-def split_identifier(id: int) -> Address:
-    """Return the parts of an identifier."""
-    return Address(node=id >> 7 & 0xF, command=id >> 1 & 0x3F, error=bool(id & 1))
-
-
-def encode_poll(node: int) -> CanMessage:
-    """Return the empty command 61, which changes nothing and is always answered."""
-    return CanMessage(id=identifier(node, Command.MOVE))
+    return CanMessage(id=node << 7 | command << 1, data=data, remote=remote)
 
 
 def encode_move(node: int, move: Move) -> CanMessage:
     """Return a 5-byte command 61."""
-    current = move.current_mA.to_bytes(2, "big")
-    return CanMessage(id=identifier(node, Command.MOVE), data=bytes((move.position, move.speed, *current, move.flags)))
-
-
-def encode_command(node: int, command: Command) -> CanMessage:
-    """Return a command without content; none of them is answered."""
-    return CanMessage(id=identifier(node, command))
+    return encode(node, Command.MOVE, _MOVE.pack(move.position, move.speed, move.current_mA, move.flags))
 
 
 def encode_watchdog(node: int, seconds: float) -> list[CanMessage]:
@@ -273,36 +237,27 @@ def encode_watchdog(node: int, seconds: float) -> list[CanMessage]:
 
     Each takes the form that it knows and ignores the other one; neither is answered.
     """
-    data = round(1e3 * seconds).to_bytes(4, "big", signed=True)
-    return [CanMessage(id=identifier(node, Command.WATCHDOG), data=form) for form in (data + b"\x00", data)]
-
-
-def encode_request(node: int, command: Command) -> CanMessage:
-    """Return the remote message that asks for a value; the answer has the same command."""
-    return CanMessage(id=identifier(node, command), remote=True)
+    data = struct.pack(">i", round(1e3 * seconds))
+    return [encode(node, Command.WATCHDOG, form) for form in (data + b"\x00", data)]
 
 
 def decode_move(message: CanMessage) -> Move:
     """Return the content of a 5-byte command 61, of whichever master.
 
     Raises:
-        CanMessageError: it is no such message, or a value is out of range.
+        TargetError: a value is out of range.
     """
-    data = _content(message, Command.MOVE, 5)
-    return Move(position=data[0], speed=data[1], current_mA=_signed(data[2:4]), flags=data[4])
+    position, speed, current, flags = _MOVE.unpack(message.data)
+    return Move(position=position, speed=speed, current_mA=current, flags=flags)
 
 
-def decode_reply(message: CanMessage) -> Reply:
-    """Return the content of a reply 60.
-
-    Raises:
-        CanMessageError: it is none.
-    """
-    data = _content(message, Command.REPLY, 4)
-    status = data[3]
+def decode_reply(message: CanMessage, time: float) -> Reply:
+    """Return the content of a reply 60 that came at a time [s]."""
+    position, current, status = _REPLY.unpack(message.data)
     return Reply(
-        position=data[0],
-        current_mA=_signed(data[1:3]),
+        time=time,
+        position=position,
+        current_mA=current,
         activated=bool(status & 0x80),
         action=bool(status & 0x40),
         code=status >> 5 & 1 | (status >> 4 & 1) << 1,  # low bit first on the wire
@@ -310,61 +265,28 @@ def decode_reply(message: CanMessage) -> Reply:
         watchdog=bool(status & 0x04),
         estopped=bool(status & 0x02),
         calibrated=bool(status & 0x01),
-        error=split_identifier(message.id).error,
+        error=bool(message.id & 1),
     )
 
 
 def decode_temperature(message: CanMessage) -> float:
-    """Return the temperature of the motor [deg C].
-
-    Raises:
-        CanMessageError: it is no answer to command 23.
-    """
-    return float(_signed(_content(message, Command.TEMPERATURE, 2)))
+    """Return the temperature of the motor [deg C] in an answer to command 23."""
+    return float(struct.unpack(">h", message.data)[0])
 
 
 def decode_supply(message: CanMessage) -> float:
-    """Return the voltage of the supply [V].
-
-    Raises:
-        CanMessageError: it is no answer to command 24.
-    """
-    return 1e-3 * int.from_bytes(_content(message, Command.SUPPLY, 2), "big")
+    """Return the voltage of the supply [V] in an answer to command 24."""
+    return 1e-3 * struct.unpack(">H", message.data)[0]
 
 
 def decode_encoder(message: CanMessage) -> int:
-    """Return the count of the motor's encoder [ticks], of all its turns since the start; 16384 are a turn.
-
-    Raises:
-        CanMessageError: it is no answer to command 28.
-    """
-    return _signed(_content(message, Command.ENCODER, 8)[:4])
+    """Return the count of the motor's encoder [ticks], 16384 a turn, in an answer to command 28."""
+    return struct.unpack_from(">i", message.data)[0]
 
 
-def decode_errors(message: CanMessage) -> ErrorReport:
-    """Return what is latched; no name beside a fault means the E-stop of a command 61.
-
-    Raises:
-        CanMessageError: it is no answer to command 26.
-    """
-    first, second = _content(message, Command.ERRORS, 2)
+def decode_errors(message: CanMessage) -> tuple[str, ...]:
+    """Return the names of the faults in an answer to command 26; none of a fault is the E-stop of a command 61."""
+    first, second = message.data
     names = [name for bit, name in FAULT_BITS if first & bit]
-    if second & WATCHDOG:
-        names.append("watchdog")
-    if not second & MOTOR_CALIBRATED:
-        names.append("motor not calibrated")
-    return ErrorReport(faults=tuple(names), motor_calibrated=bool(second & MOTOR_CALIBRATED))
-
-
-def _content(message: CanMessage, command: Command, length: int) -> bytes:
-    """Return the data of a message that has to be of a command and of a length."""
-    got = split_identifier(message.id).command
-    if got != command or message.remote or len(message.data) != length:
-        kind = "remote message" if message.remote else f"message of {len(message.data)} bytes"
-        raise CanMessageError(f"{kind} of command {got}: expected {length} bytes of command {command:d}")
-    return message.data
-
-
-def _signed(data: bytes) -> int:
-    """Return a signed number."""
-    return int.from_bytes(data, "big", signed=True)
+    names += ["watchdog"] * bool(second & WATCHDOG) + ["motor not calibrated"] * (not second & MOTOR_CALIBRATED)
+    return tuple(names)

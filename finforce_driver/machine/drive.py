@@ -1,23 +1,154 @@
-"""What the driver knows of one gripper and wants of it; requests are chosen from it, and the state is read from it."""
+"""What the driver knows of one gripper and wants of it, and the request that follows: the most urgent one first."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter, deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 
-from finforce_driver.can.protocol import CanMessage, Flag, Move
-from finforce_driver.machine.exchange import Exchange
+from finforce_driver.can.protocol import (
+    LARGEST_NODE,
+    CanMessage,
+    Command,
+    Flag,
+    Move,
+    encode,
+    encode_move,
+    encode_watchdog,
+)
 from finforce_driver.machine.knowledge import Knowledge
 from finforce_driver.machine.move import CLEAR_CURRENT, CONTACT_TIME, GRACE, Arrival, MoveJob, Orders, push_direction
-from finforce_driver.machine.procedures import CalibrationRun, EmergencyStop, Recovery, StopStage
-from finforce_driver.settings import SLOWEST_BYTE, GripperScale, GripperSettings
+from finforce_driver.machine.procedures import CalibrationRun, EmergencyStop, Recovery, Step, StopStage
+from finforce_driver.settings import SLOWEST_BYTE, GripperSettings
 from finforce_driver.state import HALF_CALIBRATED, STOP_PENDING, GripperState, MoveOutcome, Phase, describe
+
+LENGTHS = {
+    Command.REPLY: 4,
+    Command.PING: 0,
+    Command.TEMPERATURE: 2,
+    Command.SUPPLY: 2,
+    Command.ERRORS: 2,
+    Command.CURRENT: 2,
+    Command.ENCODER: 8,
+}
+# asked in turn, so that the late answer to one is not taken for the answer to the next
+MARKERS = (Command.PING, Command.CURRENT, Command.ENCODER, Command.ERRORS)
+UNANSWERED_PAUSE = 0.001  # [s] for the gripper to take a message that it does not answer: it keeps three at most
+TRIES = 2  # with markers before the first answer to one: an adapter may know no remote messages
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """A message to be sent.
+
+    Attributes:
+        message: it.
+        move: the order in it, where there is one.
+        counted: whether silence says that the gripper does not answer.
+    """
+
+    message: CanMessage
+    move: Move | None = None
+    counted: bool = True
+
+    @property
+    def answer(self) -> int | None:
+        """Command of the message that answers it; None when none does."""
+        if self.message.command == Command.MOVE:
+            return Command.REPLY
+        return self.message.command if self.message.remote else None
+
+
+class Exchange:
+    """One request at a time, paired with its reply; gets back into step after a lost one.
+
+    A reply that comes after its time-out would be taken for the one to the next request, and every later one with it.
+    After a silence the gripper is asked for something else, whose answer says that nothing older is on the way.
+
+    Attributes:
+        pending: request whose reply is waited for.
+        sent: when the last request was sent [s].
+        free: from when the next one may be sent [s].
+        misses: requests in a row without a reply.
+        latency: from the last request to its reply [s]; NaN before the first.
+    """
+
+    def __init__(self, node: int) -> None:
+        self.pending: Request | None = None
+        self.sent = self.latency = math.nan
+        self.free = -math.inf
+        self._node = node
+        self._marker = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew on a link that was opened anew."""
+        self.pending = None
+        self.misses = self._tries = 0
+        self._marks = self._rested = False
+
+    @property
+    def in_step(self) -> bool:
+        """Whether the next reply belongs to the next request."""
+        return self._tries == 0
+
+    def begin(self, request: Request, now: float) -> None:
+        """Note that a request is sent."""
+        self.pending = request if request.answer is not None else None
+        self.sent = now
+        self.free = now if request.answer is not None else now + UNANSWERED_PAUSE
+
+    def answers(self, message: CanMessage) -> bool:
+        """Return whether a message is the reply that is waited for."""
+        request = self.pending
+        return (
+            request is not None
+            and not message.remote
+            and (message.node, message.command) == (request.message.node, request.answer)
+            and len(message.data) == LENGTHS[request.answer]
+        )
+
+    def end(self, now: float) -> Request:
+        """Note the reply and return its request."""
+        request, self.pending = self.pending, None
+        self.latency = now - self.sent
+        if request.message.node == self._node:
+            self.misses = 0 if request.counted else self.misses
+            self._marks |= request.message.remote
+            if request.answer == MARKERS[self._marker] or self._rested:
+                self._tries, self._rested = 0, False
+        return request
+
+    def miss(self) -> Request | None:
+        """Note that no reply came and return the request."""
+        request, self.pending = self.pending, None
+        if request is not None and request.counted:
+            self.misses += 1
+            self._tries += 1
+            self._marker = (self._marker + 1) % len(MARKERS)
+            self._rested = False
+        return request
+
+    def marker(self) -> Request | None:
+        """Return the request that gets us back into step; None when in step, or when that is not answered."""
+        if self.in_step or not (self._marks or self._tries <= TRIES):
+            return None
+        return Request(message=encode(self._node, MARKERS[self._marker], remote=True))
+
+    def rest(self) -> None:
+        """Note that so long a pause was made that nothing older can be on the way: the next reply puts us in step."""
+        self._rested = True
+
 
 MISSED_REPLIES = 25  # requests in a row without a reply after which the link is opened anew
 GO = Flag.ACTIVATE | Flag.GO
 USABLE = (Phase.READY, Phase.MOVING)
 DIRECTIONS = {1: "closing", -1: "opening", 0: ""}
+LATEST_REPLY = 0.5  # [s] after which no reply is expected any more
+SPACING = 0.001  # [s] before a reply is asked for again
+WATCHDOG_PERIOD = 1.0  # [s] between two settings of the gripper's watchdog
+SEARCH_MISSES = 10  # requests without a reply after which other nodes are looked for
 
 
 class Drive:
@@ -25,7 +156,6 @@ class Drive:
 
     Attributes:
         settings: of the gripper.
-        scale: its units.
         known: what the replies say.
         exchange: requests and replies.
         orders: what the gripper shall do.
@@ -38,7 +168,7 @@ class Drive:
         joined: the link is open.
         silent: nothing has answered for long.
         arrival: whether the jaws move by an order from before the link was there; None: that is known.
-        farewell: messages that have still to leave before the end.
+        watchdogs: messages that set the gripper's watchdog and have still to leave.
         hold_wanted: the jaws are to be held where the next reply says that they are.
         note: sentence that stays until the next command.
         counts: of events by name.
@@ -51,7 +181,6 @@ class Drive:
 
     def __init__(self, settings: GripperSettings, salt: int = 0) -> None:
         self.settings = settings
-        self.scale = GripperScale(settings)
         self.known = Knowledge(settings)
         self.exchange = Exchange(settings.node_id)
         self.orders = Orders(salt)
@@ -63,11 +192,32 @@ class Drive:
         self.ended = MoveOutcome.NONE
         self.joined = self.silent = False
         self.arrival: Arrival | None = None
-        self.farewell: deque[CanMessage] = deque()
+        self.watchdogs: deque[CanMessage] = deque()
         self.hold_wanted = False
         self.note = ""
         self.counts: Counter[str] = Counter()
         self.link_counts: Mapping[str, int] = {}
+        self.next_watchdog = -math.inf
+        self._next_poll = -math.inf
+        self._polled = False
+        # an order leaves on the word of a reply, not on that of an old one
+        self._freshness = 1.5 / settings.poll_rate + settings.reply_timeout
+        self._searched = settings.node_id
+        self._second_stop: Request | None = None
+        self._sources = (
+            self._stop_request,
+            self._urgent_order,
+            lambda now: self.exchange.marker(),
+            self._order,
+            self._confirmation,
+            self._procedure,
+            self._travel,
+            self._watchdog,
+            self._poll,
+            self._telemetry,
+        )
+
+    # What is known
 
     @property
     def phase(self) -> Phase:
@@ -104,14 +254,9 @@ class Drive:
         return self.phase in USABLE and self.exchange.in_step and not self.known.filter.alarming
 
     @property
-    def settled(self) -> bool:
-        """Whether the last believed reply speaks of the last order, not of the one before."""
-        return self.known.stamp - self.order_sent >= GRACE
-
-    @property
     def has_orders(self) -> bool:
         """Whether an order or an emergency stop has still to be sent."""
-        return self.orders.pending or bool(self.farewell) or (self.stop.active and not self.known.error)
+        return self.orders.pending or bool(self.watchdogs) or (self.stop.active and not self.known.error)
 
     @property
     def must_reopen(self) -> bool:
@@ -120,21 +265,21 @@ class Drive:
 
     def opening_at(self, time: float) -> float:
         """Return the opening [m] at a past time; NaN unknown."""
-        reach = 2.0 / self.settings.poll_rate + self.settings.reply_timeout
-        return self.scale.opening_of(self.known.history.place_at(time, reach))
+        validity = 2.0 / self.settings.poll_rate + self.settings.reply_timeout
+        return self.settings.opening_of(self.known.history.position_at(time, validity))
 
-    def place_now(self, now: float) -> float:
+    def position_now(self, now: float) -> float:
         """Return where the jaws are by now [counts]; NaN unknown."""
         order = self.orders.taken
-        return self.known.place_now(now, float(order.position) if order is not None and order.drives else None)
+        return self.known.position_now(now, float(order.position) if order is not None and order.drives else None)
 
     def setpoint(self, now: float) -> float:
         """Return where the target or the jaws are now [counts], for a move that goes on from there."""
-        place, wanted = self.place_now(now), self.orders.wanted
+        position, wanted = self.position_now(now), self.orders.wanted
         if wanted is None or not wanted.flags & Flag.GO:
-            return place
+            return position
         ramp = self.job.steps.ramp(now) if self.job and self.job.steps else float(wanted.position)
-        return ramp if abs(ramp - place) <= 2.0 else place
+        return ramp if abs(ramp - position) <= 2.0 else position
 
     def order(self, *, position: int, flags: int, speed: int | None = None, current_mA: int | None = None) -> Move:
         """Return an order; what is not given stays as it was last."""
@@ -149,46 +294,41 @@ class Drive:
             flags=flags,
         )
 
-    def place_for_order(self, now: float) -> int:
+    def hold_position(self, now: float) -> int:
         """Return the position that holds the jaws where they are [counts].
 
         The reply truncates: jaws that rest between two counts report the one on the open side.
         """
-        place = self.place_now(now)
-        if math.isnan(place):
+        position = self.position_now(now)
+        if math.isnan(position):
             return 0
-        return math.ceil(place) if self.known.history.speed() >= 0.0 else math.floor(place)
-
-    def advance_move(self, now: float) -> None:
-        """Let the target of a slow move go on when it is due."""
-        if self.job is not None and self.orders.wanted is not None and not (self.job.sent and self.orders.pending):
-            self.job.advance(now, self.known.place, self.known.stamp)
-            self.want_position()
+        return math.ceil(position) if self.known.history.speed() >= 0.0 else math.floor(position)
 
     def want_position(self) -> None:
         """Have the gripper get the order that the present move wants."""
         goal = self.job.goal
-        order = self.order(position=self.job.position, flags=GO, speed=goal.pace.byte, current_mA=goal.current_mA)
+        order = self.order(position=self.job.position, flags=GO, speed=goal.byte, current_mA=goal.current_mA)
         self.orders.want(order)
 
     def report(self) -> GripperState:
         """Return what is known now, in SI units."""
-        known, phase = self.known, self.phase
+        known, phase, settings = self.known, self.phase, self.settings
         reply, telemetry = known.reply, known.telemetry
         placed = known.calibrated and self.calibration is None
         current = math.nan if reply is None else 1e-3 * reply.current_mA
         stopped = self.stop.active or bool(reply and reply.estopped)
         faults = known.faults(stopped)
+        settled = known.stamp - self.order_sent >= GRACE  # the reply speaks of the last order
         return GripperState(
             phase=phase,
             stamp=known.stamp,
-            opening=self.scale.opening_of(known.place) if placed else math.nan,
-            velocity=-self.scale.resolution * known.history.speed() if placed else math.nan,
+            opening=settings.opening_of(known.position) if placed else math.nan,
+            velocity=-settings.resolution * known.history.speed() if placed else math.nan,
             current=current,
-            force=-self.scale.force_of(current),
+            force=-settings.force_of(current),
             target=self._target(),
-            contact=DIRECTIONS[self._push()],
-            at_target=known.driving and bool(reply and reply.at_target) and placed and self.settled,
+            contact=DIRECTIONS[self._push()] if placed else "",
+            at_target=known.driving and bool(reply and reply.at_target) and placed and settled,
             calibrated=placed,
             activated=bool(reply and reply.activated),
             faults=faults,
@@ -207,15 +347,13 @@ class Drive:
         order = self.orders.wanted
         if order is None or not order.drives:
             return math.nan
-        return self.scale.opening_of(order.position) if self.job is None else self.job.goal.opening
+        return self.settings.opening_of(order.position) if self.job is None else self.job.goal.opening
 
     def _push(self) -> int:
         """Return 1 or -1 for what the motor pushes against closing or opening, else 0."""
-        reply = self.known.reply
-        placed = self.known.driving and self.known.calibrated and self.calibration is None
-        if not placed or self.known.contact_time < CONTACT_TIME:
+        reply, order = self.known.reply, self.orders.taken
+        if not self.known.driving or self.known.contact_time < CONTACT_TIME:
             return 0
-        order = self.orders.taken
         if abs(reply.current_mA) < CLEAR_CURRENT and order is None:
             return 0
         return push_direction(reply, order is not None and order.position > reply.position)
@@ -229,3 +367,159 @@ class Drive:
         if phase is Phase.UNCALIBRATED and self.known.half_calibrated:
             return HALF_CALIBRATED
         return describe(phase, self.outcome, faults)
+
+    # What is sent next
+
+    def choose_request(self, now: float) -> Request | None:
+        """Return what to send at a time [s]; None when nothing is due."""
+        if self._quiet(now) or (now < self.exchange.free and not self.stop.active):
+            return None
+        return next((request for source in self._sources if (request := source(now)) is not None), None)
+
+    def next_time(self, now: float) -> float:
+        """Return when the next request is due at the latest [s]."""
+        if self._quiet(now):
+            return self.calibration.quiet_until(now)
+        step = self.job.next_time if self.job is not None and self.may_drive else math.inf
+        question = self.known.telemetry.next_time if self._may_ask() else math.inf
+        if self._watches_travel():
+            question = self.calibration.travel.next_time
+        repetition = self.exchange.sent + SPACING if self._wants_reply() else math.inf
+        poll = self.exchange.sent + LATEST_REPLY if self._resting() else self._next_poll
+        return max(self.exchange.free, min(poll, step, question, repetition))
+
+    def begin_stop(self, now: float) -> Request | None:
+        """Return the first message of an emergency stop, an order with its flag; None when it is not due again."""
+        if not self.stop.due(now):
+            return None
+        self._second_stop = Request(message=encode(self.settings.node_id, Command.ESTOP))
+        position = self.known.position
+        flags = Flag.ACTIVATE | Flag.GO | Flag.ESTOP
+        return self._request(self.order(position=0 if math.isnan(position) else math.ceil(position), flags=flags))
+
+    def end_stop(self) -> Request | None:
+        """Return the second message of an emergency stop, its own command; None when it was sent."""
+        request, self._second_stop = self._second_stop, None
+        return request
+
+    def _stop_request(self, now: float) -> Request | None:
+        """The emergency stop until it is acknowledged: an order with its flag, and its own command."""
+        return self.end_stop() or self.begin_stop(now)
+
+    def _quiet(self, now: float) -> bool:
+        """Whether the gripper boots and nothing is to be sent; an emergency stop is sent all the same."""
+        run = self.calibration
+        return run is not None and run.quiet_until(now) is not None and not self.stop.active
+
+    @property
+    def _busy(self) -> bool:
+        """Whether a stop, a recovery or a calibration keeps orders back."""
+        return self.stop.active or self.recovery is not None or self.calibration is not None
+
+    def _urgent_order(self, _: float) -> Request | None:
+        """An order that makes the gripper stop does not wait for anything."""
+        urgent = self.orders.urgent and self.orders.pending and not self._busy
+        return self._request(self.orders.wanted) if urgent else None
+
+    def _order(self, now: float) -> Request | None:
+        """The wanted order, where it differs from the gripper's and may leave."""
+        if self._busy:
+            return None
+        may_drive = self.may_drive and now - self.known.stamp <= self._freshness
+        if may_drive:
+            self._advance_move(now)
+        if not self.orders.pending or (self.orders.wanted.drives and not may_drive) or self.known.reply is None:
+            return None
+        return self._request(self.orders.wanted)
+
+    def _advance_move(self, now: float) -> None:
+        """Let the target of a slow move go on when it is due."""
+        if self.job is not None and self.orders.wanted is not None and not (self.job.sent and self.orders.pending):
+            self.job.advance(now, self.known.position, self.known.stamp)
+            self.want_position()
+
+    def _wants_reply(self) -> bool:
+        return self.known.filter.wants_reply or self.hold_wanted
+
+    def _confirmation(self, now: float) -> Request | None:
+        """A reply that is not believed is asked for again, and one that tells where to hold."""
+        return self._request() if self._wants_reply() and now >= self.exchange.sent + SPACING else None
+
+    def _procedure(self, now: float) -> Request | None:
+        """The next message of a recovery or a calibration."""
+        recovery, run = self.recovery, self.calibration
+        if recovery is not None and recovery.step is Step.UNFLAG:
+            return self._request(self.order(position=self.hold_position(now), flags=Flag.ACTIVATE))
+        command = None
+        if recovery is not None and recovery.step is Step.CLEAR:
+            command = recovery.clear(now)
+        elif run is not None and run.step is Step.RESET:
+            command = run.reset(now)
+        elif run is not None and run.step is Step.START:
+            command = run.start(now)
+        return None if command is None else Request(message=encode(self.settings.node_id, command))
+
+    def _travel(self, now: float) -> Request | None:
+        """A question for the encoder's count while the gripper looks for its stops, in turn with the polls."""
+        if not self._watches_travel() or now < self.calibration.travel.next_time:
+            return None
+        self.calibration.travel.ask(now)
+        self._polled = False
+        return self._question(Command.ENCODER)
+
+    def _watchdog(self, now: float) -> Request | None:
+        """The gripper's watchdog, again and again, since it forgets it when it restarts; none at the end."""
+        seconds = self.settings.watchdog
+        if seconds and now >= self.next_watchdog and self.known.reply is not None and self.calibration is None:
+            self.next_watchdog = now + WATCHDOG_PERIOD
+            self.watchdogs.extend(encode_watchdog(self.settings.node_id, seconds))
+        return Request(message=self.watchdogs.popleft()) if self.watchdogs else None
+
+    def _poll(self, now: float) -> Request | None:
+        """The empty command at the poll rate; while nothing answers, every other one looks for another node."""
+        if now < self._next_poll or self._rests(now):
+            return None
+        # a late poll does not delay the next ones, unless it is so late that one is left out
+        self._next_poll = max(self._next_poll + 1.0 / self.settings.poll_rate, now)
+        self._polled = True
+        misses = self.exchange.misses
+        if misses < SEARCH_MISSES or misses % 2 or self.calibration is not None:
+            return self._request()
+        self._searched = (self._searched + 1) % (LARGEST_NODE + 1)
+        if self._searched == self.settings.node_id:
+            return self._request()
+        return Request(message=encode(self._searched, Command.PING, remote=True))
+
+    def _rests(self, now: float) -> bool:
+        """Whether a late reply is waited for: the way back into step without markers."""
+        if not self._resting():
+            return False
+        if now < self.exchange.sent + LATEST_REPLY:
+            return True
+        self.exchange.rest()
+        return False
+
+    def _resting(self) -> bool:
+        exchange = self.exchange
+        return exchange.marker() is None and not exchange.in_step and self.known.reply is not None and not self.silent
+
+    def _telemetry(self, now: float) -> Request | None:
+        """A question, where nothing more important is under way."""
+        command = self.known.telemetry.question(now) if self._may_ask() else None
+        return None if command is None else self._question(command)
+
+    def _may_ask(self) -> bool:
+        known = self.known.reply is not None and self.exchange.in_step
+        return known and self.calibration is None and self.recovery is None
+
+    def _watches_travel(self) -> bool:
+        run = self.calibration
+        return run is not None and run.step is Step.WATCH and self._polled and self.exchange.in_step
+
+    def _question(self, command: Command) -> Request:
+        return Request(message=encode(self.settings.node_id, command, remote=True), counted=False)
+
+    def _request(self, order: Move | None = None) -> Request:
+        """Return the request of an order, or of a poll without one."""
+        node = self.settings.node_id
+        return Request(message=encode(node, Command.MOVE) if order is None else encode_move(node, order), move=order)

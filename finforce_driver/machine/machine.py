@@ -6,31 +6,16 @@ Times are those of the carrier's clock [s].
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 
-from finforce_driver.can.protocol import (
-    CanMessage,
-    Command,
-    Flag,
-    Reply,
-    decode_reply,
-    encode_watchdog,
-    split_identifier,
-)
+from finforce_driver.can.protocol import CanMessage, Command, Flag, Reply, decode_reply, encode_watchdog
 from finforce_driver.errors import GripperStateError
-from finforce_driver.machine.drive import GO, USABLE, Drive
-from finforce_driver.machine.exchange import Request
-from finforce_driver.machine.move import Arrival, Echo, EchoWatch, Goal, MoveJob
-from finforce_driver.machine.procedures import (
-    CalibrationRun,
-    CalibrationStep,
-    Recovery,
-    RecoveryStep,
-    StopStage,
-)
-from finforce_driver.machine.requests import RequestSource
-from finforce_driver.settings import GripperSettings, check_numbers
+from finforce_driver.machine.drive import GO, USABLE, Drive, Request
+from finforce_driver.machine.move import Arrival, EchoWatch, Goal, MoveJob
+from finforce_driver.machine.procedures import CalibrationRun, Recovery, Step, StopStage
+from finforce_driver.settings import SLOWEST_BYTE, GripperSettings, check_numbers
 from finforce_driver.state import (
     HALF_CALIBRATED,
     OTHER_MASTER,
@@ -63,6 +48,8 @@ REFUSALS = {
 class GripperMachine(Drive):
     """Drives one gripper, without input or output of its own; what is known and wanted changes here.
 
+    The commands are those of `Gripper`, which says what they do and raise; each is followed by `refresh`.
+
     Attributes:
         state: what is known now.
 
@@ -71,24 +58,22 @@ class GripperMachine(Drive):
         salt: any number, other than that of the program that drove the gripper before.
     """
 
-    def __init__(self, settings: GripperSettings | None = None, salt: int = 0) -> None:
-        super().__init__(settings or GripperSettings(), salt)
+    def __init__(self, settings: GripperSettings, salt: int = 0) -> None:
+        super().__init__(settings, salt)
         self._echo = EchoWatch()
         self._enabled = True  # not switched off
-        self._requests = RequestSource(self)
         self._sent: deque[CanMessage] = deque(maxlen=ECHOES)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Make the state anew."""
         self.state = self.report()
 
-    # Commands; each is refused by name where it cannot be done
+    # Commands
 
     def move(self, opening: float, speed: float | None, force: float | None, now: float) -> None:
-        """Go to an opening [m] at a speed [m/s], stalling with a force [N]; the same goal again changes nothing.
-
-        Raises:
-            TargetError: a value is no number or out of bounds.
-            GripperStateError: the gripper could not move.
-        """
-        goal = self._make_goal(opening, speed, force)
+        """Go to an opening [m] at a speed [m/s], stalling with a force [N]; the same goal again changes nothing."""
+        goal = self.make_goal(opening, speed, force)
         self._require("move", USABLE)
         if not self._enabled:
             raise GripperStateError("move: the gripper was switched off: activate it first")
@@ -98,33 +83,27 @@ class GripperMachine(Drive):
         start = self.setpoint(now)
         self.hold_wanted = False
         self._end_job(MoveOutcome.REPLACED)
-        self.note, self.ended = goal.pace.note, MoveOutcome.NONE
-        self.job = MoveJob(goal, start=start, rate=goal.pace.speed / self.scale.resolution, now=now)
+        fastest, speed = self.settings.fastest, self.settings.default_speed if speed is None else speed
+        self.note = f"speed {speed:g} m/s is limited to {fastest:.3g} m/s" if speed > fastest else ""
+        self.ended = MoveOutcome.NONE
+        self.job = MoveJob(goal, start=start, now=now)
         self.want_position()
-        self._refresh()
 
     def hold(self, now: float) -> None:
         """Stop in place and hold, or end a calibration, limp; a gripper that stands or was let go stays as it is.
 
-        Raises:
-            GripperStateError: the jaws are limp, or unknown. One that has just fallen silent is held as soon as it
-                answers again.
+        One that has just fallen silent is held as soon as it answers again.
         """
         if self.silent and self.calibration is None and self.known.driving:
             self._end_job(MoveOutcome.REPLACED)
             self._postpone_hold()
-            self._refresh()
+            self.refresh()
             raise GripperStateError("hold pending: the gripper does not answer; it is held as soon as it does")
         self._require("hold", (*USABLE, Phase.CALIBRATING))
         self._hold(now)
-        self._refresh()
 
     def calibrate(self) -> None:
-        """Find the end stops.
-
-        Raises:
-            GripperStateError: the gripper is absent or faulty, or calibrates already.
-        """
+        """Find the end stops."""
         self._require("calibrate", CONNECTED)
         self._end_job(MoveOutcome.REPLACED)
         self.orders.drop()
@@ -133,28 +112,18 @@ class GripperMachine(Drive):
         self.calibration = CalibrationRun(
             self.settings, calibrated=self.known.calibrated, reset=self.known.half_calibrated
         )
-        self._refresh()
 
     def clear_errors(self) -> None:
-        """Clear what is latched; without a fault nothing is sent, since clearing lets go.
-
-        Raises:
-            GripperStateError: the gripper is absent, or calibrates.
-        """
+        """Clear what is latched; without a fault nothing is sent, since clearing lets go."""
         self._require("clear_errors", (*CONNECTED, Phase.FAULT))
         self.note = ""
         if self.phase is Phase.FAULT and self.recovery is None:
             self._abort()
             self.recovery = Recovery(unflag=self.stop.active or bool(self.known.reply and self.known.reply.estopped))
             self.stop.begin_clearing()
-        self._refresh()
 
     def activate(self, on: bool, now: float) -> None:
-        """Switch the power stage on, holding in place, or off, limp.
-
-        Raises:
-            GripperStateError: the gripper is absent, faulty or calibrates.
-        """
+        """Switch the power stage on, holding in place, or off, limp."""
         self._require("activate", CONNECTED)
         self.note, self._enabled = "", on
         if not on:
@@ -163,19 +132,13 @@ class GripperMachine(Drive):
             self.orders.want(self.order(position=0, flags=Flag.ACTIVATE))
         elif not self.known.driving:
             self._end_job(MoveOutcome.REPLACED)
-            self.orders.want(self.order(position=self.place_for_order(now), flags=GO))
-        self._refresh()
+            self.orders.want(self.order(position=self.hold_position(now), flags=GO))
 
     def release_power(self, now: float) -> None:
-        """Let the jaws go limp, ready for the next move.
-
-        Raises:
-            GripperStateError: the gripper is absent, faulty or calibrates.
-        """
+        """Let the jaws go limp, ready for the next move."""
         self._require("release_power", CONNECTED)
         self.note = ""
         self._let_go(Flag.ACTIVATE, now)
-        self._refresh()
 
     def estop(self, now: float) -> list[CanMessage]:
         """Stop at once, in whichever state: return the messages to be sent before anything else; no motion follows."""
@@ -183,12 +146,11 @@ class GripperMachine(Drive):
         self.recovery = None
         self._abort()
         self.stop.demand()
-        first = self._requests.begin_stop(now)
+        first = self.begin_stop(now)
         # the gripper keeps three messages at most, and one is on the way already: the second follows its reply
-        second = self._requests.end_stop() if self.exchange.pending is None else None
+        second = self.end_stop() if self.exchange.pending is None else None
         messages = [request.message for request in (first, second) if request is not None]
         self._sent.extend(messages)
-        self._refresh()
         return messages
 
     def leave(self, now: float) -> None:
@@ -199,27 +161,25 @@ class GripperMachine(Drive):
             self.hold(now)
         if self.settings.watchdog and not self.settings.release_on_stop:
             # what is held stays held, with nobody to feed the watchdog
-            self.farewell = deque(encode_watchdog(self.settings.node_id, 0.0))
+            self.watchdogs = deque(encode_watchdog(self.settings.node_id, 0.0))
+            self.next_watchdog = math.inf
+        self.refresh()
 
     # What the carrier asks and tells
 
     def next_request(self, now: float) -> Request | None:
         """Return what to send now, None when nothing is due; it counts as sent."""
-        request = self._requests.next_request(now)
+        request = self.choose_request(now)
         if request is not None:
             self.exchange.begin(request, now)
             self._sent.append(request.message)
         return request
 
-    def next_time(self, now: float) -> float:
-        """Return when the next request is due at the latest."""
-        return self._requests.next_time(now)
-
     def on_link_open(self) -> None:
         """Begin on a link that was opened."""
         self.exchange.reset()
         self.joined, self.arrival = True, Arrival()
-        self._refresh()
+        self.refresh()
 
     def on_link_lost(self, reason: str) -> None:
         """Forget what can have changed by the time the link is back, and want nothing."""
@@ -234,7 +194,7 @@ class GripperMachine(Drive):
         self.exchange.reset()
         self.joined = self.silent = False
         self.arrival = None
-        self._refresh()
+        self.refresh()
 
     def on_message(self, message: CanMessage, now: float, link_counts: Mapping[str, int] | None = None) -> bool:
         """Take a message; return whether it was the reply that was waited for.
@@ -251,13 +211,13 @@ class GripperMachine(Drive):
             return False
         request = self.exchange.end(now)
         self.counts["replies"] += 1
-        if request.answer is Command.REPLY:
+        if request.answer == Command.REPLY:
             self._take_reply(request, message, now)
-        elif request.node != self.settings.node_id:
-            self.note = OTHER_NODE.format(node=self.settings.node_id, other=request.node)
-            self._refresh()
+        elif message.node != self.settings.node_id:
+            self.note = OTHER_NODE.format(node=self.settings.node_id, other=message.node)
+            self.refresh()
         elif not request.counted:
-            self._take_answer(request, message, now)
+            self._take_answer(message, now)
         return True
 
     def on_silence(self, now: float, suspicion: str = "") -> None:
@@ -276,18 +236,18 @@ class GripperMachine(Drive):
             if self.orders.pending:
                 self._abort(LOST_ORDER)
             self.note = self.note or suspicion or SILENT.format(node=self.settings.node_id)
-            self._refresh()
+            self.refresh()
 
-    def _take_answer(self, request: Request, message: CanMessage, now: float) -> None:
+    def _take_answer(self, message: CanMessage, now: float) -> None:
         """Take the answer to a question."""
-        if request.answer is not Command.ENCODER:
-            self.known.telemetry.take(request.answer, message, now)
+        if message.command != Command.ENCODER:
+            self.known.telemetry.take(message, now)
         elif self.calibration is not None:
             self.calibration.travel.take(message, now)
 
     def _miss_answer(self, request: Request, now: float) -> None:
         """Note that a question was not answered."""
-        if request.answer is not Command.ENCODER:
+        if request.answer != Command.ENCODER:
             self.known.telemetry.miss(now)
         elif self.calibration is not None:
             self.calibration.travel.miss()
@@ -299,19 +259,21 @@ class GripperMachine(Drive):
         if self.phase not in phases:
             raise GripperStateError(f"{what}: {REFUSALS[self.phase]}" + (f" ({self.note})" if self.note else ""))
 
-    def check_move(self, opening: float, speed: float | None, force: float | None) -> None:
-        """Refuse what no move can be, by raising TargetError."""
-        self._make_goal(opening, speed, force)
-
-    def _make_goal(self, opening: float, speed: float | None, force: float | None) -> Goal:
+    def make_goal(self, opening: float, speed: float | None, force: float | None) -> Goal:
         """Return a move in the gripper's units; raises TargetError."""
         check_numbers(opening=opening, speed=speed, force=force)
-        default = round(1e3 * self.settings.default_current)
+        settings = self.settings
+        default = round(1e3 * settings.default_current)
+        speed = settings.default_speed if speed is None else speed
+        byte = settings.speed_byte(speed)
+        stepped = speed < settings.speed_of(SLOWEST_BYTE)
         return Goal(
             opening=float(opening),
-            position=self.scale.position_of(opening),
-            pace=self.scale.pace_of(self.settings.default_speed if speed is None else speed),
-            current_mA=default if force is None else self.scale.current_of(force),
+            position=settings.position_of(opening),
+            rate=(speed if stepped else settings.speed_of(byte)) / settings.resolution,
+            byte=byte,
+            stepped=stepped,
+            current_mA=default if force is None else settings.current_of(force),
         )
 
     def _hold(self, now: float) -> None:
@@ -331,8 +293,8 @@ class GripperMachine(Drive):
         if now - self.known.stamp > OLD and drives:
             self._postpone_hold()
             return
-        kept, place = self.orders.wanted, self.place_now(now)
-        if standing or not drives or (kept is not None and (not kept.drives or abs(kept.position - place) <= 1.0)):
+        kept, position = self.orders.wanted, self.position_now(now)
+        if standing or not drives or (kept is not None and (not kept.drives or abs(kept.position - position) <= 1.0)):
             return
         self._hold_here(now)
 
@@ -340,7 +302,7 @@ class GripperMachine(Drive):
         """Want an order that moves nothing and holds nothing."""
         self._end_job(MoveOutcome.REPLACED)
         self.hold_wanted = False
-        self.orders.want(self.order(position=self.place_for_order(now), flags=flags), urgent=True)
+        self.orders.want(self.order(position=self.hold_position(now), flags=flags), urgent=True)
 
     def _end_job(self, outcome: MoveOutcome) -> None:
         """End a move that is under way; one that has ended keeps its outcome."""
@@ -362,7 +324,7 @@ class GripperMachine(Drive):
             self.calibration, self.known.half_calibrated = None, True
 
     def _postpone_hold(self) -> None:
-        """Hold as soon as it is known where: at an old place, to hold would be to go back."""
+        """Hold as soon as it is known where: at an old position, to hold would be to go back."""
         self.orders.forget()
         self._echo.forget()
         self.hold_wanted = True
@@ -372,12 +334,12 @@ class GripperMachine(Drive):
         if request.move is not None:
             self._take_echo(request, now)
         order, before = self.orders.taken, self.known.reply
-        speed = 0.0 if order is None else self.scale.speed_of(order.speed) / self.scale.resolution
-        believed = self.known.take(decode_reply(message), now, order, speed)
-        self.counts["doubted replies"] = self.known.filter.doubted
+        speed = 0.0 if order is None else self.settings.speed_of(order.speed) / self.settings.resolution
+        believed = self.known.take(decode_reply(message, now), order, speed)
+        self.counts["unconfirmed replies"] = self.known.filter.rejected
         if believed is not None:
-            self._conclude(before, believed, now)
-            self._refresh()
+            self._conclude(before, believed)
+            self.refresh()
 
     def _take_echo(self, request: Request, now: float) -> None:
         """Note that an order was answered."""
@@ -391,97 +353,96 @@ class GripperMachine(Drive):
             if self.job is not None:
                 self.job.send(now)
 
-    def _conclude(self, before: Reply | None, reply: Reply, now: float) -> None:
+    def _conclude(self, before: Reply | None, reply: Reply) -> None:
         """Draw the conclusions from a reply that is believed; `before` is the one before it."""
         if self.silent or before is None:
             self.silent, self.note = False, ""
         self.stop.take(reply)
-        self._follow_recovery(reply, now)
-        self._follow_fault(before, reply, now)
+        self._follow_recovery(reply)
+        self._follow_fault(before, reply)
         if self.calibration is not None:
-            self._follow_calibration(reply, now)
+            self._follow_calibration(reply)
         elif before is not None and before.calibrated and not reply.calibrated:
             self._abort(REBOOTED)
             self.known.half_calibrated = False
         elif not reply.error:
-            self._follow_orders(reply, now)
-        self._follow_arrival(reply, now)
+            self._follow_orders(reply)
+        self._follow_arrival(reply)
         if self.hold_wanted and self.phase in USABLE:
-            self._hold(now)
+            self._hold(reply.time)
 
-    def _follow_arrival(self, reply: Reply, now: float) -> None:
+    def _follow_arrival(self, reply: Reply) -> None:
         """Hold jaws that move by an order from before the link was there."""
         arrival = self.arrival
         if arrival is None:
             return
         was_moving = arrival.moving
-        arrival.take(reply, now)
+        arrival.take(reply)
         if arrival.over:
             self.arrival = None
         elif arrival.moving and not was_moving and self.orders.wanted is None:
-            self._hold_here(now)
+            self._hold_here(reply.time)
             self.note = INHERITED
 
     def _hold_here(self, now: float) -> None:
         """Want the jaws to stay where they are by now."""
-        self.orders.want(self.order(position=self.place_for_order(now), flags=GO), urgent=True)
+        self.orders.want(self.order(position=self.hold_position(now), flags=GO), urgent=True)
 
-    def _follow_recovery(self, reply: Reply, now: float) -> None:
+    def _follow_recovery(self, reply: Reply) -> None:
         """Let the clearing of errors go on."""
         recovery = self.recovery
         if recovery is None:
             return
-        recovery.take(reply, now)
-        if recovery.over:
-            cleared = recovery.step is RecoveryStep.DONE
+        recovery.take(reply)
+        if recovery.step.over:
+            cleared = recovery.step is Step.DONE
             self.recovery = None
             self.stop.end_clearing(cleared)
             self._abort()
             if not cleared:
-                self.known.telemetry.ask_errors(now)
+                self.known.telemetry.ask_errors(reply.time)
 
-    def _follow_fault(self, before: Reply | None, reply: Reply, now: float) -> None:
+    def _follow_fault(self, before: Reply | None, reply: Reply) -> None:
         """End what a fault ends, and have its name asked for."""
         if reply.faults == (before.faults if before is not None else NO_FAULTS):
             return
-        self.known.telemetry.ask_errors(now)
+        self.known.telemetry.ask_errors(reply.time)
         if reply.error and self.recovery is None and self.stop.stage is not StopStage.CLEARING:
             self._abort()
 
-    def _follow_calibration(self, reply: Reply, now: float) -> None:
+    def _follow_calibration(self, reply: Reply) -> None:
         """Let the calibration go on, and end it."""
         run = self.calibration
-        run.take(reply, now)
-        if run.over:
+        run.take(reply)
+        if run.step.over:
             self.calibration = None
-            self.known.half_calibrated = run.step is CalibrationStep.FAILED
-            self.known.restart_places()
+            self.known.half_calibrated = run.step is Step.FAILED
+            self.known.restart_history()
             self._abort(run.reason)
             self.ended = MoveOutcome.NONE
 
-    def _follow_orders(self, reply: Reply, now: float) -> None:
+    def _follow_orders(self, reply: Reply) -> None:
         """Judge the move, and whether the gripper has our order."""
-        echo = self._echo.take(reply, now)
-        if echo is Echo.OVERRULED:
-            self._yield_to_other("it does not do what it was told last")
-        elif echo is Echo.UNHEARD and not (self.moving and self.orders.repeat()):
-            self._echo.forget()
+        if self._echo.is_ignored(reply):
+            if self._echo.heard:
+                self._yield_to_other("it does not do what it was told last")
+            elif not (self.moving and self.orders.repeat()):
+                self._echo.forget()
         if self.job is not None:
-            self.job.take(reply, now)
+            self.job.take(reply)
             if self.job.outcome is MoveOutcome.TIMED_OUT and self.orders.pending:
                 self.orders.drop()
 
     def _take_unasked(self, message: CanMessage) -> None:
         """Count a message that nobody waits for, and look for other programs' orders."""
-        address = split_identifier(message.id)
-        if address.node != self.settings.node_id:
+        if message.node != self.settings.node_id:
             self.counts["messages of other nodes"] += 1
-        elif address.command == Command.HEARTBEAT:
+        elif message.command == Command.HEARTBEAT:
             self.counts["heartbeats"] += 1
-        elif address.command == Command.MOVE and len(message.data) == 5 and not message.remote:
+        elif message.command == Command.MOVE and len(message.data) == 5 and not message.remote:
             self._yield_to_other("a move was seen on the bus")
-        elif address.command in FOREIGN and not message.remote:
-            self._yield_to_other(f"command {address.command} was seen on the bus")
+        elif message.command in FOREIGN and not message.remote:
+            self._yield_to_other(f"command {message.command} was seen on the bus")
         else:
             self.counts["unexpected messages"] += 1
 
@@ -490,8 +451,4 @@ class GripperMachine(Drive):
         self.counts["foreign commands"] += 1
         self._break_calibration()
         self._abort(OTHER_MASTER.format(what=what))
-        self._refresh()
-
-    def _refresh(self) -> None:
-        """Make the state anew."""
-        self.state = self.report()
+        self.refresh()

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from enum import Enum, auto
 
 from finforce_driver.can.protocol import FREE_FLAGS, Flag, Move, Reply
-from finforce_driver.settings import Pace
 from finforce_driver.state import MoveOutcome
 
 GRACE = 0.05  # [s] after a move in which its replies may still speak of the one before
 CONTACT_TIME = 0.1  # [s] and
 CONTACT_REPLIES = 5  # replies that a contact must last
 REACHED_REPLIES = 2
-REST_TIME = 0.3  # [s] at one count, beside the target, that are rest
+REST_TIME = 0.3  # [s] at one count, next to the target, that are rest
 TOLERANCE = 2  # [counts]: the reply truncates, the gripper stops within a fraction of a count
 CLOSED = 250  # [counts] from which contact while closing is with the other jaw
 OPENED = 3  # [counts] up to which contact while opening is with the stop
 CLEAR_CURRENT = 50  # [mA] from which the sign of the current is trusted
-EXTRA_TIME, LEAST_TIME = 1.0, 1.5  # [s] beyond the way's own time, and in all
+EXTRA_TIME, LEAST_TIME = 1.0, 1.5  # [s] beyond the travel's own time, and in all
 
 
 def push_direction(reply: Reply, closing: bool) -> int:
@@ -29,92 +27,7 @@ def push_direction(reply: Reply, closing: bool) -> int:
     return 1 if closing else -1
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Contact:
-    """A contact that lasts: since when [s], at which position, in how many replies."""
-
-    since: float
-    position: int
-    replies: int
-
-
-class MoveWatch:
-    """Judges one move.
-
-    Attributes:
-        closing: whether the move closes.
-
-    Args:
-        position: where the move ends [counts].
-        closing: the same.
-        allowed: its own time [s]; of one that goes in steps, that of two steps.
-        now: time [s].
-    """
-
-    def __init__(self, *, position: int, closing: bool, allowed: float, now: float) -> None:
-        self.closing = closing
-        self._position = position
-        self._allowed = max(allowed + EXTRA_TIME, LEAST_TIME)
-        self._deadline = now + self._allowed
-        self._sent = now
-        self._contact: _Contact | None = None
-        self._arrivals = 0
-        self._beside, self._beside_since = -1, now
-
-    def send(self, now: float) -> None:
-        """Note that a message of the move was sent: what comes soon after is of the one before."""
-        self._sent = now
-        self._contact, self._arrivals = None, 0
-
-    def delay(self, now: float) -> None:
-        """Note that the move got on: its time begins anew."""
-        self._deadline = now + self._allowed
-
-    def take(self, reply: Reply, now: float, final: bool) -> MoveOutcome:
-        """Return what became of the move; NONE while it is under way.
-
-        Args:
-            reply: the newest one that is believed.
-            now: when it came [s].
-            final: whether the gripper was sent to the end of the move, not to a step on the way.
-        """
-        if now - self._sent < GRACE:
-            return MoveOutcome.NONE
-        self._follow_contact(reply, now)
-        contact = self._contact
-        if contact and now - contact.since >= CONTACT_TIME and contact.replies >= CONTACT_REPLIES:
-            return self._judge_contact(reply)
-        there = reply.at_target and abs(reply.position - self._position) <= TOLERANCE
-        self._arrivals = self._arrivals + 1 if there and final else 0
-        if self._arrivals >= REACHED_REPLIES or self._rests_beside(reply, now, final):
-            return MoveOutcome.REACHED
-        return MoveOutcome.TIMED_OUT if now > self._deadline else MoveOutcome.NONE
-
-    def _rests_beside(self, reply: Reply, now: float, final: bool) -> bool:
-        """Whether the jaws have come to rest a count beside the target, which old firmware never calls reached."""
-        if not final or reply.contact or abs(reply.position - self._position) > 1 or reply.position != self._beside:
-            self._beside, self._beside_since = reply.position, now
-            return False
-        return now - self._beside_since >= REST_TIME
-
-    def _follow_contact(self, reply: Reply, now: float) -> None:
-        """Keep how long a contact lasts at one place."""
-        kept = self._contact
-        if not reply.contact:
-            self._contact = None
-            return
-        if kept is None or abs(reply.position - kept.position) > 1:
-            kept = _Contact(since=now, position=reply.position, replies=0)
-        self._contact = _Contact(since=kept.since, position=kept.position, replies=kept.replies + 1)
-
-    def _judge_contact(self, reply: Reply) -> MoveOutcome:
-        """Return what a lasting contact means."""
-        if push_direction(reply, self.closing) > 0:
-            return MoveOutcome.CLOSED_EMPTY if reply.position >= CLOSED else MoveOutcome.GRASPED
-        return MoveOutcome.REACHED if max(reply.position, self._position) <= OPENED else MoveOutcome.BLOCKED
-
-
-LARGEST_LAG = 3.5  # [counts] that the jaws may stay behind the target: more means that something is in the way
+LARGEST_LAG = 3.5  # [counts] that the jaws may lag behind the target: more means that something is in the way
 LAG_PAUSE = 0.02  # [s] until a target that waits for the jaws is looked at again
 
 
@@ -122,7 +35,7 @@ class Steps:
     """A target on its way to another one, at a speed.
 
     The ideal ramp is the target between the counts; it is rounded, hence half a count off at most. The target waits
-    for jaws that stay behind, and a late step delays the ramp: it never hurries.
+    for jaws that lag behind, and a late step delays the ramp: it never hurries.
 
     Attributes:
         position: present target [counts].
@@ -139,9 +52,9 @@ class Steps:
     def __init__(self, *, start: float, goal: int, rate: float, now: float) -> None:
         self.goal = goal
         self._period = 1.0 / rate
-        self._way = 1 if goal > start else -1
+        self._sign = 1 if goal > start else -1
         self.position = round(start)
-        self.next_time = now + self._until_step(start)
+        self.next_time = now + self._period * max(0.0, self._sign * (self.position - start) + 0.5)
         self.waiting = False
 
     @property
@@ -154,31 +67,22 @@ class Steps:
         if self.done:
             return float(self.goal)
         ahead = (self.next_time - now) / self._period
-        place = self.position + self._way * (0.5 - ahead)
-        return min(max(place, self.position - 0.5), self.position + 0.5)
+        ideal = self.position + self._sign * (0.5 - ahead)
+        return min(max(ideal, self.position - 0.5), self.position + 0.5)
 
-    def advance(self, now: float, place: float) -> None:
-        """Go on by one count when it is due and the jaws have followed.
-
-        Args:
-            now: time [s].
-            place: of the jaws [counts].
-        """
+    def advance(self, now: float, jaws: float) -> None:
+        """Go on by one count when it is due at a time [s] and the jaws [counts] have followed."""
         if self.done or now < self.next_time:
             return
-        lag = self._way * (self.position - place)
-        if lag < -LARGEST_LAG:  # the jaws are ahead: the ramp began at a place where they have not been
-            self.position = round(place)
+        lag = self._sign * (self.position - jaws)
+        if lag < -LARGEST_LAG:  # the jaws are ahead: the ramp began where they have not been
+            self.position = round(jaws)
         self.waiting = lag > LARGEST_LAG
         if self.waiting:
             self.next_time = now + LAG_PAUSE
             return
-        self.position += self._way
+        self.position += self._sign
         self.next_time = max(self.next_time, now - 0.5 * self._period) + self._period
-
-    def _until_step(self, start: float) -> float:
-        """Return the time from the start to the first step [s]."""
-        return self._period * max(0.0, self._way * (self.position - start) + 0.5)
 
 
 LOOSE_TIME = 0.1  # [s] without contact after which what was grasped is taken to be gone
@@ -192,13 +96,17 @@ class Goal:
     Attributes:
         opening: to be reached [m].
         position: the same [counts].
-        pace: how fast.
+        rate: speed [counts/s].
+        byte: speed byte of the orders.
+        stepped: the speed is below what the byte can do, the target has to be moved on in steps.
         current_mA: limit [mA].
     """
 
     opening: float
     position: int
-    pace: Pace
+    rate: float
+    byte: int
+    stepped: bool
     current_mA: int
 
 
@@ -209,24 +117,28 @@ class MoveJob:
         goal: what was asked for.
         outcome: what became of it; NONE while it is under way.
         sent: an order of it has left.
+        steps: target of a slow move; None: the gripper goes to the end by itself.
 
     Args:
         goal: the same.
         start: where the target or the jaws are now [counts].
-        rate: speed [counts/s].
         now: time [s].
     """
 
-    def __init__(self, goal: Goal, *, start: float, rate: float, now: float) -> None:
+    def __init__(self, goal: Goal, *, start: float, now: float) -> None:
         self.goal = goal
         self.outcome = MoveOutcome.NONE
-        self._rate = rate
-        self.steps = Steps(start=start, goal=goal.position, rate=rate, now=now) if goal.pace.stepped else None
-        allowed = 2.0 / rate if self.steps else abs(goal.position - start) / rate
-        closing = goal.position > start
-        self.watch = MoveWatch(position=goal.position, closing=closing, allowed=allowed, now=now)
-        self._begun = self._pressed = now
         self.sent = False
+        self.steps = self._ramp_from(start, now) if goal.stepped else None
+        # of a move in steps, the time of two steps
+        allowed = 2.0 / goal.rate if self.steps else abs(goal.position - start) / goal.rate
+        self._allowed = max(allowed + EXTRA_TIME, LEAST_TIME)
+        self._deadline = now + self._allowed
+        self._closing = goal.position > start
+        self._begun = self._pressed = self._sent_at = now
+        self._contact: Reply | None = None  # the first of those that report it at one position
+        self._contacts = self._arrivals = 0
+        self._rest_position, self._rest_since = -1, now
 
     @property
     def position(self) -> int:
@@ -243,40 +155,76 @@ class MoveJob:
         """Whether the target may go on: under way, or pressing on something that may give way."""
         return self.outcome is MoveOutcome.NONE or self.outcome in PRESSING
 
-    def advance(self, now: float, place: float, stamp: float) -> None:
+    def advance(self, now: float, jaws: float, stamp: float) -> None:
         """Let the target go on when it is due.
 
         Args:
             now: time [s].
-            place: of the jaws [counts].
+            jaws: where they are [counts].
             stamp: when they were there [s].
         """
         if self.steps is None or not self.stepping or stamp <= self._begun:
             return
-        if not self.sent and abs(self.steps.position - place) > LARGEST_LAG:
+        if not self.sent and abs(self.steps.position - jaws) > LARGEST_LAG:
             # the link failed meanwhile, and the jaws are not where they were thought to be
-            self.steps = Steps(start=place, goal=self.goal.position, rate=self._rate, now=now)
+            self.steps = self._ramp_from(jaws, now)
         before = self.steps.position
-        self.steps.advance(now, place)
+        self.steps.advance(now, jaws)
         if self.steps.position != before:
-            self.watch.delay(now)
+            self._deadline = now + self._allowed
 
     def send(self, now: float) -> None:
-        """Note that its order was sent."""
-        self.sent = True
-        self.watch.send(now)
+        """Note that its order was sent: what comes soon after speaks of the one before."""
+        self.sent, self._sent_at = True, now
+        self._contact, self._arrivals = None, 0
 
-    def take(self, reply: Reply, now: float) -> None:
+    def take(self, reply: Reply) -> None:
         """Judge by a believed reply."""
         if self.outcome is MoveOutcome.NONE:
-            final = self.steps is None or self.steps.done
-            self.outcome = self.watch.take(reply, now, final)
-            self._pressed = now
+            self.outcome = self._judge(reply)
+            self._pressed = reply.time
         elif self.outcome in PRESSING:
-            self._pressed = now if reply.contact else self._pressed
-            if now - self._pressed > LOOSE_TIME:
+            self._pressed = reply.time if reply.contact else self._pressed
+            if reply.time - self._pressed > LOOSE_TIME:
                 self.outcome = MoveOutcome.NONE
-                self.watch.delay(now)
+                self._deadline = reply.time + self._allowed
+
+    def _ramp_from(self, start: float, now: float) -> Steps:
+        return Steps(start=start, goal=self.goal.position, rate=self.goal.rate, now=now)
+
+    def _judge(self, reply: Reply) -> MoveOutcome:
+        """Return what became of the move; NONE while it is under way."""
+        if reply.time - self._sent_at < GRACE:
+            return MoveOutcome.NONE
+        if self._lasting_contact(reply):
+            if push_direction(reply, self._closing) > 0:
+                return MoveOutcome.CLOSED_EMPTY if reply.position >= CLOSED else MoveOutcome.GRASPED
+            stopped = max(reply.position, self.goal.position) <= OPENED
+            return MoveOutcome.REACHED if stopped else MoveOutcome.BLOCKED
+        final = self.steps is None or self.steps.done  # else the gripper was sent to a step on the way
+        there = reply.at_target and abs(reply.position - self.goal.position) <= TOLERANCE
+        self._arrivals = self._arrivals + 1 if there and final else 0
+        if self._arrivals >= REACHED_REPLIES or self._rests_next_to_goal(reply, final):
+            return MoveOutcome.REACHED
+        return MoveOutcome.TIMED_OUT if reply.time > self._deadline else MoveOutcome.NONE
+
+    def _lasting_contact(self, reply: Reply) -> bool:
+        """Whether a contact has lasted for long enough at one position."""
+        if not reply.contact:
+            self._contact = None
+            return False
+        if self._contact is None or abs(reply.position - self._contact.position) > 1:
+            self._contact, self._contacts = reply, 0
+        self._contacts += 1
+        return reply.time - self._contact.time >= CONTACT_TIME and self._contacts >= CONTACT_REPLIES
+
+    def _rests_next_to_goal(self, reply: Reply, final: bool) -> bool:
+        """Whether the jaws have come to rest a count off the goal, which old firmware never calls reached."""
+        near = abs(reply.position - self.goal.position) <= 1
+        if not final or reply.contact or not near or reply.position != self._rest_position:
+            self._rest_position, self._rest_since = reply.position, reply.time
+            return False
+        return reply.time - self._rest_since >= REST_TIME
 
 
 REPEATS = 2  # times that an order without effect is sent again
@@ -291,7 +239,7 @@ class Orders:
     Attributes:
         wanted: what the gripper shall do; None: whatever it does.
         taken: what it has acknowledged; None: unknown.
-        urgent: the wanted order makes it stop, and does not wait for a link in doubt.
+        urgent: the wanted order makes it stop, and does not wait for the link to be in step.
 
     Args:
         salt: any number, other than that of the program that drove the gripper before.
@@ -324,8 +272,7 @@ class Orders:
 
     def drop(self) -> None:
         """Want nothing any more, and know nothing: after what may have interrupted the last order."""
-        self.wanted = self.taken = None
-        self.urgent = False
+        self.forget()
         self._salt = self._salt + 1 & FREE_FLAGS
 
     def forget(self) -> None:
@@ -345,31 +292,26 @@ class Orders:
 LASTING = 3  # replies: what the gripper was told may cross with what it says
 
 
-class Echo(Enum):
-    """How the gripper follows its order."""
-
-    FOLLOWS = auto()
-    UNHEARD = auto()  # it never did: the order was probably lost
-    OVERRULED = auto()  # it did before: somebody else gave it another one
-
-
 class EchoWatch:
     """Looks whether the gripper does what it was told.
 
     The gripper stays at its target, as it says, until it gets another order, whatever pulls at its jaws: leaving that
     state, or taking itself to be at a target elsewhere, is the sign of an order that was not ours.
+
+    Attributes:
+        heard: it followed the order before: one that is ignored now was overruled, else it was probably lost.
     """
 
     def __init__(self) -> None:
         self._order: Move | None = None
         self._sent = 0.0
-        self._heard = self._arrived = False
+        self.heard = self._arrived = False
         self._odd = 0
 
     def send(self, order: Move, now: float) -> None:
         """Note an order that was answered."""
         if order != self._order:
-            self._heard = False
+            self.heard = False
         self._order, self._sent = order, now
         self._odd, self._arrived = 0, False
 
@@ -377,18 +319,15 @@ class EchoWatch:
         """Expect nothing."""
         self._order = None
 
-    def take(self, reply: Reply, now: float) -> Echo:
-        """Judge a believed reply."""
-        if self._order is None or now - self._sent < GRACE:
-            return Echo.FOLLOWS
+    def is_ignored(self, reply: Reply) -> bool:
+        """Judge a believed reply; return whether several in a row do not fit the order."""
+        if self._order is None or reply.time - self._sent < GRACE:
+            return False
         if self._fits(self._order, reply):
-            self._heard, self._odd = True, 0
-            return Echo.FOLLOWS
-        self._odd += 1
-        if self._odd < LASTING:
-            return Echo.FOLLOWS
-        self._odd = 0
-        return Echo.OVERRULED if self._heard else Echo.UNHEARD
+            self.heard, self._odd = True, 0
+            return False
+        self._odd = (self._odd + 1) % LASTING
+        return self._odd == 0
 
     def _fits(self, order: Move, reply: Reply) -> bool:
         """Return whether a reply echoes an order's flags, and tells of its target and no other."""
@@ -402,8 +341,8 @@ class EchoWatch:
         return near or not reply.at_target
 
 
-LOOK = 0.3  # [s] in which jaws that go at 1.5 mm/s show it
-STEPS = 2  # counts that are motion and no rounding
+SETTLING_TIME = 0.3  # [s] in which jaws that go at 1.5 mm/s show it
+MOTION = 2  # counts that are motion and no rounding
 
 
 class Arrival:
@@ -418,17 +357,16 @@ class Arrival:
 
     def __init__(self) -> None:
         self.moving = self.over = False
-        self._first: int | None = None
-        self._since = 0.0
+        self._first: Reply | None = None
 
-    def take(self, reply: Reply, now: float) -> None:
+    def take(self, reply: Reply) -> None:
         """Take a believed reply."""
-        drives = reply.activated and reply.action and not reply.error
-        if not drives or (reply.at_target and not self.moving):
+        first = self._first
+        if not reply.driving or (reply.at_target and not self.moving):
             self.over = True
-        elif self._first is None or (self.moving and reply.position != self._first):
-            self._first, self._since = reply.position, now
-        elif abs(reply.position - self._first) >= STEPS:
-            self.moving, self._first, self._since = True, reply.position, now
-        elif now - self._since >= LOOK:
+        elif first is None or (self.moving and reply.position != first.position):
+            self._first = reply
+        elif abs(reply.position - first.position) >= MOTION:
+            self.moving, self._first = True, reply
+        elif reply.time - first.time >= SETTLING_TIME:
             self.over = True

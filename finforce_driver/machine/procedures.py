@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from enum import Enum, auto
 
-from finforce_driver.can.protocol import CanMessage, Reply, decode_encoder
+from finforce_driver.can.protocol import CanMessage, Command, Reply, decode_encoder
 from finforce_driver.settings import OPENING_PER_TICK, GripperSettings
 
 REPEAT = 0.02  # [s] between two tries
@@ -69,18 +69,26 @@ class EmergencyStop:
             self.demand()
 
 
-CHECK_TIME = 0.2  # [s] in which the error has to go
-SETTLE = 0.005  # [s] in which the control loop may latch again what persists
-
-
-class RecoveryStep(Enum):
-    """What is to be done next."""
+class Step(Enum):
+    """What a recovery or a calibration does next."""
 
     UNFLAG = auto()  # an order without the stop's flag: the flag latches the fault again every 0.2 ms
     CLEAR = auto()
-    LOOK = auto()
+    RESET = auto()  # an aborted calibration would be resumed half-way
+    BOOT = auto()  # nothing is sent
+    START = auto()
+    WATCH = auto()
     DONE = auto()
     FAILED = auto()
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more is to be done."""
+        return self in (Step.DONE, Step.FAILED)
+
+
+CHECK_TIME = 0.2  # [s] in which the error has to go
+SETTLE = 0.005  # [s] in which the control loop may latch again what persists
 
 
 class Recovery:
@@ -94,34 +102,29 @@ class Recovery:
     """
 
     def __init__(self, *, unflag: bool) -> None:
-        self._first = RecoveryStep.UNFLAG if unflag else RecoveryStep.CLEAR
-        self.step = self._first
+        self.step = self._first = Step.UNFLAG if unflag else Step.CLEAR
         self._cleared = 0.0
         self._tries = 1
 
-    @property
-    def over(self) -> bool:
-        """Whether nothing more is to be done."""
-        return self.step in (RecoveryStep.DONE, RecoveryStep.FAILED)
-
     def unflagged(self) -> None:
         """Note that the order without the flag was answered."""
-        if self.step is RecoveryStep.UNFLAG:
-            self.step = RecoveryStep.CLEAR
+        if self.step is Step.UNFLAG:
+            self.step = Step.CLEAR
 
-    def clear(self, now: float) -> None:
-        """Note that the clearing is sent."""
-        self._cleared, self.step = now, RecoveryStep.LOOK
+    def clear(self, now: float) -> Command:
+        """Return the command that clears, which counts as sent."""
+        self._cleared, self.step = now, Step.WATCH
+        return Command.CLEAR
 
-    def take(self, reply: Reply, now: float) -> None:
-        """Look at a reply that came at a time [s]."""
-        if self.step is not RecoveryStep.LOOK or now < self._cleared + SETTLE:
+    def take(self, reply: Reply) -> None:
+        """Look at a believed reply."""
+        if self.step is not Step.WATCH or reply.time < self._cleared + SETTLE:
             return
         if not reply.error:
             # the flag's fault shows again within a control cycle: this reply is later than that
-            self.step = RecoveryStep.DONE
-        elif now > self._cleared + CHECK_TIME:
-            self.step = self._first if self._tries < TRIES else RecoveryStep.FAILED
+            self.step = Step.DONE
+        elif reply.time > self._cleared + CHECK_TIME:
+            self.step = self._first if self._tries < TRIES else Step.FAILED
             self._tries += 1
 
 
@@ -138,19 +141,17 @@ NO_GRIPPER = (
     "the calibration is done, but the position does not follow: configure the controller as a gripper "
     "(#Gripper 1, #Save over UART)"
 )
-CALIBRATED_REPLIES = 2  # the first reply may carry a position of before
-
-
-UNCHECKED = "calibrated; whether all of the stroke was travelled is not known: the gripper does not tell its encoder"
+CALIBRATED_REPLIES = 2  # the first reply may carry an old position
+UNCHECKED = "calibrated; whether the whole stroke was travelled is unknown: the gripper does not report its encoder"
 FASTEST = 16000.0  # [ticks/s] of a calibrating gripper, 14150 at most
-JITTER = 60  # [ticks] by which a count may differ from the last one beside that
+JITTER = 60  # [ticks] by which a count may differ from the last one in addition to that
 SILENCES = 3  # questions without any answer after which there is none to be had
 
 
 class Travel:
-    """The way that the motor goes during a calibration, by the counts of its encoder.
+    """The travel of the motor during a calibration, by the counts of its encoder.
 
-    A count is believed when it goes on from the last one: a digit that fell over on the line is a count, too.
+    A count is believed when it continues the last one: a digit that was corrupted on the line is a count, too.
 
     Attributes:
         answers: counts that came.
@@ -168,10 +169,6 @@ class Travel:
         self._believed: float | None = None  # time of the newest believed count
         self._low = self._high = 0
         self._gap = 0.0
-
-    def is_due(self, now: float) -> bool:
-        """Whether the encoder is to be asked now."""
-        return now >= self.next_time
 
     @property
     def next_time(self) -> float:
@@ -201,36 +198,25 @@ class Travel:
         self._believed = now
 
     def has_seen(self, time: float) -> bool:
-        """Whether a count was believed after a time [s], or none is to be had."""
+        """Return whether a count was believed after a time [s], or none is to be had."""
         return self.next_time == math.inf or (self._believed is not None and self._believed > time)
 
-    def find_doubt(self) -> str:
-        """Return what is wrong with the way that was gone; empty where nothing is."""
+    def find_fault(self) -> str:
+        """Return what is wrong with the travel; empty where nothing is."""
         if not self.answers:
             return ""
-        settings, way = self._settings, OPENING_PER_TICK * (self._high - self._low)
+        settings, travel = self._settings, OPENING_PER_TICK * (self._high - self._low)
         # between two counts the jaws may have gone on to a stop and come back
         unseen = 0.5 * OPENING_PER_TICK * FASTEST * max(0.0, self._gap - 1.5 * self._period)
         least, most = (settings.stroke * (1.0 + sign * STROKE_TOLERANCE) for sign in (-1.0, 1.0))
-        words = f"the jaws travelled {1e3 * way:.1f} mm of the stroke of {1e3 * settings.stroke:.1f} mm"
-        if way > most:
+        words = f"the jaws travelled {1e3 * travel:.1f} mm of the stroke of {1e3 * settings.stroke:.1f} mm"
+        if travel > most:
             return f"{words}: is gripper.stroke wrong, or does the pinion slip?"
-        if way + unseen < least:
+        if travel + unseen < least:
             return f"{words}: is something between them? Take it out, then calibrate again"
-        if way < least:
+        if travel < least:
             return f"{words}, and too many replies were lost to tell whether that is all: calibrate again"
         return ""
-
-
-class CalibrationStep(Enum):
-    """What is to be done next."""
-
-    RESET = auto()  # an aborted calibration would be resumed half-way
-    BOOT = auto()  # nothing is sent
-    START = auto()
-    WATCH = auto()
-    DONE = auto()
-    FAILED = auto()
 
 
 class CalibrationRun:
@@ -238,8 +224,8 @@ class CalibrationRun:
 
     Attributes:
         step: what is to be done next.
-        reason: why it failed, or what is to be said of its success.
-        travel: the way that the jaws have gone.
+        reason: why it failed, or a remark on its success.
+        travel: of the jaws.
 
     Args:
         settings: of the gripper.
@@ -250,98 +236,90 @@ class CalibrationRun:
     def __init__(self, settings: GripperSettings, *, calibrated: bool, reset: bool) -> None:
         self._settings = settings
         self.travel = Travel(settings)
-        self.step = CalibrationStep.RESET if reset else CalibrationStep.START
+        self.step = Step.RESET if reset else Step.START
         self.reason = ""
         self._was_calibrated = calibrated and not reset
         self._starts = 0
         self._begun = self._booted = 0.0
-        self._place: int | None = None
+        self._first: int | None = None  # position
         self._runs = self._moved = self._opened = self._closed = False
         self._idle = self._calibrated = 0
         self._ended: float | None = None
 
-    @property
-    def over(self) -> bool:
-        """Whether it has ended, well or not."""
-        return self.step in (CalibrationStep.DONE, CalibrationStep.FAILED)
-
-    def reset(self, now: float) -> None:
-        """Note that the reset is sent."""
-        self._booted, self.step = now + BOOT_TIME, CalibrationStep.BOOT
+    def reset(self, now: float) -> Command:
+        """Return the command that resets the gripper, which counts as sent."""
+        self._booted, self.step = now + BOOT_TIME, Step.BOOT
+        return Command.RESET
 
     def quiet_until(self, now: float) -> float | None:
         """Return until when nothing is sent [s]; None when anything may be."""
-        return self._booted if self.step is CalibrationStep.BOOT and now < self._booted else None
+        return self._booted if self.step is Step.BOOT and now < self._booted else None
 
-    def start(self, now: float) -> None:
-        """Note that the calibration is sent."""
+    def start(self, now: float) -> Command:
+        """Return the command that calibrates, which counts as sent."""
         self._starts += 1
-        self._begun, self.step = now, CalibrationStep.WATCH
-        self._place, self._runs, self._moved = None, False, False
+        self._begun, self.step = now, Step.WATCH
+        self._first, self._runs, self._moved = None, False, False
         self.travel = Travel(self._settings)
+        return Command.CALIBRATE
 
-    def fail(self, reason: str) -> None:
-        """End it without success."""
-        self.reason, self.step = reason, CalibrationStep.FAILED
-
-    def take(self, reply: Reply, now: float) -> None:
-        """Look at a believed reply that came at a time [s]."""
+    def take(self, reply: Reply) -> None:
+        """Look at a believed reply."""
         if reply.error:
-            self.fail("a fault ended the calibration")
-        elif self.step is CalibrationStep.BOOT:
-            self.step = CalibrationStep.START
-        elif self.step is CalibrationStep.WATCH:
-            self._watch(reply, now)
+            self._fail("a fault ended the calibration")
+        elif self.step is Step.BOOT:
+            self.step = Step.START
+        elif self.step is Step.WATCH:
+            self._watch(reply)
 
-    def _watch(self, reply: Reply, now: float) -> None:
+    def _fail(self, reason: str) -> None:
+        self.reason, self.step = reason, Step.FAILED
+
+    def _watch(self, reply: Reply) -> None:
         """Look for the start, the end, and the time limit."""
-        self._place = reply.position if self._place is None else self._place
-        self._moved |= abs(reply.position - self._place) > 1
+        now = reply.time
+        self._first = reply.position if self._first is None else self._first
+        self._moved |= abs(reply.position - self._first) > 1
         self._runs |= self._moved or abs(reply.current_mA) > QUIET_CURRENT
         if self._was_calibrated and not reply.calibrated:
-            self.fail("the gripper gave the calibration up, or was restarted")
+            self._fail("the gripper gave the calibration up, or was restarted")
         elif self._was_calibrated:
-            self._look_for_end(reply, now)
+            self._look_for_end(reply)
         elif reply.calibrated:
-            self._check_end(reply, now)
-        if self.step is CalibrationStep.WATCH and not self._runs and now > self._begun + START_TIME:
-            self._start_again()
-        elif self.step is CalibrationStep.WATCH and now > self._begun + TIME_LIMIT:
-            self.fail("no end stop was found in time: is something in the way, or the current too small?")
+            self._check_end(reply)
+        if self.step is Step.WATCH and not self._runs and now > self._begun + START_TIME:
+            if self._starts < STARTS:
+                self.step = Step.START  # the gripper evidently did not get it
+            else:
+                self._fail("the calibration does not start: the motor draws no current; check its supply")
+        elif self.step is Step.WATCH and now > self._begun + TIME_LIMIT:
+            self._fail("no end stop was found in time: is something in the way, or the current too small?")
 
-    def _start_again(self) -> None:
-        """Send the calibration again, which the gripper evidently did not get, or give up."""
-        if self._starts < STARTS:
-            self.step = CalibrationStep.START
-        else:
-            self.fail("the calibration does not start: the motor draws no current; check its supply")
-
-    def _look_for_end(self, reply: Reply, now: float) -> None:
+    def _look_for_end(self, reply: Reply) -> None:
         """Look for the end where the flag, which was set before, does not tell."""
         self._opened |= reply.position <= OPENED
         self._closed |= self._opened and reply.position >= CLOSED
         self._idle = self._idle + 1 if self._closed and abs(reply.current_mA) < IDLE_CURRENT else 0
-        if self._idle >= IDLE_REPLIES and now > self._begun + LEAST_TIME:
+        if self._idle >= IDLE_REPLIES and reply.time > self._begun + LEAST_TIME:
             self._end()
 
-    def _check_end(self, reply: Reply, now: float) -> None:
+    def _check_end(self, reply: Reply) -> None:
         """Check what the flag tells: a controller that is no gripper moves, too, and keeps its position.
 
         The jaws end closed, but limp: what is soft between them opens them again.
         """
-        self._ended = now if self._ended is None else self._ended
+        self._ended = reply.time if self._ended is None else self._ended
+        late = reply.time > self._ended + END_TIME
         self._calibrated = self._calibrated + 1 if self._moved or reply.position >= CLOSED else 0
-        # what is soft between the jaws opens them: a count is waited for, for as long as the position is
-        seen = self.travel.has_seen(self._ended) or now > self._ended + END_TIME
-        if self._calibrated >= CALIBRATED_REPLIES and seen:
+        if self._calibrated >= CALIBRATED_REPLIES and (late or self.travel.has_seen(self._ended)):
             self._end()
-        elif self._calibrated < CALIBRATED_REPLIES and now > self._ended + END_TIME:
-            self.fail(NO_GRIPPER)
+        elif self._calibrated < CALIBRATED_REPLIES and late:
+            self._fail(NO_GRIPPER)
 
     def _end(self) -> None:
         """End it, well if the jaws went from stop to stop."""
-        if doubt := self.travel.find_doubt():
-            self.fail(doubt)
+        if fault := self.travel.find_fault():
+            self._fail(fault)
         else:
-            self.step = CalibrationStep.DONE
+            self.step = Step.DONE
             self.reason = "" if self.travel.answers else UNCHECKED

@@ -20,11 +20,11 @@ from typing import Any
 import pandas as pd
 from tqdm import tqdm
 
-from finforce_driver.can.protocol import CanMessage, Command, Move, decode_move, split_identifier
+from finforce_driver.can.protocol import CanMessage, Command, Move, decode_move
 from finforce_driver.errors import DriverError
 from finforce_driver.gripper import Gripper
 from finforce_driver.machine.machine import INHERITED
-from finforce_driver.settings import GripperScale, GripperSettings
+from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.control import Mode
@@ -115,7 +115,7 @@ class FaultRun:
         self.clock.attach(self.tape)
         settings = GripperSettings(poll_rate=self._random.choice((50.0, 100.0, 200.0)), telemetry_period=0.3)
         self.gripper = Gripper(self.bus, settings, self.clock)
-        self.oracle, self.guard = Oracle(self.tape, self.gripper.scale), Guard(self.tape)
+        self.oracle, self.guard = Oracle(self.tape, settings), Guard(self.tape)
         self._goal, self._stopped, self._clearing, self._allowed = 0.0, False, False, False
         self._next_act = 0.0
         self.gripper.listen(self._take)
@@ -219,9 +219,9 @@ class FaultRun:
 
     def _watch_message(self, message: CanMessage) -> None:
         """Check a message that leaves."""
-        if split_identifier(message.id).command == Command.MOVE and message.data:
+        if message.command == Command.MOVE and message.data:
             self.tally.orders += 1
-            goal = self.gripper.scale.counts_of(self._goal) if self._allowed else None
+            goal = self.gripper.settings.counts_of(self._goal) if self._allowed else None
             # jaws that move by somebody's order when a link comes up are held where they are, as documented
             allowed = self._allowed or self.gripper.state.message == INHERITED
             self.tally.motion.update(self.guard.check(decode_move(message), goal, self._stopped, allowed))
@@ -254,7 +254,7 @@ class FaultRun:
         self._goal, self._allowed = 0.030 if self.emulated.true_opening < 0.02 else 0.010, True
         self.gripper.move(self._goal, 0.1)
         state = self.gripper.wait(lambda state: state.phase is not Phase.MOVING, 5.0)
-        distance = self.tape.truths[-1].position - self.gripper.scale.counts_of(self._goal)
+        distance = self.tape.truths[-1].position - self.gripper.settings.counts_of(self._goal)
         return state.outcome is MoveOutcome.REACHED and abs(distance) < 3.0
 
 
@@ -362,10 +362,10 @@ class Oracle:
         outcome: of the last move, in the last state that was checked.
     """
 
-    def __init__(self, tape: Tape, scale: GripperScale) -> None:
+    def __init__(self, tape: Tape, settings: GripperSettings) -> None:
         self.tape = tape
         self.worst: Counter[str] = Counter()
-        self._scale = scale
+        self._settings = settings
         self.outcome = MoveOutcome.NONE
         self._telemetry: dict[str, float] = {}
         self._cut = False
@@ -421,7 +421,7 @@ class Oracle:
         wrong = []
         # a controller that ceases to be a gripper freezes its position byte, which only a calibration finds out
         if not math.isnan(state.opening) and all(truth.configured for truth in near):
-            position = self._scale.counts_of(state.opening)
+            position = self._settings.counts_of(state.opening)
             # the reply tells a position between the stops
             error = min(abs(position - min(max(truth.position, 0.0), 255.0)) for truth in near)
             self.worst["place [counts]"] = max(self.worst["place [counts]"], error)
@@ -449,7 +449,7 @@ class Oracle:
         recent = self.tape.last(state.stamp, LONG_WINDOW)
         right = True
         if state.outcome is MoveOutcome.REACHED:
-            position = self._scale.counts_of(goal)
+            position = self._settings.counts_of(goal)
             right = any(abs(truth.position - position) <= GOAL_TOLERANCE for truth in recent)
         elif state.outcome in (MoveOutcome.GRASPED, MoveOutcome.CLOSED_EMPTY):
             right = any(truth.blocked in (1, 2) for truth in recent)
