@@ -20,11 +20,11 @@ from time import monotonic
 
 from finforce.errors import FinforceError
 from finforce_driver.can.protocol import Bus
-from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, LinkError
+from finforce_driver.errors import GripperStateError, GripperTimeoutError, LinkError
 from finforce_driver.machine.drive import Request
 from finforce_driver.machine.machine import GripperMachine
 from finforce_driver.settings import GripperSettings
-from finforce_driver.state import GripperState, MoveOutcome, Phase
+from finforce_driver.state import GripperState
 
 LOG = logging.getLogger(__name__)
 FIRST_PAUSE, LONGEST_PAUSE = 0.5, 5.0  # [s] between two tries to open the bus
@@ -34,7 +34,6 @@ LEAVING_TURNS = 20  # that the last order may take
 Listener = Callable[[GripperState], None]
 StateCondition = Callable[[GripperState], bool]
 JOIN_TIMEOUT = 2.0  # [s], for a cycle under way: the longest wait for a reply is 1 s
-LIMP = (Phase.DISCONNECTED, Phase.PROBING, Phase.FAULT, Phase.UNCALIBRATED)  # or not known
 
 
 class Clock:
@@ -290,43 +289,6 @@ class Gripper(StateSource):
             GripperStateError: the gripper is absent, faulty or calibrating.
         """
         self._command(lambda machine, now: machine.release_power(now))
-
-    def grasp_without_vision(
-        self,
-        current_force: float,
-        speed: float | None = None,
-        least_opening: float | None = None,
-        time_limit: float = 20.0,
-    ) -> GripperState:
-        """Close until something resists with a force that the motor's current alone tells; return the state holding.
-
-        The force is that of the maker's curve, 7 to 62 N: too much for what is fragile. Blocks; the same without
-        waiting is `move(least_opening, speed, current_force)`.
-
-        Args:
-            current_force: grip force by the maker's curve [N].
-            speed: of the opening [m/s].
-            least_opening: how far to close [m]; fully where None.
-            time_limit: longest time [s].
-
-        Raises:
-            TargetError: a value is no number or out of bounds.
-            GripperStateError: the gripper could not move, or was lost on the way.
-            GripperTimeoutError: nothing resisted in time; the gripper holds in place.
-            GraspError: the jaws closed as far as they may on nothing; the gripper holds in place.
-        """
-        self.move(self.settings.closed_opening if least_opening is None else least_opening, speed, current_force)
-        try:
-            state = self.wait(lambda state: state.phase is not Phase.MOVING, time_limit)
-        except GripperTimeoutError:
-            self.hold()
-            raise
-        if state.phase in LIMP:
-            raise GripperStateError(f"the grasp was lost: {state.message}")
-        if state.outcome is not MoveOutcome.GRASPED:
-            self.hold()
-            raise GraspError(f"nothing was grasped ({state.outcome.value}) down to {1e3 * state.opening:.1f} mm")
-        return state
 
     def _pass_time(self, condition: StateCondition, left: float) -> None:
         """Let the gripper get on, by a turn of our own where no thread makes them."""

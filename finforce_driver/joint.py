@@ -11,74 +11,24 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Event, RLock
 
-from finforce.settings import check_bounds, setting
-from finforce_driver.clock import Clock, MonotonicClock
-from finforce_driver.errors import GripperStateError, GripperTimeoutError, TargetError
+from finforce_driver.errors import GripperStateError, TargetError
+from finforce_driver.gripper import Clock, StateCondition, StateSource
 from finforce_driver.machine.knowledge import History
-from finforce_driver.settings import GripperSettings, check_numbers, is_number
-from finforce_driver.state import GripperState, MoveOutcome, Phase
+from finforce_driver.settings import GripperSettings, JointSettings, check_numbers, is_number
+from finforce_driver.state import GripperState, MoveOutcome, Phase, describe
 
-
-@dataclass(frozen=True, kw_only=True)
-class JointSettings:
-    """How a joint's value goes with the opening, and how it follows its commands; units stand in the metadata.
-
-    The opening is linear between the two ends: `gripper.closed_opening` at `closed`, that and `gripper.stroke` at
-    `open`.
-    """
-
-    names: tuple[str, ...] = setting(("gripper_joint",), "Names of the commanded joints; the first is read")
-    closed: float = setting(0.0, "Joint value of the closed gripper, in the joint's unit", "", -1e4, 1e4)
-    open: float = setting(1.0, "Joint value of the open gripper, in the joint's unit", "", -1e4, 1e4)
-    resolution: float = setting(0.0002, "Smallest step of the opening that the joint follows", "m", 1e-6, 0.01)
-    rate: float = setting(
-        25.0, "Rate of setpoints on the way; 0: one command, the joint keeps the speed itself", "Hz", 0.0, 500.0
-    )
-    largest_speed: float = setting(0.1, "Maximum speed of the opening", "m/s", 1e-4, 2.0)
-    largest_force: float = setting(0.0, "Maximum effort of a command; 0: the joint takes none", "N", 0.0, 1000.0)
-    effort_is_force: bool = setting(
-        False, "Whether the joint's effort is its grip force [N], as a check of the camera's", ""
-    )
-
-    def __post_init__(self) -> None:
-        """Refuse what no joint is.
-
-        Raises:
-            TargetError: a value is out of bounds, there is no joint, or both ends are the same.
-        """
-        check_bounds(self, TargetError)
-        if not self.names or not all(self.names) or len(set(self.names)) != len(self.names):
-            raise TargetError(f"joint.names: got {self.names!r}, expected one name or more, each once")
-        if self.closed == self.open:
-            raise TargetError(f"joint.closed and joint.open: both are {self.open:g}, expected two values")
-
-
-Listener = Callable[[GripperState], None]
 NEAR = 1.5  # steps within which the target is reached
 STILL, STALL = 1e-3, 0.4  # [m/s], and [s] without motion after which the jaws are stalled
-SILENCE = 0.5  # [s] without a state after which the joint counts as away
-PATIENCE = 2.0  # [s] beyond the way's time
+SILENCE = 0.5  # [s] without a state after which the joint counts as disconnected
+EXTRA_TIME = 2.0  # [s] beyond the travel's own time
 TURN = 0.005  # [s] between two looks of one who waits
+ABSENT = (Phase.PROBING, Phase.DISCONNECTED)
+SendCommand = Callable[[float, float, float], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointCommand:
-    """What is sent to the joint.
-
-    Attributes:
-        position: in the joint's own unit.
-        velocity: of the joint, positive; NaN: its own.
-        effort: greatest [N]; NaN: its own.
-    """
-
-    position: float
-    velocity: float = math.nan
-    effort: float = math.nan
-
-
-@dataclass(kw_only=True)
-class _Way:
-    """A move: opening to go to [m], speed [m/s], effort [N], when it began and will be over [s]."""
+class _Ramp:
+    """A move: opening to go to [m], speed [m/s], effort [N], and when [s] and where [m] it began."""
 
     target: float
     speed: float
@@ -87,7 +37,7 @@ class _Way:
     start: float
 
     def setpoint(self, now: float) -> float:
-        """Return where it is to be by now [m]."""
+        """Return where the jaws are to be by now [m]."""
         reach = self.speed * (now - self.begun)
         return self.start + min(max(self.target - self.start, -reach), reach)
 
@@ -97,39 +47,34 @@ class _Way:
         return self.begun + abs(self.target - self.start) / self.speed
 
 
-class JointGripper:
+class JointGripper(StateSource):
     """A gripper over a joint's position.
 
     Args:
-        send: sends a command to the joint; it must return at once.
+        send: sends position and velocity in the joint's own unit and effort [N], NaN: the joint's own; it must return
+            at once.
         settings: stroke, offset and default speed.
-        joint: how the joint's value goes with the opening.
+        joint: relates the joint's value to the opening.
         clock: what it lives by; the machine's own where none is given.
 
     Attributes:
         settings: the same.
-        clock: the same.
         resolution: smallest step of the opening [m].
-        state: what is known now.
     """
 
     def __init__(
-        self,
-        send: Callable[[JointCommand], None],
-        settings: GripperSettings,
-        joint: JointSettings,
-        clock: Clock | None = None,
+        self, send: SendCommand, settings: GripperSettings, joint: JointSettings, clock: Clock | None = None
     ) -> None:
-        self.settings, self.clock, self.resolution = settings, clock or MonotonicClock(), joint.resolution
+        super().__init__(clock)
+        self.settings, self.resolution = settings, joint.resolution
         self.state = GripperState(phase=Phase.PROBING, message=f"waiting for the first state of {joint.names[0]}")
         self._send, self._joint = send, joint
-        self._listeners: list[Listener] = []
         self._history = History()  # of openings [m]
         self._stamp = -math.inf  # of the newest [s]
-        self._way: _Way | None = None
+        self._ramp: _Ramp | None = None
         self._sent = -math.inf
         self._moved = -math.inf  # when the jaws were last seen to move [s]
-        self._stopped = self._closed = False
+        self._stopped = False
         self._outcome = MoveOutcome.NONE
         self._effort = math.nan
         self._lock = RLock()
@@ -152,29 +97,26 @@ class JointGripper:
             self._history.add(stamp, opening)
             self._stamp, self._effort = stamp, effort
             self._judge(stamp)
-        self._tell()
+            self._refresh()
 
     def tick(self) -> None:
         """Send the setpoint that is due, and notice silence."""
         now = self.clock.now()
         with self._lock:
+            ramp = self._ramp
             due = now - self._sent >= 1.0 / self._joint.rate if self._joint.rate else False
-            if self._way is not None and due and not self._stopped:
-                self._command(self._way.setpoint(now), now)
-                if now > self._way.arrives and self._outcome is not MoveOutcome.NONE:
-                    self._way = None  # it stays at its last command
-            silent = self.state.phase not in (Phase.PROBING, Phase.DISCONNECTED)
-            silent &= now - self._stamp > SILENCE
-            if silent:
+            if ramp is not None and due and not self._stopped:
+                self._command(ramp.setpoint(now), now)
+                if now > ramp.arrives and self._outcome is not MoveOutcome.NONE:
+                    self._ramp = None  # it stays at its last command
+            if self.state.phase not in ABSENT and now - self._stamp > SILENCE:
                 self._end(MoveOutcome.ABORTED)
                 self._refresh()
-        if silent:
-            self._tell()
 
     # What it is told
 
     def check_move(self, opening: float, speed: float | None = None, force: float | None = None) -> None:
-        """Refuse what `move` would refuse in whatever state.
+        """Reject what `move` would reject in whatever state.
 
         Raises:
             TargetError: a value is no number or out of bounds.
@@ -191,33 +133,35 @@ class JointGripper:
 
         Raises:
             TargetError: a value is no number or out of bounds.
-            GripperStateError: the joint is away, or an emergency stop is latched.
+            GripperStateError: the joint is disconnected, or an emergency stop is latched.
         """
         self.check_move(opening, speed, force)
         with self._lock:
             self._require("move")
-            now = self.clock.now()
-            start = self._history.last if self._way is None else self._way.setpoint(now)
-            largest = self._joint.largest_force
-            effort = math.nan if force is None or not largest else min(float(force), largest)
-            pace = self.settings.default_speed if speed is None else speed
-            self._way = _Way(target=float(opening), speed=pace, effort=effort, begun=now, start=start)
+            if self._stopped:
+                raise GripperStateError("move: an emergency stop is latched: clear the errors first")
+            now, rate, largest = self.clock.now(), self._joint.rate, self._joint.largest_force
+            self._ramp = _Ramp(
+                target=float(opening),
+                speed=self.settings.default_speed if speed is None else speed,
+                effort=math.nan if force is None or not largest else min(float(force), largest),
+                begun=now,
+                start=self._history.last if self._ramp is None else self._ramp.setpoint(now),
+            )
             self._outcome, self._moved = MoveOutcome.NONE, now
-            self._command(opening if not self._joint.rate else self._way.setpoint(now + 1.0 / self._joint.rate), now)
+            self._command(self._ramp.setpoint(now + 1.0 / rate) if rate else opening, now)
             self._refresh()
-        self._tell()
 
     def hold(self) -> None:
         """Stop in place and hold there.
 
         Raises:
-            GripperStateError: the joint is away.
+            GripperStateError: the joint is disconnected.
         """
         with self._lock:
-            self._require("hold", stopped=True)
+            self._require("hold")
             self._hold()
             self._refresh()
-        self._tell()
 
     def estop(self) -> None:
         """Stop in place, and refuse moves until it is cleared; a joint does not go limp."""
@@ -226,144 +170,101 @@ class JointGripper:
             if self._is_known:
                 self._hold()
             self._refresh()
-        self._tell()
 
     def clear_errors(self) -> None:
         """End an emergency stop."""
         with self._lock:
             self._stopped = False
             self._refresh()
-        self._tell()
 
     def calibrate(self) -> None:
-        """Refuse: a joint knows where it is.
-
-        Raises:
-            GripperStateError: always.
-        """
+        """Refuse, by raising GripperStateError: a joint knows where it is."""
         raise GripperStateError("calibrate: this gripper is a joint, which knows where it is")
 
     def activate(self, on: bool) -> None:
-        """Refuse to switch off what has no switch.
-
-        Raises:
-            GripperStateError: it was to be switched off.
-        """
+        """Refuse to switch off what has no switch, by raising GripperStateError."""
         if not on:
             raise GripperStateError("activate: this gripper is a joint, which does not go limp")
 
     def release_power(self) -> None:
-        """Refuse: a joint does not go limp.
-
-        Raises:
-            GripperStateError: always.
-        """
+        """Refuse, by raising GripperStateError: a joint does not go limp."""
         self.activate(False)
 
     # As of a gripper
 
     def start(self) -> None:
-        """Nothing: it lives by what it is told."""
+        """Do nothing: it lives by what it is told."""
 
     def close(self) -> None:
         """Hold in place, where the joint is there, and end."""
         with self._lock:
             if self.state.phase is Phase.MOVING:
                 self._hold()
-            self._closed = True
-
-    def listen(self, callback: Listener) -> Callable[[], None]:
-        """Have a function called with the state after every state of the joint; return what ends it."""
-        self._listeners.append(callback)
-        return lambda: self._listeners.remove(callback) if callback in self._listeners else None
+            self._ended.set()
 
     def opening_at(self, time: float) -> float:
         """Return the opening [m] at a time of the last 5 s [s]; NaN where it is not known."""
         with self._lock:
-            return self._history.place_at(time, 0.0)
+            return self._history.position_at(time, 0.0)
 
-    def wait(self, condition: Callable[[GripperState], bool], timeout: float) -> GripperState:
-        """Return the first state that fulfils a condition.
-
-        Raises:
-            GripperTimeoutError: none did within `timeout` [s].
-            GripperStateError: the gripper was closed meanwhile.
-        """
-        deadline, wake = self.clock.now() + timeout, Event()
-        while not condition(state := self.state):
-            if self._closed:
-                raise GripperStateError("wait: the driver of the gripper has ended; start it again")
-            if self.clock.now() >= deadline:
-                words = f"not within {timeout:g} s: the gripper is {state.phase.value}: {state.message}"
-                raise GripperTimeoutError(words)
-            self.clock.wait(TURN, wake)
-        return state
-
-    # Within
+    def _pass_time(self, condition: StateCondition, left: float) -> None:
+        self.clock.wait(TURN, Event())
 
     @property
     def _is_known(self) -> bool:
         return self._stamp > -math.inf
 
-    def _require(self, what: str, *, stopped: bool = False) -> None:
-        if self.state.phase in (Phase.PROBING, Phase.DISCONNECTED):
+    def _require(self, what: str) -> None:
+        if self.state.phase in ABSENT:
             raise GripperStateError(f"{what}: no state of {self._joint.names[0]} comes ({self.state.message})")
-        if self._stopped and not stopped:
-            raise GripperStateError(f"{what}: an emergency stop is latched: clear the errors first")
 
     def _hold(self) -> None:
         self._end(MoveOutcome.REPLACED)
         self._command(self._history.last, self.clock.now())
 
     def _end(self, outcome: MoveOutcome) -> None:
-        if self._way is not None and self._outcome is MoveOutcome.NONE:
+        if self._ramp is not None and self._outcome is MoveOutcome.NONE:
             self._outcome = outcome
-        self._way = None
+        self._ramp = None
 
     def _command(self, opening: float, now: float) -> None:
         """Send an opening [m] to the joint."""
-        self._sent, way = now, self._way
-        rate = 1.0 / abs(self._per_unit)
+        self._sent, ramp = now, self._ramp
+        position = self._joint.closed + (opening - self.settings.closed_opening) / self._per_unit
         self._send(
-            JointCommand(
-                position=self._joint.closed + (opening - self.settings.closed_opening) / self._per_unit,
-                velocity=math.nan if way is None else rate * way.speed,
-                effort=math.nan if way is None else way.effort,
-            )
+            position,
+            math.nan if ramp is None else ramp.speed / abs(self._per_unit),
+            math.nan if ramp is None else ramp.effort,
         )
 
     def _judge(self, stamp: float) -> None:
         """Judge the move by a new state."""
         if abs(self._history.speed()) > STILL:
             self._moved = stamp
-        way, opening = self._way, self._history.last
-        if way is not None and self._outcome is MoveOutcome.NONE:
-            over = stamp > way.arrives
-            if over and abs(opening - way.target) <= NEAR * self.resolution:
-                self._outcome = MoveOutcome.REACHED
-            elif over and stamp - self._moved > STALL and stamp - way.arrives > STALL:
-                closes = way.target < opening
-                self._outcome = MoveOutcome.GRASPED if closes else MoveOutcome.BLOCKED
-            elif stamp > way.arrives + PATIENCE:
-                self._outcome = MoveOutcome.TIMED_OUT
-        self._refresh()
+        ramp, opening = self._ramp, self._history.last
+        if ramp is None or self._outcome is not MoveOutcome.NONE:
+            return
+        late = stamp - ramp.arrives
+        if late > 0.0 and abs(opening - ramp.target) <= NEAR * self.resolution:
+            self._outcome = MoveOutcome.REACHED
+        elif late > STALL and stamp - self._moved > STALL:
+            self._outcome = MoveOutcome.GRASPED if ramp.target < opening else MoveOutcome.BLOCKED
+        elif late > EXTRA_TIME:
+            self._outcome = MoveOutcome.TIMED_OUT
 
     def _refresh(self) -> None:
-        """Make the state anew."""
+        """Make the state anew, and tell it."""
         if not self._is_known:
             self.state = replace(self.state, estopped=self._stopped)
+            self._tell()
             return
-        away = self.clock.now() - self._stamp > SILENCE
-        moving = self._way is not None and self._outcome is MoveOutcome.NONE
+        moving = self._ramp is not None and self._outcome is MoveOutcome.NONE
         phase = Phase.MOVING if moving else Phase.READY
-        phase = Phase.FAULT if self._stopped else phase
-        words = {MoveOutcome.GRASPED: "something is grasped", MoveOutcome.BLOCKED: "something blocks the opening jaws"}
-        message = words.get(
-            self._outcome, self._outcome.value if self._outcome is not MoveOutcome.NONE else phase.value
-        )
+        message = describe(phase, self._outcome, ())
         if self._stopped:
+            phase = Phase.FAULT
             message = "emergency stop: the jaws hold; make the place safe, then clear the errors"
-        if away:
+        if self.clock.now() - self._stamp > SILENCE:
             phase, message = Phase.DISCONNECTED, f"no state of {self._joint.names[0]} for {SILENCE:g} s"
         self.state = GripperState(
             phase=phase,
@@ -371,7 +272,7 @@ class JointGripper:
             opening=self._history.last,
             velocity=self._history.speed(),
             force=self._effort if self._joint.effort_is_force else math.nan,
-            target=math.nan if self._way is None else self._way.target,
+            target=math.nan if self._ramp is None else self._ramp.target,
             at_target=self._outcome is MoveOutcome.REACHED,
             calibrated=True,
             activated=True,
@@ -379,7 +280,4 @@ class JointGripper:
             outcome=self._outcome,
             message=message,
         )
-
-    def _tell(self) -> None:
-        for listener in tuple(self._listeners):
-            listener(self.state)
+        self._tell()

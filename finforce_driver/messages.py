@@ -4,30 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from finforce.health import Health, Level, Outcome, Report
+from finforce.stamps import NANOSECONDS, StampError, StampGate
 from finforce_driver.errors import TargetError
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspStatus
-from finforce_driver.state import GripperState, MoveOutcome, Phase, describe
+from finforce_driver.gripper import Clock
+from finforce_driver.settings import GraspGoal
+from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveOutcome, MoveRequest, Phase, describe
 
 JOINTS_DIFFER = 1e-4  # [m] by which the joints of one command may differ
-
-
-@dataclass(frozen=True, kw_only=True)
-class MoveRequest:
-    """What a command asks for, as it came.
-
-    Attributes:
-        opening: to go to [m].
-        speed: of the opening [m/s]; None: the driver's own.
-        force: grip force by the motor's current [N]; None: the driver's own.
-    """
-
-    opening: float
-    speed: float | None = None
-    force: float | None = None
 
 
 def move_from_joint_state(message: Any, joints: Sequence[str] = ()) -> MoveRequest:
@@ -73,9 +60,32 @@ def _move_of_joints(message: Any, joints: Sequence[str]) -> MoveRequest:
     )
 
 
-def move_from_gripper_command(command: Any) -> MoveRequest:
-    """Return the move of a control_msgs/GripperCommand: position = opening, max_effort = grip force, 0 for none."""
-    return MoveRequest(opening=command.position, force=command.max_effort or None)
+def move_from_gripper_command(goal: Any) -> MoveRequest:
+    """Return the move of a goal of control_msgs/GripperCommand: opening and grip force, 0 for the driver's own."""
+    return MoveRequest(opening=goal.command.position, force=goal.command.max_effort or None)
+
+
+def move_from_parallel_command(goal: Any, joints: Sequence[str]) -> MoveRequest:
+    """Return the move of a goal of control_msgs/ParallelGripperCommand, a JointState; 0 for the driver's own.
+
+    Raises:
+        TargetError: as `move_from_joint_state`.
+    """
+    request = move_from_joint_state(goal.command, joints)
+    return replace(request, force=request.force or None, speed=request.speed or None)
+
+
+def fill_outcome(message: Any, state: GripperState) -> None:
+    """Write what became of a move into a result of either action."""
+    message.stalled = state.outcome is MoveOutcome.GRASPED
+    message.reached_goal = state.outcome is MoveOutcome.REACHED
+
+
+def fill_gripper_command(message: Any, state: GripperState) -> None:
+    """Write a state into a result or feedback of control_msgs/GripperCommand; what is not known is 0."""
+    message.position = state.opening if math.isfinite(state.opening) else 0.0
+    message.effort = state.force if math.isfinite(state.force) else 0.0
+    fill_outcome(message, state)
 
 
 def fill_joint_state(message: Any, joints: Sequence[str], state: GripperState, effort: float | None) -> None:
@@ -122,13 +132,53 @@ def _single(values: Sequence[float], what: str) -> float | None:
     return float(values[0]) if len(values) else None
 
 
+class MessageTimes:
+    """Translates between a node's clock and the gripper's by what both show at the same moment.
+
+    Args:
+        clock: the gripper's.
+        sources: names of what sends messages, each in the order of its stamps.
+        max_age: greatest age of a message, and greatest time that its stamp may lie ahead [s].
+        restart_gap: by which the stamps of a source may go back, because they begin anew [s].
+    """
+
+    def __init__(self, clock: Clock, sources: tuple[str, ...], *, max_age: float, restart_gap: float) -> None:
+        self._clock = clock
+        self._gates = {name: StampGate(max_age=max_age, restart_gap=restart_gap) for name in sources}
+
+    def enter(self, source: str, stamp: int, now: int) -> float:
+        """Return the stamp [ns] of a fresh message of a source on the gripper's clock [s].
+
+        Args:
+            source: its name.
+            stamp: of the message [ns].
+            now: the node's clock [ns].
+
+        Raises:
+            StaleError: the message is too old.
+            StampError: the stamp repeats, goes back or lies ahead of the clock.
+        """
+        self._gates[source].enter(stamp, now)
+        return self._clock.now() - (now - stamp) / NANOSECONDS
+
+    def to_stamp(self, time: float, now: int) -> int:
+        """Return a time of the gripper's clock [s] as a stamp [ns], with `now` of the node's clock [ns].
+
+        Raises:
+            StampError: the node's clock does not go yet.
+        """
+        stamp = now - round((self._clock.now() - time) * NANOSECONDS)
+        if stamp < 0:
+            raise StampError(f"the node's clock stands at {now / NANOSECONDS:g} s: use_sim_time without /clock?")
+        return stamp
+
+
 LEVELS = {Phase.READY: Level.OK, Phase.MOVING: Level.OK, Phase.FAULT: Level.ERROR, Phase.DISCONNECTED: Level.ERROR}
 FAILURES = (MoveOutcome.BLOCKED, MoveOutcome.TIMED_OUT, MoveOutcome.ABORTED)
-MEASURED = {"callback to published": "request to reply", "image to published": "reply to published"}
 
 
 class GripperHealth(Health):
-    """Keeps what became of the gripper's replies, and of commands and forces that were refused.
+    """Keeps what became of the gripper's replies, and of commands and forces that were rejected.
 
     Args:
         options: of `finforce.health.Health`.
@@ -136,11 +186,11 @@ class GripperHealth(Health):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._told: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
 
     def is_news(self, topic: str, text: str) -> bool:
-        """Say whether something else was said of a topic the last time."""
-        last, self._told[topic] = self._told.get(topic), text
+        """Keep a text and return whether the last one on this topic was another one."""
+        last, self._reported[topic] = self._reported.get(topic), text
         return text != last
 
     def take(self, state: GripperState, now: float) -> None:
@@ -161,21 +211,17 @@ class GripperHealth(Health):
     def report(self, alarms: Sequence[Outcome] = (), values: Mapping[str, str] | None = None) -> Report:
         """Return the state now, with the times of a driver by their own names."""
         report = super().report(alarms, values)
-        named = {_rename(name): value for name, value in report.values.items()}
-        return Report(level=report.level, message=report.message, values=named)
-
-
-def _rename(figure: str) -> str:
-    """Return the name that a figure of images has for a driver."""
-    for name, own in MEASURED.items():
-        figure = figure.replace(name, own)
-    return figure
+        names = {
+            name: name.replace("callback to published", "request to reply").replace("image to", "reply to")
+            for name in report.values
+        }
+        return replace(report, values={names[name]: value for name, value in report.values.items()})
 
 
 def outcome_of_state(state: GripperState) -> Outcome:
     """Return the level of a gripper's phase, a word for it and its sentence."""
     level = Level.ERROR if state.estopped or state.faults else LEVELS.get(state.phase, Level.WARN)
-    # what no phase says by itself is worth a look: another program's commands, or a speed that was cut
+    # what no phase says by itself deserves attention: another program's commands, or a speed that was limited
     extraordinary = state.message not in ("", describe(state.phase, state.outcome, state.faults))
     if level == Level.OK and (state.outcome in FAILURES or extraordinary):
         level = Level.WARN
@@ -184,7 +230,7 @@ def outcome_of_state(state: GripperState) -> Outcome:
 
 
 def news_of_state(state: GripperState) -> str:
-    """Return what a log should say of a gripper once; its moves are no news."""
+    """Return the text to log of a gripper when it changes; moves do not change it."""
     outcome = outcome_of_state(state)
     return "the gripper is ready" if outcome.level == Level.OK else outcome.text
 
@@ -216,7 +262,7 @@ def describe_state(state: GripperState) -> dict[str, str]:
 
 
 def outcome_of_grasp(status: GraspStatus) -> Outcome:
-    """Return the level of a grasp, its phase and its sentence; one that was ended wants to be looked at."""
+    """Return the level of a grasp, its phase and its sentence; one that was ended deserves attention."""
     level = Level.WARN if status.phase is GraspPhase.STOPPED else Level.OK
     level = Level.ERROR if status.unseen else level
     return Outcome(level=level, reason=status.phase.value, text=status.reason)
@@ -231,7 +277,7 @@ def describe_grasp(status: GraspStatus | None) -> dict[str, str]:
     """Return the figures of a grasp as text, nothing before the first."""
     if status is None:
         return {}
-    refused = ", ".join(f"{count} {reason}" for reason, count in status.refused.items() if count)
+    rejected = ", ".join(f"{count} {reason}" for reason, count in status.rejected.items() if count)
     return {
         "grasp": status.phase.value,
         "grasp reason": status.reason,
@@ -245,7 +291,7 @@ def describe_grasp(status: GraspStatus | None) -> dict[str, str]:
         "force of one step [N]": _number(status.resolution, 3),
         "image to force [ms]": _number(1e3 * status.latency, 0),
         "image period [ms]": _number(1e3 * status.period, 0),
-        "forces refused": refused or "none",
+        "forces rejected": rejected or "none",
     }
 
 

@@ -22,30 +22,32 @@ from finforce.messages import stamp_of
 from finforce.optional import import_library
 from finforce.ros import node as ros
 from finforce_driver.can import build_bus
-from finforce_driver.clock import MessageTimes
 from finforce_driver.errors import GraspError, TargetError
 from finforce_driver.grasp.controller import check_force_value
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import GraspSession
-from finforce_driver.grasp.settings import GraspGoal, GraspSettings, GraspStatus
 from finforce_driver.gripper import Gripper
-from finforce_driver.joint import JointCommand, JointGripper, JointSettings
+from finforce_driver.joint import JointGripper, SendCommand
 from finforce_driver.messages import (
     GripperHealth,
+    MessageTimes,
     describe_grasp,
     describe_state,
+    fill_gripper_command,
     fill_joint_state,
     goal_from_joint_state,
     grasp_alarms,
     gripper_alarms,
+    move_from_gripper_command,
     move_from_joint_state,
+    move_from_parallel_command,
     news_of_state,
     outcome_of_grasp,
     outcome_of_state,
 )
-from finforce_driver.settings import DriverParameters, GripperSettings
+from finforce_driver.settings import DriverParameters, GraspGoal, GraspSettings, GripperSettings, JointSettings
 from finforce_driver.state import GripperState
-from finforce_driver.tasks import GripperCommandAction, GripperTasks, ParallelGripperCommandAction
+from finforce_driver.tasks import GripperTasks, MoveAction
 
 JAWS = ("left", "right")
 LINKS = ("joint_command", "parallel_gripper_command", "gripper_command")  # of other grippers
@@ -61,46 +63,6 @@ def build_gripper(parameters: DriverParameters, settings: GripperSettings) -> Gr
     if not math.isnan(parameters.release_opening):
         settings.check_opening("release_opening", parameters.release_opening)
     return Gripper(build_bus(parameters.port, parameters.interface, baud_rate=parameters.baud_rate), settings)
-
-
-class DriverOutputs:
-    """The publishers of a gripper driver node.
-
-    Args:
-        qos: makes publishers and watches them.
-        parameters: names of the joints.
-        own_joints: nobody else tells the state of the joints.
-    """
-
-    def __init__(self, qos: ros.QosWatch, parameters: DriverParameters, *, own_joints: bool = True) -> None:
-        self._names, self._source = parameters.joint_names, qos.node.get_name()
-        self._told: tuple[str, str] | None = None
-        self.joints = qos.publisher(ros.JointState, "joint_states", ros.RESULT) if own_joints else None
-        self.grasp = qos.publisher(ros.DiagnosticStatus, "~/grasp_state", ros.LATCHED)
-
-    def send_joints(self, stamp: int, state: GripperState, effort: float | None) -> None:
-        """Send the joints as a reply at `stamp` [ns] shows them; what is not known stays empty.
-
-        Args:
-            stamp: of the reply [ns].
-            state: with it.
-            effort: force that is trusted [N]; None: none is.
-        """
-        if self.joints is None:
-            return
-        message = ros.JointState(header=ros.Header(stamp=ros.stamp_message(stamp)))
-        fill_joint_state(message, self._names, state, effort)
-        self.joints.publish(message)
-
-    def send_grasp(self, status: GraspStatus | None) -> None:
-        """Send how the grasp is, when its phase or its reason has changed."""
-        if status is None:
-            return
-        outcome = outcome_of_grasp(status)
-        if self._told != (told := (outcome.reason, outcome.text)):
-            self._told = told
-            report = Report(level=outcome.level, message=outcome.text, values=describe_grasp(status))
-            self.grasp.publish(ros.status_message("finforce: grasp", self._source, report))
 
 
 class JointLink:
@@ -125,8 +87,8 @@ class JointLink:
         if not target:
             raise TargetError(f"port: got none, expected the name of the {kind} to send to")
         self._node, self._joint = node, joint
-        self._send = self._topic(target) if kind == "joint_command" else self._action(kind, target)
-        self.gripper = JointGripper(self._send, settings, joint)
+        send = self._topic(target) if kind == "joint_command" else self._action(kind, target)
+        self.gripper = JointGripper(send, settings, joint)
         node.create_subscription(JointState, "joint_states", self._take, ros.SENSOR)
         node.create_timer(1.0 / (joint.rate or 10.0), self.gripper.tick)
 
@@ -141,23 +103,23 @@ class JointLink:
         try:
             self.gripper.take(message.position[index], self.gripper.clock.now(), effort)
         except FinforceError as error:
-            self._node.get_logger().warning(f"joint state refused: {error}", throttle_duration_sec=5.0)
+            self._node.get_logger().warning(f"joint state rejected: {error}", throttle_duration_sec=5.0)
 
-    def _message(self, command: JointCommand) -> JointState:
+    def _message(self, position: float, velocity: float, effort: float) -> JointState:
         """Return a command for all joints alike; what it does not say stays empty."""
         count = len(self._joint.names)
         return JointState(
             name=list(self._joint.names),
-            position=[command.position] * count,
-            velocity=[command.velocity] * count if math.isfinite(command.velocity) and not self._joint.rate else [],
-            effort=[command.effort] * count if math.isfinite(command.effort) else [],
+            position=[position] * count,
+            velocity=[velocity] * count if math.isfinite(velocity) and not self._joint.rate else [],
+            effort=[effort] * count if math.isfinite(effort) else [],
         )
 
-    def _topic(self, target: str) -> Callable[[JointCommand], None]:
+    def _topic(self, target: str) -> SendCommand:
         out = self._node.create_publisher(JointState, target, ros.RESULT)
-        return lambda command: out.publish(self._message(command))
+        return lambda *command: out.publish(self._message(*command))
 
-    def _action(self, kind: str, target: str) -> Callable[[JointCommand], None]:
+    def _action(self, kind: str, target: str) -> SendCommand:
         from rclpy.action import ActionClient
 
         actions = import_library("control_msgs.action", f"port:={target}")
@@ -165,13 +127,13 @@ class JointLink:
         action = actions.ParallelGripperCommand if parallel else actions.GripperCommand
         client = ActionClient(self._node, action, target)
 
-        def send(command: JointCommand) -> None:
+        def send(position: float, velocity: float, effort: float) -> None:
             goal = action.Goal()
             if parallel:
-                goal.command = self._message(command)
+                goal.command = self._message(position, velocity, effort)
             else:
-                goal.command.position = command.position
-                goal.command.max_effort = command.effort if math.isfinite(command.effort) else 0.0
+                goal.command.position = position
+                goal.command.max_effort = effort if math.isfinite(effort) else 0.0
             if client.server_is_ready():
                 client.send_goal_async(goal)
             else:
@@ -213,7 +175,8 @@ class GripperDriverNode(Node):
         self.times = MessageTimes(self.gripper.clock, ("force", *JAWS, *told), **gate)
         self.health = GripperHealth(source=parameters.port, stale_after=parameters.max_age)
         self.qos = ros.QosWatch(self)
-        self.out = DriverOutputs(self.qos, parameters, own_joints=not self.is_other)
+        self.joints = None if self.is_other else self.qos.publisher(JointState, "joint_states", ros.RESULT)
+        self.grasp_state = self.qos.publisher(ros.DiagnosticStatus, "~/grasp_state", ros.LATCHED)
         self.seen: ForceSample | None = None
         self.stale_after = grasp.stale_after
         self.arrived: deque[GripperState] = deque(maxlen=100)
@@ -247,21 +210,20 @@ class GripperDriverNode(Node):
         if kind is None:
             self.get_logger().info(f"no action {topic}: control_msgs, or its {name}, is not installed")
             return None
-        if name == "GripperCommand":
-            action = GripperCommandAction(kind, self.gripper, self.tasks)
-        else:
-            joints = self.parameters.joint_names
-            action = ParallelGripperCommandAction(joints, self._effort, kind, self.gripper, self.tasks)
+        read, fill = move_from_gripper_command, fill_gripper_command
+        if name == "ParallelGripperCommand":
+            read, fill = partial(move_from_parallel_command, joints=self.parameters.joint_names), self._fill_joints
+        action = MoveAction(kind, read, fill, self.gripper, self.tasks)
 
         async def execute(handle: Any) -> Any:
             return await ros.run_aside(self, partial(action.execute, handle))
 
         def judge(goal: Any) -> GoalResponse:
-            if refusal := action.refusal(goal):
-                self.get_logger().warning(f"goal of {topic} rejected: {refusal}")
+            if rejection := action.rejection(goal):
+                self.get_logger().warning(f"goal of {topic} rejected: {rejection}")
             elif remark := action.remark(goal):
                 self.get_logger().info(f"goal of {topic}: {remark}")
-            return GoalResponse.REJECT if refusal else GoalResponse.ACCEPT
+            return GoalResponse.REJECT if rejection else GoalResponse.ACCEPT
 
         accept = {"goal_callback": judge, "cancel_callback": lambda _: CancelResponse.ACCEPT}
         return ActionServer(self, kind, topic, execute, **accept)
@@ -290,15 +252,26 @@ class GripperDriverNode(Node):
             if state.stamp > self.published:
                 self.published = state.stamp
                 self.health.take(state, self.gripper.clock.now())
-                with self._refusals("joint state"):
-                    self.out.send_joints(self.times.to_stamp(state.stamp, self._now()), state, self._effort(state))
+                with self._rejections("joint state"):
+                    self._send_joints(state)
             if self.health.is_news("gripper", text := news_of_state(state)):
                 self._log(outcome_of_state(state).level, text)
         self._tell_grasp()
 
-    def _effort(self, state: GripperState | None = None) -> float | None:
+    def _send_joints(self, state: GripperState) -> None:
+        """Send the joints as a reply shows them; what is not known stays empty."""
+        stamp = self.times.to_stamp(state.stamp, self._now())
+        if self.joints is not None:
+            message = JointState(header=ros.Header(stamp=ros.stamp_message(stamp)))
+            fill_joint_state(message, self.parameters.joint_names, state, self._effort(state))
+            self.joints.publish(message)
+
+    def _fill_joints(self, message: Any, state: GripperState) -> None:
+        """Write a state into a result or feedback of control_msgs/ParallelGripperCommand."""
+        fill_joint_state(message.state, self.parameters.joint_names, state, self._effort(state))
+
+    def _effort(self, state: GripperState) -> float | None:
         """Return the force for joint_states [N]; None where none is trusted."""
-        state = self.gripper.state if state is None else state
         if self.parameters.joint_effort == "motor":
             return state.force if math.isfinite(state.force) else None
         status, seen = self.session.status, self.seen
@@ -311,8 +284,12 @@ class GripperDriverNode(Node):
             return None
 
     def _tell_grasp(self) -> None:
-        """Publish how the grasp is, and log that it failed."""
-        self.out.send_grasp(status := self.session.status)
+        """Publish how the grasp is when its phase or its reason has changed, and log that it failed."""
+        status = self.session.status
+        if status is not None and self.health.is_news("grasp state", f"{status.phase.value}: {status.reason}"):
+            outcome = outcome_of_grasp(status)
+            report = Report(level=outcome.level, message=outcome.text, values=describe_grasp(status))
+            self.grasp_state.publish(ros.status_message("finforce: grasp", self.get_name(), report))
         for outcome in grasp_alarms(status):
             if self.health.is_news("grasp", outcome.text):
                 self._log(outcome.level, f"the grasp failed: {outcome.text}")
@@ -330,17 +307,17 @@ class GripperDriverNode(Node):
 
     def _on_command(self, message: JointState) -> None:
         """Move as a message says."""
-        with self._refusals("command"):
+        with self._rejections("command"):
             self.tasks.stream(move_from_joint_state(message, self.parameters.joint_names))
 
     def _on_goal(self, message: JointState) -> None:
         """Set the goal of the grasp that runs, and of the next."""
-        with self._refusals("grasp goal", stream=False):
+        with self._rejections("grasp goal", stream=False):
             self.session.set_goal(goal_from_joint_state(message, self.session.goal))
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         """Hand the force of an image to the grasp."""
-        with self._refusals("force", told=self.session.refuse):
+        with self._rejections("force", told=self.session.reject):
             force, stamp = ros.grasp_force(message, self.parameters.gripper_frame), self._enter("force", message)
             sample = ForceSample(stamp=stamp, arrived=self.gripper.clock.now(), force=force)
             self.session.take_force(sample)
@@ -349,21 +326,23 @@ class GripperDriverNode(Node):
 
     def _on_stddev(self, side: str, message: WrenchStamped) -> None:
         """Keep how sure a jaw's force is."""
-        with self._refusals("standard deviation"):
+        with self._rejections("standard deviation"):
             stddev, stamp = ros.force_stddev(message, f"{side}_jaw"), self._enter(f"{side} stddev", message)
             self.session.take_stddev(side, stddev, stamp)
 
     def _on_slip(self, side: str, message: TwistStamped) -> None:
         """Hand to the grasp how fast the object slides over a jaw."""
-        with self._refusals("slip"):
+        with self._rejections("slip"):
             speed, stamp = ros.twist_speed(message, f"{side}_jaw"), self._enter(f"{side} slip", message)
             force = self.session.take_slip(side, speed, stamp)
             if force is not None:
-                self.get_logger().warning(f"the object slides at {1e3 * speed:.1f} mm/s: goes to {force:.2f} N")
+                self.get_logger().warning(
+                    f"the object slides over the {side} jaw at {1e3 * speed:.1f} mm/s: set force raised to {force:.2f} N"
+                )
 
     def _on_contact(self, side: str, cloud: PointCloud2) -> None:
         """Hand to the grasp whether a jaw touches the object."""
-        with self._refusals("contact"):
+        with self._rejections("contact"):
             touching, stamp = ros.is_touching(cloud, f"{side}_jaw"), self._enter(side, cloud)
             self.session.take_touch(side, touching, stamp)
 
@@ -372,8 +351,10 @@ class GripperDriverNode(Node):
         return self.times.enter(source, stamp_of(message), self._now())
 
     @contextmanager
-    def _refusals(self, what: str, stream: bool = True, told: Callable[[str], None] = lambda _: None) -> Iterator[None]:
-        """Survive what is wrong with a message, and say it; in a stream only once while its kind is the same."""
+    def _rejections(
+        self, what: str, stream: bool = True, told: Callable[[str], None] = lambda _: None
+    ) -> Iterator[None]:
+        """Log what is wrong with a message and go on; in a stream only once while its kind is the same."""
         kind = ""
         try:
             yield
@@ -382,7 +363,7 @@ class GripperDriverNode(Node):
             self.health.refuse(outcome := Outcome.of_error(error))
             kind = outcome.reason
             if self.health.is_news(what, kind) or not stream:
-                self.get_logger().warning(f"{what} refused: {error}")
+                self.get_logger().warning(f"{what} rejected: {error}")
         self.health.is_news(what, kind)
 
     def _report(self, alarms: list[Outcome]) -> Report:

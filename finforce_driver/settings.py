@@ -172,6 +172,112 @@ class GripperSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class JointSettings:
+    """How a joint's value goes with the opening, and how it follows its commands; units stand in the metadata.
+
+    The opening is linear between the two ends: `gripper.closed_opening` at `closed`, that and `gripper.stroke` at
+    `open`.
+    """
+
+    names: tuple[str, ...] = setting(("gripper_joint",), "Names of the commanded joints; the first is read")
+    closed: float = setting(0.0, "Joint value of the closed gripper, in the joint's unit", "", -1e4, 1e4)
+    open: float = setting(1.0, "Joint value of the open gripper, in the joint's unit", "", -1e4, 1e4)
+    resolution: float = setting(0.0002, "Smallest step of the opening that the joint follows", "m", 1e-6, 0.01)
+    rate: float = setting(
+        25.0, "Rate of setpoints on the way; 0: one command, the joint keeps the speed itself", "Hz", 0.0, 500.0
+    )
+    largest_speed: float = setting(0.1, "Maximum speed of the opening", "m/s", 1e-4, 2.0)
+    largest_force: float = setting(0.0, "Maximum effort of a command; 0: the joint takes none", "N", 0.0, 1000.0)
+    effort_is_force: bool = setting(
+        False, "Whether the joint's effort is its grip force [N], as a check of the camera's", ""
+    )
+
+    def __post_init__(self) -> None:
+        """Reject what no joint is.
+
+        Raises:
+            TargetError: a value is out of bounds, there is no joint, or both ends are the same.
+        """
+        check_bounds(self, TargetError)
+        if not self.names or not all(self.names) or len(set(self.names)) != len(self.names):
+            raise TargetError(f"joint.names: got {self.names!r}, expected one name or more, each once")
+        if self.closed == self.open:
+            raise TargetError(f"joint.closed and joint.open: both are {self.open:g}, expected two values")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspGoal:
+    """One grasp.
+
+    Attributes:
+        force: to be reached and held, by vision [N].
+        speed: greatest of the opening while closing [m/s].
+        least_opening: below which the jaws never go [m].
+        time_limit: to reach the force in [s]; holding has none.
+    """
+
+    force: float = setting(description="Set force", unit="N", low=0.1, high=30.0)
+    speed: float = setting(0.004, "Maximum speed of the opening while closing", "m/s", 1e-4, 0.1)
+    least_opening: float = setting(0.0, "Minimum opening of the jaws", "m", 0.0, 0.5)
+    time_limit: float = setting(20.0, "Maximum time to reach the set force", "s", 0.1, 3600.0)
+
+    def __post_init__(self) -> None:
+        """Reject what no grasp can be.
+
+        Raises:
+            TargetError: a value is no number or out of bounds.
+        """
+        check_bounds(self, TargetError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspSettings:
+    """Settings of `ForceGrasp`; each field's metadata says unit, bounds and meaning."""
+
+    force_limit: float = setting(8.0, "Grasp force that ends a grasp, and maximum set force", "N", 0.2, 30.0)
+    largest_stiffness: float = setting(
+        1400.0, "Maximum stiffness of jaws and object per opening, assumed until it is learnt", "N/m", 50.0, 1e5
+    )
+    approach_speed: float = setting(0.004, "Maximum speed of the opening before contact", "m/s", 1e-4, 0.1)
+    reaction: float = setting(0.05, "Delay from a command to the motion of the gripper", "s", 0.0, 1.0)
+    stale_after: float = setting(0.25, "Maximum age of the newest force; a grasp ends beyond it", "s", 0.05, 2.0)
+    force_timeout: float = setting(
+        1.0,
+        "Maximum wait for a force once the jaws touch; twice as long before",
+        "s",
+        0.1,
+        10.0,
+        alias="touch_timeout",
+    )
+    slip_raise: float = setting(
+        0.0, "Share of the set force that is added while the object slides; 0: none", "", 0.0, 1.0
+    )
+    motor_force: float = setting(
+        7.5, "Motor limit as grip force by the maker's curve; 2.5 times the set force if that is more", "N", 7.0, 62.0
+    )
+
+    def __post_init__(self) -> None:
+        """Reject values out of bounds.
+
+        Raises:
+            TargetError: a value is out of its bounds.
+        """
+        check_bounds(self, TargetError)
+
+    def check_force(self, force: float) -> float:
+        """Return a set force [N] that may be held.
+
+        Raises:
+            TargetError: it is no number, not above zero, or above the force limit.
+        """
+        if not 0.1 <= force <= self.force_limit:
+            raise TargetError(
+                f"set force: got {force:g} N, expected 0.1 to {self.force_limit:g} N, the force limit of the grasp"
+            )
+        return float(force)
+
+
+@dataclass(frozen=True, kw_only=True)
 class DriverParameters(TimeParameters):
     """Parameters of a gripper driver node besides the settings of gripper and grasp; the metadata have units."""
 

@@ -1,11 +1,13 @@
-"""What is known of a gripper at one instant, in SI units, and in one sentence."""
+"""What is asked of a gripper and what is known of it and its grasp at one instant, in SI units and in a sentence."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+
+from finforce_driver.errors import GraspError, UnseenForceError
 
 
 class Phase(Enum):
@@ -80,6 +82,82 @@ class GripperState:
     voltage: float = math.nan
     latency: float = math.nan
     counts: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MoveRequest:
+    """A move that is asked for.
+
+    Attributes:
+        opening: to go to [m].
+        speed: of the opening [m/s]; None: the driver's own.
+        force: grip force by the motor's current [N]; None: the driver's own.
+    """
+
+    opening: float
+    speed: float | None = None
+    force: float | None = None
+
+
+class GraspPhase(Enum):
+    """Where a grasp is."""
+
+    APPROACH = "approach"  # nothing presses yet
+    LOADING = "loading"  # on the way to the set force
+    HOLDING = "holding"  # as near to the set force as the gripper's steps allow, and following it
+    STOPPED = "stopped"  # ended; the jaws stay where they are, and a new grasp is needed
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspStatus:
+    """A grasp at one instant.
+
+    Attributes:
+        phase: where it is.
+        reason: one sentence: what it does, or why it ended.
+        goal: set force [N].
+        force: last one measured [N]; NaN before the first.
+        predicted: force now, over the latency [N]; NaN without load.
+        stiffness: change of the force per metre of closing [N/m]; as expected until it is learnt.
+        stiffness_stddev: of it [N/m].
+        latency: from image to arrival of a force, median [s].
+        period: between two images with a force, median [s].
+        overshoot_bound: by which the set force is passed at most if the stiffness at most doubles on the way that no
+            image has shown yet, and the force is off by two of its stated deviations [N].
+        peak: largest force measured while loaded [N]; 0 before.
+        resolution: change of the force with one step of the gripper [N].
+        target: opening that the jaws were told to go to [m]; NaN before the first move.
+        stddev: of the newest force, as its source states it [N].
+        failure: how it failed; None: it did not, it was ended by a command, or something has been commanded since.
+        rejected: forces and touches that were not used, by reason.
+    """
+
+    phase: GraspPhase
+    reason: str
+    goal: float
+    force: float = math.nan
+    predicted: float = math.nan
+    stiffness: float = math.nan
+    stiffness_stddev: float = math.nan
+    latency: float = math.nan
+    period: float = math.nan
+    overshoot_bound: float = math.nan
+    peak: float = 0.0
+    resolution: float = math.nan
+    target: float = math.nan
+    stddev: float = 0.0
+    failure: type[GraspError] | None = None
+    rejected: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def failed(self) -> bool:
+        """Whether it failed."""
+        return self.failure is not None
+
+    @property
+    def unseen(self) -> bool:
+        """Whether it failed because the motor pressed much harder than the camera said."""
+        return self.failed and issubclass(self.failure, UnseenForceError)
 
 
 SILENT = (

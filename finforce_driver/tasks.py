@@ -7,8 +7,7 @@ which. A goal that cannot be is rejected.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -16,9 +15,9 @@ from typing import Any
 from finforce_driver.errors import DriverError, GripperStateError, GripperTimeoutError
 from finforce_driver.grasp.session import GraspSession
 from finforce_driver.gripper import Gripper
-from finforce_driver.messages import MoveRequest, fill_joint_state, move_from_gripper_command, move_from_joint_state
-from finforce_driver.settings import FORCE_PER_CURRENT, DriverParameters
-from finforce_driver.state import GripperState, MoveOutcome, Phase
+from finforce_driver.messages import fill_outcome
+from finforce_driver.settings import DriverParameters
+from finforce_driver.state import GripperState, MoveOutcome, MoveRequest, Phase
 
 CALIBRATION_TIMEOUT = 50.0  # s; the driver gives up after 35 s, and a reset may go before
 STOP_TIMEOUT = 0.2  # s in which a gripper says that it stands; usually 0.02 s
@@ -30,9 +29,9 @@ LIMP = (*ABSENT, Phase.FAULT, Phase.UNCALIBRATED)
 
 
 class GripperTasks:
-    """Commands that end whatever the gripper was about, and wait for what becomes of them.
+    """Commands that end whatever the gripper was doing, and wait for their outcome.
 
-    What is refused leaves the gripper as it was, a grasp by force included.
+    A rejected command leaves the gripper as it was, a grasp by force included.
 
     Args:
         gripper: that is commanded.
@@ -109,7 +108,9 @@ class GripperTasks:
     def clear_errors(self) -> str:
         """Clear what is latched, and wait for it; without a fault nothing changes, for a grasp neither."""
         self._gripper.clear_errors()
-        state = self._await(_is_clear, CLEARING_TIMEOUT, self._commands)
+        state = self._await(
+            lambda state: state.phase is not Phase.FAULT and not state.estopped, CLEARING_TIMEOUT, self._commands
+        )
         return f"no error is latched; the gripper is {state.phase.value}"
 
     def grasp(self) -> str:
@@ -129,8 +130,8 @@ class GripperTasks:
 
     def release(self) -> str:
         """Open, and wait for it."""
-        given, widest = self._parameters, self._gripper.settings.closed_opening + self._gripper.settings.stroke
-        opening = widest if math.isnan(given.release_opening) else given.release_opening
+        opening = self._parameters.release_opening
+        opening = self._gripper.settings.largest_opening if math.isnan(opening) else opening
         state = self.go(MoveRequest(opening=opening), "release was commanded")
         if state.outcome is not MoveOutcome.REACHED:
             raise GripperStateError(f"the gripper did not open: {state.outcome.value} at {1e3 * state.opening:.1f} mm")
@@ -157,13 +158,15 @@ class GripperTasks:
         longest = settings.stroke / (request.speed or settings.default_speed) + MOVE_MARGIN
         for _ in range(math.ceil(longest / WATCH_PERIOD)):
             with suppress(GripperTimeoutError):
-                return _check(self._await(_is_over, WATCH_PERIOD, own), "the move was lost")
+                return _check(
+                    self._await(lambda state: state.phase is not Phase.MOVING, WATCH_PERIOD, own), "the move was lost"
+                )
             if leave(state := self._gripper.state):
                 return state
         raise GripperTimeoutError(f"the move has no end after {longest:.1f} s")
 
     def _command(self, command: Callable[[], None], reason: str) -> None:
-        """Give a command that ends whatever the gripper was about."""
+        """Give a command that ends whatever the gripper was doing."""
         self._session.replace(command, reason)
         self._count()
 
@@ -189,14 +192,6 @@ class GripperTasks:
         return state
 
 
-def _is_clear(state: GripperState) -> bool:
-    return state.phase is not Phase.FAULT and not state.estopped
-
-
-def _is_over(state: GripperState) -> bool:
-    return state.phase is not Phase.MOVING
-
-
 def _check(state: GripperState, what: str) -> GripperState:
     """Return a state, unless it is one in which the jaws are limp."""
     if state.phase in LIMP:
@@ -207,34 +202,32 @@ def _check(state: GripperState, what: str) -> GripperState:
 SUCCESSES = (MoveOutcome.REACHED, MoveOutcome.GRASPED)
 
 
-class MoveAction(ABC):
-    """Executes goals of an action, each in the thread that calls.
+class MoveAction:
+    """Executes goals of an action of control_msgs, each in the thread that calls.
 
     Args:
         kind: the action's type.
+        read: returns the move of a goal, or raises TargetError.
+        fill: writes a state into a result or feedback.
         gripper: that moves.
         tasks: its commands.
     """
 
-    def __init__(self, kind: Any, gripper: Gripper, tasks: GripperTasks) -> None:
-        self.kind, self._gripper, self._tasks = kind, gripper, tasks
+    def __init__(
+        self,
+        kind: Any,
+        read: Callable[[Any], MoveRequest],
+        fill: Callable[[Any, GripperState], None],
+        gripper: Gripper,
+        tasks: GripperTasks,
+    ) -> None:
+        self._kind, self._read, self._fill = kind, read, fill
+        self._gripper, self._tasks = gripper, tasks
 
-    @abstractmethod
-    def read(self, goal: Any) -> MoveRequest:
-        """Return the move of a goal.
-
-        Raises:
-            TargetError: it is none.
-        """
-
-    @abstractmethod
-    def tell(self, message: Any, state: GripperState) -> None:
-        """Fill a result or feedback with a state."""
-
-    def refusal(self, goal: Any) -> str:
+    def rejection(self, goal: Any) -> str:
         """Return why a goal cannot be carried out, with what was expected; empty when it can."""
         try:
-            request = self.read(goal)
+            request = self._read(goal)
             self._gripper.check_move(request.opening, request.speed, request.force)
         except DriverError as error:
             return str(error)
@@ -242,10 +235,10 @@ class MoveAction(ABC):
 
     def remark(self, goal: Any) -> str:
         """Return what a goal leaves to the settings; empty where it leaves nothing."""
-        if self.read(goal).force is not None:
+        if self._read(goal).force is not None:
             return ""
         settings = self._gripper.settings
-        force = settings.default_current * FORCE_PER_CURRENT
+        force = settings.force_of(settings.default_current)
         return f"no effort, or 0: {force:.0f} N of grip force by the motor's current, gripper.default_current"
 
     def execute(self, handle: Any) -> Any:
@@ -254,8 +247,15 @@ class MoveAction(ABC):
         Args:
             handle: of the goal: `request`, `is_cancel_requested`, `publish_feedback`, `succeed`, `abort`, `canceled`.
         """
+
+        def tell(state: GripperState) -> bool:
+            feedback = self._kind.Feedback()
+            self._fill(feedback, state)
+            handle.publish_feedback(feedback)
+            return handle.is_cancel_requested
+
         try:
-            state = self._tasks.go(self.read(handle.request), leave=self._teller(handle))
+            state = self._tasks.go(self._read(handle.request), leave=tell)
             if state.phase is Phase.MOVING:
                 self._tasks.stop()
         except DriverError:
@@ -266,64 +266,7 @@ class MoveAction(ABC):
             handle.succeed()
         else:
             handle.abort()
-        result = self.kind.Result()
-        self.tell(result, state)
-        _judge(result, state)
+        result = self._kind.Result()
+        self._fill(result, state)
+        fill_outcome(result, state)
         return result
-
-    def _teller(self, handle: Any) -> Callable[[GripperState], bool]:
-        """Return what tells how far a move has come, and says whether it is to be ended."""
-
-        def tell(state: GripperState) -> bool:
-            feedback = self.kind.Feedback()
-            self.tell(feedback, state)
-            handle.publish_feedback(feedback)
-            return handle.is_cancel_requested
-
-        return tell
-
-
-def _judge(message: Any, state: GripperState) -> None:
-    message.stalled = state.outcome is MoveOutcome.GRASPED
-    message.reached_goal = state.outcome is MoveOutcome.REACHED
-
-
-class GripperCommandAction(MoveAction):
-    """control_msgs/action/GripperCommand: position = opening [m], effort = grip force by the motor's current [N].
-
-    An effort of 0 is that of the settings; what is not known of the state is 0.
-    """
-
-    def read(self, goal: Any) -> MoveRequest:
-        """Return the move of a goal."""
-        return move_from_gripper_command(goal.command)
-
-    def tell(self, message: Any, state: GripperState) -> None:
-        """Fill a result or feedback with a state."""
-        message.position, message.effort = (
-            value if math.isfinite(value) else 0.0 for value in (state.opening, state.force)
-        )
-        _judge(message, state)
-
-
-class ParallelGripperCommandAction(MoveAction):
-    """control_msgs/action/ParallelGripperCommand: a JointState, as that of `~/command`, and one back.
-
-    Args:
-        joints: names of the two jaws' joints, whose value is half the opening.
-        effort: returns the trusted force [N]; None: there is none, and the field stays empty.
-        options: of `MoveAction`.
-    """
-
-    def __init__(self, joints: Sequence[str], effort: Callable[[], float | None], *options: Any) -> None:
-        super().__init__(*options)
-        self._joints, self._effort = joints, effort
-
-    def read(self, goal: Any) -> MoveRequest:
-        """Return the move of a goal."""
-        request = move_from_joint_state(goal.command, self._joints)
-        return replace(request, force=request.force or None, speed=request.speed or None)
-
-    def tell(self, message: Any, state: GripperState) -> None:
-        """Fill a result or feedback with a state."""
-        fill_joint_state(message.state, self._joints, state, self._effort())

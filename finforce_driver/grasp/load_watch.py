@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from statistics import median
 
 from finforce_driver.errors import BackOffError, GraspError
-from finforce_driver.grasp.settings import GraspSettings
+from finforce_driver.settings import GraspSettings
 
 NOISE = 0.05  # [N], standard deviation of a force that is expected at first
 _JUMP = 1.0  # [N] between two images, beyond what motion and noise explain
@@ -34,16 +34,16 @@ class LocatedForce:
         force: [N].
         stamp: time of the image [s].
         opening: at that time [m].
-        way_stddev: standard deviation of the way since the last force that was no passing one [m].
+        travel_stddev: standard deviation of the travel since the last force that was no passing one [m].
         resting: the jaws rested at their target.
-        passing: from a way between two rests, whose ends say more than it does.
+        passing: taken between two rests, which say more than it does.
         stddev: of the force, as its source states it [N].
     """
 
     force: float
     stamp: float
     opening: float
-    way_stddev: float = 0.0
+    travel_stddev: float = 0.0
     resting: bool = False
     passing: bool = False
     stddev: float = 0.0
@@ -59,7 +59,7 @@ class LoadWatch:
     Attributes:
         model: of force over opening, in use once loaded.
         loaded: whether something presses.
-        doubtful: whether the newest force was set aside as a possible jump.
+        suspect: whether the newest force was rejected as a possible jump.
         force: the newest that was believed [N]; NaN before the first.
         opening: that belongs to it [m].
         resting: whether the jaws rested then.
@@ -70,11 +70,11 @@ class LoadWatch:
     def __init__(self, settings: GraspSettings, onset_force: float) -> None:
         self._settings, self._onset_force = settings, onset_force
         self.model = ForceModel(stiffness=settings.largest_stiffness, noise=NOISE)
-        self.loaded = self.doubtful = self.resting = False
+        self.loaded = self.suspect = self.resting = False
         self.force = self.opening = math.nan
         self.peak = self.stddev = 0.0
         self._idle: deque[float] = deque([0.0], maxlen=15)
-        self._above = self._doubts = self._empty = self._same = 0
+        self._above = self._jumps = self._empty = self._same = 0
         self._last = self._last_opening = math.nan
 
     @property
@@ -92,14 +92,14 @@ class LoadWatch:
 
         Args:
             sample: force, time and opening.
-            touching: the jaws are said to touch, so that one image makes an onset.
+            touching: the jaws are reported to touch, so that one image makes an onset.
 
         Raises:
             GraspError: the force is above the limit or frozen, a jump was confirmed, or the object is gone.
         """
         self._check_life(sample)
-        self.doubtful = self._is_jump(sample)
-        if self.doubtful:
+        self.suspect = self._is_jump(sample)
+        if self.suspect:
             return
         if sample.force > self._settings.force_limit:
             raise GraspError(
@@ -111,7 +111,7 @@ class LoadWatch:
             self._watch_onset(sample, touching)
             return
         if not sample.passing:
-            self.model.update(sample.opening, sample.force, sample.stamp, sample.way_stddev)
+            self.model.update(sample.opening, sample.force, sample.stamp, sample.travel_stddev)
         self._check_presence(sample.force)
         self.peak = max(self.peak, sample.force)
 
@@ -125,7 +125,7 @@ class LoadWatch:
         if self._above == 1:
             self.model.begin(sample.opening, sample.force, sample.stamp)
         else:
-            self.model.update(sample.opening, sample.force, sample.stamp, sample.way_stddev)
+            self.model.update(sample.opening, sample.force, sample.stamp, sample.travel_stddev)
         self.loaded = touching or self._above >= _CONFIRMED
 
     def _is_jump(self, sample: LocatedForce) -> bool:
@@ -139,15 +139,16 @@ class LoadWatch:
             return False
         beyond = self._surprise(sample)
         if abs(beyond) <= _JUMP:
-            self._doubts = 0
+            self._jumps = 0
             return False
-        self._doubts += 1
-        if self._doubts >= _CONFIRMED and not self.loaded and sample.opening < self.opening:
+        self._jumps += 1
+        if self._jumps >= _CONFIRMED and not self.loaded and sample.opening < self.opening:
+            bound = f"{1e-3 * self._settings.largest_stiffness:g} N/mm (largest_stiffness)"
             raise BackOffError(
-                f"the force rose to {sample.force:.2f} N at the first touch, more than {self._bound} explain: is "
+                f"the force rose to {sample.force:.2f} N at the first touch, more than {bound} explain: is "
                 "something stiffer than that between the jaws? They back off"
             )
-        if self._doubts >= _CONFIRMED:
+        if self._jumps >= _CONFIRMED:
             verb = "jumped to" if beyond > 0.0 else "fell to"
             raise GraspError(
                 f"the force {verb} {sample.force:.2f} N from {self.force:.2f} N, which no motion of the jaws explains: "
@@ -162,10 +163,6 @@ class LoadWatch:
         # where contact began between the two images is not known: any force up to the greatest stiffness may be
         reach = self._settings.largest_stiffness * max(0.0, self.opening - sample.opening)
         return max(0.0, sample.force - self.force - reach)
-
-    @property
-    def _bound(self) -> str:
-        return f"{1e-3 * self._settings.largest_stiffness:g} N/mm (largest_stiffness)"
 
     def _check_life(self, sample: LocatedForce) -> None:
         """Refuse a force that stays the same while the jaws close; none at all always does.
@@ -227,7 +224,7 @@ class ForceSample:
 
 @dataclass(frozen=True, kw_only=True)
 class TouchSample:
-    """Whether the jaws were said to touch in the image at `stamp` [s], on the driver's clock."""
+    """Whether the jaws are reported to touch in the image at `stamp` [s], on the driver's clock."""
 
     stamp: float
     touching: bool
@@ -241,10 +238,10 @@ class ForceFeed:
 
     Attributes:
         stamp: of the newest admitted image with a force [s]; NaN before the first.
-        touch: the newest word on touching; None before the first.
+        touch: the newest report on touching; None before the first.
         touched_since: time of the first image of those in a row that show touching [s]; NaN while none does.
-        refused: samples that were not admitted, by reason.
-        last_refusal: why the newest force was not, with what would help; empty once one is.
+        rejected: samples that were not admitted, by reason.
+        last_rejection: why the newest force was not, with what would help; empty once one is.
     """
 
     def __init__(self, stale_after: float) -> None:
@@ -252,8 +249,8 @@ class ForceFeed:
         self.stamp = math.nan
         self.touch: TouchSample | None = None
         self.touched_since = math.nan
-        self.refused: Counter[str] = Counter()
-        self.last_refusal = ""
+        self.rejected: Counter[str] = Counter()
+        self.last_rejection = ""
         self._latencies: deque[float] = deque(maxlen=31)
         self._periods: deque[float] = deque(maxlen=31)
 
@@ -263,11 +260,11 @@ class ForceFeed:
         return not math.isnan(self.stamp)
 
     def is_touching(self, now: float) -> bool:
-        """Whether the newest fresh word says that the jaws touch."""
+        """Whether the newest fresh report says that the jaws touch."""
         return (touch := self._fresh_touch(now)) is not None and touch.touching
 
     def is_apart(self, now: float) -> bool:
-        """Whether the newest fresh word says that the jaws do not touch."""
+        """Whether the newest fresh report says that the jaws do not touch."""
         return (touch := self._fresh_touch(now)) is not None and not touch.touching
 
     def _fresh_touch(self, now: float) -> TouchSample | None:
@@ -289,27 +286,58 @@ class ForceFeed:
 
     def admit(self, sample: ForceSample) -> bool:
         """Take a force if its times can be; otherwise count why not."""
-        reason = self._doubt(sample)
+        reason = self._find_fault(sample)
         if reason:
-            self.refuse(reason, f"{reason}, {sample.arrived - sample.stamp:.2f} s after its image")
+            self.reject(reason, f"{reason}, {sample.arrived - sample.stamp:.2f} s after its image")
             return False
-        self.last_refusal = ""
+        self.last_rejection = ""
         if self.heard:
             self._periods.append(sample.stamp - self.stamp)
         self._latencies.append(sample.arrived - sample.stamp)
         self.stamp = sample.stamp
         return True
 
-    def refuse(self, reason: str, words: str) -> None:
+    def reject(self, reason: str, words: str) -> None:
         """Count a force that cannot be used, and keep why."""
-        self.refused[reason] += 1
-        self.last_refusal = words
+        self.rejected[reason] += 1
+        self.last_rejection = words
+
+    def check_silence(self, now: float, started: float, timeout: float) -> None:
+        """Refuse to go on without fresh data of the camera.
+
+        Before the first force a report on touching will do: an estimator that waits for its first contact has none yet.
+
+        Args:
+            now: time [s].
+            started: when the grasp began [s].
+            timeout: maximum wait for a force once the jaws touch [s]; twice as long before.
+
+        Raises:
+            GraspError: forces have become stale, or did not come when they were due.
+        """
+        cause = f"those that came were rejected, the last one as {self.last_rejection}" if self.last_rejection else ""
+        if self.heard:
+            if self.age(now) > self._stale_after:
+                raise GraspError(
+                    f"the newest force is {self.age(now):.2f} s old, at most {self._stale_after:g} s are allowed: "
+                    + (cause or "is the camera there, and the solver sure of itself?")
+                )
+            return
+        if now - self.touched_since > timeout:
+            words = f"the jaws are reported to touch, but no force came for {now - self.touched_since:.2f} s"
+            raise GraspError(f"{words}: {cause}" if cause else words)
+        heard = max(started, self.touch.stamp if self.touch else started)
+        if now - heard > 2.0 * timeout:
+            raise GraspError(
+                f"no force came for {now - heard:.2f} s: "
+                + (cause or "is the camera there, are the solvers tared (30 unloaded images)?")
+            )
 
     def admit_touch(self, sample: TouchSample, now: float) -> bool:
-        """Take a word on touching if it is newer than the last one and fresh."""
+        """Take a report on touching if it is newer than the last one and fresh."""
         newest = self.touch is None or sample.stamp > self.touch.stamp
         if not (newest and -_AHEAD <= now - sample.stamp <= self._stale_after):
-            self.refused["touch out of time"] += 1
+            self.rejected["touch out of time"] += 1
             return False
         self.touch = sample
         if not sample.touching:
@@ -318,7 +346,7 @@ class ForceFeed:
             self.touched_since = sample.stamp
         return True
 
-    def _doubt(self, sample: ForceSample) -> str:
+    def _find_fault(self, sample: ForceSample) -> str:
         """Return why the times of a sample cannot be; empty when they can."""
         latency = sample.arrived - sample.stamp
         if not math.isfinite(latency):
@@ -384,7 +412,7 @@ class ForceModel:
 
     @property
     def safe_stiffness(self) -> float:
-        """A stiffness that is hardly exceeded on the way to come [N/m]: two deviations and a tenth more."""
+        """A stiffness that is hardly exceeded from here on [N/m]: two deviations and a tenth more."""
         return 1.1 * self.stiffness + 2.0 * self.stiffness_stddev
 
     @property
@@ -403,29 +431,31 @@ class ForceModel:
 
     def surprise(self, opening: float, force: float) -> float:
         """Return by how much a force [N] differs from the predicted one beyond four standard deviations [N], signed."""
-        way = self.opening - opening
-        spread = self._force_variance + way**2 * self._stiffness_variance + self._noise_variance
+        travel = self.opening - opening
+        spread = self._force_variance + travel**2 * self._stiffness_variance + self._noise_variance
         beyond = force - self.predict(opening)
         return math.copysign(max(0.0, abs(beyond) - 4.0 * math.sqrt(spread)), beyond)
 
-    def update(self, opening: float, force: float, stamp: float, way_stddev: float) -> None:
+    def update(self, opening: float, force: float, stamp: float, travel_stddev: float) -> None:
         """Take the force [N] of a later image at `stamp` [s].
 
         Args:
             opening: at the time of the image [m].
             force: measured [N].
             stamp: time of the image [s].
-            way_stddev: standard deviation of the change of the opening since the last image [m].
+            travel_stddev: standard deviation of the change of the opening since the last image [m].
         """
-        way, dt = self.opening - opening, max(0.0, stamp - self.stamp)
+        travel, dt = self.opening - opening, max(0.0, stamp - self.stamp)
         forces, mixed, stiffnesses = self._force_variance, self._covariance, self._stiffness_variance
-        forces += 2.0 * way * mixed + way**2 * stiffnesses + _DRIFT**2 * dt + (self.stiffness * way_stddev) ** 2
-        mixed += way * stiffnesses
-        stiffnesses += _GROWTH**2 * abs(way)
-        innovation = force - (self.force + self.stiffness * way)
+        forces += (
+            2.0 * travel * mixed + travel**2 * stiffnesses + _DRIFT**2 * dt + (self.stiffness * travel_stddev) ** 2
+        )
+        mixed += travel * stiffnesses
+        stiffnesses += _GROWTH**2 * abs(travel)
+        innovation = force - (self.force + self.stiffness * travel)
         self._learn_noise(innovation, forces)
         total = forces + self._noise_variance
-        self.force += self.stiffness * way + forces / total * innovation
+        self.force += self.stiffness * travel + forces / total * innovation
         self.stiffness = max(LEAST_STIFFNESS, self.stiffness + mixed / total * innovation)
         self._stiffness_variance = stiffnesses - mixed**2 / total
         self._covariance = mixed * (1.0 - forces / total)

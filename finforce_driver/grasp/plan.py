@@ -17,21 +17,22 @@ from dataclasses import dataclass
 
 from finforce_driver.errors import GraspError
 from finforce_driver.grasp.load_watch import ForceFeed, LoadWatch
-from finforce_driver.grasp.settings import MOTOR_MARGIN, GraspGoal, GraspSettings
+from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GripperState
 
+MOTOR_MARGIN = 4.0  # [N] of the motor's force above the camera's, friction included, at which a grasp backs off
 _APPROACH_SHARE = 0.7  # of the set force, that may build up before an image can show the contact
 _TOLERANCE = 0.08  # [N] by which the set force may be passed to come nearer to it
 _LEAST_SPEED = 0.001  # [m/s] slower would only cost time: the target is bounded anyway
 _FEW_STEPS = 3.5  # by which a target may lie ahead of the one that was sent
 _BACK_STEPS = 1.5  # by which it must lie behind while the jaws move, where a step is noise
 _SPEED_CHANGE = 1.25  # ratio at which a new speed is worth a command
-_CALM = 0.15  # [N] stated deviation of the force above which the jaws go slower
+_CERTAIN = 0.15  # [N] stated deviation of the force above which the jaws go slower
 _CONTRADICTED = 0.5  # share of the speed while the contact estimator says that nothing touches
 _WITNESS_TIME = 0.15  # [s] from a force to the stop that the motor's current brings about
 _FRICTION = 1.0  # [N] by which the motor's current may tell too little
 _BEYOND_NOISE = 4.0  # deviations of one force, beyond which a step's change of it is no chance
-_SURE = 2.0  # stated deviations of the force within which it is reckoned with
+_DEVIATIONS = 2.0  # stated deviations of the force within which it is reckoned with
 _HYSTERESIS = 0.3  # [steps] of force beyond the tolerance before jaws at rest open again
 
 
@@ -65,7 +66,7 @@ class GraspPlan:
         """Change of the force with one step of the gripper [N]."""
         return self._load.model.stiffness * self._jaws.resolution
 
-    def wish(self, set_force: float) -> float:
+    def ideal_target(self, set_force: float) -> float:
         """Return the opening [m] to go to, on a step of the gripper; it may lie below the least opening."""
         load, jaws = self._load, self._jaws
         if not self._load.resting:
@@ -90,19 +91,19 @@ class GraspPlan:
             expected = load.model.likely_stiffness * jaws.resolution + _BEYOND_NOISE * load.model.noise
             self._step_force = change if change > expected else 0.0
 
-    def limit(self, wish: float) -> float:
-        """Return a wish [m] within the least opening and what the gripper can open."""
-        return min(max(wish, self._least), self._jaws.widest)
+    def limit(self, target: float) -> float:
+        """Return a target [m] within the least opening and what the gripper can open."""
+        return min(max(target, self._least), self._jaws.widest)
 
     def choose_speed(self, target: float) -> float:
         """Return the speed [m/s] at which the next image comes before the jaws are at `target` [m].
 
         It is less where the force is uncertain, and where contact and force contradict each other.
         """
-        way = abs(self._load.opening - target)
+        travel = abs(self._load.opening - target)
         due = self._feed.latency + 1.5 * self._feed.period + self._settings.reaction
         wanted = self._goal.speed if self._load.loaded else min(self._goal.speed, self._settings.approach_speed)
-        return min(wanted * self._sureness, self._blind_speed, max(_LEAST_SPEED, way / due))
+        return min(wanted * self._confidence, self._blind_speed, max(_LEAST_SPEED, travel / due))
 
     @property
     def _blind_speed(self) -> float:
@@ -111,14 +112,14 @@ class GraspPlan:
         return max(_LEAST_SPEED, spare / (self._settings.largest_stiffness * _WITNESS_TIME))
 
     @property
-    def _sureness(self) -> float:
+    def _confidence(self) -> float:
         """Share of the speed that the force's stated deviation and the contact's state leave."""
         load, feed = self._load, self._feed
-        sure = min(1.0, _CALM / max(load.stddev, 1e-9)) if load.loaded else 1.0
-        return _CONTRADICTED * sure if load.loaded and feed.is_apart(feed.stamp) else sure
+        share = min(1.0, _CERTAIN / max(load.stddev, 1e-9)) if load.loaded else 1.0
+        return _CONTRADICTED * share if load.loaded and feed.is_apart(feed.stamp) else share
 
     @property
-    def _caution(self) -> float:
+    def _uncertainty(self) -> float:
         """What the force's stated deviation has beyond the tolerance [N]: so much nearer to the set force it may be."""
         return max(0.0, self._load.stddev - _TOLERANCE)
 
@@ -152,8 +153,8 @@ class GraspPlan:
         if not load.loaded:
             return max(0.0, self.stiffness * unseen - set_force)
         stiffness = max(2.0 * load.model.stiffness, self.stiffness)
-        doubt = load.model.force_stddev + _SURE * load.stddev
-        return max(0.0, load.model.force + doubt + stiffness * unseen - set_force)
+        margin = load.model.force_stddev + _DEVIATIONS * load.stddev
+        return max(0.0, load.model.force + margin + stiffness * unseen - set_force)
 
     def _allowed(self, set_force: float, slack: float = 0.0) -> float:
         """Return by how much the force may rise [N], with `slack` above the set one; negative: by how much to fall."""
@@ -161,8 +162,8 @@ class GraspPlan:
         if not load.loaded:
             return max(0.0, _APPROACH_SHARE * set_force - load.force)
         allowed = set_force + slack - load.model.force
-        # a doubt about the force keeps the jaws where they are, and opens them no more than it closes them
-        return max(0.0, allowed - load.model.force_stddev - self._caution) if allowed > 0.0 else allowed
+        # an uncertain force keeps the jaws where they are, and opens them no more than it closes them
+        return max(0.0, allowed - load.model.force_stddev - self._uncertainty) if allowed > 0.0 else allowed
 
     def _may_step(self, allowed: float) -> bool:
         """Whether jaws at rest may close by one step for an allowed rise of the force [N]: its effect will be seen."""
@@ -189,7 +190,7 @@ _MOVING_STDDEV, _RESTING_STDDEV = 0.35, 0.1  # [steps]
 
 
 @dataclass(frozen=True, kw_only=True)
-class JawPlace:
+class JawPosition:
     """An opening [m] on the scale of the commands, and whether the jaws rested there, at their target."""
 
     opening: float
@@ -233,7 +234,7 @@ class JawHistory:
         """Return the step [m] nearest to a reported opening [m]."""
         return self.snap(opening - 0.5 * self.resolution)
 
-    def command(self, target: float, speed: float, now: float, here: JawPlace) -> None:
+    def command(self, target: float, speed: float, now: float, here: JawPosition) -> None:
         """Remember a command and when the jaws, now at `here`, will have followed it."""
         self.stepping = here.resting and abs(target - here.opening) < _SMALL * self.resolution
         if math.isnan(self.target):
@@ -258,15 +259,15 @@ class JawHistory:
         """Whether the jaws should have been at their target for long and are not there."""
         return now > self._arrives + _LATE and abs(reported - self.target) > (_NEAR + 1.0) * self.resolution
 
-    def locate(self, stamp: float, state: GripperState, opening_at: Callable[[float], float]) -> JawPlace:
+    def locate(self, stamp: float, state: GripperState, opening_at: Callable[[float], float]) -> JawPosition:
         """Return where the jaws were at a past time [s]; NaN when it is not known."""
         reported = state.opening if stamp >= state.stamp else opening_at(stamp)
         if self.rests_at(stamp, reported):
-            return JawPlace(opening=self.target, resting=True)
-        return JawPlace(opening=reported, resting=False)
+            return JawPosition(opening=self.target, resting=True)
+        return JawPosition(opening=reported, resting=False)
 
-    def way_stddev(self, before: JawPlace, after: JawPlace) -> float:
-        """Return the standard deviation of the way between two places [m]."""
+    def travel_stddev(self, before: JawPosition, after: JawPosition) -> float:
+        """Return the standard deviation of the travel between two positions [m]."""
         if before == after:
             return 0.0
         is_exact = before.resting and after.resting

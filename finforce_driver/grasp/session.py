@@ -12,9 +12,9 @@ from threading import Condition
 from finforce_driver.errors import BackOffError, DriverError, GraspError, GripperTimeoutError
 from finforce_driver.grasp.controller import ForceGrasp
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
 from finforce_driver.gripper import Gripper
-from finforce_driver.state import GripperState
+from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.state import GraspPhase, GraspStatus, GripperState, Phase
 
 _SLIDES = 0.003  # [m/s] of the object over a jaw, above which it slides
 _LIMIT = 1.5  # times the set force, to which it rises at most
@@ -68,6 +68,7 @@ class SlipGuard:
 CYCLE = 0.05  # [s] in which the silence of a gripper is noticed
 MARGIN = 2.0  # [s] beyond the time limit of a goal, after which nobody waits for its grasp any longer
 SETTLED = (GraspPhase.HOLDING, GraspPhase.STOPPED)
+USABLE = (Phase.READY, Phase.MOVING)
 
 
 class GraspSession:
@@ -217,28 +218,29 @@ class GraspSession:
         with self._changed:
             self._stddevs[jaw] = (stamp, stddev)
 
-    def refuse(self, words: str) -> None:
-        """Keep why a force was refused before it came here, for what the grasp says when none come."""
+    def reject(self, reason: str) -> None:
+        """Keep why a force was rejected before it came here, for what the grasp says when none come."""
         with self._changed:
             if self._grasp is not None:
-                self._grasp.refuse(words)
+                self._grasp.reject(reason)
 
     def update(self, state: GripperState) -> None:
         """Let the grasp that runs do what is due; what the gripper refuses ends it."""
         with self._changed:
             if self._grasp is None:
                 return
-            step = self._grasp.update(state, self._gripper.clock.now(), self._gripper.opening_at)
-            status = step.status
+            now = self._gripper.clock.now()
+            move = self._grasp.update(state, now, self._gripper.opening_at)
+            status = self._grasp.status(state, now)
             try:
-                if step.stop:
+                if move is not None:
+                    self._gripper.move(move.opening, move.speed, move.force)
+                elif status.phase is GraspPhase.STOPPED and state.phase in USABLE and not state.estopped:
                     self._gripper.hold()
-                elif step.move is not None:
-                    self._gripper.move(step.move.opening, step.move.speed, step.move.force)
             except DriverError as error:
                 with suppress(DriverError):
                     self._gripper.hold()
-                if step.move is not None:
+                if move is not None:
                     status = replace(status, phase=GraspPhase.STOPPED, reason=str(error), failure=GraspError)
             self._tell(status)
             if status.phase is GraspPhase.STOPPED:

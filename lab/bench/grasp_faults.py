@@ -29,8 +29,8 @@ from tqdm import tqdm
 from finforce_driver.errors import BackOffError, DriverError, GripperTimeoutError
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import hold_force
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
-from finforce_driver.state import GripperState, MoveOutcome, Phase
+from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveOutcome, Phase
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.faults import FaultKind, PlannedFault
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring

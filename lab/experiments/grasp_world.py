@@ -21,9 +21,9 @@ from finforce_contact.estimator import ContactEstimator
 from finforce_contact.loop import ForceLoop
 from finforce_driver.grasp.load_watch import ForceSample, TouchSample
 from finforce_driver.grasp.session import hold_force
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
 from finforce_driver.gripper import Gripper
-from finforce_driver.state import Phase
+from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.state import GraspPhase, GraspStatus, Phase
 from finforce_ifea.estimator import JawEstimator
 from finforce_ifea.grasp_force import R_GRIPPER_JAW
 from finforce_ifea.jaw.calibration import load_calibration
