@@ -7,10 +7,6 @@ class DriverError(FinforceError):
     """The base of the errors of this package."""
 
 
-class CanMessageError(DriverError, ValueError):
-    """A CAN message cannot be: its identifier or data are out of range."""
-
-
 class LinkError(DriverError, OSError):
     """The port to the CAN adapter is absent, busy, gone, or does not take what is sent."""
 

@@ -58,7 +58,7 @@ def build_gripper(parameters: DriverParameters, settings: GripperSettings) -> Gr
     """Make the driver of the gripper that the parameters name; nothing is opened before it starts.
 
     Raises:
-        TargetError: the baud rate is none that ports know, or release_opening is beyond the stroke.
+        TargetError: release_opening is beyond the stroke.
     """
     if not math.isnan(parameters.release_opening):
         settings.check_opening("release_opening", parameters.release_opening)
@@ -337,7 +337,7 @@ class GripperDriverNode(Node):
             force = self.session.take_slip(side, speed, stamp)
             if force is not None:
                 self.get_logger().warning(
-                    f"the object slides over the {side} jaw at {1e3 * speed:.1f} mm/s: set force raised to {force:.2f} N"
+                    f"the object slides over the {side} jaw at {1e3 * speed:.1f} mm/s: force raised to {force:.2f} N"
                 )
 
     def _on_contact(self, side: str, cloud: PointCloud2) -> None:

@@ -5,18 +5,12 @@ from finforce_driver.can.python_can import PythonCanBus
 from finforce_driver.can.slcan import SerialBus
 
 
-def build_bus(port: str, interface: str = "slcan", *, baud_rate: int = 115_200, bit_rate: int = 1_000_000) -> Bus:
-    """Return a bus that is not yet open.
+def build_bus(port: str, interface: str = "slcan", *, baud_rate: int = 115_200) -> Bus:
+    """Return a bus of 1 Mbit/s that is not yet open.
 
     Args:
         port: path of the adapter's serial port for "slcan", else python-can's name of the channel, "can0" for one.
         interface: "slcan", or a name of python-can's: "socketcan", "gs_usb", "virtual", ...
         baud_rate: of the serial port [baud].
-        bit_rate: of the CAN bus [bit/s]; the gripper's is 1,000,000.
-
-    Raises:
-        TargetError: a rate is none that ports or SLCAN know.
     """
-    if interface == "slcan":
-        return SerialBus(port, baud_rate=baud_rate, bit_rate=bit_rate)
-    return PythonCanBus(interface, port, bit_rate=bit_rate)
+    return SerialBus(port, baud_rate) if interface == "slcan" else PythonCanBus(interface, port)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from contextlib import suppress
 from threading import Lock
 from time import monotonic
@@ -12,6 +13,7 @@ from finforce.optional import import_library
 from finforce_driver.can.protocol import LARGEST_DATA, LARGEST_ID, Bus, CanMessage
 from finforce_driver.errors import LinkError
 
+BIT_RATE = 1_000_000  # [bit/s] of the gripper, where the interface sets it
 _ADVICE = {
     "socketcan": "`sudo ip link set {channel} up type can bitrate {bit_rate}`; if it is up, check 24 V and CANH/CANL"
 }
@@ -23,20 +25,19 @@ class PythonCanBus(Bus):
     `send` may be called from any thread while another one waits in `receive`.
     """
 
-    def __init__(self, interface: str, channel: str, bit_rate: int = 1_000_000) -> None:
+    def __init__(self, interface: str, channel: str) -> None:
         """Remember what to open; nothing is opened yet.
 
         Args:
             interface: python-can's name of it: "socketcan", "gs_usb", "virtual", ...
             channel: python-can's name of the port, "can0" for one.
-            bit_rate: of the CAN bus [bit/s], where the interface sets it; the gripper's is 1,000,000.
         """
-        self._interface, self._channel, self._bit_rate = interface, channel, bit_rate
+        self._interface, self._channel = interface, channel
         self._can: Any = None
         self._bus: Any = None
         self._errors: tuple[type[Exception], ...] = ()
         self._reading, self._writing = Lock(), Lock()
-        self._counts = dict.fromkeys(("opened", "sent", "messages", "garbage", "extended", "bus_errors"), 0)
+        self._counts: Counter[str] = Counter()
 
     def open(self) -> None:
         """Open the interface; one that is open is opened anew.
@@ -51,7 +52,7 @@ class PythonCanBus(Bus):
         self._errors = (can.CanError, ValueError, IndexError, OSError)
         with self._reading, self._writing:
             try:
-                self._bus = can.Bus(interface=self._interface, channel=self._channel, bitrate=self._bit_rate)
+                self._bus = can.Bus(interface=self._interface, channel=self._channel, bitrate=BIT_RATE)
             except (*self._errors, TypeError, ImportError) as error:
                 raise LinkError(self._explain(error)) from error
             self._counts["opened"] += 1
@@ -104,16 +105,17 @@ class PythonCanBus(Bus):
         """Return a message of python-can as ours; None when it is none of ours, which is counted."""
         data = bytes(received.data or b"")
         whole = len(data) == received.dlc <= LARGEST_DATA or (received.is_remote_frame and not data)
+        kind, message = "messages", None
         if received.is_error_frame:
-            self._counts["bus_errors"] += 1
+            kind = "bus_errors"
         elif received.is_extended_id:
-            self._counts["extended"] += 1
+            kind = "extended"
         elif not whole or received.is_fd or not 0 <= received.arbitration_id <= LARGEST_ID:
-            self._counts["garbage"] += 1
+            kind = "garbage"
         else:
-            self._counts["messages"] += 1
-            return CanMessage(id=received.arbitration_id, data=data, remote=received.is_remote_frame)
-        return None
+            message = CanMessage(id=received.arbitration_id, data=data, remote=received.is_remote_frame)
+        self._counts[kind] += 1
+        return message
 
     def _opened(self) -> Any:
         """Return the open bus."""
@@ -124,7 +126,7 @@ class PythonCanBus(Bus):
     def _explain(self, error: Exception) -> str:
         """Return what failed and what would help, in one line."""
         fallback = "check interface, channel and cables"
-        advice = _ADVICE.get(self._interface, fallback).format(channel=self._channel, bit_rate=self._bit_rate)
+        advice = _ADVICE.get(self._interface, fallback).format(channel=self._channel, bit_rate=BIT_RATE)
         return f"CAN interface {self._interface} {self._channel}: {one_line(error)}: {advice}"
 
     @property
@@ -142,6 +144,6 @@ class PythonCanBus(Bus):
         if self._counts["bus_errors"] and not self._counts["messages"]:
             return (
                 f"CAN interface {self._interface} {self._channel} reports only errors: check 24 V, CANH/CANL, "
-                f"termination, and that the bus runs at {self._bit_rate:,} bit/s"
+                f"termination, and that the bus runs at {BIT_RATE:,} bit/s"
             )
         return ""

@@ -1,4 +1,8 @@
-"""SLCAN: CAN messages as lines of the Lawicel protocol, their strict reading, and the bus behind a serial adapter."""
+"""SLCAN: CAN messages as lines of the Lawicel protocol, their strict reading, and the bus behind a serial adapter.
+
+python-can's own `slcan` is not used: it raises on a damaged line and then on every later one, ignores refusals (BELL),
+shares the port with other programs, and its writes may block for ever.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +11,16 @@ import os
 import re
 import select
 import termios
-from collections import deque
+from collections import Counter, deque
 from contextlib import suppress
 from math import ceil
 from threading import Lock
 from time import monotonic, sleep
-from types import ModuleType
 from typing import Any
 
 from finforce.optional import import_library
 from finforce_driver.can.protocol import Bus, CanMessage
-from finforce_driver.errors import LinkError, TargetError
+from finforce_driver.errors import LinkError
 
 END = b"\r"
 BELL = b"\a"  # an adapter's refusal; it stands alone, no END follows
@@ -56,24 +59,14 @@ class SlcanParser:
     Attributes:
         unexplained: bytes since the last message that belong to no message, acknowledgement or refusal.
         refused: refusals since the last message.
+        counts: lines that came: `messages`; `acknowledgements`; `bells` (refusals); `garbage` (no message, to the
+            letter); `overlong` (no end within 64 bytes); `extended` (29-bit identifiers).
     """
 
     def __init__(self) -> None:
-        """Start with an empty line and nothing counted."""
-        self.unexplained = 0
-        self.refused = 0
+        self.unexplained = self.refused = 0
+        self.counts: Counter[str] = Counter()
         self._line = bytearray()
-        names = ("messages", "acknowledgements", "bells", "garbage", "overlong", "extended")
-        self._counts = dict.fromkeys(names, 0)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many lines came, by what they were.
-
-        `messages`; `acknowledgements`; `bells` (refusals); `garbage` (no message, to the letter); `overlong` (no end
-        within 64 bytes); `extended` (29-bit identifiers, which this bus has no use for).
-        """
-        return dict(self._counts)
 
     def feed(self, data: bytes) -> list[CanMessage]:
         """Return the messages that `data` completes; takes any bytes."""
@@ -103,33 +96,24 @@ class SlcanParser:
         line = bytes(self._line)
         self._line.clear()
         if refused:
-            self._counts["bells"] += 1
+            self.counts["bells"] += 1
             self.refused += 1
             if not line:
                 return None
         message = decode_line(line)
         if message is not None:
-            self._counts["messages"] += 1
+            kind = "messages"
             self.unexplained = self.refused = 0
+        elif len(line) > LONGEST_LINE:
+            kind = "overlong"
+        elif line in _ACKNOWLEDGEMENTS or EXTENDED.fullmatch(line):
+            kind = "acknowledgements" if line in _ACKNOWLEDGEMENTS else "extended"
+            self.unexplained -= len(line)
         else:
-            self._count_other(line)
+            kind = "garbage"
+        self.counts[kind] += 1
         return message
 
-    def _count_other(self, line: bytes) -> None:
-        """Count a line that is no message."""
-        if len(line) > LONGEST_LINE:
-            self._counts["overlong"] += 1
-        elif line in _ACKNOWLEDGEMENTS:
-            self._counts["acknowledgements"] += 1
-            self.unexplained -= len(line)
-        elif EXTENDED.fullmatch(line):
-            self._counts["extended"] += 1
-            self.unexplained -= len(line)
-        else:
-            self._counts["garbage"] += 1
-
-
-BIT_RATES = {10_000: 0, 20_000: 1, 50_000: 2, 100_000: 3, 125_000: 4, 250_000: 5, 500_000: 6, 800_000: 7, 1_000_000: 8}
 
 _PORT_ERRORS = (OSError, termios.error)  # pyserial passes the second one through
 _SETTLE = 0.02  # [s] in which an adapter that was left open stops sending after "C"
@@ -145,30 +129,20 @@ class SerialBus(Bus):
     `send` may be called from any thread while another one waits in `receive`.
     """
 
-    def __init__(self, port: str, baud_rate: int = 115_200, bit_rate: int = 1_000_000) -> None:
+    def __init__(self, port: str, baud_rate: int = 115_200) -> None:
         """Remember what to open; nothing is opened yet.
 
         Args:
             port: path of the serial port.
             baud_rate: of the serial port [baud]; an adapter that is a USB device itself does not care.
-            bit_rate: of the CAN bus [bit/s]; the gripper's is 1,000,000.
-
-        Raises:
-            TargetError: a rate is none that ports or SLCAN know.
         """
-        if not baud_rate > 0:
-            raise TargetError(f"baud_rate: got {baud_rate!r}, expected a positive number, 115200 for most adapters")
-        if bit_rate not in BIT_RATES:
-            known = ", ".join(f"{rate:,}" for rate in BIT_RATES)
-            raise TargetError(f"bit_rate: got {bit_rate!r}, expected one of {known} bit/s (the gripper's is 1,000,000)")
-        self._port, self._baud_rate, self._bit_rate = port, baud_rate, bit_rate
+        self._port, self._baud_rate = port, baud_rate
         self._serial: Any = None
         self._poll = select.poll()
         self._torn = b""  # what ends a line that went out only in part
         self._parser = SlcanParser()
         self._messages: deque[CanMessage] = deque()
         self._reading, self._writing = Lock(), Lock()
-        self._counts = {"opened": 0, "sent": 0}
 
     def open(self) -> None:
         """Open the port for this program alone and the adapter's channel; a port that is open is opened anew.
@@ -190,7 +164,7 @@ class SerialBus(Bus):
                 raise self._gone(error) from error
             self._poll = select.poll()
             self._poll.register(port.fileno(), select.POLLIN)
-            self._counts["opened"] += 1
+            self._parser.counts["opened"] += 1
 
     def _join(self) -> None:
         """Take the adapter from any state onto the bus, and forget what it had received before."""
@@ -200,7 +174,7 @@ class SerialBus(Bus):
         self._serial.reset_input_buffer()
         self._parser.discard()
         self._messages.clear()
-        write_all(self._serial, b"S%d\rO\r" % BIT_RATES[self._bit_rate])
+        write_all(self._serial, b"S8\rO\r")  # 1 Mbit/s
 
     def close(self) -> None:
         """Leave the bus and close the port, also one that is gone; a `receive` under way ends first."""
@@ -236,7 +210,7 @@ class SerialBus(Bus):
                 self._torn = END
                 raise self._gone(error) from error
             self._torn = b""
-            self._counts["sent"] += 1
+            self._parser.counts["sent"] += 1
 
     def receive(self, timeout: float) -> CanMessage | None:
         """Return the next message as soon as its last byte is there, None when none came within `timeout` [s].
@@ -286,7 +260,7 @@ class SerialBus(Bus):
     @property
     def counts(self) -> dict[str, int]:
         """Events since the bus was made: `opened`, `sent`, and what `SlcanParser.counts` names."""
-        return {**self._counts, **self._parser.counts}
+        return dict(self._parser.counts)
 
     @property
     def suspicion(self) -> str:
@@ -298,8 +272,8 @@ class SerialBus(Bus):
             )
         if self._parser.refused >= _SUSPICIOUS_REFUSALS:
             return (
-                f"the adapter at {self._port} refuses what is sent (BELL): does it know "
-                f"{self._bit_rate:,} bit/s? its queue also fills when no gripper listens: check 24 V, CANH/CANL"
+                f"the adapter at {self._port} refuses what is sent (BELL): does it know 1 Mbit/s? its queue also fills "
+                "when no gripper listens: check 24 V, CANH/CANL"
             )
         return ""
 
@@ -314,13 +288,13 @@ def write_all(port: Any, data: bytes) -> None:
         OSError: it is gone.
     """
     end, descriptor = monotonic() + _WRITE_TIMEOUT, port.fileno()
-    room = select.poll()
-    room.register(descriptor, select.POLLOUT)
+    space = select.poll()
+    space.register(descriptor, select.POLLOUT)
     while data:
         try:
             data = data[os.write(descriptor, data) :]
         except BlockingIOError:
-            if not room.poll(ceil(1e3 * max(0.0, end - monotonic()))):
+            if not space.poll(ceil(1e3 * max(0.0, end - monotonic()))):
                 raise TimeoutError("the port takes no more") from None
 
 
@@ -331,7 +305,7 @@ def open_port(path: str, baud_rate: int) -> Any:
         LinkError: it is absent, busy, no serial port, or may not be opened; the message says what would help.
         MissingDependencyError: pyserial is not installed.
     """
-    serial = _import_serial()
+    serial = import_library("serial", "A gripper on a serial port", "pyserial")
     try:
         port = serial.Serial(path, baud_rate, timeout=0, write_timeout=_WRITE_TIMEOUT, exclusive=True)
     except (*_PORT_ERRORS, ValueError) as error:
@@ -342,24 +316,19 @@ def open_port(path: str, baud_rate: int) -> Any:
     return port
 
 
-def _import_serial() -> ModuleType:
-    """Return pyserial."""
-    return import_library("serial", "A gripper on a serial port", "pyserial")
-
-
 def explain_refusal(path: str, baud_rate: int, error: Exception) -> str:
     """Return why a port cannot be opened and what would help, in one line."""
     number = getattr(error, "errno", None)
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.ENOTDIR):
-        return f"there is no port {path!r}: ports here: {name_ports()}; is the adapter plugged in?"
+        return f"there is no port {path!r}: ports here: {_name_ports()}; is the adapter plugged in?"
     if number in (errno.EBUSY, errno.EAGAIN):
         return f"{path} is in use by another program: end that first (`fuser -v {path}` names it)"
     if number in (errno.EACCES, errno.EPERM):
         return f"no permission to open {path}: `sudo usermod -aG dialout $USER`, then log in again"
-    return f"{path} is no serial port, or knows no {baud_rate} baud ({error}): ports here: {name_ports()}"
+    return f"{path} is no serial port, or knows no {baud_rate} baud ({error}): ports here: {_name_ports()}"
 
 
-def name_ports() -> str:
+def _name_ports() -> str:
     """Return the serial ports of this machine with what is plugged into them, "none" without any."""
     from serial.tools import list_ports
 

@@ -16,10 +16,8 @@ from finforce.systems.launch import options_from_texts
 from finforce.systems.live import bench_processes
 from finforce.systems.processes import BenchOptions, Process, ReplayOptions, RobotOptions, replay_processes
 from finforce_contact.parameters import ContactParameters, ContactSettings
-from finforce_driver.grasp.settings import GraspSettings
-from finforce_driver.joint import JointSettings
 from finforce_driver.node import LINKS
-from finforce_driver.settings import DriverParameters, GripperSettings
+from finforce_driver.settings import DriverParameters, GraspSettings, GripperSettings, JointSettings
 from finforce_eval.replay.node import PlayerParameters
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings

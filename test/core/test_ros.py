@@ -26,8 +26,7 @@ from finforce.messages import decode_keypoints, stamp_of
 from finforce.ros import node as ros
 from finforce.settings import refresh_record
 from finforce_contact.parameters import ContactParameters, ContactSettings, TrackerSettings
-from finforce_driver.grasp.settings import GraspSettings
-from finforce_driver.settings import DriverParameters, GripperSettings
+from finforce_driver.settings import DriverParameters, GraspSettings, GripperSettings
 from finforce_eval.replay.node import PlayerParameters
 from finforce_ifea.parameters import NodeParameters
 from finforce_ifea.settings import EstimatorSettings

@@ -14,8 +14,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from finforce.ros import node as ros
-from finforce_driver.clock import MonotonicClock
 from finforce_driver.errors import GripperStateError, GripperTimeoutError, TargetError
+from finforce_driver.gripper import Clock
 from finforce_driver.node import GripperDriverNode
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
@@ -43,7 +43,7 @@ class FakeGripper:
     resolution = 0.048 / 255
 
     def __init__(self, state=READY, **settings):
-        self.settings, self.clock = GripperSettings(**settings), MonotonicClock()
+        self.settings, self.clock = GripperSettings(**settings), Clock()
         self.state = state
         self.calls, self.listeners = [], []
         self.started = self.closed = False
@@ -85,9 +85,6 @@ class FakeGripper:
                 raise TargetError(f"{name}: got {value}, expected a number that is not negative")
         self._do("move", opening, speed, force)
         self.state = replace(self.state, phase=Phase.MOVING, outcome=MoveOutcome.NONE, target=opening)
-
-    def grasp_without_vision(self, current_force, speed=None, least_opening=None, time_limit=None):
-        self._do("grasp_without_vision", current_force)
 
     def activate(self, on):
         self._do("activate", on)
@@ -191,7 +188,7 @@ def driver(probe, state=READY, **parameters):
     """A driver node around a fake gripper, both ends of joint_states found."""
     gripper = FakeGripper(state)
     node = start_driver(probe, gripper, **parameters)
-    probe.wait_for(lambda: node.out.joints.get_subscription_count() == 1)
+    probe.wait_for(lambda: node.joints.get_subscription_count() == 1)
     return gripper, node
 
 

@@ -12,9 +12,8 @@ from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from finforce_driver.can.protocol import Bus, CanMessage, Reply, decode_move
+from finforce_driver.can.protocol import Bus, CanMessage, Command, Reply, decode_move
 from finforce_driver.can.slcan import decode_line, encode_message
-from finforce_driver.errors import CanMessageError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import Phase
@@ -227,13 +226,11 @@ class Rig:
         return [order for _, order in self.timed_orders(since)]
 
     def timed_orders(self, since=0.0):
-        found = []
-        for time, message in self.bus.sent:
-            try:
-                found += [(time, decode_move(message))] if time >= since else []
-            except CanMessageError:
-                continue
-        return found
+        return [
+            (time, decode_move(message))
+            for time, message in self.bus.sent
+            if time >= since and message.command == Command.MOVE and message.data
+        ]
 
     def messages(self, command, since=0.0):
         return [message for message in self.sent(since) if message.id >> 1 & 0x3F == command]
@@ -241,7 +238,7 @@ class Rig:
 
 def reply(**changes) -> Reply:
     """A reply of a calibrated gripper at rest, with changes."""
-    parts = {"position": 100, "current_mA": 0, "activated": True, "action": True, "code": 3}
+    parts = {"time": 0.0, "position": 100, "current_mA": 0, "activated": True, "action": True, "code": 3}
     flags = dict.fromkeys(("overheated", "watchdog", "estopped", "error"), False)
     return Reply(**{**parts, **flags, "calibrated": True, **changes})
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from finforce_driver.grasp.controller import ForceGrasp
 from finforce_driver.grasp.load_watch import ForceSample
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings, GraspStatus
-from finforce_driver.state import GripperState, Phase
+from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.state import GraspPhase, GraspStatus, GripperState, Phase
 
 STEP = 0.048 / 255
 DT = 0.002
@@ -207,13 +207,15 @@ class Bench:
 
     def _update(self, now: float, course: Course) -> None:
         state = self.change_state(replace(self.jaws.state), now)
-        step = self.grasp.update(state, now, self.jaws.opening_at)
-        if step.move is not None:
-            self.jaws.move(now, step.move.opening, step.move.speed)
-        if step.stop:
+        ended = self.grasp.phase is GraspPhase.STOPPED
+        move = self.grasp.update(state, now, self.jaws.opening_at)
+        if move is not None:
+            self.jaws.move(now, move.opening, move.speed)
+        usable = state.phase in (Phase.READY, Phase.MOVING) and not state.estopped
+        if self.grasp.phase is GraspPhase.STOPPED and not ended and move is None and usable:
             course.stops.append(now)
             self.jaws.move(now, math.floor(self.jaws.opening / STEP + 0.5) * STEP, 0.02)
         course.times.append(now)
         course.forces.append(self.fingers.force)
         course.openings.append(self.jaws.opening)
-        course.statuses.append(step.status)
+        course.statuses.append(self.grasp.status(state, now))

@@ -3,8 +3,8 @@
 import math
 from collections import deque
 
-from finforce_driver.joint import JointGripper, JointSettings
-from finforce_driver.settings import GripperSettings
+from finforce_driver.joint import JointGripper
+from finforce_driver.settings import GripperSettings, JointSettings
 from finforce_sim.emulator.virtual import VirtualClock
 
 # As their makers and drivers have them: 85 mm and 0.8 rad in 255 steps, polled at 100 Hz; 70 mm and 1.7 rad in steps
@@ -48,16 +48,16 @@ class EmulatedJoint:
     def opening_of(self, value):
         return (value - self.joint.closed) * self.settings.stroke / (self.joint.open - self.joint.closed)
 
-    def receive(self, command):
-        self.commands.append(command)
-        self._due.append((self.clock.now() + self.latency, command))
+    def receive(self, position, velocity, effort):
+        self.commands.append((position, velocity, effort))
+        self._due.append((self.clock.now() + self.latency, position, velocity))
 
     def step(self, dt):
         now = self.clock.now()
         while self._due and self._due[0][0] <= now:
-            _, command = self._due.popleft()
-            self.target = round(command.position / self.step_size) * self.step_size
-            self.pace = min(self.speed, command.velocity) if self.takes_speed and command.velocity > 0 else self.speed
+            _, position, velocity = self._due.popleft()
+            self.target = round(position / self.step_size) * self.step_size
+            self.pace = min(self.speed, velocity) if self.takes_speed and velocity > 0 else self.speed
         way = min(max(self.target - self.value, -self.pace * dt), self.pace * dt)
         if self.opening_of(self.value + way) >= self.blocked_at or self.opening_of(self.value + way) > self.opening:
             self.value += way

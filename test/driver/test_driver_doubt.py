@@ -8,7 +8,8 @@ from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, spring
 
 from finforce.errors import ObservationError
 from finforce.ros.messages import force_stddev
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
+from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.state import GraspPhase
 from lab.experiments.grasp_world import GraspCase, NoisySensor, Plant, World, build_spring
 
 
@@ -76,11 +77,11 @@ def test_forces_that_are_all_too_old_end_the_grasp_by_that_name():
 
 def test_forces_in_another_frame_end_the_grasp_by_that_name():
     bench = Bench(goal=GraspGoal(force=2.0), camera=Camera(change=lambda sample: None))
-    bench.on_step = lambda bench, now: bench.grasp.refuse("the grasp wrench: frame 'left_jaw', expected 'gripper_base'")
+    bench.on_step = lambda bench, now: bench.grasp.reject("the grasp wrench: frame 'left_jaw', expected 'gripper_base'")
     course = bench.run(4.0)
     assert course.status.phase is GraspPhase.STOPPED
     assert "frame 'left_jaw', expected 'gripper_base'" in course.status.reason
-    assert course.status.refused["refused"] > 0
+    assert course.status.rejected["rejected"] > 0
 
 
 def stddev_message(x, y, z, frame="left_jaw"):

@@ -1,8 +1,8 @@
 """Claims about the driver under random faults, against the emulator's truth."""
 
 import pytest
-
 from finforce_driver.machine.exchange import Exchange
+
 from finforce_driver.machine.knowledge import ReplyFilter
 from finforce_sim.emulator.faults import FaultKind
 from lab.bench.driver_faults import FaultRun, choose_kinds

@@ -8,7 +8,8 @@ import pytest
 from grasp_fakes import STEP, Bench, Camera, Fingers, Jaws, spring
 
 from finforce_driver.errors import TargetError
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
+from finforce_driver.settings import GraspGoal, GraspSettings
+from finforce_driver.state import GraspPhase
 
 STIFF = 1300.0  # [N/m] of opening, the greatest of a real finger
 NOISE = 0.05

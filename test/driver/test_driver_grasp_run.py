@@ -9,9 +9,9 @@ import pytest
 from finforce_driver.errors import GraspError
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import hold_force
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase
 from finforce_driver.gripper import Gripper
-from finforce_driver.state import Phase
+from finforce_driver.settings import GraspGoal
+from finforce_driver.state import GraspPhase, Phase
 from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock

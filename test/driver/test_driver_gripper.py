@@ -9,7 +9,7 @@ from emulator_fakes import COUNT, VARIANTS, Rig
 
 from finforce_driver.can.protocol import Flag
 from finforce_driver.can.slcan import SerialBus
-from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, TargetError
+from finforce_driver.errors import GripperTimeoutError, TargetError
 from finforce_driver.gripper import Gripper
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import MoveOutcome, Phase
@@ -80,40 +80,19 @@ def test_an_opening_within_a_long_silence_is_unknown(rig):
 
 
 @both_variants
-def test_a_grasp_without_vision_holds_with_its_current(variant):
+def test_a_move_that_meets_something_holds_it_with_the_current_of_its_force(variant):
     rig = Rig(variant)
     rig.emulated.jaws.object_opening = 0.03
-    state = rig.gripper.grasp_without_vision(10.0, 0.05)
+    state = rig.arrive(0.0, 0.05, 10.0)
     assert state.outcome is MoveOutcome.GRASPED
     assert state.force == pytest.approx(10.0, rel=0.03)
     assert rig.emulated.order.current == 210
 
 
-def test_a_grasp_without_vision_of_nothing_is_an_error_and_stays_put(rig):
-    with pytest.raises(GraspError, match="nothing was grasped .* down to 20.0 mm"):
-        rig.gripper.grasp_without_vision(10.0, 0.05, least_opening=0.02)
-    rig.live(0.3)
-    assert rig.emulated.true_opening == pytest.approx(0.02, abs=COUNT)
-
-
-def test_a_grasp_without_vision_ends_in_time_and_in_place(rig):
-    with pytest.raises(GripperTimeoutError):
-        rig.gripper.grasp_without_vision(10.0, 0.01, time_limit=1.0)
-    rig.live(0.3)
-    assert rig.emulated.true_opening == pytest.approx(0.048 - rig.gripper.scale.pace_of(0.01).speed, abs=0.0005)
-    assert rig.state.phase is Phase.READY
-
-
-def test_a_grasp_without_vision_that_loses_its_gripper_is_an_error(rig):
-    rig.gripper.listen(lambda state: rig.emulated.faults or state.opening > 0.03 or rig.gripper.estop())
-    with pytest.raises(GripperStateError, match="the grasp was lost"):
-        rig.gripper.grasp_without_vision(10.0, 0.05)
-
-
 @pytest.mark.parametrize("force", [3.0, 80.0, math.nan, -10.0])
-def test_a_grasp_without_vision_refuses_forces_that_the_current_cannot_give(rig, force):
+def test_forces_that_the_current_cannot_give_move_nothing(rig, force):
     with pytest.raises(TargetError, match="force"):
-        rig.gripper.grasp_without_vision(force)
+        rig.gripper.move(0.0, force=force)
     assert rig.orders() == []
 
 

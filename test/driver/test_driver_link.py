@@ -86,13 +86,6 @@ def test_a_line_does_not_go_on_after_opening_anew(adapter, bus):
     assert bus.counts["garbage"] == 0
 
 
-def test_the_bit_rate_is_told_to_the_adapter(adapter):
-    link = SerialBus(adapter.link, bit_rate=500_000)
-    link.open()
-    assert adapter.read(b"O\r") == b"\rC\rS6\rO\r"
-    link.close()
-
-
 def test_a_busy_port_is_refused_and_the_first_program_keeps_it(adapter, bus):
     with pytest.raises(LinkError, match="in use by another program.*fuser"):
         SerialBus(adapter.link).open()

@@ -10,11 +10,10 @@ from driver_node_fakes import READY, FakeGripper
 from finforce.health import Level
 from finforce.settings import ParameterError
 from finforce.stamps import NANOSECONDS, StampError
-from finforce_driver.clock import MessageTimes
 from finforce_driver.errors import TargetError
 from finforce_driver.grasp.session import GraspSession
-from finforce_driver.grasp.settings import GraspGoal, GraspSettings
 from finforce_driver.messages import (
+    MessageTimes,
     describe_state,
     goal_from_joint_state,
     move_from_gripper_command,
@@ -23,7 +22,7 @@ from finforce_driver.messages import (
     outcome_of_state,
 )
 from finforce_driver.node import build_gripper
-from finforce_driver.settings import DriverParameters, GripperSettings
+from finforce_driver.settings import DriverParameters, GraspGoal, GraspSettings, GripperSettings
 from finforce_driver.state import MoveOutcome, Phase
 
 JOINTS = ("left_jaw_joint", "right_jaw_joint")
@@ -84,10 +83,10 @@ def test_a_command_that_is_none_is_refused(message, words):
 
 
 def test_no_effort_of_the_standard_action_is_the_drivers_own():
-    command = SimpleNamespace(position=0.01, max_effort=0.0)
-    assert move_from_gripper_command(command).force is None
-    command.max_effort = 12.0
-    assert move_from_gripper_command(command).force == 12.0
+    goal = SimpleNamespace(command=SimpleNamespace(position=0.01, max_effort=0.0))
+    assert move_from_gripper_command(goal).force is None
+    goal.command.max_effort = 12.0
+    assert move_from_gripper_command(goal).force == 12.0
 
 
 def test_a_goal_changes_only_what_it_says():

@@ -114,7 +114,7 @@ def test_a_slow_move_grasps_and_follows_what_gives_way(rig):
     rig.arrive(0.027)
     state = rig.arrive(0.01, 0.002)
     assert state.outcome is MoveOutcome.GRASPED
-    assert min(order.position for order in rig.orders()[-1:]) - rig.gripper.scale.counts_of(0.025) < 5.0
+    assert min(order.position for order in rig.orders()[-1:]) - rig.gripper.settings.counts_of(0.025) < 5.0
     rig.emulated.jaws.object_opening = 0.020
     begin = rig.clock.now()
     rig.gripper.wait(lambda _: rig.emulated.true_opening < 0.0205, 10.0)
@@ -182,7 +182,7 @@ def test_bad_input_is_refused_and_leaves_the_move_as_it_was(rig, arguments, erro
 
 @both_variants
 def test_velocity_is_that_of_the_opening(rig):
-    speed = rig.gripper.scale.pace_of(0.0232).speed
+    speed = rig.gripper.settings.speed_of(rig.gripper.settings.speed_byte(0.0232))
     for goal, way in ((0.0, -1.0), (0.048, 1.0)):
         rig.gripper.move(goal, 0.0232)
         rig.live(0.5)

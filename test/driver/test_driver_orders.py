@@ -103,7 +103,7 @@ def test_hold_aims_at_where_the_jaws_are_by_now(rig):
     rig.gripper.move(0.0, 0.1)
     rig.live(0.2)
     rig.clock.wait(0.018)
-    begin, place = rig.clock.now(), rig.gripper.scale.counts_of(rig.emulated.true_opening)
+    begin, place = rig.clock.now(), rig.gripper.settings.counts_of(rig.emulated.true_opening)
     rig.gripper.hold()
     rig.live(0.1)
     # 0.1 m/s are 10 counts in the 18 ms that the last reply is old

@@ -5,17 +5,29 @@ import math
 import pytest
 from emulator_fakes import reply
 
-from finforce_driver.can.protocol import CanMessage, Command, Flag, Move, encode_poll
-from finforce_driver.machine.exchange import MARKERS, Exchange, Request
+from finforce_driver.can.protocol import CanMessage, Command, Flag, Move, encode
+from finforce_driver.machine.drive import MARKERS, Exchange, Request
 from finforce_driver.machine.knowledge import History, Telemetry
-from finforce_driver.machine.move import GRACE, Goal, MoveJob, MoveWatch, Orders
-from finforce_driver.machine.procedures import CalibrationRun, CalibrationStep
-from finforce_driver.settings import GripperSettings, Pace
+from finforce_driver.machine.move import GRACE, Goal, MoveJob, Orders
+from finforce_driver.machine.procedures import CalibrationRun, Step
+from finforce_driver.settings import GripperSettings
 from finforce_driver.state import MoveOutcome
 
-POLL = Request(message=encode_poll(0), answer=Command.REPLY)
+POLL = Request(message=encode(0, Command.MOVE))
 REPLY = CanMessage(id=0x078, data=b"\x00\x00\x00\xf1")
 GO = Flag.ACTIVATE | Flag.GO
+
+
+def job(stepped=False):
+    """A move that closes to 100 counts within a second."""
+    goal = Goal(opening=0.03, position=100, rate=100.0, byte=3, stepped=stepped, current_mA=500)
+    return MoveJob(goal, start=0.0, now=0.0)
+
+
+def outcome_after(move, newest):
+    """What a reply makes of a move."""
+    move.take(newest)
+    return move.outcome
 
 
 def temperature(value):
@@ -36,7 +48,7 @@ def test_after_a_lost_reply_a_late_one_is_not_taken_for_the_next():
 
 def test_every_lost_marker_is_followed_by_another_one():
     exchange = Exchange(0)
-    exchange.begin(Request(message=CanMessage(id=0x14, remote=True), answer=Command.PING), 0.0)
+    exchange.begin(Request(message=encode(0, Command.PING, remote=True)), 0.0)
     exchange.end(0.0)
     asked = []
     for _ in range(6):
@@ -61,7 +73,7 @@ def test_a_single_odd_temperature_is_not_believed_and_a_repeated_one_is():
     telemetry = Telemetry(1.0)
     told = []
     for time, value in enumerate((26, 26, 90, 27, 90, 91)):
-        telemetry.take(Command.TEMPERATURE, temperature(value), float(time))
+        telemetry.take(temperature(value), float(time))
         told.append(telemetry.temperature)
     assert told[1:] == [26.0, 26.0, 27.0, 27.0, 91.0]
 
@@ -69,31 +81,30 @@ def test_a_single_odd_temperature_is_not_believed_and_a_repeated_one_is():
 def test_a_doubted_answer_is_asked_for_again_at_once():
     telemetry = Telemetry(1.0)
     assert telemetry.question(0.0) is Command.TEMPERATURE
-    telemetry.take(Command.TEMPERATURE, temperature(26), 0.0)
+    telemetry.take(temperature(26), 0.0)
     assert telemetry.question(0.0) is Command.TEMPERATURE
-    telemetry.take(Command.TEMPERATURE, temperature(26), 0.0)
+    telemetry.take(temperature(26), 0.0)
     assert telemetry.question(0.0) is None
     assert telemetry.question(1.0) is Command.SUPPLY
 
 
 def test_what_comes_soon_after_an_order_speaks_of_the_one_before():
-    watch = MoveWatch(position=100, closing=True, allowed=1.0, now=0.0)
-    early = [watch.take(reply(), GRACE * part, True) for part in (0.1, 0.5, 0.9)]
-    late = [watch.take(reply(), GRACE + time, True) for time in (0.01, 0.03)]
+    move = job()
+    early = [outcome_after(move, reply(time=GRACE * part)) for part in (0.1, 0.5, 0.9)]
+    late = [outcome_after(move, reply(time=GRACE + time)) for time in (0.01, 0.03)]
     assert (early, late) == ([MoveOutcome.NONE] * 3, [MoveOutcome.NONE, MoveOutcome.REACHED])
 
 
 def test_a_step_on_the_way_is_not_the_end():
-    watch = MoveWatch(position=100, closing=True, allowed=1.0, now=0.0)
-    assert {watch.take(reply(), 0.1 + 0.02 * index, False) for index in range(10)} == {MoveOutcome.NONE}
+    move = job(stepped=True)
+    assert {outcome_after(move, reply(time=0.1 + 0.02 * index)) for index in range(10)} == {MoveOutcome.NONE}
 
 
 def test_a_slow_move_begins_where_the_jaws_are_not_where_they_were_thought_to_be():
-    pace = Pace(byte=3, speed=0.001, stepped=True)
-    goal = Goal(opening=0.035, position=67, pace=pace, current_mA=500)
-    job = MoveJob(goal, start=155.0, rate=5.0, now=0.0)
-    job.advance(0.05, 105.5, 0.04)
-    assert job.position in (105, 106)
+    goal = Goal(opening=0.035, position=67, rate=5.0, byte=3, stepped=True, current_mA=500)
+    move = MoveJob(goal, start=155.0, now=0.0)
+    move.advance(0.05, 105.5, 0.04)
+    assert move.position in (105, 106)
 
 
 def test_the_first_reply_that_says_calibrated_does_not_end_a_calibration():
@@ -103,9 +114,9 @@ def test_the_first_reply_that_says_calibrated_does_not_end_a_calibration():
         run.travel.miss()  # it does not tell its encoder
     steps = []
     for time, position, calibrated in ((0.5, 0, False), (1.0, 255, False), (2.0, 255, True), (2.02, 255, True)):
-        run.take(reply(position=position, calibrated=calibrated, current_mA=-400), time)
+        run.take(reply(time=time, position=position, calibrated=calibrated, current_mA=-400))
         steps.append(run.step)
-    assert steps == [CalibrationStep.WATCH] * 3 + [CalibrationStep.DONE]
+    assert steps == [Step.WATCH] * 3 + [Step.DONE]
 
 
 def test_orders_are_pending_until_taken_and_differ_after_an_interruption():
@@ -123,24 +134,23 @@ def test_orders_are_pending_until_taken_and_differ_after_an_interruption():
     assert orders.wanted.flags & 0xF0 == GO
 
 
-def test_speed_and_place_come_from_the_last_tenth_of_a_second():
+def test_speed_and_position_come_from_the_last_tenth_of_a_second():
     history = History()
     assert history.speed() == 0.0 and math.isnan(history.last)
     for index in range(20):
         history.add(0.02 * index, 5.0 if index < 10 else 5.0 + (index - 10))
     assert history.speed() == pytest.approx(50.0)
-    assert history.place_at(0.37, 0.0) == pytest.approx(13.5)
-    assert math.isnan(history.place_at(-0.01, 0.0))
-    assert history.place_at(0.40, 0.05) == 14.0
+    assert history.position_at(0.37, 0.0) == pytest.approx(13.5)
+    assert math.isnan(history.position_at(-0.01, 0.0))
+    assert history.position_at(0.40, 0.05) == 14.0
 
 
 @pytest.mark.parametrize(("position", "outcome"), [(99, "REACHED"), (101, "REACHED"), (97, "TIMED_OUT")])
 def test_jaws_that_rest_a_count_beside_the_target_have_reached_it(position, outcome):
-    watch = MoveWatch(position=100, closing=True, allowed=1.0, now=0.0)
-    found = {}
+    move, found = job(), {}
     for step in range(1, 120):
         now = 0.02 * step
-        result = watch.take(reply(position=min(position, 60 + 4 * step), code=0), now, True)
+        result = outcome_after(move, reply(time=now, position=min(position, 60 + 4 * step), code=0))
         found.setdefault(result, now)
     assert MoveOutcome[outcome] in found
     if outcome == "REACHED":

@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from finforce_driver.can.protocol import CanMessage, decode_reply
-from finforce_driver.errors import CanMessageError
-from finforce_driver.machine.knowledge import MOST_DOUBTS, Expectation, ReplyFilter, TimedReply
+from finforce_driver.machine.knowledge import MOST_UNCONFIRMED, ReplyFilter
 
-REST = Expectation(drift=0.0, reach=100.0)
+REST = (0.0, 100.0)  # speed and greatest speed that is possible [counts/s]
 SOON, POLL = 0.0015, 0.02  # [s]
 
 
@@ -19,14 +18,13 @@ def settled(first, time=0.0):
     """A filter that believes a reply."""
     judge = ReplyFilter(0.05)
     for index in range(4):
-        judge.take(TimedReply(reply=first, time=time - (3 - index) * SOON), REST)
+        judge.take(replace(first, time=time - (3 - index) * SOON), *REST)
     return judge
 
 
 def feed(judge, replies, start=POLL, step=SOON, expected=REST):
-    return [
-        judge.take(TimedReply(reply=item, time=start + index * step), expected) for index, item in enumerate(replies)
-    ]
+    believed = [judge.take(replace(item, time=start + index * step), *expected) for index, item in enumerate(replies)]
+    return [None if item is None else replace(item, time=0.0) for item in believed]
 
 
 def test_the_first_reply_is_believed_when_three_others_repeat_it():
@@ -38,7 +36,7 @@ def test_the_first_reply_is_believed_when_three_others_repeat_it():
 def test_a_doubt_is_alarming_when_what_the_gripper_may_be_told_is_at_stake(change, alarming):
     judge = settled(reply())
     feed(judge, [reply(**change)])
-    assert (judge.doubtful, judge.alarming) == (True, alarming)
+    assert (judge.wants_reply, judge.alarming) == (True, alarming)
 
 
 def test_what_goes_on_is_believed_at_once():
@@ -48,9 +46,9 @@ def test_what_goes_on_is_believed_at_once():
 def test_a_doubted_reply_asks_for_another_at_once():
     judge = settled(reply())
     feed(judge, [reply(position=90)])
-    assert judge.doubtful
+    assert judge.wants_reply
     feed(judge, [reply()], POLL + SOON)
-    assert not judge.doubtful
+    assert not judge.wants_reply
 
 
 @given(
@@ -65,13 +63,10 @@ def test_a_flipped_digit_never_becomes_a_state(position, current, status, error,
     data = bytes([position, *current.to_bytes(2, "big", signed=True), status])
     line = f"{0x079 if error else 0x078:03X}{data.hex()}"
     flipped = line[:place] + f"{digit:X}" + line[place + 1 :]
-    true = decode_reply(CanMessage(id=int(line[:3], 16), data=data))
+    true = decode_reply(CanMessage(id=int(line[:3], 16), data=data), 0.0)
     if int(flipped[:3], 16) & 0x7FE != 0x078:
         return  # another node's or command's message, which no filter sees
-    try:
-        wrong = decode_reply(CanMessage(id=int(flipped[:3], 16), data=bytes.fromhex(flipped[3:])))
-    except CanMessageError:
-        return
+    wrong = decode_reply(CanMessage(id=int(flipped[:3], 16), data=bytes.fromhex(flipped[3:])), 0.0)
     for believed in feed(settled(true), [wrong, true]):
         if believed is not None:
             # the current may be off by what it may change between two replies
@@ -93,13 +88,13 @@ def test_three_different_lies_are_not_believed():
 
 
 def test_motion_at_the_known_speed_is_believed_at_once():
-    moving = Expectation(drift=50.0, reach=75.0)
+    moving = (50.0, 75.0)
     assert feed(settled(reply()), [reply(position=101)], POLL, expected=moving) == [reply(position=101)]
     assert feed(settled(reply()), [reply(position=108)], POLL, expected=moving) == [None]
 
 
 def test_fast_motion_is_always_confirmed_since_the_jaws_may_have_stopped():
-    fast = Expectation(drift=500.0, reach=750.0)
+    fast = (500.0, 750.0)
     places = [reply(position=110 + index) for index in range(4)]
     assert feed(settled(reply()), places, POLL, expected=fast) == [None, None, None, places[-1]]
 
@@ -109,7 +104,7 @@ def test_after_a_long_gap_even_the_same_reply_is_confirmed():
 
 
 def test_a_noisy_current_ends_with_its_middle():
-    noisy = [reply(current_mA=(-400, 400, 0)[index % 3]) for index in range(1, MOST_DOUBTS + 2)]
+    noisy = [reply(current_mA=(-400, 400, 0)[index % 3]) for index in range(1, MOST_UNCONFIRMED + 2)]
     judge = settled(reply(current_mA=-1000))
     believed = [item for item in feed(judge, noisy) if item is not None]
     assert believed and believed[0].current_mA == 0

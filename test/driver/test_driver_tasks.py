@@ -10,11 +10,10 @@ from emulator_fakes import Rig
 from finforce_driver.errors import DriverError, GraspError, GripperStateError, TargetError
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import GraspSession
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
-from finforce_driver.messages import move_from_joint_state
-from finforce_driver.settings import DriverParameters
-from finforce_driver.state import MoveOutcome, Phase
-from finforce_driver.tasks import GripperCommandAction, GripperTasks
+from finforce_driver.messages import fill_gripper_command, move_from_gripper_command, move_from_joint_state
+from finforce_driver.settings import DriverParameters, GraspGoal, GraspSettings
+from finforce_driver.state import GraspPhase, MoveOutcome, Phase
+from finforce_driver.tasks import GripperTasks, MoveAction
 
 
 def build(gripper=None, **parameters):
@@ -248,7 +247,10 @@ def test_a_jaw_that_is_silent_does_not_silence_the_other(monkeypatch):
         grasp.tasks.stop()
 
 
-KIND = SimpleNamespace(Result=SimpleNamespace, Feedback=SimpleNamespace)
+def action(gripper, tasks=None):
+    """The action GripperCommand of a gripper."""
+    kind = SimpleNamespace(Result=SimpleNamespace, Feedback=SimpleNamespace)
+    return MoveAction(kind, move_from_gripper_command, fill_gripper_command, gripper, tasks)
 
 
 @pytest.mark.parametrize(
@@ -263,7 +265,7 @@ KIND = SimpleNamespace(Result=SimpleNamespace, Feedback=SimpleNamespace)
 def test_the_standard_action_ends_with_the_outcome_of_the_move(outcome, end, reached, stalled):
     gripper, _, tasks = build()
     goal = FakeGoal(0.02, 10.0)
-    with Caller(lambda: GripperCommandAction(KIND, gripper, tasks).execute(goal)) as caller:
+    with Caller(lambda: action(gripper, tasks).execute(goal)) as caller:
         caller.wait_for(lambda: goal.feedback)
         gripper.reply(phase=Phase.READY, outcome=outcome, opening=0.021, force=9.0)
         result = caller.result()
@@ -275,14 +277,14 @@ def test_a_cancelled_action_holds_in_place():
     gripper, _, tasks = build()
     goal = FakeGoal(0.02)
     goal.is_cancel_requested = True
-    GripperCommandAction(KIND, gripper, tasks).execute(goal)
+    action(gripper, tasks).execute(goal)
     assert gripper.calls[-1] == ("hold",) and goal.ends == ["canceled"]
 
 
 def test_an_action_that_is_refused_moves_nothing():
     gripper, _, tasks = build()
     goal = FakeGoal(math.nan)
-    result = GripperCommandAction(KIND, gripper, tasks).execute(goal)
+    result = action(gripper, tasks).execute(goal)
     assert gripper.calls == [] and goal.ends == ["abort"]
     assert (result.position, result.reached_goal) == (READY.opening, False)
 
@@ -291,7 +293,7 @@ def test_an_action_of_a_gripper_that_knows_no_opening_has_numbers_all_the_same()
     gripper, _, tasks = build()
     gripper.refusal = "not calibrated"
     gripper.reply(opening=math.nan, force=math.nan)
-    result = GripperCommandAction(KIND, gripper, tasks).execute(FakeGoal(0.02))
+    result = action(gripper, tasks).execute(FakeGoal(0.02))
     assert (result.position, result.effort) == (0.0, 0.0)
 
 
@@ -314,6 +316,6 @@ def test_a_first_goal_above_the_limit_is_refused():
 def test_a_goal_of_the_action_that_cannot_be_is_rejected_with_the_reason(position, effort, words):
     rig = Rig()
     goal = SimpleNamespace(command=SimpleNamespace(position=position, max_effort=effort))
-    refusal = GripperCommandAction(KIND, rig.gripper, None).refusal(goal)
-    assert words in refusal and bool(words) == bool(refusal)
+    rejection = action(rig.gripper).rejection(goal)
+    assert words in rejection and bool(words) == bool(rejection)
     assert rig.state.outcome is MoveOutcome.NONE

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from finforce_driver.errors import TargetError
-from finforce_driver.settings import GripperScale, GripperSettings
+from finforce_driver.settings import SLOWEST_BYTE, GripperSettings
 
-SCALE = GripperScale(GripperSettings())
-FINGERS = GripperScale(GripperSettings(closed_opening=0.012, stroke=0.04))
+SCALE = GripperSettings()
+FINGERS = GripperSettings(closed_opening=0.012, stroke=0.04)
 # the maker's table: speed byte, ticks per second, speed of the opening [mm/s]
 SPEEDS = {3: 4.5, 10: 14.6, 20: 29.0, 30: 43.5, 40: 57.9, 50: 72.3, 100: 144.5, 128: 184.9, 200: 288.8, 255: 368.2}
 
@@ -36,31 +36,23 @@ def test_speeds_of_the_makers_table(byte):
 
 @pytest.mark.parametrize("byte", range(3, 256))
 def test_every_speed_comes_back(byte):
-    pace = SCALE.pace_of(SCALE.speed_of(byte))
-    assert (pace.byte, pace.stepped, pace.note) == (byte, False, "")
+    assert SCALE.speed_byte(SCALE.speed_of(byte)) == byte
 
 
 @given(st.floats(1e-5, 0.36))
-def test_no_pace_is_faster_than_asked_for(speed):
-    pace = SCALE.pace_of(speed)
-    assert pace.speed <= speed * (1 + 1e-9)
-    assert pace.speed == speed if pace.stepped else SCALE.speed_of(pace.byte + 1) > speed
+def test_no_byte_is_faster_than_asked_for_but_the_slowest(speed):
+    byte = SCALE.speed_byte(speed)
+    assert SCALE.speed_of(byte) <= max(speed * (1 + 1e-9), SCALE.speed_of(SLOWEST_BYTE))
+    assert SCALE.speed_of(byte + 1) > speed
 
 
-def test_slow_speeds_go_in_steps_at_the_slowest_byte():
-    pace = SCALE.pace_of(0.001)
-    assert (pace.byte, pace.stepped, pace.speed) == (3, True, 0.001)
-
-
-def test_a_speed_beyond_the_gripper_is_cut_with_a_note():
-    pace = SCALE.pace_of(0.5)
-    assert (pace.byte, pace.speed) == (255, SCALE.fastest)
-    assert "more than the gripper can do" in pace.note
+def test_a_speed_beyond_the_gripper_is_its_fastest():
+    assert SCALE.speed_byte(0.5) == 255
 
 
 def test_a_speed_in_another_unit_is_refused():
     with pytest.raises(TargetError, match=r"speed: got 20 m/s, expected 1e-05 to 0.368 m/s"):
-        SCALE.pace_of(20.0)
+        SCALE.speed_byte(20.0)
 
 
 def test_forces_follow_the_makers_curve():
@@ -77,7 +69,7 @@ def test_openings_out_of_reach_are_refused(opening):
 @pytest.mark.parametrize("speed", [math.nan, math.inf, 0.0, -0.01, 1e-6])
 def test_speeds_that_are_none_are_refused(speed):
     with pytest.raises(TargetError, match="speed: got"):
-        SCALE.pace_of(speed)
+        SCALE.speed_byte(speed)
 
 
 @pytest.mark.parametrize("force", [math.nan, math.inf, 0.0, -10.0, 7.0, 62.1])

@@ -10,9 +10,8 @@ from joint_fakes import LEROBOT, ROBOTIQ, EmulatedJoint
 from finforce_driver.errors import GraspError, GripperStateError, GripperTimeoutError, TargetError
 from finforce_driver.grasp.load_watch import ForceSample
 from finforce_driver.grasp.session import hold_force
-from finforce_driver.grasp.settings import GraspGoal, GraspPhase, GraspSettings
-from finforce_driver.joint import JointSettings
-from finforce_driver.state import MoveOutcome, Phase
+from finforce_driver.settings import GraspGoal, GraspSettings, JointSettings
+from finforce_driver.state import GraspPhase, MoveOutcome, Phase
 from finforce_ifea.relaxation import Relaxation
 from lab.experiments.grasp_world import TERMS, build_spring
 

@@ -4,7 +4,7 @@ import pytest
 
 from finforce_driver.errors import TargetError
 from finforce_driver.grasp.session import SlipGuard
-from finforce_driver.grasp.settings import GraspSettings
+from finforce_driver.settings import GraspSettings
 
 
 def slide(guard, force, speed=0.006, images=60, rate=30.0, jaw="left"):
