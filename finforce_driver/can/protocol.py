@@ -134,25 +134,25 @@ class Move:
     current_mA: int
     flags: int
 
-    def __post_init__(self) -> None:
-        """Reject what the gripper would misread: it checks nothing itself.
+    @property
+    def activated(self) -> bool:
+        """Whether the power stage may move the jaws."""
+        return bool(self.flags & Flag.ACTIVATE)
 
-        Raises:
-            TargetError: a value is out of range.
-        """
-        for name, low, high in (
-            ("position", 0, LARGEST_BYTE),
-            ("speed", 0, LARGEST_BYTE),
-            ("current_mA", 1, LARGEST_CURRENT_MA),
-            ("flags", 0, LARGEST_BYTE),
-        ):
-            if not low <= getattr(self, name) <= high:
-                raise TargetError(f"{name} of a move: got {getattr(self, name)}, expected {low} to {high}")
+    @property
+    def action(self) -> bool:
+        """Whether to go to the position."""
+        return bool(self.flags & Flag.GO)
+
+    @property
+    def estop(self) -> bool:
+        """Whether it asks for an emergency stop."""
+        return bool(self.flags & Flag.ESTOP)
 
     @property
     def drives(self) -> bool:
         """Whether the gripper would move by it."""
-        return bool(self.flags & Flag.ACTIVATE and self.flags & Flag.GO and not self.flags & Flag.ESTOP)
+        return self.activated and self.action and not self.estop
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,7 +228,19 @@ def encode(node: int, command: int, data: bytes = b"", *, remote: bool = False) 
 
 
 def encode_move(node: int, move: Move) -> CanMessage:
-    """Return a 5-byte command 61."""
+    """Return a 5-byte command 61.
+
+    Raises:
+        TargetError: a value is out of range; the gripper checks nothing itself.
+    """
+    for name, low, high in (
+        ("position", 0, LARGEST_BYTE),
+        ("speed", 0, LARGEST_BYTE),
+        ("current_mA", 1, LARGEST_CURRENT_MA),
+        ("flags", 0, LARGEST_BYTE),
+    ):
+        if not low <= getattr(move, name) <= high:
+            raise TargetError(f"{name} of a move: got {getattr(move, name)}, expected {low} to {high}")
     return encode(node, Command.MOVE, _MOVE.pack(move.position, move.speed, move.current_mA, move.flags))
 
 
@@ -242,11 +254,7 @@ def encode_watchdog(node: int, seconds: float) -> list[CanMessage]:
 
 
 def decode_move(message: CanMessage) -> Move:
-    """Return the content of a 5-byte command 61, of whichever master.
-
-    Raises:
-        TargetError: a value is out of range.
-    """
+    """Return the content of a 5-byte command 61, of whichever master."""
     position, speed, current, flags = _MOVE.unpack(message.data)
     return Move(position=position, speed=speed, current_mA=current, flags=flags)
 

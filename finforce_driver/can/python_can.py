@@ -136,7 +136,7 @@ class PythonCanBus(Bus):
         `opened`; `sent`; `messages`; `garbage` (messages whose length is wrong); `extended` (29-bit identifiers);
         `bus_errors` (error messages).
         """
-        return dict(self._counts)
+        return self._counts.copy()
 
     @property
     def suspicion(self) -> str:

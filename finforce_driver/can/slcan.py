@@ -260,7 +260,7 @@ class SerialBus(Bus):
     @property
     def counts(self) -> dict[str, int]:
         """Events since the bus was made: `opened`, `sent`, and what `SlcanParser.counts` names."""
-        return dict(self._parser.counts)
+        return self._parser.counts.copy()
 
     @property
     def suspicion(self) -> str:

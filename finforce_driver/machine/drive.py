@@ -276,7 +276,7 @@ class Drive:
     def setpoint(self, now: float) -> float:
         """Return where the target or the jaws are now [counts], for a move that goes on from there."""
         position, wanted = self.position_now(now), self.orders.wanted
-        if wanted is None or not wanted.flags & Flag.GO:
+        if wanted is None or not wanted.action:
             return position
         ramp = self.job.steps.ramp(now) if self.job and self.job.steps else float(wanted.position)
         return ramp if abs(ramp - position) <= 2.0 else position

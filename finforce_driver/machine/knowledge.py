@@ -18,7 +18,6 @@ from finforce_driver.can.protocol import (
     LARGEST_CURRENT_MA,
     CanMessage,
     Command,
-    Flag,
     Move,
     Reply,
     decode_errors,
@@ -207,7 +206,7 @@ class Knowledge:
 
 def estimate_position(reply: Reply, order: Move | None) -> float:
     """Return where the jaws are [counts]: in the middle of what the truncated byte allows, or at the target."""
-    if order is not None and order.flags & Flag.GO and reply.at_target and 0 <= order.position - reply.position <= 1:
+    if order is not None and order.action and reply.at_target and 0 <= order.position - reply.position <= 1:
         return float(order.position)
     return float(reply.position) if reply.position in (0, LARGEST_BYTE) else reply.position + 0.5
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from finforce_driver.can.protocol import FREE_FLAGS, Flag, Move, Reply
+from finforce_driver.can.protocol import FREE_FLAGS, Move, Reply
 from finforce_driver.state import MoveOutcome
 
 GRACE = 0.05  # [s] after a move in which its replies may still speak of the one before
@@ -267,7 +267,7 @@ class Orders:
     def take(self, move: Move) -> None:
         """Note that an order was answered."""
         self.taken = move
-        if not move.flags & Flag.GO:  # the next move to the same place must differ
+        if not move.action:  # the next move to the same place must differ
             self._salt = self._salt + 1 & FREE_FLAGS
 
     def drop(self) -> None:
@@ -331,8 +331,7 @@ class EchoWatch:
 
     def _fits(self, order: Move, reply: Reply) -> bool:
         """Return whether a reply echoes an order's flags, and tells of its target and no other."""
-        told = bool(order.flags & Flag.ACTIVATE), bool(order.flags & Flag.GO)
-        if (reply.activated, reply.action) != told:
+        if (reply.activated, reply.action) != (order.activated, order.action):
             return False
         near = abs(reply.position - order.position) <= TOLERANCE + 1
         if not order.drives or self._arrived:

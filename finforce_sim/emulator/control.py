@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
+from finforce_driver.can.protocol import Move
 from finforce_sim.emulator.mechanism import Jaws
 
 AT_POSITION = 3  # object code
@@ -114,48 +115,9 @@ class Endpoints:
         return min(max(divide((count - self.open) * _LARGEST, self.closed - self.open), 0), _LARGEST)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Order:
-    """The five bytes of a move.
-
-    Attributes:
-        position: 0 open to 255 closed.
-        speed: 0 to 255.
-        current: limit [mA], as it came: signed.
-        flags: activate 0x80, action 0x40, emergency stop 0x20.
-    """
-
-    position: int = 0
-    speed: int = 0
-    current: int = 0
-    flags: int = 0
-
-    @classmethod
-    def read(cls, data: bytes) -> Order:
-        """Return the order in five bytes."""
-        return cls(
-            position=data[0], speed=data[1], current=int.from_bytes(data[2:4], "big", signed=True), flags=data[4]
-        )
-
-    @property
-    def activated(self) -> bool:
-        """Return whether the power stage may move the jaws."""
-        return bool(self.flags & 0x80)
-
-    @property
-    def action(self) -> bool:
-        """Return whether to go to the position."""
-        return bool(self.flags & 0x40)
-
-    @property
-    def estop(self) -> bool:
-        """Return whether it asks for an emergency stop."""
-        return bool(self.flags & 0x20)
-
-    @property
-    def ticks_per_second(self) -> float:
-        """Return the commanded speed [ticks/s]."""
-        return float(_SLOWEST + divide(self.speed * _SPEED_RANGE, _LARGEST))
+def ticks_per_second(speed: int) -> float:
+    """Return the speed [ticks/s] of a speed byte."""
+    return float(_SLOWEST + divide(speed * _SPEED_RANGE, _LARGEST))
 
 
 class MoveControl:
@@ -169,11 +131,11 @@ class MoveControl:
 
     def __init__(self, firmware: Firmware) -> None:
         self._firmware = firmware
-        self.order = Order()
+        self.order = Move(position=0, speed=0, current_mA=0, flags=0)
         self.object_code = AT_POSITION
         self.latched = False
 
-    def take(self, order: Order) -> None:
+    def take(self, order: Move) -> None:
         """Follow an order; the same one again changes nothing, not even after an interruption."""
         if order != self.order:
             self.latched = False
@@ -197,13 +159,13 @@ class MoveControl:
         self.latched = self.latched or self._reached(jaws, target, position)
         if self.latched:
             self.object_code = AT_POSITION
-            jaws.hold(target, self.order.current)
+            jaws.hold(target, self.order.current_mA)
             return
         error = target - jaws.encoder
         # byte equality may want one tick more than the target, and the sign of the speed is kept there
         reach = abs(error) + (0 if self._firmware.tick_tolerance else 1)
-        speed = self.order.ticks_per_second
-        jaws.drive(speed if error > 0 else -speed, self.order.current, reach)
+        speed = ticks_per_second(self.order.speed)
+        jaws.drive(speed if error > 0 else -speed, self.order.current_mA, reach)
         self.object_code = self._contact_code(jaws)
 
     def _reached(self, jaws: Jaws, target: int, position: int) -> bool:
@@ -218,71 +180,51 @@ class MoveControl:
 
     def _strains(self, current: float) -> bool:
         if self._firmware.contact_ratio:
-            return current > self._firmware.contact_ratio * self.order.current
-        return abs(current - self.order.current) <= self._firmware.contact_margin
+            return current > self._firmware.contact_ratio * self.order.current_mA
+        return abs(current - self.order.current_mA) <= self._firmware.contact_margin
 
 
-class FirmwareCalibration:
-    """Looks for the open stop, then for the closed one; an abort leaves it where it was.
+_PAUSE = 20  # [ms] of a calibration between its two ways
 
-    Attributes:
-        finished: the last step completed it.
-        failed: the last step gave it up.
+
+def find_stops(firmware: Firmware, jaws: Jaws, endpoints: Endpoints) -> Iterator[None]:
+    """Look for the open stop, then for the closed one, a step at a time, and write what is found into `endpoints`.
+
+    Whoever stops asking leaves the search where it is.
     """
+    yield from _seek(firmware, jaws, 1.0)
+    endpoints.open = jaws.encoder
+    yield
+    for _ in range(_PAUSE):
+        jaws.drive(0.0, 0.0)
+        yield
+    yield from _seek(firmware, jaws, -1.0)
+    endpoints.closed = jaws.encoder
 
-    _PAUSE = 20  # [ms] between the two ways
 
-    def __init__(self, firmware: Firmware) -> None:
-        self._firmware = firmware
-        self._restart()
-        self.finished = self.failed = False
-
-    def step(self, jaws: Jaws, endpoints: Endpoints) -> None:
-        """Go on for one step, and write found stops into `endpoints`."""
-        self.finished = self.failed = False
-        self._elapsed += 1
-        if self._open_found and self._pause == 0:
-            self.finished = self._seek(jaws, -1.0)
-            if self.finished:
-                endpoints.closed = jaws.encoder
-        elif self._open_found:
-            self._pause -= 1
-            jaws.drive(0.0, 0.0)
-        elif self._seek(jaws, 1.0):
-            endpoints.open = jaws.encoder
-            self._open_found = True
-        self.failed = not self.finished and self._elapsed >= self._firmware.calibration_timeout
-        if self.finished or self.failed:
-            self._restart()
-
-    def _seek(self, jaws: Jaws, direction: float) -> bool:
-        """Drive towards a stop and return whether it was felt for long enough."""
-        firmware = self._firmware
+def _seek(firmware: Firmware, jaws: Jaws, direction: float) -> Iterator[None]:
+    """Drive towards a stop until it was felt for long enough."""
+    felt = 0
+    while True:
         jaws.drive(direction * firmware.calibration_speed, firmware.calibration_current)
         strains = abs(abs(jaws.current) - firmware.calibration_current) <= firmware.calibration_margin
-        self._felt = self._felt + 1 if strains and abs(jaws.velocity) <= 700.0 else 0
-        if self._felt < firmware.confirm_time:
-            return False
-        self._felt = 0
-        return True
-
-    def _restart(self) -> None:
-        self._open_found = False
-        self._pause = self._PAUSE
-        self._elapsed = self._felt = 0
+        felt = felt + 1 if strains and abs(jaws.velocity) <= 700.0 else 0
+        if felt >= firmware.confirm_time:
+            return
+        yield
 
 
 _WEAK_CURRENT, _STRONG_CURRENT = 150, 1500  # [mA] that the maker advises against going beyond
 _SLOW_SPEED = 3  # byte below which contact is felt while the jaws still move
 
 
-def list_violations(order: Order, control: MoveControl, mode: Mode) -> Iterator[str]:
+def list_violations(order: Move, control: MoveControl, mode: Mode) -> Iterator[str]:
     """Yield what is wrong with an order, given the control that has not taken it yet, and the present mode."""
     if mode is Mode.CALIBRATE and not order.estop:
         yield "order during calibration"
-    if not _WEAK_CURRENT <= order.current <= _STRONG_CURRENT:
+    if not _WEAK_CURRENT <= order.current_mA <= _STRONG_CURRENT:
         yield "current out of range"
-    if not (order.activated and order.action) or order.estop:
+    if not order.drives:
         return
     if order.speed < _SLOW_SPEED:
         yield "too slow"

@@ -5,84 +5,60 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from random import Random
+from typing import Any
 
 from finforce_driver.can.protocol import CanMessage
 from finforce_driver.errors import TargetError
 from finforce_sim.emulator.adapter import EmulatedAdapter
-from finforce_sim.emulator.firmware import Fault
+from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 
 Pieces = list[tuple[float, bytes]]  # delays after the piece before [s], and what then comes
 
 _DIGITS = b"0123456789ABCDEF"
 
 
-def lose(_line: bytes, _random: Random) -> Pieces:
-    """Return nothing."""
-    return []
-
-
-def delay(line: bytes, random: Random) -> Pieces:
-    """Return the line, late by up to 120 ms, longer than drivers wait."""
-    return [(random.uniform(0.005, 0.12), line)]
-
-
-def double(line: bytes, _random: Random) -> Pieces:
-    """Return the line twice."""
-    return [(0.0, line + line)]
-
-
-def refuse(line: bytes, _random: Random) -> Pieces:
-    """Return the line after a BELL."""
-    return [(0.0, b"\a" + line)]
-
-
-def split(line: bytes, random: Random) -> Pieces:
+def _split(line: bytes, random: Random) -> Pieces:
     """Return the line in two pieces, up to 20 ms apart."""
     cut = random.randrange(1, len(line))
     return [(0.0, line[:cut]), (random.uniform(0.001, 0.02), line[cut:])]
 
 
-def litter(line: bytes, random: Random) -> Pieces:
+def _litter(line: bytes, random: Random) -> Pieces:
     """Return the line after random bytes, of which at least one is no ASCII."""
     return [(0.0, random.randbytes(random.randrange(1, 40)) + b"\xff" + random.choice((b"", b"\r")) + line)]
 
 
-def truncate(line: bytes, random: Random) -> Pieces:
+def _truncate(line: bytes, random: Random) -> Pieces:
     """Return the beginning of the line, with or without its end."""
     return [(0.0, line[: random.randrange(1, len(line) - 1)] + random.choice((b"", b"\r")))]
 
 
-def change_length(line: bytes, random: Random) -> Pieces:
+def _change_length(line: bytes, random: Random) -> Pieces:
     """Return a sound line of another number of data bytes."""
     length = random.choice([size for size in range(9) if size != int(line[4:5])])
     data = (line[5:-1] + b"00" * 8)[: 2 * length]
     return [(0.0, line[:4] + b"%d" % length + data + b"\r")]
 
 
-def intersperse_foreign(line: bytes, random: Random) -> Pieces:
+def _intersperse_foreign(line: bytes, random: Random) -> Pieces:
     """Return the line after the reply of another node."""
     node = int(line[1:4], 16) >> 7
     other = random.choice([number for number in range(16) if number != node])
     return [(0.0, b"t%03X4%s\r" % (other << 7 | 0x78, random.randbytes(4).hex().upper().encode()) + line)]
 
 
-def intersperse_heartbeat(line: bytes, _random: Random) -> Pieces:
-    """Return the line after a heartbeat of the same node."""
-    return [(0.0, b"t%03X0\r" % (int(line[1:4], 16) & 0x780 | 0x12) + line)]
-
-
-def flip(line: bytes, random: Random) -> Pieces:
+def _flip(line: bytes, random: Random) -> Pieces:
     """Return the line with one hex digit turned into another one: a sound line that lies."""
     place = random.randrange(1, len(line) - 1)
     digit = random.choice([digit for digit in _DIGITS if digit != line[place]])
     return [(0.0, line[:place] + bytes([digit]) + line[place + 1 :])]
 
 
-def set_stale_code(line: bytes, _random: Random) -> Pieces:
+def _set_stale_code(line: bytes, _random: Random) -> Pieces:
     """Return a reply whose object code says at position, as it can right after a command."""
     if len(line) < 14:
         return [(0.0, line)]
@@ -123,18 +99,18 @@ class FaultKind(Enum):
 
 
 LINE_FAULTS: dict[FaultKind, Callable[[bytes, Random], Pieces]] = {
-    FaultKind.LOST: lose,
-    FaultKind.LATE: delay,
-    FaultKind.DOUBLED: double,
-    FaultKind.BELL: refuse,
-    FaultKind.SPLIT: split,
-    FaultKind.GARBAGE: litter,
-    FaultKind.TRUNCATED: truncate,
-    FaultKind.WRONG_LENGTH: change_length,
-    FaultKind.FOREIGN: intersperse_foreign,
-    FaultKind.HEARTBEAT: intersperse_heartbeat,
-    FaultKind.FLIPPED: flip,
-    FaultKind.STALE_CODE: set_stale_code,
+    FaultKind.LOST: lambda line, random: [],
+    FaultKind.LATE: lambda line, random: [(random.uniform(0.005, 0.12), line)],  # longer than drivers wait
+    FaultKind.DOUBLED: lambda line, random: [(0.0, line + line)],
+    FaultKind.BELL: lambda line, random: [(0.0, b"\a" + line)],
+    FaultKind.SPLIT: _split,
+    FaultKind.GARBAGE: _litter,
+    FaultKind.TRUNCATED: _truncate,
+    FaultKind.WRONG_LENGTH: _change_length,
+    FaultKind.FOREIGN: _intersperse_foreign,
+    FaultKind.HEARTBEAT: lambda line, random: [(0.0, b"t%03X0\r" % (int(line[1:4], 16) & 0x780 | 0x12) + line)],
+    FaultKind.FLIPPED: _flip,
+    FaultKind.STALE_CODE: _set_stale_code,
 }
 
 
@@ -171,31 +147,37 @@ def draw_plan(
     ]
 
 
-class FaultyAdapter:
+class FaultyAdapter(EmulatedAdapter):
     """An adapter with faults: those of a plan as time passes, and those injected at once.
 
     Attributes:
-        adapter: the sound one within.
         injected: all faults so far with their times [s].
     """
 
-    def __init__(self, adapter: EmulatedAdapter, plan: Sequence[PlannedFault] = (), seed: int = 0) -> None:
-        """Wrap an adapter.
+    def __init__(
+        self,
+        grippers: EmulatedGripper | Iterable[EmulatedGripper],
+        plan: Sequence[PlannedFault] = (),
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        """Make an adapter.
 
         Args:
-            adapter: a sound one.
+            grippers: on the bus.
             plan: faults to come.
             seed: of the details: where a line is cut, which digit flips.
+            options: of `EmulatedAdapter`.
         """
-        self.adapter = adapter
+        self._spoiled: deque[tuple[float, bytes]] = deque()
+        super().__init__(grippers, **options)
         self.injected: list[PlannedFault] = []
         self._plan = deque(sorted(plan, key=lambda fault: fault.time))
         self._random = Random(seed)
         self._armed: deque[FaultKind] = deque()
         self._requests_to_lose = 0
-        self._output: deque[tuple[float, bytes]] = deque()
         self._lasting: dict[FaultKind, tuple[float, Callable[[], None]]] = {}
-        gripper = adapter.gripper
+        gripper = self.gripper
         self._happenings: dict[FaultKind, Callable[[PlannedFault], None]] = {
             FaultKind.REQUEST_LOST: self._lose_requests,
             FaultKind.BLIP: lambda _fault: gripper.blip(),
@@ -211,19 +193,14 @@ class FaultyAdapter:
         }
 
     @property
-    def plugged(self) -> bool:
-        """Return whether the host sees the adapter."""
-        return self.adapter.plugged
-
-    @property
     def has_output(self) -> bool:
-        """Return whether bytes wait for the host."""
-        return bool(self._output) or self.adapter.has_output
+        """Whether bytes wait for the host."""
+        return bool(self._spoiled) or super().has_output
 
     @property
     def pending(self) -> bool:
         """Return whether a fault is armed or lasts."""
-        return bool(self._armed or self._lasting or self._requests_to_lose or self._output)
+        return bool(self._armed or self._lasting or self._requests_to_lose or self._spoiled)
 
     def inject(self, kind: FaultKind, count: int = 1, duration: float = 0.5) -> None:
         """Inject a fault at once, or into the next lines.
@@ -238,7 +215,7 @@ class FaultyAdapter:
         """
         if count < 1 or not duration > 0.0:
             raise TargetError(f"fault {kind.value}: got count {count}, duration {duration}, expected positive ones")
-        fault = PlannedFault(time=self.adapter.now, kind=kind, count=count, duration=duration)
+        fault = PlannedFault(time=self.now, kind=kind, count=count, duration=duration)
         self.injected.append(fault)
         if kind in LINE_FAULTS:
             self._armed.extend([kind] * count)
@@ -253,39 +230,35 @@ class FaultyAdapter:
 
     def unplug(self) -> None:
         """Take the adapter off the host."""
-        self._output.clear()
-        self.adapter.unplug()
-
-    def replug(self) -> None:
-        """Plug the adapter in again, closed."""
-        self.adapter.replug()
+        self._spoiled.clear()
+        super().unplug()
 
     def write(self, data: bytes) -> None:
         """Take bytes from the host, whole lines of which may get lost."""
         if not self._requests_to_lose:
-            self.adapter.write(data)
+            super().write(data)
             return
         for line in _COMMAND.findall(data):
             if self._requests_to_lose and line[:1] in _MESSAGE_LINES:
                 self._requests_to_lose -= 1
             else:
-                self.adapter.write(line)
+                super().write(line)
 
     def read(self) -> bytes:
         """Return the bytes for the host that are due."""
-        data = self.adapter.read()
-        if self._armed or self._output:
+        data = super().read()
+        if self._armed or self._spoiled:
             for line in _LINE.findall(data):
                 self._spoil(line)
             data = b""
-            while self._output and self._output[0][0] <= self.adapter.now + 1e-9:
-                data += self._output.popleft()[1]
+            while self._spoiled and self._spoiled[0][0] <= self.now + 1e-9:
+                data += self._spoiled.popleft()[1]
         return data
 
     def step(self, dt: float) -> None:
         """Let `dt` [s] pass, inject what the plan holds and end what lasted long enough."""
-        self.adapter.step(dt)
-        now = self.adapter.now
+        super().step(dt)
+        now = self.now
         while self._plan and self._plan[0].time <= now:
             fault = self._plan.popleft()
             self.inject(fault.kind, fault.count, fault.duration)
@@ -297,10 +270,10 @@ class FaultyAdapter:
         pieces: Pieces = [(0.0, line)]
         if self._armed and line[:1] in _MESSAGE_LINES:
             pieces = LINE_FAULTS[self._armed.popleft()](line, self._random)
-        time = self.adapter.now
+        time = self.now
         for delay, data in pieces:
             time += delay
-            self._output.append((time, data))
+            self._spoiled.append((time, data))
 
     def _hold(self, fault: PlannedFault, owner: object, name: str, value: object) -> None:
         """Set an attribute for the duration of a fault."""
@@ -310,7 +283,7 @@ class FaultyAdapter:
 
     def _end_later(self, fault: PlannedFault, end: Callable[[], None]) -> None:
         """Plan the end of a fault; one that lasts already lasts longer, and ends as it would have."""
-        until = self.adapter.now + fault.duration
+        until = self.now + fault.duration
         if fault.kind in self._lasting:
             earlier, end = self._lasting[fault.kind]
             until = max(until, earlier)
@@ -330,7 +303,7 @@ class FaultyAdapter:
 
     def _command_otherwise(self, _fault: PlannedFault) -> None:
         """Let another master move, stop, clear or switch off the gripper."""
-        node = self.adapter.gripper.node_id << 7
+        node = self.gripper.node_id << 7
         position = self._random.randrange(256)
         commands = [
             CanMessage(id=node | 0x7A, data=bytes([position, 50, 0x01, 0xF4, 0xC0])),
@@ -339,4 +312,4 @@ class FaultyAdapter:
             CanMessage(id=node | 0x02),
             CanMessage(id=node | 0x18),
         ]
-        self.adapter.put_on_bus(self._random.choice(commands))
+        self.put_on_bus(self._random.choice(commands))

@@ -5,18 +5,17 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
-from finforce_driver.can.protocol import CanMessage
+from finforce_driver.can.protocol import CanMessage, Move, decode_move, encode
 from finforce_driver.errors import TargetError
 from finforce_sim.emulator.control import (
     VARIANTS,
     Endpoints,
-    FirmwareCalibration,
     Mode,
     MoveControl,
-    Order,
+    find_stops,
     list_violations,
 )
 from finforce_sim.emulator.mechanism import STEP, EmulatorSettings, Jaws
@@ -24,21 +23,6 @@ from finforce_sim.emulator.mechanism import STEP, EmulatorSettings, Jaws
 _REPLY, _ORDER = 60, 61
 _FIFO = 3  # messages that the CAN controller keeps while the firmware is busy
 _ADVISED_BURST = 2
-
-
-@dataclass(frozen=True, kw_only=True)
-class StoredConfiguration:
-    """What outlives a reset once it was saved.
-
-    Attributes:
-        node_id: on the CAN bus.
-        watchdog: longest silence [ms]; 0: any.
-        heartbeat: period [ms]; 0: none.
-    """
-
-    node_id: int
-    watchdog: int = 0
-    heartbeat: int = 0
 
 
 class EmulatedGripper:
@@ -89,7 +73,8 @@ class EmulatedGripper:
         self.violations: Counter[str] = Counter()
         self.configured = True
         self._firmware = VARIANTS[variant]
-        self._stored = StoredConfiguration(node_id=node_id)
+        # outlives a reset once it was saved: node, watchdog and heartbeat [ms]
+        self._stored = {"node_id": node_id, "watchdog": 0, "heartbeat": 0}
         self._steps = self._deaf_until = self._last_sent = 0
         self._rest = 0.0
         self._blip_until = self._received = 0
@@ -114,24 +99,14 @@ class EmulatedGripper:
         return self.jaws.opening
 
     @property
-    def ticks(self) -> int:
-        """Return the encoder's count [ticks]."""
-        return self.jaws.encoder
-
-    @property
     def faults(self) -> set[Fault]:
         """Return what is latched."""
         return self.protection.faults
 
     @property
-    def order(self) -> Order:
+    def order(self) -> Move:
         """Return the last order of five bytes."""
         return self._control.order
-
-    @property
-    def object_code(self) -> int:
-        """Return the firmware's own object code: 0 moving, 1 and 2 contact, 3 at position."""
-        return self._control.object_code
 
     @property
     def reported_current(self) -> int:
@@ -154,21 +129,21 @@ class EmulatedGripper:
 
     def handle(self, message: CanMessage) -> list[CanMessage]:
         """Take a message from the bus and return the answers."""
-        if self.booting or (message.id >> 7) & 0xF != self.node_id:
+        if self.booting or message.node != self.node_id:
             return []
         self._received += 1
         if self._received > _ADVISED_BURST:
             self.violations["burst"] += 1
         if self._received > _FIFO:
             return []
-        command = (message.id >> 1) & 0x3F
+        command = message.command
         if message.remote:
             if command not in self._questions:
                 return []
             self.protection.feed()
             return [self._send(command, self._questions[command]())]
         if command == _ORDER:
-            return [self._take_order(message.data)]
+            return [self._take_order(message)]
         if command in self._orders:
             self._orders[command](message.data)
         return []
@@ -182,7 +157,7 @@ class EmulatedGripper:
     def blip(self, duration: float = 0.01) -> None:
         """Report contact with a high current for some time [s], as can happen at the start of a move."""
         closes = self.endpoints.target(self.order.position) < self.jaws.encoder
-        self._blip_current = (-0.9 if closes else 0.9) * abs(self.order.current)
+        self._blip_current = (-0.9 if closes else 0.9) * abs(self.order.current_mA)
         self._blip_until = self._steps + round(duration / STEP)
 
     def _list_orders(self) -> dict[int, Callable[[bytes], None]]:
@@ -217,15 +192,15 @@ class EmulatedGripper:
         return answers
 
     def _power_up(self) -> None:
-        self.node_id = self._stored.node_id
-        self.heartbeat_period = self._stored.heartbeat
+        self.node_id = self._stored["node_id"]
+        self.heartbeat_period = self._stored["heartbeat"]
         self.protection.restart()
-        self.protection.watchdog_period = self._stored.watchdog
+        self.protection.watchdog_period = self._stored["watchdog"]
         self.calibrated = False
         self.mode = Mode.IDLE
         self.endpoints = Endpoints()
         self._control = MoveControl(self._firmware)
-        self._calibration = FirmwareCalibration(self._firmware)
+        self._restart_calibration()
         self._position = self.endpoints.position(self.jaws.encoder) if self.configured else 0
         self._last_sent = self._steps
 
@@ -246,20 +221,27 @@ class EmulatedGripper:
             self.jaws.rest()
 
     def _calibrate(self) -> None:
-        self._calibration.step(self.jaws, self.endpoints)
-        if self._calibration.finished or self._calibration.failed:
-            self.calibrated = self._calibration.finished
+        self._calibrating += 1
+        finished = next(self._stops, True)
+        if finished or self._calibrating >= self._firmware.calibration_timeout:
+            self.calibrated = bool(finished)
             self.mode = Mode.IDLE
+            self._restart_calibration()
+
+    def _restart_calibration(self) -> None:
+        self._stops = find_stops(self._firmware, self.jaws, self.endpoints)
+        self._calibrating = 0  # [ms], not counted anew after an abort
 
     def _send(self, command: int, data: bytes) -> CanMessage:
         self._last_sent = self._steps
-        return CanMessage(id=(self.node_id & 0xF) << 7 | command << 1 | bool(self.faults), data=data)
+        message = encode(self.node_id & 0xF, command, data)
+        return replace(message, id=message.id | bool(self.faults))
 
-    def _take_order(self, data: bytes) -> CanMessage:
-        if len(data) in (0, 5):
+    def _take_order(self, message: CanMessage) -> CanMessage:
+        if len(message.data) in (0, 5):
             self.protection.feed()
-        if len(data) == 5:
-            order = Order.read(data)
+        if len(message.data) == 5:
+            order = decode_move(message)
             self.violations.update(list_violations(order, self._control, self.mode))
             if self.settings.resets_integrators:
                 self.jaws.current = 0.0
@@ -317,8 +299,8 @@ class EmulatedGripper:
             self.heartbeat_period = max(int.from_bytes(data, "big", signed=True), 0)
 
     def _save(self, _data: bytes) -> None:
-        watchdog = self.protection.watchdog_period
-        self._stored = StoredConfiguration(node_id=self.node_id, watchdog=watchdog, heartbeat=self.heartbeat_period)
+        watchdog, heartbeat = self.protection.watchdog_period, self.heartbeat_period
+        self._stored = {"node_id": self.node_id, "watchdog": watchdog, "heartbeat": heartbeat}
         self._deaf_until = self._steps + round(self.settings.save_time / STEP)
 
 

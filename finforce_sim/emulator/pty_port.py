@@ -23,7 +23,6 @@ from finforce_sim.emulator.adapter import ACK_MODES, EmulatedAdapter
 from finforce_sim.emulator.control import VARIANTS
 from finforce_sim.emulator.faults import FaultyAdapter, draw_plan
 from finforce_sim.emulator.firmware import EmulatedGripper
-from finforce_sim.emulator.virtual import SteppedAdapter
 
 _IDLE_PERIOD = 0.004  # [s] between two steps of the emulation while nothing comes in
 _BUSY_PERIOD = 0.0005  # [s] the same while an answer waits for its time
@@ -41,7 +40,7 @@ class PtyPort:
         lock: held by the thread while it steps and answers.
     """
 
-    def __init__(self, adapter: SteppedAdapter, link: str | Path | None = None, baud_rate: int | None = None) -> None:
+    def __init__(self, adapter: EmulatedAdapter, link: str | Path | None = None, baud_rate: int | None = None) -> None:
         """Prepare a port; `open` makes it.
 
         Args:
@@ -201,7 +200,7 @@ def build_load(width: float, stiffness: float) -> Callable[[float], float]:
     return lambda opening: stiffness * max(width - opening, 0.0)
 
 
-def build_adapter(options: argparse.Namespace) -> SteppedAdapter:
+def build_adapter(options: argparse.Namespace) -> EmulatedAdapter:
     """Return the adapter with the gripper that a command line describes.
 
     Raises:
@@ -215,10 +214,8 @@ def build_adapter(options: argparse.Namespace) -> SteppedAdapter:
         object_opening=None if soft else width,
         load=build_load(width, 1e3 * options.stiffness) if soft else None,
     )
-    adapter = EmulatedAdapter(gripper, options.ack, latency=1e-3 * options.latency_ms)
-    if not options.faults > 0.0:
-        return adapter
-    return FaultyAdapter(adapter, draw_plan(options.seed, _FAULTS, 60.0 / options.faults), options.seed)
+    plan = draw_plan(options.seed, _FAULTS, 60.0 / options.faults) if options.faults > 0.0 else ()
+    return FaultyAdapter(gripper, plan, options.seed, ack_mode=options.ack, latency=1e-3 * options.latency_ms)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

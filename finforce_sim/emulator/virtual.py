@@ -5,48 +5,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from threading import Event
-from typing import Protocol
+from typing import Any
 
 from finforce_driver.can.protocol import CanMessage
 from finforce_driver.can.slcan import SlcanParser, encode_message
 from finforce_driver.errors import LinkError
+from finforce_driver.gripper import Clock
+from finforce_sim.emulator.adapter import EmulatedAdapter
 
 _STEP = 0.001  # [s]
 _LEAST = 1e-6  # [s] that a wait takes: a rest of rounding would not move the clock, and be waited for for ever
 
 
-class Steppable(Protocol):
-    """What lives in stepped time."""
-
-    def step(self, dt: float) -> object:
-        """Let `dt` [s] pass."""
-
-
-class SteppedAdapter(Steppable, Protocol):
-    """An adapter without a port: `EmulatedAdapter`, or one that injects faults."""
-
-    @property
-    def plugged(self) -> bool:
-        """Return whether the host sees the adapter."""
-
-    @property
-    def has_output(self) -> bool:
-        """Return whether bytes wait for the host, also such that are not due yet."""
-
-    def unplug(self) -> None:
-        """Take the adapter off the host."""
-
-    def replug(self) -> None:
-        """Plug it in again, closed."""
-
-    def write(self, data: bytes) -> None:
-        """Take bytes from the host."""
-
-    def read(self) -> bytes:
-        """Return the bytes for the host that are due."""
-
-
-class VirtualClock:
+class VirtualClock(Clock):
     """A clock that passes only while somebody waits, and then steps all that is attached."""
 
     def __init__(self, step: float = _STEP) -> None:
@@ -57,14 +28,14 @@ class VirtualClock:
         """
         self._step = step
         self._now = 0.0
-        self._attached: list[Steppable] = []
+        self._attached: list[Any] = []
 
     def now(self) -> float:
         """Return the time [s]."""
         return self._now
 
-    def attach(self, part: Steppable) -> None:
-        """Step a part from now on, after those that were attached before."""
+    def attach(self, part: Any) -> None:
+        """Call `step(dt)` of a part from now on, after those that were attached before."""
         self._attached.append(part)
 
     def wait(self, seconds: float, wake: Event | None = None) -> None:
@@ -89,7 +60,7 @@ class VirtualBus:
         sent: the last messages with their times [s].
     """
 
-    def __init__(self, adapter: SteppedAdapter, clock: VirtualClock) -> None:
+    def __init__(self, adapter: EmulatedAdapter, clock: VirtualClock) -> None:
         """Connect an adapter, which the clock steps from now on."""
         self.sent: deque[tuple[float, CanMessage]] = deque(maxlen=1000)
         self._adapter = adapter

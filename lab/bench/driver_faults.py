@@ -26,7 +26,6 @@ from finforce_driver.gripper import Gripper
 from finforce_driver.machine.machine import INHERITED
 from finforce_driver.settings import GripperSettings
 from finforce_driver.state import GripperState, MoveOutcome, Phase
-from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.control import Mode
 from finforce_sim.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, draw_plan
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault
@@ -104,11 +103,9 @@ class FaultRun:
         self._random = Random(seed)
         self._until = START + count * PERIOD
         self.clock, self.emulated = VirtualClock(), EmulatedGripper(("new", "old")[seed % 2])
-        sound = EmulatedAdapter(
-            self.emulated, self._random.choice(("none", "lawicel")), latency=self._random.choice(LATENCIES)
-        )
+        ack_mode, latency = self._random.choice(("none", "lawicel")), self._random.choice(LATENCIES)
         plan = [replace(fault, time=fault.time + START) for fault in draw_plan(seed, count, PERIOD, kinds)]
-        self.adapter = FaultyAdapter(sound, plan, seed)
+        self.adapter = FaultyAdapter(self.emulated, plan, seed, ack_mode=ack_mode, latency=latency)
         self.bus = VirtualBus(self.adapter, self.clock)
         self._send, self.bus.send = self.bus.send, self._watch_message
         self.tape = Tape(self.emulated)

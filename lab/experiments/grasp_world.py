@@ -35,7 +35,6 @@ from finforce_keypoints.detectors.dots import DotSettings
 from finforce_keypoints.geometry.jaw_localizer import JawKeypoints
 from finforce_keypoints.images import RgbdImage
 from finforce_keypoints.parameters import DetectorParameters, DetectorSettings, load_jaws
-from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.faults import FaultyAdapter, PlannedFault
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
@@ -148,7 +147,7 @@ class World:
         self._case, self._sensor, self._settings = case, sensor, settings
         self.emulated = EmulatedGripper(case.variant, load=case.plant.force_at)
         self.clock = VirtualClock()
-        self.adapter = FaultyAdapter(EmulatedAdapter(self.emulated), plan, case.seed)
+        self.adapter = FaultyAdapter(self.emulated, plan, case.seed)
         self.bus = VirtualBus(self.adapter, self.clock)
         self.gripper = Gripper(self.bus, clock=self.clock)
         self._relaxation = Relaxation(case.plant.terms)

@@ -188,7 +188,7 @@ class Rig:
         self.clock = VirtualClock()
         self.emulated = EmulatedGripper(variant, node_id=node_id)
         self.emulated.calibrated = calibrated
-        self.adapter = FaultyAdapter(EmulatedAdapter(self.emulated, latency=latency))
+        self.adapter = FaultyAdapter(self.emulated, latency=latency)
         self.bus = VirtualBus(self.adapter, self.clock)
         self.gripper = Gripper(self.bus, GripperSettings(**settings), self.clock)
         self.states = []

@@ -115,7 +115,7 @@ def test_a_gripper_that_does_not_tell_its_encoder_is_calibrated_and_that_is_said
     sent = rig.bus.send
     rig.bus.send = lambda message: None if message.id == 0x038 else sent(message)
     rig.gripper.calibrate()
-    assert "is not known" in rig.wait_for(Phase.UNCALIBRATED, Phase.READY).message
+    assert "is unknown" in rig.wait_for(Phase.UNCALIBRATED, Phase.READY).message
     assert rig.state.phase is Phase.READY
 
 

@@ -72,7 +72,7 @@ def test_negative_forces_within_three_stated_deviations_are_noise():
 def test_forces_that_are_all_too_old_end_the_grasp_by_that_name():
     course = Bench(goal=GraspGoal(force=2.0), camera=Camera(latency=0.5)).run(4.0)
     assert course.status.phase is GraspPhase.STOPPED
-    assert "refused" in course.status.reason and "as too old, 0." in course.status.reason
+    assert "rejected" in course.status.reason and "as too old, 0." in course.status.reason
 
 
 def test_forces_in_another_frame_end_the_grasp_by_that_name():

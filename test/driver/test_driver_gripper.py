@@ -86,7 +86,7 @@ def test_a_move_that_meets_something_holds_it_with_the_current_of_its_force(vari
     state = rig.arrive(0.0, 0.05, 10.0)
     assert state.outcome is MoveOutcome.GRASPED
     assert state.force == pytest.approx(10.0, rel=0.03)
-    assert rig.emulated.order.current == 210
+    assert rig.emulated.order.current_mA == 210
 
 
 @pytest.mark.parametrize("force", [3.0, 80.0, math.nan, -10.0])

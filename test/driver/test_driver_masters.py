@@ -23,7 +23,7 @@ def test_an_order_of_another_program_that_is_seen_ends_our_move(rig):
     rig.gripper.move(0.0, 0.01)
     rig.live(0.3)
     begin = rig.clock.now()
-    rig.adapter.adapter.put_on_bus(ELSEWHERE)
+    rig.adapter.put_on_bus(ELSEWHERE)
     rig.live(2.0)
     assert rig.state.outcome is MoveOutcome.ABORTED
     assert "another program commands this gripper" in rig.state.message
@@ -44,7 +44,7 @@ def test_an_order_of_another_program_that_is_not_seen_is_found_by_its_effect(rig
 
 @both_variants
 def test_a_new_move_takes_the_gripper_back(rig):
-    rig.adapter.adapter.put_on_bus(ELSEWHERE)
+    rig.adapter.put_on_bus(ELSEWHERE)
     rig.live(0.5)
     assert rig.arrive(0.01).outcome is MoveOutcome.REACHED
     assert "another program" not in rig.state.message
@@ -54,7 +54,7 @@ def test_a_new_move_takes_the_gripper_back(rig):
 def test_a_calibration_that_another_program_cuts_short_is_not_trusted(rig):
     rig.gripper.calibrate()
     rig.live(0.3)
-    rig.adapter.adapter.put_on_bus(ELSEWHERE)
+    rig.adapter.put_on_bus(ELSEWHERE)
     rig.live(0.1)
     assert rig.state.phase is Phase.UNCALIBRATED
 
@@ -62,7 +62,7 @@ def test_a_calibration_that_another_program_cuts_short_is_not_trusted(rig):
 @both_variants
 @pytest.mark.parametrize("id", [0x000, 0x002, 0x018, 0x07C])
 def test_other_commands_of_another_program_are_told(rig, id):
-    rig.adapter.adapter.put_on_bus(CanMessage(id=id))
+    rig.adapter.put_on_bus(CanMessage(id=id))
     rig.live(0.05)
     assert rig.state.counts["foreign commands"] == 1
     assert "another program" in rig.state.message or rig.state.estopped
@@ -72,7 +72,7 @@ def test_other_commands_of_another_program_are_told(rig, id):
 def test_messages_of_other_nodes_change_nothing(rig):
     before = rig.state
     for id in (0x0F8, 0x0FA, 0x7F9):
-        rig.adapter.adapter.put_on_bus(CanMessage(id=id, data=b"\x10\x00\x00\xd1"))
+        rig.adapter.put_on_bus(CanMessage(id=id, data=b"\x10\x00\x00\xd1"))
     rig.live(0.5)
     assert rig.state.counts["messages of other nodes"] == 3
     assert (rig.state.opening, rig.state.phase, rig.state.message) == (before.opening, before.phase, before.message)
@@ -83,7 +83,7 @@ def test_an_adapter_that_gives_our_messages_back_is_no_other_program(rig):
     send = rig.bus.send
 
     def echo(message):
-        rig.adapter.adapter.deliver(message)
+        rig.adapter.deliver(message)
         send(message)
 
     rig.bus.send = echo

@@ -23,7 +23,7 @@ def test_hold_stops_the_jaws_where_they_are(rig):
     rig.live(0.3)
     assert (rig.state.phase, rig.state.outcome) == (Phase.READY, MoveOutcome.REPLACED)
     assert rig.emulated.true_opening == pytest.approx(place, abs=0.02 * 0.03 + COUNT)
-    assert rig.emulated.order.current == 500
+    assert rig.emulated.order.current_mA == 500
 
 
 @both_variants

@@ -140,7 +140,7 @@ def test_decoding_inverts_encoding(position, speed, current, flags):
 )
 def test_what_the_gripper_would_misread_is_refused(change):
     with pytest.raises(TargetError, match=next(iter(change))):
-        Move(**{"position": 0, "speed": 3, "current_mA": 500, "flags": 0, **change})
+        encode_move(0, Move(**{"position": 0, "speed": 3, "current_mA": 500, "flags": 0, **change}))
 
 
 def test_only_an_order_with_both_flags_and_no_stop_drives():

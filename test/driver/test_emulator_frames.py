@@ -3,9 +3,9 @@ import struct
 import pytest
 from emulator_fakes import CALIBRATE, CLEAR, ESTOP, IDLE, VARIANTS, Host, calibrated_host, code_of, current_of
 
-from finforce_driver.can.protocol import CanMessage
+from finforce_driver.can.protocol import CanMessage, decode_move
 from finforce_driver.errors import TargetError
-from finforce_sim.emulator.control import Endpoints, Mode, Order
+from finforce_sim.emulator.control import Endpoints, Mode, ticks_per_second
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 
 
@@ -18,7 +18,10 @@ def set_reply(host, *, position, current=0.0, code=0, order="0000000000", calibr
     """Bring a gripper into the state that a reply is said to tell of."""
     gripper = host.gripper
     gripper._position, gripper.jaws.current, gripper.calibrated = position, current, calibrated
-    gripper._control.order, gripper._control.object_code = Order.read(bytes.fromhex(order)), code
+    gripper._control.order, gripper._control.object_code = (
+        decode_move(CanMessage(id=0x07A, data=bytes.fromhex(order))),
+        code,
+    )
 
 
 def test_after_power_up_the_reply_is_that_of_the_maker(host):
@@ -128,12 +131,12 @@ def test_any_length_is_answered_but_only_five_bytes_are_an_order(host):
         host.wait(0.001)
         answers = host.gripper.handle(CanMessage(id=0x7A, data=b"\xc8" * length))
         assert len(answers) == 1
-        assert (host.gripper.order != Order()) == (length >= 5)
+        assert (host.gripper.order.flags != 0) == (length >= 5)
     assert host.gripper.order.position == 0xC8
 
 
 def test_currents_below_zero_are_read_as_such():
-    assert Order.read(bytes.fromhex("001EFED4C0")).current == -300
+    assert decode_move(CanMessage(id=0x07A, data=bytes.fromhex("001EFED4C0"))).current_mA == -300
 
 
 def test_positions_round_trip_with_the_makers_truncation():
@@ -155,7 +158,7 @@ def test_speeds_are_those_of_the_maker():
         200: 62753,
         255: 80000,
     }
-    assert {byte: Order(speed=byte).ticks_per_second for byte in speeds} == speeds
+    assert {byte: ticks_per_second(byte) for byte in speeds} == speeds
 
 
 def test_messages_beyond_the_controllers_memory_are_lost(host):

@@ -3,7 +3,6 @@ from emulator_fakes import VARIANTS
 
 from finforce_driver.can.protocol import CanMessage
 from finforce_driver.errors import TargetError
-from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.faults import LINE_FAULTS, FaultKind, FaultyAdapter, PlannedFault, draw_plan
 from finforce_sim.emulator.firmware import EmulatedGripper, Fault
 
@@ -13,12 +12,12 @@ POLL = b"t07A0\r"
 
 class FaultyHost:
     def __init__(self, variant="new", plan=(), seed=0):
-        self.faulty = FaultyAdapter(EmulatedAdapter(EmulatedGripper(variant), latency=0.0), plan, seed)
+        self.faulty = FaultyAdapter(EmulatedGripper(variant), plan, seed, latency=0.0)
         self.open()
 
     @property
     def gripper(self):
-        return self.faulty.adapter.gripper
+        return self.faulty.gripper
 
     def open(self):
         self.faulty.write(b"C\rS8\rO\r")
@@ -207,11 +206,11 @@ def test_faults_without_number_or_time_are_refused(host):
 
 
 def test_foreign_messages_of_the_bus_pass_without_spoiling_acknowledgements():
-    faulty = FaultyAdapter(EmulatedAdapter(EmulatedGripper(), "lawicel", latency=0.0))
+    faulty = FaultyAdapter(EmulatedGripper(), ack_mode="lawicel", latency=0.0)
     faulty.write(b"S8\rO\r")
     faulty.inject(FaultKind.LOST)
     faulty.write(POLL)
     faulty.step(0.001)
     assert faulty.read() == b"\r\rz\r"
-    faulty.adapter.deliver(CanMessage(id=0x155))
+    faulty.deliver(CanMessage(id=0x155))
     assert faulty.read() == b"t1550\r"

@@ -34,7 +34,7 @@ def test_speed_is_that_of_the_byte(variant, speed, ticks_per_second):
     host = calibrated_host(variant)
     host.order(255, speed)
     host.wait(0.1)
-    assert 10329 - host.gripper.ticks == pytest.approx(0.1 * ticks_per_second, abs=1.5)  # whole ticks, one step
+    assert 10329 - host.gripper.jaws.encoder == pytest.approx(0.1 * ticks_per_second, abs=1.5)  # whole ticks, one step
     assert code_of(host.poll()) == 0
 
 

@@ -94,7 +94,7 @@ def test_unplugging_is_an_error_for_who_has_it_open_and_replugging_restores_the_
 
 
 def test_adapter_that_unplugs_itself_takes_the_port_along(link):
-    adapter = FaultyAdapter(make_adapter())
+    adapter = FaultyAdapter(EmulatedGripper(), latency=0.0)
     with PtyPort(adapter, link) as port:
         with port.lock:
             adapter.inject(FaultKind.UNPLUGGED, duration=0.1)
@@ -156,8 +156,7 @@ def test_command_line_describes_the_gripper():
         ]
     )
     adapter = build_adapter(options)
-    gripper = adapter.adapter.gripper
-    assert isinstance(adapter, FaultyAdapter)
+    gripper = adapter.gripper
     assert (gripper.variant, gripper.node_id, gripper.jaws.object_opening) == ("old", 3, None)
     assert gripper.jaws.load(0.024) == pytest.approx(0.8) and gripper.jaws.load(0.026) == 0.0
     rigid = build_adapter(build_parser().parse_args(["--object-mm", "25"]))

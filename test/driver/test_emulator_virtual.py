@@ -5,7 +5,6 @@ from emulator_fakes import VARIANTS
 
 from finforce_driver.can.protocol import CanMessage
 from finforce_driver.errors import LinkError
-from finforce_sim.emulator.adapter import EmulatedAdapter
 from finforce_sim.emulator.faults import FaultKind, FaultyAdapter
 from finforce_sim.emulator.firmware import EmulatedGripper
 from finforce_sim.emulator.virtual import VirtualBus, VirtualClock
@@ -17,7 +16,7 @@ REPLY = CanMessage(id=0x078, data=bytes.fromhex("00000030"))
 class Setup:
     def __init__(self, variant="new", **named):
         self.gripper = EmulatedGripper(variant)
-        self.adapter = FaultyAdapter(EmulatedAdapter(self.gripper, **named))
+        self.adapter = FaultyAdapter(self.gripper, **named)
         self.clock = VirtualClock()
         self.bus = VirtualBus(self.adapter, self.clock)
 
@@ -105,7 +104,7 @@ def test_unplugging_is_felt_while_waiting(setup):
 
 
 def test_half_a_line_from_before_does_not_spoil_the_first_reply(setup):
-    setup.adapter.adapter._output.append((0.0, b"t0784"))
+    setup.adapter._output.append((0.0, b"t0784"))
     assert setup.bus.receive(0.001) is None
     setup.bus.close()
     setup.bus.open()
