@@ -6,12 +6,16 @@ Identifiers are (node << 7) | (command << 1) | error. Multi-byte values are big-
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from typing import Protocol
+from threading import Lock
+from time import monotonic
+from typing import Any
 
-from finforce_driver.errors import TargetError
+from finforce_driver.errors import LinkError, TargetError
 
 LARGEST_ID = 0x7FF  # 11 bits; the gripper misreads longer ones
 LARGEST_DATA = 8
@@ -42,40 +46,97 @@ class CanMessage:
         return self.id >> 1 & 0x3F
 
 
-class Bus(Protocol):
-    """What carries messages; opened and closed again and again."""
+class Bus(ABC):
+    """What carries messages; opened and closed again and again.
+
+    `send` may be called from any thread while another one waits in `receive`.
+
+    Args:
+        name: of the port, for errors.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._port: Any = None
+        self._messages: deque[CanMessage] = deque()
+        self._counts: Counter[str] = Counter()
+        self._reading, self._writing = Lock(), Lock()
 
     def open(self) -> None:
-        """Open the port and join the bus.
+        """Open the port and join the bus; one that is open is opened anew.
 
         Raises:
             LinkError: the port is absent, busy or may not be opened.
+            MissingDependencyError: the library for it is not installed.
         """
+        self.close()
+        with self._reading, self._writing:
+            self._port = self._connect()
+            self._counts["opened"] += 1
 
     def close(self) -> None:
-        """Leave the bus and close the port, also one that is gone; never raises."""
+        """Leave the bus and close the port, also one that is gone; a `receive` under way ends first. Never raises."""
+        with self._reading, self._writing:
+            if self._port is not None:
+                self._disconnect(self._port)
+            self._port = None
+            self._messages.clear()
 
     def send(self, message: CanMessage) -> None:
-        """Put a message on the way; may be called from any thread.
+        """Put a message on the way.
 
         Raises:
-            LinkError: the port is closed or gone.
+            LinkError: the port is closed or gone, or takes nothing.
         """
+        with self._writing:
+            self._write(self._opened(), message)
+            self._counts["sent"] += 1
 
     def receive(self, timeout: float) -> CanMessage | None:
-        """Return the next message, None when none came within `timeout` [s].
+        """Return the next message as soon as it is there, None when none came within `timeout` [s].
 
         Raises:
             LinkError: the port is closed or gone.
         """
+        end = monotonic() + timeout
+        with self._reading:
+            while not self._messages:
+                left = max(0.0, end - monotonic())
+                self._messages.extend(self._read(self._opened(), left))
+                if not self._messages and left == 0.0:
+                    return None
+            return self._messages.popleft()
 
     @property
-    def counts(self) -> Mapping[str, int]:
-        """Events since the bus was made, by name: messages, lines that were no messages, refusals (BELL)."""
+    def counts(self) -> Counter[str]:
+        """Events since the bus was made: `opened`, `sent`, `messages`, and what was received that is none."""
+        return self._counts.copy()
 
     @property
     def suspicion(self) -> str:
-        """What seems wrong with the link, in a sentence of advice; "" when nothing does."""
+        """What seems wrong with the link, in a sentence of advice; empty when nothing does."""
+        return ""
+
+    def _opened(self) -> Any:
+        if self._port is None:
+            raise LinkError(f"{self._name} is not open: expected open() first")
+        return self._port
+
+    @abstractmethod
+    def _connect(self) -> Any:
+        """Return the port, opened; raises as `open`."""
+
+    @abstractmethod
+    def _disconnect(self, port: Any) -> None:
+        """Leave the bus and close a port in whichever state, without raising."""
+
+    @abstractmethod
+    def _write(self, port: Any, message: CanMessage) -> None:
+        """Put a message on the way, whole, at once; raises as `send`."""
+
+    @abstractmethod
+    def _read(self, port: Any, timeout: float) -> Sequence[CanMessage]:
+        """Return what has come as soon as something is there, nothing after `timeout` [s]; raises as `receive`."""
 
 
 LARGEST_NODE = 15

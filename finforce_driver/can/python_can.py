@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from contextlib import suppress
-from threading import Lock
-from time import monotonic
 from typing import Any
 
 from finforce.errors import one_line
@@ -22,87 +19,50 @@ _ADVICE = {
 class PythonCanBus(Bus):
     """CAN messages through an interface of python-can, whose errors become ours.
 
-    `send` may be called from any thread while another one waits in `receive`.
+    Args:
+        interface: python-can's name of it: "socketcan", "gs_usb", "virtual", ...
+        channel: python-can's name of the port, "can0" for one.
     """
 
     def __init__(self, interface: str, channel: str) -> None:
-        """Remember what to open; nothing is opened yet.
-
-        Args:
-            interface: python-can's name of it: "socketcan", "gs_usb", "virtual", ...
-            channel: python-can's name of the port, "can0" for one.
-        """
+        super().__init__(f"{interface} {channel}")
         self._interface, self._channel = interface, channel
         self._can: Any = None
-        self._bus: Any = None
         self._errors: tuple[type[Exception], ...] = ()
-        self._reading, self._writing = Lock(), Lock()
-        self._counts: Counter[str] = Counter()
 
-    def open(self) -> None:
-        """Open the interface; one that is open is opened anew.
-
-        Raises:
-            LinkError: the interface does not exist or cannot be opened.
-            MissingDependencyError: python-can is not installed.
-        """
-        self.close()
+    def _connect(self) -> Any:
         self._can = can = import_library("can", "This CAN interface", "python-can")
         # what its interfaces raise: their own, and those of parsers and of the system
         self._errors = (can.CanError, ValueError, IndexError, OSError)
-        with self._reading, self._writing:
-            try:
-                self._bus = can.Bus(interface=self._interface, channel=self._channel, bitrate=BIT_RATE)
-            except (*self._errors, TypeError, ImportError) as error:
-                raise LinkError(self._explain(error)) from error
-            self._counts["opened"] += 1
+        try:
+            return can.Bus(interface=self._interface, channel=self._channel, bitrate=BIT_RATE)
+        except (*self._errors, TypeError, ImportError) as error:
+            raise LinkError(self._explain(error)) from error
 
-    def close(self) -> None:
-        """Leave the bus, also one that is gone; a `receive` under way ends first."""
-        with self._reading, self._writing:
-            if self._bus is not None:
-                # the interfaces raise all sorts of things when their port is gone
-                with suppress(Exception):
-                    self._bus.shutdown()
-                self._bus = None
+    def _disconnect(self, port: Any) -> None:
+        # the interfaces raise all sorts of things when their port is gone
+        with suppress(Exception):
+            port.shutdown()
 
-    def send(self, message: CanMessage) -> None:
-        """Put a message on the way.
+    def _write(self, port: Any, message: CanMessage) -> None:
+        sent = self._can.Message(
+            arbitration_id=message.id, data=message.data, is_remote_frame=message.remote, is_extended_id=False
+        )
+        try:
+            port.send(sent, timeout=0.1)
+        except self._errors as error:
+            raise LinkError(self._explain(error)) from error
 
-        Raises:
-            LinkError: the bus is closed or gone, or took nothing for 0.1 s.
-        """
-        with self._writing:
-            bus = self._opened()
-            sent = self._can.Message(
-                arbitration_id=message.id, data=message.data, is_remote_frame=message.remote, is_extended_id=False
-            )
-            try:
-                bus.send(sent, timeout=0.1)
-            except self._errors as error:
-                raise LinkError(self._explain(error)) from error
-            self._counts["sent"] += 1
-
-    def receive(self, timeout: float) -> CanMessage | None:
-        """Return the next message, None when none came within `timeout` [s].
-
-        Raises:
-            LinkError: the bus is closed or gone.
-        """
-        end = monotonic() + timeout
-        with self._reading:
-            while True:
-                left = max(0.0, end - monotonic())
-                try:
-                    received = self._opened().recv(left)
-                except self._errors as error:
-                    raise LinkError(self._explain(error)) from error
-                message = None if received is None else self._accept(received)
-                if message is not None or left == 0.0:
-                    return message
+    def _read(self, port: Any, timeout: float) -> list[CanMessage]:
+        try:
+            received = port.recv(timeout)
+        except self._errors as error:
+            raise LinkError(self._explain(error)) from error
+        message = None if received is None else self._accept(received)
+        return [] if message is None else [message]
 
     def _accept(self, received: Any) -> CanMessage | None:
-        """Return a message of python-can as ours; None when it is none of ours, which is counted."""
+        """Return a message of python-can as ours; None when it is none, which is counted by what it is."""
         data = bytes(received.data or b"")
         whole = len(data) == received.dlc <= LARGEST_DATA or (received.is_remote_frame and not data)
         kind, message = "messages", None
@@ -117,26 +77,11 @@ class PythonCanBus(Bus):
         self._counts[kind] += 1
         return message
 
-    def _opened(self) -> Any:
-        """Return the open bus."""
-        if self._bus is None:
-            raise LinkError(f"{self._interface} {self._channel} is not open: expected open() first")
-        return self._bus
-
     def _explain(self, error: Exception) -> str:
         """Return what failed and what would help, in one line."""
         fallback = "check interface, channel and cables"
         advice = _ADVICE.get(self._interface, fallback).format(channel=self._channel, bit_rate=BIT_RATE)
         return f"CAN interface {self._interface} {self._channel}: {one_line(error)}: {advice}"
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Events since the bus was made.
-
-        `opened`; `sent`; `messages`; `garbage` (messages whose length is wrong); `extended` (29-bit identifiers);
-        `bus_errors` (error messages).
-        """
-        return self._counts.copy()
 
     @property
     def suspicion(self) -> str:

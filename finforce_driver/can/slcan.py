@@ -11,10 +11,9 @@ import os
 import re
 import select
 import termios
-from collections import Counter, deque
+from collections import Counter
 from contextlib import suppress
 from math import ceil
-from threading import Lock
 from time import monotonic, sleep
 from typing import Any
 
@@ -126,153 +125,93 @@ _SUSPICIOUS_REFUSALS = 5  # one is normal: "C" on a channel that is closed
 class SerialBus(Bus):
     """CAN messages through a USB-CAN adapter that speaks SLCAN, acknowledging or silent.
 
-    `send` may be called from any thread while another one waits in `receive`.
+    The port is opened for this program alone. What the adapter answers is ignored, since many answer nothing.
+
+    Args:
+        port: path of the serial port.
+        baud_rate: of the serial port [baud]; an adapter that is a USB device itself does not care.
     """
 
     def __init__(self, port: str, baud_rate: int = 115_200) -> None:
-        """Remember what to open; nothing is opened yet.
-
-        Args:
-            port: path of the serial port.
-            baud_rate: of the serial port [baud]; an adapter that is a USB device itself does not care.
-        """
-        self._port, self._baud_rate = port, baud_rate
-        self._serial: Any = None
+        super().__init__(port)
+        self._baud_rate = baud_rate
         self._poll = select.poll()
         self._torn = b""  # what ends a line that went out only in part
         self._parser = SlcanParser()
-        self._messages: deque[CanMessage] = deque()
-        self._reading, self._writing = Lock(), Lock()
 
-    def open(self) -> None:
-        """Open the port for this program alone and the adapter's channel; a port that is open is opened anew.
+    def _connect(self) -> Any:
+        port = open_port(self._name, self._baud_rate)
+        try:
+            # the empty line ends what an earlier program left half written: no move may come of it and a letter of ours
+            write_all(port, END + b"C" + END)
+            sleep(_SETTLE)
+            port.reset_input_buffer()
+            self._parser.discard()
+            write_all(port, b"S8\rO\r")  # 1 Mbit/s
+        except _PORT_ERRORS as error:
+            with suppress(*_PORT_ERRORS):
+                port.close()
+            raise self._gone(error) from error
+        self._poll = select.poll()
+        self._poll.register(port.fileno(), select.POLLIN)
+        return port
 
-        What the adapter answers is ignored, since many answer nothing.
-
-        Raises:
-            LinkError: the port is absent, busy, no serial port, may not be opened, or goes while it is opened.
-            MissingDependencyError: pyserial is not installed.
-        """
-        self.close()
-        port = open_port(self._port, self._baud_rate)
-        with self._reading, self._writing:
-            self._serial = port
-            try:
-                self._join()
-            except _PORT_ERRORS as error:
-                self._drop()
-                raise self._gone(error) from error
-            self._poll = select.poll()
-            self._poll.register(port.fileno(), select.POLLIN)
-            self._parser.counts["opened"] += 1
-
-    def _join(self) -> None:
-        """Take the adapter from any state onto the bus, and forget what it had received before."""
-        # the empty line ends what an earlier program left half written: no move may come of it and a letter of ours
-        write_all(self._serial, END + b"C" + END)
-        sleep(_SETTLE)
-        self._serial.reset_input_buffer()
-        self._parser.discard()
-        self._messages.clear()
-        write_all(self._serial, b"S8\rO\r")  # 1 Mbit/s
-
-    def close(self) -> None:
-        """Leave the bus and close the port, also one that is gone; a `receive` under way ends first."""
-        with self._reading, self._writing:
-            if self._serial is not None:
-                try:
-                    write_all(self._serial, END + b"C" + END)
-                except _PORT_ERRORS:
-                    # else the system waits up to 30 s for an adapter that hangs to take the rest
-                    with suppress(*_PORT_ERRORS):
-                        self._serial.reset_output_buffer()
-                self._drop()
-
-    def _drop(self) -> None:
-        """Close the port, whatever state it is in."""
+    def _disconnect(self, port: Any) -> None:
+        try:
+            write_all(port, END + b"C" + END)
+        except _PORT_ERRORS:
+            # else the system waits up to 30 s for an adapter that hangs to take the rest
+            with suppress(*_PORT_ERRORS):
+                port.reset_output_buffer()
         with suppress(*_PORT_ERRORS):
-            self._serial.close()
-        self._serial = None
-        self._messages.clear()
+            port.close()
 
-    def send(self, message: CanMessage) -> None:
-        """Write a message's line, whole, at once.
+    def _write(self, port: Any, message: CanMessage) -> None:
+        try:
+            write_all(port, self._torn + encode_message(message))
+        except _PORT_ERRORS as error:
+            self._torn = END
+            raise self._gone(error) from error
+        self._torn = b""
 
-        Raises:
-            LinkError: the port is closed or gone, or the adapter takes nothing.
-        """
-        line = encode_message(message)
-        with self._writing:
-            port = self._opened()
-            try:
-                write_all(port, self._torn + line)
-            except _PORT_ERRORS as error:
-                self._torn = END
-                raise self._gone(error) from error
-            self._torn = b""
-            self._parser.counts["sent"] += 1
-
-    def receive(self, timeout: float) -> CanMessage | None:
-        """Return the next message as soon as its last byte is there, None when none came within `timeout` [s].
-
-        Raises:
-            LinkError: the port is closed or gone.
-        """
-        end = monotonic() + timeout
-        with self._reading:
-            while not self._messages:
-                port = self._opened()
-                left = max(0.0, end - monotonic())
-                if not self._poll.poll(ceil(1e3 * left)):
-                    return None
-                self._messages.extend(self._parser.feed(self._read(port)))
-                if not self._messages and left == 0.0:
-                    return None
-            return self._messages.popleft()
-
-    def _read(self, port: Any) -> bytes:
-        """Return what has come; the port is known to have something, or to be gone."""
+    def _read(self, port: Any, timeout: float) -> list[CanMessage]:
+        if not self._poll.poll(ceil(1e3 * timeout)):
+            return []
         try:
             data = os.read(port.fileno(), _CHUNK)
         except BlockingIOError:
-            return b""
+            return []
         except OSError as error:
             raise self._gone(error) from error
         if not data:
             raise self._gone("it reads as empty")
-        return data
-
-    def _opened(self) -> Any:
-        """Return the open port."""
-        if self._serial is None:
-            raise LinkError(f"{self._port} is not open: expected open() first")
-        return self._serial
+        return self._parser.feed(data)
 
     def _gone(self, cause: Exception | str) -> LinkError:
         """Return the error of a port that fails while it is open."""
         if isinstance(cause, TimeoutError):
             return LinkError(
-                f"{self._port} took nothing for {_WRITE_TIMEOUT:g} s: expected an adapter that reads; "
+                f"{self._name} took nothing for {_WRITE_TIMEOUT:g} s: expected an adapter that reads; "
                 "unplug it and plug it in again"
             )
-        return LinkError(f"{self._port} is gone ({cause}): was the adapter unplugged? plug it in, then open it again")
+        return LinkError(f"{self._name} is gone ({cause}): was the adapter unplugged? plug it in, then open it again")
 
     @property
-    def counts(self) -> dict[str, int]:
+    def counts(self) -> Counter[str]:
         """Events since the bus was made: `opened`, `sent`, and what `SlcanParser.counts` names."""
-        return self._parser.counts.copy()
+        return self._counts + self._parser.counts
 
     @property
     def suspicion(self) -> str:
         """What the received bytes say is wrong with the adapter, with advice, in one sentence; empty: nothing."""
         if self._parser.unexplained >= _SUSPICIOUS_BYTES:
             return (
-                f"only garbage comes from {self._port} at {self._baud_rate} baud: wrong adapter speed? set baud_rate "
+                f"only garbage comes from {self._name} at {self._baud_rate} baud: wrong adapter speed? set baud_rate "
                 "to the adapter's, and make sure that it speaks SLCAN"
             )
         if self._parser.refused >= _SUSPICIOUS_REFUSALS:
             return (
-                f"the adapter at {self._port} refuses what is sent (BELL): does it know 1 Mbit/s? its queue also fills "
+                f"the adapter at {self._name} refuses what is sent (BELL): does it know 1 Mbit/s? its queue also fills "
                 "when no gripper listens: check 24 V, CANH/CANL"
             )
         return ""

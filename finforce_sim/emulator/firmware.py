@@ -79,8 +79,6 @@ class EmulatedGripper:
         self._rest = 0.0
         self._blip_until = self._received = 0
         self._blip_current = 0.0
-        self._orders = self._list_orders()
-        self._questions = self._list_questions()
         self._power_up()
 
     @property
@@ -138,14 +136,14 @@ class EmulatedGripper:
             return []
         command = message.command
         if message.remote:
-            if command not in self._questions:
+            answer = self._answer(command)
+            if answer is None:
                 return []
             self.protection.feed()
-            return [self._send(command, self._questions[command]())]
+            return [self._send(command, answer)]
         if command == _ORDER:
             return [self._take_order(message)]
-        if command in self._orders:
-            self._orders[command](message.data)
+        self._obey(command, message.data)
         return []
 
     def reboot(self) -> None:
@@ -160,36 +158,63 @@ class EmulatedGripper:
         self._blip_current = (-0.9 if closes else 0.9) * abs(self.order.current_mA)
         self._blip_until = self._steps + round(duration / STEP)
 
-    def _list_orders(self) -> dict[int, Callable[[bytes], None]]:
-        """Return what obeys the commands that nothing answers."""
-        return {
-            0: self._take_estop,
-            1: self._clear_errors,
-            2: self._feed_watchdog,
-            4: self._feed_watchdog,
-            11: self._set_node,
-            12: self._go_idle,
-            13: self._save,
-            14: lambda _data: self.reboot(),
-            15: self._set_watchdog,
-            30: self._set_heartbeat,
-            62: self._start_calibration,
-        }
+    def _answer(self, command: int) -> bytes | None:
+        """Return the data that answers a remote message; None where nothing does."""
+        match command:
+            case 10:
+                return b""
+            case 23:
+                return struct.pack(">h", self.protection.reported_temperature)
+            case 24:
+                return struct.pack(">H", round(1000.0 * self.protection.voltage))
+            case 25:
+                return struct.pack(">BBBi", 1, 1, 101, 48)
+            case 26:
+                return self.protection.error_bytes
+            case 27:
+                return struct.pack(">h", self.reported_current)
+            case 28:
+                return struct.pack(">ii", self.jaws.encoder, round(self.jaws.velocity))
+            case 33 if self._firmware.has_torque_constant:
+                return struct.pack(">f", 0.325)
+        return None
 
-    def _list_questions(self) -> dict[int, Callable[[], bytes]]:
-        """Return what answers the remote messages."""
-        answers: dict[int, Callable[[], bytes]] = {
-            10: lambda: b"",
-            23: lambda: struct.pack(">h", self.protection.reported_temperature),
-            24: lambda: struct.pack(">H", round(1000.0 * self.protection.voltage)),
-            25: lambda: struct.pack(">BBBi", 1, 1, 101, 48),
-            26: lambda: self.protection.error_bytes,
-            27: lambda: struct.pack(">h", self.reported_current),
-            28: lambda: struct.pack(">ii", self.jaws.encoder, round(self.jaws.velocity)),
-        }
-        if self._firmware.has_torque_constant:
-            answers[33] = lambda: struct.pack(">f", 0.325)
-        return answers
+    def _obey(self, command: int, data: bytes) -> None:
+        """Do what a command says that nothing answers."""
+        match command, len(data):
+            case 0, _:
+                self.faults.add(Fault.ESTOP_COMMAND)
+            case 1, _:
+                self.faults.clear()
+                self.mode = Mode.IDLE
+            case 2 | 4, _:
+                self.violations["raw motor command"] += 1
+                self.protection.feed()
+            case 12, _:
+                self.mode = Mode.IDLE
+            case 14, _:
+                self.reboot()
+            case 62, 0:
+                self.mode = Mode.CALIBRATE
+            case _:
+                self._configure(command, data)
+
+    def _configure(self, command: int, data: bytes) -> None:
+        """Take a setting, or save all of them."""
+        protection = self.protection
+        match command, len(data):
+            case 11, 1:
+                self.violations.update(["node id out of range"] * (data[0] > 15))
+                self.node_id = data[0]
+            case 13, _:
+                watchdog, heartbeat = protection.watchdog_period, self.heartbeat_period
+                self._stored = {"node_id": self.node_id, "watchdog": watchdog, "heartbeat": heartbeat}
+                self._deaf_until = self._steps + round(self.settings.save_time / STEP)
+            case 15, self._firmware.watchdog_length:
+                protection.watchdog_period = int.from_bytes(data[:4], "big", signed=True)
+                protection.feed()
+            case 30, 4:
+                self.heartbeat_period = max(int.from_bytes(data, "big", signed=True), 0)
 
     def _power_up(self) -> None:
         self.node_id = self._stored["node_id"]
@@ -264,44 +289,6 @@ class EmulatedGripper:
             | self.calibrated
         )
         return struct.pack(">BhB", self._position, self.reported_current, status)
-
-    def _take_estop(self, _data: bytes) -> None:
-        self.faults.add(Fault.ESTOP_COMMAND)
-
-    def _clear_errors(self, _data: bytes) -> None:
-        self.faults.clear()
-        self.mode = Mode.IDLE
-
-    def _feed_watchdog(self, _data: bytes) -> None:
-        self.violations["raw motor command"] += 1
-        self.protection.feed()
-
-    def _go_idle(self, _data: bytes) -> None:
-        self.mode = Mode.IDLE
-
-    def _start_calibration(self, data: bytes) -> None:
-        if not data:
-            self.mode = Mode.CALIBRATE
-
-    def _set_node(self, data: bytes) -> None:
-        if len(data) == 1:
-            if data[0] > 15:
-                self.violations["node id out of range"] += 1
-            self.node_id = data[0]
-
-    def _set_watchdog(self, data: bytes) -> None:
-        if len(data) == self._firmware.watchdog_length:
-            self.protection.watchdog_period = int.from_bytes(data[:4], "big", signed=True)
-            self.protection.feed()
-
-    def _set_heartbeat(self, data: bytes) -> None:
-        if len(data) == 4:
-            self.heartbeat_period = max(int.from_bytes(data, "big", signed=True), 0)
-
-    def _save(self, _data: bytes) -> None:
-        watchdog, heartbeat = self.protection.watchdog_period, self.heartbeat_period
-        self._stored = {"node_id": self.node_id, "watchdog": watchdog, "heartbeat": heartbeat}
-        self._deaf_until = self._steps + round(self.settings.save_time / STEP)
 
 
 _COLDEST, _HOTTEST = -20.0, 75.0  # [deg C] of the motor

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping
+from collections import Counter, deque
 from threading import Event
 from typing import Any
 
-from finforce_driver.can.protocol import CanMessage
+from finforce_driver.can.protocol import Bus, CanMessage
 from finforce_driver.can.slcan import SlcanParser, encode_message
 from finforce_driver.errors import LinkError
 from finforce_driver.gripper import Clock
@@ -53,7 +52,7 @@ class VirtualClock(Clock):
             part.step(dt)
 
 
-class VirtualBus:
+class VirtualBus(Bus):
     """A bus through the bytes of an emulated adapter, in stepped time; receiving lets time pass.
 
     Attributes:
@@ -62,53 +61,17 @@ class VirtualBus:
 
     def __init__(self, adapter: EmulatedAdapter, clock: VirtualClock) -> None:
         """Connect an adapter, which the clock steps from now on."""
+        super().__init__("virtual adapter")
         self.sent: deque[tuple[float, CanMessage]] = deque(maxlen=1000)
         self._adapter = adapter
         self._clock = clock
         self._parser = SlcanParser()
-        self._waiting: deque[CanMessage] = deque()
-        self._opened = False
         clock.attach(adapter)
 
     @property
-    def counts(self) -> Mapping[str, int]:
+    def counts(self) -> Counter[str]:
         """Return what the parser counted."""
-        return self._parser.counts
-
-    @property
-    def suspicion(self) -> str:
-        """Return that nothing is wrong: no line lies between."""
-        return ""
-
-    def open(self) -> None:
-        """Join the bus.
-
-        Raises:
-            LinkError: the adapter is unplugged.
-        """
-        if not self._adapter.plugged:
-            raise LinkError("virtual adapter: it is unplugged, expected it to be there; plug it in")
-        self._adapter.read()
-        self._waiting.clear()
-        self._parser.discard()
-        self._adapter.write(b"C\rS8\rO\r")
-        self._opened = True
-
-    def close(self) -> None:
-        """Leave the bus."""
-        if self._opened and self._adapter.plugged:
-            self._adapter.write(b"C\r")
-        self._opened = False
-
-    def send(self, message: CanMessage) -> None:
-        """Hand a message to the adapter at once.
-
-        Raises:
-            LinkError: the bus is closed, or the adapter unplugged.
-        """
-        self._check()
-        self.sent.append((self._clock.now(), message))
-        self._adapter.write(encode_message(message))
+        return self._parser.counts.copy()
 
     def receive(self, timeout: float) -> CanMessage | None:
         """Return the next message; time passes until it comes or `timeout` [s] is over.
@@ -118,17 +81,35 @@ class VirtualBus:
         """
         end = self._clock.now() + timeout
         while True:
-            self._check()
-            self._waiting.extend(self._parser.feed(self._adapter.read()))
-            if self._waiting:
-                return self._waiting.popleft()
+            self._messages.extend(self._read(self._opened(), 0.0))
+            if self._messages:
+                return self._messages.popleft()
             left = end - self._clock.now()
             if left <= 1e-9:
                 return None
             self._clock.tick(min(left, _STEP))
 
-    def _check(self) -> None:
-        if not self._opened:
-            raise LinkError("virtual adapter: the bus is closed, expected it open; open it")
+    def _opened(self) -> EmulatedAdapter:
+        adapter = super()._opened()
+        if not adapter.plugged:
+            raise LinkError(f"{self._name}: it was unplugged, expected it to stay; plug it in and open the bus")
+        return adapter
+
+    def _connect(self) -> EmulatedAdapter:
         if not self._adapter.plugged:
-            raise LinkError("virtual adapter: it was unplugged, expected it to stay; plug it in and open the bus")
+            raise LinkError(f"{self._name}: it is unplugged, expected it to be there; plug it in")
+        self._adapter.read()
+        self._parser.discard()
+        self._adapter.write(b"C\rS8\rO\r")
+        return self._adapter
+
+    def _disconnect(self, port: EmulatedAdapter) -> None:
+        if port.plugged:
+            port.write(b"C\r")
+
+    def _write(self, port: EmulatedAdapter, message: CanMessage) -> None:
+        self.sent.append((self._clock.now(), message))
+        port.write(encode_message(message))
+
+    def _read(self, port: EmulatedAdapter, timeout: float) -> list[CanMessage]:
+        return self._parser.feed(port.read())

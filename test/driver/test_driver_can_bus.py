@@ -37,7 +37,7 @@ def test_messages_that_are_no_classic_messages_are_dropped_and_counted(pair):
         can.Message(arbitration_id=0x78, is_extended_id=False, is_error_frame=True),
         can.Message(arbitration_id=0x78, is_extended_id=False, is_fd=True, data=b"1234"),
     ):
-        pair[0]._bus.send(message)
+        pair[0]._port.send(message)
     assert pair[1].receive(0.0) is None
     assert pair[1].receive(0.0) is None
     assert pair[1].receive(0.0) is None
@@ -53,7 +53,7 @@ def test_a_bus_that_fails_is_named_with_advice_and_can_be_closed(pair, monkeypat
         raise OSError("network is down")
 
     for name in ("recv", "send"):
-        monkeypatch.setattr(pair[0]._bus, name, fail)
+        monkeypatch.setattr(pair[0]._port, name, fail)
     with pytest.raises(LinkError, match="CAN interface virtual.*network is down.*check interface"):
         act(pair[0])
     pair[0].close()

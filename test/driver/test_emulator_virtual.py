@@ -70,9 +70,9 @@ def test_waiting_ends_when_woken(setup):
 def test_closed_bus_takes_nothing(setup):
     setup.bus.close()
     setup.bus.close()
-    with pytest.raises(LinkError, match="open it"):
+    with pytest.raises(LinkError, match="expected open"):
         setup.bus.send(POLL)
-    with pytest.raises(LinkError, match="open it"):
+    with pytest.raises(LinkError, match="expected open"):
         setup.bus.receive(0.1)
 
 
