@@ -235,12 +235,6 @@ def news_of_state(state: GripperState) -> str:
     return "the gripper is ready" if outcome.level == Level.OK else outcome.text
 
 
-def gripper_alarms(state: GripperState) -> list[Outcome]:
-    """Return the alarm of a gripper that cannot do what it is asked."""
-    outcome = outcome_of_state(state)
-    return [] if outcome.level == Level.OK else [outcome]
-
-
 def describe_state(state: GripperState) -> dict[str, str]:
     """Return what is known of a gripper as text."""
     return {
@@ -268,9 +262,12 @@ def outcome_of_grasp(status: GraspStatus) -> Outcome:
     return Outcome(level=level, reason=status.phase.value, text=status.reason)
 
 
-def grasp_alarms(status: GraspStatus | None) -> list[Outcome]:
-    """Return the alarm of a grasp that failed, until something else is commanded."""
-    return [outcome_of_grasp(status)] if status is not None and status.failed else []
+def find_alarms(state: GripperState, status: GraspStatus | None) -> list[Outcome]:
+    """Return the alarms of a gripper that cannot do what it is asked, and of a grasp that failed."""
+    found = [outcome_of_state(state)]
+    if status is not None and status.failed:
+        found.append(outcome_of_grasp(status))
+    return [outcome for outcome in found if outcome.level != Level.OK]
 
 
 def describe_grasp(status: GraspStatus | None) -> dict[str, str]:

@@ -35,9 +35,8 @@ from finforce_driver.messages import (
     describe_state,
     fill_gripper_command,
     fill_joint_state,
+    find_alarms,
     goal_from_joint_state,
-    grasp_alarms,
-    gripper_alarms,
     move_from_gripper_command,
     move_from_joint_state,
     move_from_parallel_command,
@@ -290,11 +289,8 @@ class GripperDriverNode(Node):
             outcome = outcome_of_grasp(status)
             report = Report(level=outcome.level, message=outcome.text, values=describe_grasp(status))
             self.grasp_state.publish(ros.status_message("finforce: grasp", self.get_name(), report))
-        for outcome in grasp_alarms(status):
-            if self.health.is_news("grasp", outcome.text):
+            if status.failed:
                 self._log(outcome.level, f"the grasp failed: {outcome.text}")
-        if status is not None and not status.failed:
-            self.health.is_news("grasp", "")
 
     def _log(self, level: Level, text: str) -> None:
         """Log a sentence at the level of a diagnosis."""
@@ -370,7 +366,7 @@ class GripperDriverNode(Node):
         """Return how gripper and grasp are doing."""
         state = self.gripper.state
         values = describe_state(state) | describe_grasp(self.session.status)
-        return self.health.report([*alarms, *gripper_alarms(state), *grasp_alarms(self.session.status)], values)
+        return self.health.report([*alarms, *find_alarms(state, self.session.status)], values)
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds

@@ -119,7 +119,6 @@ class GraspStatus:
         force: last one measured [N]; NaN before the first.
         predicted: force now, over the latency [N]; NaN without load.
         stiffness: change of the force per metre of closing [N/m]; as expected until it is learnt.
-        stiffness_stddev: of it [N/m].
         latency: from image to arrival of a force, median [s].
         period: between two images with a force, median [s].
         overshoot_bound: by which the set force is passed at most if the stiffness at most doubles on the way that no
@@ -138,7 +137,6 @@ class GraspStatus:
     force: float = math.nan
     predicted: float = math.nan
     stiffness: float = math.nan
-    stiffness_stddev: float = math.nan
     latency: float = math.nan
     period: float = math.nan
     overshoot_bound: float = math.nan

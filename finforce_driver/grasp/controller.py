@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from finforce_driver.errors import BackOffError, GraspError, UnseenForceError
-from finforce_driver.grasp.load_watch import NOISE, ForceFeed, ForceSample, LoadWatch, LocatedForce, TouchSample
-from finforce_driver.grasp.plan import MOTOR_MARGIN, GraspPlan, JawHistory, JawPosition
+from finforce_driver.grasp.load_watch import NOISE, ForceFeed, ForceSample, JawPosition, LoadWatch, TouchSample
+from finforce_driver.grasp.plan import MOTOR_MARGIN, GraspPlan, JawHistory
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GraspStatus, GripperState, MoveRequest, Phase
 
@@ -146,16 +146,13 @@ class ForceGrasp:
     def _take(self, sample: ForceSample, here: JawPosition) -> None:
         """Take a force and where the jaws were at its image."""
         passing = self._jaws.stepping and not here.resting and self._load.loaded
-        located = LocatedForce(
-            force=sample.force,
-            stamp=sample.stamp,
-            opening=here.opening,
+        self._load.take(
+            sample,
+            here,
             travel_stddev=self._jaws.travel_stddev(self._position, here),
-            resting=here.resting,
             passing=passing,
-            stddev=sample.stddev,
+            touching=self._feed.is_touching(sample.stamp),
         )
-        self._load.take(located, self._feed.is_touching(sample.stamp))
         if not (self._load.suspect or passing):
             self._position = here
         if self.phase is GraspPhase.APPROACH:
@@ -284,7 +281,6 @@ class ForceGrasp:
             force=load.force,
             predicted=model.predict(here) if load.loaded else math.nan,
             stiffness=model.stiffness,
-            stiffness_stddev=model.stiffness_stddev,
             latency=feed.latency,
             period=feed.period,
             overshoot_bound=self._plan.overshoot_bound(self.set_force),

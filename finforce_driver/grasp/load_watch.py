@@ -27,26 +27,36 @@ _EMPTY = 3  # images in a row without force after which the object is gone
 
 
 @dataclass(frozen=True, kw_only=True)
-class LocatedForce:
-    """A force and where it belongs.
+class ForceSample:
+    """The grasp force of one image.
 
     Attributes:
+        stamp: time of the image [s], on the driver's clock.
+        arrived: when the force was there [s], on the same clock.
         force: [N].
-        stamp: time of the image [s].
-        opening: at that time [m].
-        travel_stddev: standard deviation of the travel since the last force that was no passing one [m].
-        resting: the jaws rested at their target.
-        passing: taken between two rests, which say more than it does.
-        stddev: of the force, as its source states it [N].
+        stddev: of the force, as its source states it [N]; 0 where it states none.
     """
 
-    force: float
     stamp: float
-    opening: float
-    travel_stddev: float = 0.0
-    resting: bool = False
-    passing: bool = False
+    arrived: float
+    force: float
     stddev: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TouchSample:
+    """Whether the jaws are reported to touch in the image at `stamp` [s], on the driver's clock."""
+
+    stamp: float
+    touching: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class JawPosition:
+    """An opening [m] on the scale of the commands, and whether the jaws rested there, at their target."""
+
+    opening: float
+    resting: bool
 
 
 class LoadWatch:
@@ -87,35 +97,46 @@ class LoadWatch:
         """Force [N] above which the jaws are loaded: the offset without load, and the onset force."""
         return min(median(self._idle), _LARGEST_OFFSET) + self._onset_force
 
-    def take(self, sample: LocatedForce, touching: bool) -> None:
+    def take(
+        self,
+        sample: ForceSample,
+        jaws: JawPosition,
+        *,
+        travel_stddev: float = 0.0,
+        passing: bool = False,
+        touching: bool = False,
+    ) -> None:
         """Take the force of a later image.
 
         Args:
-            sample: force, time and opening.
+            sample: the force.
+            jaws: where they were at its image.
+            travel_stddev: standard deviation of the travel since the last force that was no passing one [m].
+            passing: taken between two rests, which say more than it does.
             touching: the jaws are reported to touch, so that one image makes an onset.
 
         Raises:
             GraspError: the force is above the limit or frozen, a jump was confirmed, or the object is gone.
         """
-        self._check_life(sample)
-        self.suspect = self._is_jump(sample)
+        self._check_life(sample.force, jaws.opening)
+        self.suspect = self._is_jump(sample.force, jaws.opening)
         if self.suspect:
             return
         if sample.force > self._settings.force_limit:
             raise GraspError(
                 f"the force is {sample.force:.2f} N, above the limit of {self._settings.force_limit:g} N: the jaws hold"
             )
-        self.force, self.opening, self.resting = sample.force, sample.opening, sample.resting
+        self.force, self.opening, self.resting = sample.force, jaws.opening, jaws.resting
         self.stddev = sample.stddev
         if not self.loaded:
-            self._watch_onset(sample, touching)
+            self._watch_onset(sample, jaws, travel_stddev, touching)
             return
-        if not sample.passing:
-            self.model.update(sample.opening, sample.force, sample.stamp, sample.travel_stddev)
+        if not passing:
+            self.model.update(jaws.opening, sample.force, sample.stamp, travel_stddev)
         self._check_presence(sample.force)
         self.peak = max(self.peak, sample.force)
 
-    def _watch_onset(self, sample: LocatedForce, touching: bool) -> None:
+    def _watch_onset(self, sample: ForceSample, jaws: JawPosition, travel_stddev: float, touching: bool) -> None:
         """Begin the model with the first of the images that show a load."""
         if sample.force <= self.onset:
             self._above = 0
@@ -123,12 +144,12 @@ class LoadWatch:
             return
         self._above += 1
         if self._above == 1:
-            self.model.begin(sample.opening, sample.force, sample.stamp)
+            self.model.begin(jaws.opening, sample.force, sample.stamp)
         else:
-            self.model.update(sample.opening, sample.force, sample.stamp, sample.travel_stddev)
+            self.model.update(jaws.opening, sample.force, sample.stamp, travel_stddev)
         self.loaded = touching or self._above >= _CONFIRMED
 
-    def _is_jump(self, sample: LocatedForce) -> bool:
+    def _is_jump(self, force: float, opening: float) -> bool:
         """Whether neither motion nor noise explains a force.
 
         Raises:
@@ -137,51 +158,47 @@ class LoadWatch:
         """
         if math.isnan(self.force):
             return False
-        beyond = self._surprise(sample)
+        beyond = self._surprise(force, opening)
         if abs(beyond) <= _JUMP:
             self._jumps = 0
             return False
         self._jumps += 1
-        if self._jumps >= _CONFIRMED and not self.loaded and sample.opening < self.opening:
+        if self._jumps >= _CONFIRMED and not self.loaded and opening < self.opening:
             bound = f"{1e-3 * self._settings.largest_stiffness:g} N/mm (largest_stiffness)"
             raise BackOffError(
-                f"the force rose to {sample.force:.2f} N at the first touch, more than {bound} explain: is "
+                f"the force rose to {force:.2f} N at the first touch, more than {bound} explain: is "
                 "something stiffer than that between the jaws? They back off"
             )
         if self._jumps >= _CONFIRMED:
             verb = "jumped to" if beyond > 0.0 else "fell to"
             raise GraspError(
-                f"the force {verb} {sample.force:.2f} N from {self.force:.2f} N, which no motion of the jaws explains: "
+                f"the force {verb} {force:.2f} N from {self.force:.2f} N, which no motion of the jaws explains: "
                 "did the object slip, break or get pushed?"
             )
         return True
 
-    def _surprise(self, sample: LocatedForce) -> float:
+    def _surprise(self, force: float, opening: float) -> float:
         """Return by how much a force differs from what may be expected [N], signed."""
         if self.loaded:
-            return self.model.surprise(sample.opening, sample.force)
+            return self.model.surprise(opening, force)
         # where contact began between the two images is not known: any force up to the greatest stiffness may be
-        reach = self._settings.largest_stiffness * max(0.0, self.opening - sample.opening)
-        return max(0.0, sample.force - self.force - reach)
+        reach = self._settings.largest_stiffness * max(0.0, self.opening - opening)
+        return max(0.0, force - self.force - reach)
 
-    def _check_life(self, sample: LocatedForce) -> None:
+    def _check_life(self, force: float, opening: float) -> None:
         """Refuse a force that stays the same while the jaws close; none at all always does.
 
         Raises:
             GraspError: several images in a row have the same force to the last digit.
         """
-        if sample.force != self._last or sample.force <= 0.0:
-            self._same, self._last, self._last_opening = 0, sample.force, sample.opening
+        if force != self._last or force <= 0.0:
+            self._same, self._last, self._last_opening = 0, force, opening
             return
         self._same += 1
         # below the onset an offset may be the same for ever
-        if (
-            sample.force > self.onset
-            and self._same >= _FROZEN - 1
-            and self._last_opening - sample.opening > _FROZEN_WAY
-        ):
+        if force > self.onset and self._same >= _FROZEN - 1 and self._last_opening - opening > _FROZEN_WAY:
             raise GraspError(
-                f"the force is {sample.force} N to the last digit in {self._same + 1} images, although the jaws close: "
+                f"the force is {force} N to the last digit in {self._same + 1} images, although the jaws close: "
                 "is the estimator frozen?"
             )
 
@@ -203,31 +220,6 @@ _PERIOD = 1.0 / 30.0  # [s] of a D405, until it is measured
 _LATENCY = 0.1  # [s] until it is measured
 _SOONEST = 0.1  # of the median latency: a pipeline that others have left alone becomes several times as fast
 _KNOWN = 8  # samples after which the latency is known
-
-
-@dataclass(frozen=True, kw_only=True)
-class ForceSample:
-    """The grasp force of one image.
-
-    Attributes:
-        stamp: time of the image [s], on the driver's clock.
-        arrived: when the force was there [s], on the same clock.
-        force: [N].
-        stddev: of the force, as its source states it [N]; 0 where it states none.
-    """
-
-    stamp: float
-    arrived: float
-    force: float
-    stddev: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class TouchSample:
-    """Whether the jaws are reported to touch in the image at `stamp` [s], on the driver's clock."""
-
-    stamp: float
-    touching: bool
 
 
 class ForceFeed:

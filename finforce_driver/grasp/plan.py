@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from finforce_driver.errors import GraspError
-from finforce_driver.grasp.load_watch import ForceFeed, LoadWatch
+from finforce_driver.grasp.load_watch import ForceFeed, JawPosition, LoadWatch
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GripperState
 
@@ -187,14 +186,6 @@ _POWERED_AFTER = 0.3  # [s] of the first command, which switches the power stage
 _LATE = 1.0  # [s] after which jaws that have not come do not follow
 # A byte says the opening to a step; between two bytes it is interpolated. At rest the jaws are within 4 ticks.
 _MOVING_STDDEV, _RESTING_STDDEV = 0.35, 0.1  # [steps]
-
-
-@dataclass(frozen=True, kw_only=True)
-class JawPosition:
-    """An opening [m] on the scale of the commands, and whether the jaws rested there, at their target."""
-
-    opening: float
-    resting: bool
 
 
 class JawHistory:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -37,7 +36,7 @@ class SlipGuard:
     def begin(self, force: float) -> None:
         """Take the set force [N] that somebody asked for; rises count from there."""
         self._asked, self._raised = force, -math.inf
-        self._rows: dict[str, deque[tuple[float, bool]]] = {}
+        self._sliding: dict[str, tuple[float, int]] = {}  # of each jaw: stamp, and fast images in a row
 
     def take(self, jaw: str, speed: float, stamp: float, force: float) -> float | None:
         """Take a speed of the object over a jaw; return the force to be set now [N], None to leave it.
@@ -49,19 +48,17 @@ class SlipGuard:
             force: that is set [N].
         """
         settings = self._settings
-        row = self._rows.setdefault(jaw, deque(maxlen=_IN_A_ROW))
-        if row and not 0.0 < stamp - row[-1][0] < _LONGEST_GAP:
-            row.clear()
-        row.append((stamp, speed > _SLIDES))
-        slides = len(row) == _IN_A_ROW and all(fast for _, fast in row)
-        if not slides or settings.slip_raise == 0.0 or stamp - self._raised < _APART:
+        last, count = self._sliding.get(jaw, (-math.inf, 0))
+        count = (count if 0.0 < stamp - last < _LONGEST_GAP else 0) + 1 if speed > _SLIDES else 0
+        self._sliding[jaw] = (stamp, count)
+        if count < _IN_A_ROW or settings.slip_raise == 0.0 or stamp - self._raised < _APART:
             return None
         limit = min(_LIMIT * self._asked, settings.force_limit)
         wanted = min(force + settings.slip_raise * self._asked, limit)
         if not wanted > force:
             return None
         self._raised = stamp
-        row.clear()
+        self._sliding[jaw] = (stamp, 0)
         return wanted
 
 

@@ -75,7 +75,6 @@ def test_stiffness_is_learnt_on_the_way():
     # relaxation makes a loaded finger up to 15 % stiffer than its spring
     assert soft.status.stiffness == pytest.approx(330.0, rel=0.3)
     assert stiff.status.stiffness == pytest.approx(1400.0, rel=0.3)
-    assert stiff.status.stiffness_stddev < 500.0
 
 
 def test_stiffness_that_triples_while_loading_is_followed():

@@ -16,11 +16,11 @@ from finforce_driver.grasp.load_watch import (
     ForceFeed,
     ForceModel,
     ForceSample,
+    JawPosition,
     LoadWatch,
-    LocatedForce,
     TouchSample,
 )
-from finforce_driver.grasp.plan import JawHistory, JawPosition
+from finforce_driver.grasp.plan import JawHistory
 from finforce_driver.settings import GraspGoal, GraspSettings
 from finforce_driver.state import GraspPhase, GripperState, Phase
 
@@ -154,7 +154,8 @@ def watch(forces, *, touching=False, start=0.02, speed=0.004):
     loads = LoadWatch(GraspSettings(), 0.25)
     for index, force in enumerate(forces):
         opening = start - speed * index / 30.0
-        loads.take(LocatedForce(force=force, stamp=index / 30.0, opening=opening, travel_stddev=0.0), touching)
+        sample = ForceSample(stamp=index / 30.0, arrived=index / 30.0, force=force)
+        loads.take(sample, JawPosition(opening=opening, resting=False), touching=touching)
     return loads
 
 
