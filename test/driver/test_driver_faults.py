@@ -1,8 +1,8 @@
 """Claims about the driver under random faults, against the emulator's truth."""
 
 import pytest
-from finforce_driver.machine.exchange import Exchange
 
+from finforce_driver.machine.drive import Exchange
 from finforce_driver.machine.knowledge import ReplyFilter
 from finforce_sim.emulator.faults import FaultKind
 from lab.bench.driver_faults import FaultRun, choose_kinds
@@ -30,7 +30,7 @@ def test_faults_never_become_wrong_states_hangs_crashes_or_motion(seed):
 
 
 def test_a_driver_that_believes_every_reply_is_found_out(monkeypatch):
-    monkeypatch.setattr(ReplyFilter, "take", lambda _self, sample, _expected: sample.reply)
+    monkeypatch.setattr(ReplyFilter, "take", lambda _self, reply, _drift, _reach: reply)
     assert FaultRun(1, 60, (FaultKind.FLIPPED,)).run().wrong
 
 
